@@ -1,0 +1,91 @@
+"""What nodes say to each other: frozen, typed data, and nothing else.
+
+No asyncio, no input or output, no imports from the other rooms. A node's own events subclass
+`Event`; those here are shared, so that two people's nodes fit together.
+"""
+
+from events.announcements import (
+    Announcement,
+    CameraAnnouncement,
+    ImuAnnouncement,
+    VehicleAnnouncement,
+)
+from events.base import Category, Event, Quaternion, Vector3
+from events.control import (
+    Arm,
+    AttitudeSetpoint,
+    BodyRateSetpoint,
+    Disarm,
+    Hover,
+    Land,
+    PositionSetpoint,
+    Takeoff,
+    VelocitySetpoint,
+)
+from events.estimates import PoseEstimate, TrackingLost, TrackingRegained
+from events.geometry import Odometry, PoseStamped, TransformStamped
+from events.lifecycle import Shutdown
+from events.maps import PointCloud
+from events.scores import Score
+from events.sensors import (
+    CameraInfo,
+    DepthImage,
+    FluidPressure,
+    Image,
+    Imu,
+    LaserScan3D,
+    MagneticField,
+    NavSatFix,
+    Range,
+    SegmentationImage,
+)
+from events.vehicle import Armed, Collision, Disarmed, Landed, TakenOff
+from events.window import KeyPressed, KeyReleased, WindowClosed, WindowResized
+
+__all__ = [
+    "Announcement",
+    "Arm",
+    "Armed",
+    "AttitudeSetpoint",
+    "BodyRateSetpoint",
+    "CameraAnnouncement",
+    "CameraInfo",
+    "Category",
+    "Collision",
+    "DepthImage",
+    "Disarm",
+    "Disarmed",
+    "Event",
+    "FluidPressure",
+    "Hover",
+    "Image",
+    "Imu",
+    "ImuAnnouncement",
+    "KeyPressed",
+    "KeyReleased",
+    "Land",
+    "Landed",
+    "LaserScan3D",
+    "MagneticField",
+    "NavSatFix",
+    "Odometry",
+    "PointCloud",
+    "PoseEstimate",
+    "PoseStamped",
+    "PositionSetpoint",
+    "Quaternion",
+    "Range",
+    "Score",
+    "SegmentationImage",
+    "Shutdown",
+    "TakenOff",
+    "Takeoff",
+    "TrackingLost",
+    "TrackingRegained",
+    "TransformStamped",
+    "Vector3",
+    "VehicleAnnouncement",
+    "VelocitySetpoint",
+    "WindowClosed",
+    "WindowResized",
+]

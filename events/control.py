@@ -1,0 +1,110 @@
+"""What a vehicle can be asked to do. Newest set-point wins, whatever its kind.
+
+World frame NED, body frame FRD, SI units; see `events.geometry`.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from events.base import Category, Event, Quaternion, Vector3
+
+
+class Arm(Event):
+    """Let the motors turn."""
+
+    category: ClassVar[Category] = Category.CONTROL
+
+
+class Disarm(Event):
+    """Stop the motors."""
+
+    category: ClassVar[Category] = Category.CONTROL
+
+
+class Takeoff(Event):
+    """Arm if need be, climb straight up and hover.
+
+    Attributes:
+        altitude: Metres above the point of take-off.
+    """
+
+    category: ClassVar[Category] = Category.CONTROL
+
+    altitude: float = 1.5
+
+
+class Land(Event):
+    """Go straight down, and disarm when the ground is felt."""
+
+    category: ClassVar[Category] = Category.CONTROL
+
+
+class Hover(Event):
+    """Stop and hold the position."""
+
+    category: ClassVar[Category] = Category.CONTROL
+
+
+class PositionSetpoint(Event):
+    """Be at a place; velocity and acceleration are feed-forward for those who follow a path.
+
+    Attributes:
+        position: Metres in ``map``.
+        velocity: Metres per second in ``map``, expected at that place.
+        acceleration: Metres per second squared in ``map``, expected at that place.
+        yaw: Heading in radians, clockwise from north seen from above.
+        yaw_rate: Radians per second, expected at that place.
+    """
+
+    category: ClassVar[Category] = Category.CONTROL
+
+    position: Vector3
+    velocity: Vector3 = (0.0, 0.0, 0.0)
+    acceleration: Vector3 = (0.0, 0.0, 0.0)
+    yaw: float = 0.0
+    yaw_rate: float = 0.0
+
+
+class VelocitySetpoint(Event):
+    """Move at a speed.
+
+    Attributes:
+        frame_id: ``map``, or ``heading``: x along the vehicle's heading, y to its right, z down.
+        velocity: Metres per second in that frame.
+        yaw_rate: Radians per second, clockwise seen from above.
+    """
+
+    category: ClassVar[Category] = Category.CONTROL
+
+    frame_id: str = "map"
+    velocity: Vector3
+    yaw_rate: float = 0.0
+
+
+class AttitudeSetpoint(Event):
+    """Hold an attitude at a thrust.
+
+    Attributes:
+        orientation: Rotation from body to ``map``.
+        thrust: 0 to 1 of what all motors can give together.
+    """
+
+    category: ClassVar[Category] = Category.CONTROL
+
+    orientation: Quaternion
+    thrust: float
+
+
+class BodyRateSetpoint(Event):
+    """Turn at given rates at a thrust.
+
+    Attributes:
+        angular_velocity: Radians per second in the body frame.
+        thrust: 0 to 1 of what all motors can give together.
+    """
+
+    category: ClassVar[Category] = Category.CONTROL
+
+    angular_velocity: Vector3
+    thrust: float

@@ -1,0 +1,1 @@
+"""Nodes that plug in: keyboard, scripted flights, recorders."""

@@ -1,0 +1,1 @@
+"""Simulators: pure physics, control and camera modules, and one thin node each."""
