@@ -1,0 +1,31 @@
+"""The runtime: nodes as coroutines on one event loop, talking through awaitable channels.
+
+Read in this order: `node` (what an author writes), `ports`, `sender` and `streams` (how an event
+gets from one node to another), `steps` (why that is quick), `schedule`, `clock`, `lockstep` and
+`realtime` (time), `worker` and `shared` (slow work), `graph`, `supervisor` and `execute` (a run).
+"""
+
+from runtime.clock import Clock
+from runtime.errors import RefusedError, VisnavError
+from runtime.node import Node, NodeConfig
+from runtime.ports import Input, Output, every, on
+from runtime.schedule import Tick
+from runtime.streams import Stream
+from runtime.units import Duration
+from runtime.worker import Worker
+
+__all__ = [
+    "Clock",
+    "Duration",
+    "Input",
+    "Node",
+    "NodeConfig",
+    "Output",
+    "RefusedError",
+    "Stream",
+    "Tick",
+    "VisnavError",
+    "Worker",
+    "every",
+    "on",
+]

@@ -1,0 +1,100 @@
+"""Every error this package raises on purpose, and whose fault each one is.
+
+    VisnavError
+    ├── ConfigError            the file or the command line: expected, found, where
+    ├── DeclarationError       a node's class: a port, handler or tick is declared wrongly
+    ├── MissingDependencyError something to install; the message says how
+    ├── NodeError              a node failed while running
+    │   ├── FatalError         …because it said so itself (`log.fatal`)
+    │   ├── RefusedError       …because it refused what another node announced
+    │   └── NodeTimeoutError   …because a step took longer than its limit
+    ├── ChannelError
+    │   ├── ChannelFullError   the receiver fell behind further than it allowed
+    │   ├── ChannelClosedError you (or the end of the run) closed it
+    │   └── ChannelBusyError   two coroutines wait on one input
+    └── WorkerError
+        ├── WorkerDiedError    the process ended: name, exit code and last output
+        └── WorkerTimeoutError the process did not answer in time
+
+The command line prints any of these as one line and ends with exit code 2.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class VisnavError(Exception):
+    """Base of every error below."""
+
+
+class ConfigError(VisnavError):
+    """The configuration is wrong; the message says where, what was expected and found."""
+
+
+class DeclarationError(VisnavError):
+    """A node's class is declared wrongly; its author must mend it."""
+
+
+class MissingDependencyError(VisnavError):
+    """A library is missing; the message holds the command that installs it."""
+
+
+class NodeError(VisnavError):
+    """A node failed.
+
+    Args:
+        node: The node's name.
+        what: What happened.
+    """
+
+    def __init__(self, node: str, what: str) -> None:
+        super().__init__(f"{node}: {what}")
+        self.node = node
+
+
+class FatalError(NodeError):
+    """A node called `log.fatal`: the run cannot go on."""
+
+
+class RefusedError(NodeError):
+    """A node cannot work with what another node announced."""
+
+
+class NodeTimeoutError(NodeError):
+    """A node's start-up or shutdown took longer than its limit."""
+
+
+class ChannelError(VisnavError):
+    """Base of what can go wrong between a sender and a receiver."""
+
+
+class ChannelFullError(ChannelError):
+    """An input with ``overflow="error"`` was sent more than it holds."""
+
+
+class ChannelClosedError(ChannelError):
+    """The input was closed, and what it held has been read."""
+
+
+class ChannelBusyError(ChannelError):
+    """A second coroutine wanted to wait on an input that has one waiting."""
+
+
+class WorkerError(VisnavError):
+    """Base of what can go wrong with a worker process."""
+
+
+class WorkerDiedError(WorkerError):
+    """A worker process ended on its own."""
+
+
+class WorkerTimeoutError(WorkerError):
+    """A worker process did not answer within its limit and was killed."""
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """Return ``" (did you mean 'x'?)"`` if something known is close to `word`, else ``""``."""
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f" (did you mean {near[0]!r}?)" if near else ""

@@ -1,0 +1,44 @@
+"""Limits in real time, which hold on a simulated clock too.
+
+`asyncio.timeout` on a lockstep loop is simulated: where nothing else is due, it is over at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import AsyncIterator
+
+
+@contextlib.asynccontextmanager
+async def real_time_limit(seconds: float) -> AsyncIterator[None]:
+    """Cancel the block and raise `TimeoutError` if it takes more than `seconds` of real time."""
+    loop = asyncio.get_running_loop()
+    task = asyncio.current_task()
+    assert task is not None
+    expired = False
+
+    def expire() -> None:
+        nonlocal expired
+        if not over:
+            expired = True
+            task.cancel()
+
+    def ring() -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has been closed
+            loop.call_soon_threadsafe(expire)
+
+    over = False
+    timer = threading.Timer(seconds, ring)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    except asyncio.CancelledError:
+        if expired and task.uncancel() == 0:
+            raise TimeoutError from None
+        raise
+    finally:
+        over = True
+        timer.cancel()

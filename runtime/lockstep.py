@@ -1,0 +1,174 @@
+"""Simulated time: an asyncio loop that jumps to the next thing due when nothing is ready.
+
+A selector loop calls `select(timeout)` with a timeout above zero only when nothing is ready to
+run. Then, instead of sleeping, this loop moves its clock: to the next timer of asyncio's (so plain
+`asyncio.sleep` and `asyncio.timeout` are simulated), to the next entry of the schedule, which it
+runs on the spot, or to the due time of offloaded work, for which it waits if it must. Things due
+at one time run in that order, however the outside world is interleaved, so the same program gives
+the same events on any machine.
+
+Sockets and threads of other libraries are served too, but when their answers arrive is not
+simulated; only `Clock.beside` (that is, `Node.offload` and workers), `asyncio.to_thread` and
+`loop.run_in_executor` are.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import heapq
+import itertools
+import selectors
+import time
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar
+
+from runtime.clock import Clock
+from runtime.schedule import SECOND, Schedule
+
+R = TypeVar("R")
+_Work = concurrent.futures.Future[Any]
+_Ready = list[tuple[selectors.SelectorKey, int]]
+
+_NEVER = 1 << 62
+_POLL_EVERY = 64
+"""Jumps between two looks at real files (signals, sockets) while time runs freely."""
+
+
+class _JumpingSelector(selectors.DefaultSelector):
+    """Asks the loop what to do instead of sleeping."""
+
+    advance: Callable[[float | None], _Ready]
+
+    def select(self, timeout: float | None = None) -> _Ready:
+        return self.advance(timeout)
+
+    def wait(self, timeout: float | None) -> _Ready:
+        """Wait for files, in real time."""
+        return super().select(timeout)
+
+
+class LockstepLoop(asyncio.SelectorEventLoop):
+    """A loop on simulated time.
+
+    Args:
+        speed: Simulated seconds per real second, or `None` for as fast as possible.
+    """
+
+    def __init__(self, speed: float | None = None) -> None:
+        self.schedule = Schedule()
+        self.now = 0
+        self._held: list[tuple[int, int, _Work, asyncio.Future[Any]]] = []
+        self._orders = itertools.count()
+        self._jumps = 0
+        self._pace = 0.0 if speed is None else 1.0 / (speed * SECOND)
+        self._wall_origin: float | None = None
+        selector = _JumpingSelector()
+        selector.advance = self._advance
+        self._jumping = selector
+        super().__init__(selector)
+        self._clock_resolution = 1e-9
+        self.set_default_executor(concurrent.futures.ThreadPoolExecutor(thread_name_prefix="node"))
+
+    def time(self) -> float:
+        """Return simulated seconds."""
+        return self.now / SECOND
+
+    def hold(self, work: _Work, due: int) -> asyncio.Future[Any]:
+        """Return a future that gets the outcome of `work` at simulated time `due`, exactly."""
+        future = self.create_future()
+        heapq.heappush(self._held, (due, next(self._orders), work, future))
+        work.add_done_callback(lambda _: self._wake_up())
+        return future
+
+    def run_in_executor(  # type: ignore[override]
+        self, executor: concurrent.futures.Executor | None, func: Callable[..., R], *args: Any
+    ) -> asyncio.Future[R]:
+        """Run a function beside the loop; simulated time waits for it."""
+        executor = executor or self._default_executor  # type: ignore[attr-defined]
+        return self.hold(executor.submit(func, *args), self.now)
+
+    def _wake_up(self) -> None:
+        with contextlib.suppress(RuntimeError):  # closed: nobody waits any more
+            self.call_soon_threadsafe(_nothing)
+
+    def _advance(self, timeout: float | None) -> _Ready:
+        """Stand in for the selector's sleep: run simulated time until asyncio has work again."""
+        ready: Any = self._ready  # type: ignore[attr-defined]
+        timers: Any = self._scheduled  # type: ignore[attr-defined]
+        wait = self._jumping.wait
+        schedule = self.schedule
+        while not ready and timeout != 0:
+            self._jumps += 1
+            if self._jumps % _POLL_EVERY == 0 and (events := wait(0)):
+                return events
+            timer = round(timers[0].when() * SECOND) if timers else _NEVER
+            held = self._held[0][0] if self._held else _NEVER
+            entry = schedule.next_due()
+            if entry is None:
+                entry = _NEVER
+            due = max(min(timer, held, entry), self.now)
+            if due == _NEVER:
+                return wait(None)
+            if self._pace and due > self.now and (events := self._wait_until(due)):
+                return events
+            if timer <= due:
+                self.now = due
+                return []
+            if held <= due:
+                if not self._held[0][2].done():
+                    return wait(None)
+                self.now = due
+                _, _, work, future = heapq.heappop(self._held)
+                _settle(future, work)
+            else:
+                self.now = due
+                schedule.run_first(due)
+            if self._stopping:  # type: ignore[attr-defined]
+                return []
+        self._jumps += 1
+        return wait(0) if self._jumps % _POLL_EVERY == 0 or timeout == 0 else []
+
+    def _wait_until(self, due: int) -> _Ready:
+        """Sleep until simulated time may be `due` at the set speed, or until a file is ready."""
+        wall = time.monotonic()
+        if self._wall_origin is None:
+            self._wall_origin = wall - self.now * self._pace
+        rest = self._wall_origin + due * self._pace - wall
+        return self._jumping.wait(rest) if rest > 0 else []
+
+
+class LockstepClock(Clock):
+    """The clock of a run on a `LockstepLoop`."""
+
+    kind: Literal["lockstep"] = "lockstep"
+
+    def __init__(self, loop: LockstepLoop) -> None:
+        self._loop = loop
+        self.schedule = loop.schedule
+
+    def now(self) -> int:
+        """Return simulated nanoseconds since the run began."""
+        return self._loop.now
+
+    async def beside(self, work: concurrent.futures.Future[R], latency: int = 0) -> R:
+        """Await work done elsewhere; its result comes exactly `latency` ns from now."""
+        result: R = await self._loop.hold(work, self._loop.now + latency)
+        return result
+
+
+def _settle(future: asyncio.Future[Any], work: _Work) -> None:
+    """Give an awaited future the outcome of finished work."""
+    if future.cancelled():
+        return
+    if work.cancelled():
+        future.cancel()
+    elif (error := work.exception()) is not None:
+        future.set_exception(error)
+    else:
+        future.set_result(work.result())
+
+
+def _nothing() -> None:
+    """Be what wakes the loop."""

@@ -1,0 +1,110 @@
+"""Logging: the standard library's, through a queue, so that a slow terminal delays nobody.
+
+Levels: trace (5), debug, info, warning, error, and fatal, which also stops the run. Each node has
+a logger, ``visnav.<node>``; lines carry the time of the run's clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import logging.handlers
+import queue
+from collections.abc import Callable, Iterator, MutableMapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from runtime.errors import FatalError
+
+TRACE = 5
+LEVELS = {
+    "trace": TRACE,
+    "debug": logging.DEBUG,
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+    "fatal": logging.CRITICAL,
+}
+
+
+class NodeLogger(logging.LoggerAdapter[logging.Logger]):
+    """A node's logger."""
+
+    def __init__(self, node: str) -> None:
+        super().__init__(logging.getLogger(f"visnav.{node}"))
+        self.node = node
+
+    def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, Any]:
+        """Add nothing to the message; the logger's name says who speaks."""
+        return msg, kwargs
+
+    def trace(self, msg: str, *args: object) -> None:
+        """Log what only somebody hunting a bug wants to read."""
+        self.log(TRACE, msg, *args)
+
+    def fatal(self, msg: str, *args: object) -> NoReturn:
+        """Log, and end the run: it cannot go on.
+
+        Raises:
+            FatalError: Always.
+        """
+        self.log(logging.CRITICAL, msg, *args)
+        raise FatalError(self.node, msg % args if args else msg)
+
+
+@contextlib.contextmanager
+def logging_to(
+    handlers: list[logging.Handler], level: str, now: Callable[[], int]
+) -> Iterator[None]:
+    """Send all log records through a queue to `handlers` while the block runs.
+
+    Args:
+        handlers: Where records end up; they run in a thread of their own.
+        level: One of `LEVELS`, for nodes and runtime; libraries log warnings and worse.
+        now: The run's clock (ns), read when a record is made.
+    """
+    logging.addLevelName(TRACE, "TRACE")
+    records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
+    handler = logging.handlers.QueueHandler(records)
+
+    def stamp(record: logging.LogRecord) -> bool:
+        record.seconds = now() / 1e9
+        record.speaker = record.name.removeprefix("visnav.")
+        return True
+
+    handler.addFilter(stamp)
+    listener = logging.handlers.QueueListener(records, *handlers, respect_handler_level=True)
+    root, ours = logging.getLogger(), logging.getLogger("visnav")
+    before = ours.level
+    root.addHandler(handler)
+    ours.setLevel(LEVELS[level])
+    listener.start()
+    try:
+        yield
+    finally:
+        listener.stop()
+        ours.setLevel(before)
+        root.removeHandler(handler)
+        for each in handlers:
+            each.close()
+
+
+def terminal_handler() -> logging.Handler:
+    """Return a handler that prints to standard error, in colour where that is a terminal."""
+    from rich.console import Console
+    from rich.logging import RichHandler
+
+    handler = RichHandler(
+        console=Console(stderr=True), show_path=False, show_time=False, markup=False
+    )
+    handler.setFormatter(logging.Formatter("%(seconds)9.3f %(speaker)s: %(message)s"))
+    return handler
+
+
+def file_handler(path: Path) -> logging.Handler:
+    """Return a handler that writes everything to a file."""
+    handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    handler.setFormatter(
+        logging.Formatter("%(seconds)12.6f %(levelname)-8s %(speaker)s: %(message)s")
+    )
+    return handler

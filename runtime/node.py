@@ -1,0 +1,258 @@
+"""What an author of nodes writes: a class with ports, and the phases it needs.
+
+    construct → on_startup → announce, on_announcement → run, handlers, ticks → on_shutdown
+
+Every phase is optional. All that a node may use is there before its ``__init__`` (which takes no
+arguments and need not call ``super().__init__``).
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import functools
+import zlib
+from collections.abc import Callable, Coroutine, Iterable
+from pathlib import Path
+from typing import Any, ClassVar, Generic, ParamSpec, Protocol, dataclass_transform, get_origin
+
+import msgspec
+import numpy as np
+from typing_extensions import TypeVar
+
+from events import Announcement
+from runtime.clock import Clock
+from runtime.errors import DeclarationError
+from runtime.logs import NodeLogger
+from runtime.ports import Handles, Input, Output, Ticks
+from runtime.schedule import SECOND, Tick, Ticker
+from runtime.sender import Sender
+from runtime.streams import Stream
+from runtime.worker import Worker
+
+P = ParamSpec("P")
+R = TypeVar("R")
+W = TypeVar("W")
+
+
+class _ConfigMeta(msgspec.StructMeta):
+    """Makes every subclass frozen, keyword-only, and strict about unknown keys."""
+
+    def __new__(
+        cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **options: Any
+    ) -> _ConfigMeta:
+        options = {"frozen": True, "kw_only": True, "forbid_unknown_fields": True} | options
+        return super().__new__(cls, name, bases, namespace, **options)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(msgspec.field,))
+class NodeConfig(msgspec.Struct, metaclass=_ConfigMeta, frozen=True, kw_only=True):
+    """Base of a node's settings, which stand in the file beside its name and type."""
+
+
+C = TypeVar("C", bound=NodeConfig, default=NodeConfig)
+
+
+class Declared(msgspec.Struct):
+    """What a node's class declares, by attribute name, in the order of the class body."""
+
+    inputs: dict[str, Input[Any]]
+    outputs: dict[str, Output[Any]]
+    handlers: dict[str, Handles]
+    ticks: dict[str, Ticks]
+    listening: list[str]
+    """Inputs and handlers, in the order in which they hear an event."""
+
+
+class Host(Protocol):
+    """What a run does for its nodes; see the methods of `Node` that call these."""
+
+    seed: int
+    clock: Clock
+    executor: concurrent.futures.Executor
+    out: Path | None
+
+    def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
+        """Run a coroutine as part of a node."""
+
+    def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
+        """Call a function of a node at a rate."""
+
+    async def worker(
+        self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
+    ) -> Worker[W]:
+        """Make a worker that ends with the node."""
+
+    def stop(self, reason: str) -> None:
+        """End the run in order."""
+
+
+class Node(Generic[C]):
+    """Base of all nodes: declare ports, handlers and ticks on the class.
+
+    ::
+
+        class Brightness(Node):
+            images = Input(Image, keep="latest")
+            scores = Output(Score)
+
+            async def run(self) -> None:
+                async for image in self.images:
+                    mean = await self.offload(np.mean, image.data)
+                    self.scores.send(Score(stamp=image.stamp, source=self.name, …))
+
+    ``Node[MyConfig]`` gives `config` its type; its fields are the node's settings in the file.
+
+    Attributes:
+        name: As in the file.
+        config: The node's settings.
+        clock: The run's clock; the only time that a node should know.
+        log: The node's logger (trace, debug, info, warning, error, fatal).
+        rng: Random numbers that depend on the run's seed and the node's name only.
+        out: Folder for files, or `None` if the run writes none.
+    """
+
+    declared: ClassVar[Declared]
+    config_type: ClassVar[type[NodeConfig]] = NodeConfig
+
+    name: str
+    config: C
+    clock: Clock
+    log: NodeLogger
+    rng: np.random.Generator
+    out: Path | None
+    _host: Host
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for base in getattr(cls, "__orig_bases__", ()):
+            if get_origin(base) is Node and isinstance(base.__args__[0], type):
+                cls.config_type = base.__args__[0]
+        cls.declared = _declared(cls)
+
+    # Phases, in order. Override those you need.
+
+    async def on_startup(self) -> None:
+        """Get ready: open files and devices, start workers. Nothing may be sent yet."""
+
+    def announce(self) -> Iterable[Announcement]:
+        """Return what this node will provide; called once, after every node's `on_startup`."""
+        return ()
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Hear what a node (any node) will provide; called before the first event.
+
+        Raises:
+            ValueError: This node cannot work with it; the message says why, and the run ends.
+        """
+
+    async def run(self) -> None:
+        """Do what the node does; returning is allowed. Cancelled when the run ends."""
+
+    async def on_shutdown(self) -> None:
+        """Finish: flush and close. May send; nodes before this one in the file still hear it."""
+
+    # What a node can ask for.
+
+    async def offload(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Run a slow function in a thread, and await its result; the loop goes on meanwhile.
+
+        In lockstep, simulated time waits for it; `offload_for` gives it time of its own.
+        """
+        return await self.offload_for(0.0, fn, *args, **kwargs)
+
+    async def offload_for(
+        self, latency: float, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """Run a slow function in a thread; its result comes `latency` seconds of the clock later.
+
+        In lockstep it comes exactly then, however long this machine takes; in real time not
+        before then.
+        """
+        work = self._host.executor.submit(functools.partial(fn, *args, **kwargs))
+        return await self.clock.beside(work, round(latency * SECOND))
+
+    async def worker(self, factory: Callable[..., W], *args: Any, **options: Any) -> Worker[W]:
+        """Start an object in a process of its own; it ends with this node.
+
+        Args:
+            factory: A class of an importable module.
+            args: Its arguments.
+            options: `processes`, `latency`, `timeout`, `env`, `niceness`; see `Worker`.
+
+        Raises:
+            WorkerError: The process died or hung; or whatever making the object raised.
+        """
+        return await self._host.worker(self, factory, args, **options)
+
+    def start(self, coro: Coroutine[Any, Any, None]) -> None:
+        """Run a coroutine beside `run`, as part of this node; it is cancelled with it."""
+        self._host.start(self, coro)
+
+    def every(self, hz: float, call: Callable[[Tick], Any], name: str = "") -> Ticker:
+        """Call a function at a rate from the first update on, as `@every` does.
+
+        For rates that are known only at run time; call it in `on_startup`.
+        """
+        return self._host.every(self, hz, call, name or getattr(call, "__name__", "tick"))
+
+    def stop(self, reason: str) -> None:
+        """End the run in order, as Ctrl-C would."""
+        self._host.stop(reason)
+
+
+N = TypeVar("N", bound=Node[Any])
+
+
+def make_node(cls: type[N], name: str, config: NodeConfig, host: Host) -> N:
+    """Make a node with its ports in place."""
+    node = cls.__new__(cls)
+    node.name = name
+    node.config = config
+    node.clock = host.clock
+    node.log = NodeLogger(name)
+    node.rng = np.random.default_rng([host.seed, zlib.crc32(name.encode())])
+    node.out = host.out
+    node._host = host
+    for port, declared in cls.declared.inputs.items():
+        setattr(node, port, declared.make(name))
+    for port, output in cls.declared.outputs.items():
+        setattr(node, port, Sender(f"{name}.{port}", output.event))
+    node.__init__()  # type: ignore[misc]  # now that what it may use is there
+    return node
+
+
+def streams(node: Node[Any]) -> dict[str, Stream[Any]]:
+    """Return a node's streams by port."""
+    return {port: getattr(node, port) for port in node.declared.inputs}
+
+
+def senders(node: Node[Any]) -> dict[str, Sender[Any]]:
+    """Return a node's senders by port."""
+    return {port: getattr(node, port) for port in node.declared.outputs}
+
+
+def _declared(cls: type[Node[Any]]) -> Declared:
+    """Read the declarations of a class and its bases."""
+    found = Declared({}, {}, {}, {}, [])
+    names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
+    for name in names:
+        value = getattr(cls, name, None)
+        if isinstance(value, Input | Output) and name in _RESERVED:
+            raise DeclarationError(
+                f"{cls.__name__}.{name}: every node has an attribute of this name; "
+                "call the port something else"
+            )
+        if isinstance(value, Input):
+            found.inputs[name] = value
+        elif isinstance(value, Output):
+            found.outputs[name] = value
+        if handles := getattr(value, "__handles__", None):
+            found.handlers[name] = handles
+        if ticks := getattr(value, "__ticks__", None):
+            found.ticks[name] = ticks
+        if name in found.inputs or name in found.handlers:
+            found.listening.append(name)
+    return found
+
+
+_RESERVED = {*vars(Node), *Node.__annotations__}

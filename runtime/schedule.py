@@ -1,0 +1,181 @@
+"""What is due when, in integer nanoseconds of the run's clock.
+
+Both clocks keep one `Schedule`; they differ in how they get from one due time to the next. Things
+due at the same time run in the order in which they were added, which for ticks is the order of
+the nodes in the file.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any, Protocol
+
+import msgspec
+
+from runtime.lateness import Lateness
+
+SECOND = 1_000_000_000
+
+
+class Tick(msgspec.Struct, frozen=True, gc=False):
+    """One call of an `@every` method.
+
+    Attributes:
+        stamp: Nanoseconds at which it was due. After missed ticks, the last of them.
+        index: Periods since the first tick.
+        late: Nanoseconds from the first due time not yet served to this call.
+        missed: Ticks skipped because the last call or something else took too long.
+    """
+
+    stamp: int
+    index: int
+    late: int
+    missed: int
+
+
+class Entry(Protocol):
+    """Something in the schedule."""
+
+    def fire(self, due: int, now: int) -> int | None:
+        """Run, and return when to run again, or `None`."""
+
+
+class Schedule:
+    """A queue of due times."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, Entry]] = []
+        self._orders = itertools.count()
+        self.on_sooner: Callable[[int], None] = _ignore
+        """Called when something is added that is due before all else."""
+
+    def add(self, due: int, entry: Entry) -> None:
+        """Run `entry` at `due`, after all that was added for that time before."""
+        self._push((due, next(self._orders), entry))
+
+    def next_due(self) -> int | None:
+        """Return the earliest due time, or `None` if nothing is due ever."""
+        return self._heap[0][0] if self._heap else None
+
+    def run_first(self, now: int) -> None:
+        """Run the entry due first; it keeps its place among its equals when it comes again."""
+        due, order, entry = heapq.heappop(self._heap)
+        again = entry.fire(due, now)
+        if again is not None:
+            self._push((again, order, entry))
+
+    def run_due(self, now: Callable[[], int]) -> None:
+        """Run all that is due by now, in order."""
+        while self._heap and self._heap[0][0] <= (time := now()):
+            self.run_first(time)
+
+    def _push(self, item: tuple[int, int, Entry]) -> None:
+        heapq.heappush(self._heap, item)
+        if self._heap[0] is item:
+            self.on_sooner(item[0])
+
+
+class Once:
+    """Calls a function once, unless cancelled before."""
+
+    __slots__ = ("call",)
+
+    def __init__(self, call: Callable[[], Any]) -> None:
+        self.call: Callable[[], Any] | None = call
+
+    def fire(self, due: int, now: int) -> None:  # noqa: ARG002
+        """Call it."""
+        if self.call is not None:
+            self.call()
+
+    def cancel(self) -> None:
+        """Do nothing when the time comes."""
+        self.call = None
+
+
+class Ticker:
+    """Calls a function at a steady rate.
+
+    Args:
+        name: ``node.method``, for statistics.
+        hz: Rate; due times are exact multiples of its period, rounded down to nanoseconds.
+        call: Takes a `Tick`.
+        fault: Told what `call` raises.
+        before: The ticker that this one replaces, whose statistics it carries on.
+    """
+
+    __slots__ = (
+        "_call",
+        "_fault",
+        "_hz",
+        "_index",
+        "_start",
+        "calls",
+        "late",
+        "missed",
+        "name",
+        "stopped",
+    )
+
+    def __init__(
+        self,
+        name: str,
+        hz: float,
+        call: Callable[[Tick], Any],
+        fault: Callable[[Exception], None],
+        before: Ticker | None = None,
+    ) -> None:
+        self.name = name
+        self.calls: int = before.calls if before else 0
+        self.missed: int = before.missed if before else 0
+        self.late: Lateness = before.late if before else Lateness()
+        self.stopped = False
+        self._hz = Fraction(hz).limit_denominator(1_000_000)
+        self._call = call
+        self._fault = fault
+        self._start = 0
+        self._index = 0
+
+    def begin(self, start: int) -> None:
+        """Have the first tick at `start` (ns)."""
+        self._start = start
+        self._index = 0
+
+    @property
+    def hz(self) -> float:
+        """Ticks per second."""
+        return float(self._hz)
+
+    @property
+    def due(self) -> int:
+        """When the next tick is due (ns)."""
+        return self._start + self._index * SECOND * self._hz.denominator // self._hz.numerator
+
+    def fire(self, due: int, now: int) -> int | None:
+        """Call the function, and return when it is due again."""
+        if self.stopped:
+            return None
+        late = now - due
+        missed = 0
+        if late > 0:
+            last = (now - self._start) * self._hz.numerator // (SECOND * self._hz.denominator)
+            missed = max(last - self._index, 0)
+            if missed:
+                self._index += missed
+                self.missed += missed
+        tick = Tick(self.due if missed else due, self._index, late, missed)
+        self._index += 1
+        self.calls += 1
+        self.late.add(late)
+        try:
+            self._call(tick)
+        except Exception as error:
+            self._fault(error)
+        return self.due
+
+
+def _ignore(_: int) -> None:
+    pass

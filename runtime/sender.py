@@ -1,0 +1,219 @@
+"""The sending end of an output: one loop over a frozen tuple of listeners.
+
+Delivery is synchronous: when `send` returns, every handler has run and every waiting reader has
+been resumed. Who listens is decided by `runtime.graph` before the first event.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any, Generic, TypeVar
+
+from events import Event
+from runtime.errors import ChannelClosedError
+from runtime.streams import Stream
+
+T = TypeVar("T", bound=Event)
+
+Deliver = Callable[[Any], Any]
+"""A handler, or a stream's `offer`; a true result ends the delivery."""
+
+Tap = Callable[["Sender[Any] | None", Event], None]
+"""Sees every event before its listeners do: the digest, the event log. (An announcement has no
+sender.)"""
+
+Fault = Callable[[Deliver, Exception], None]
+"""Told which listener raised what; the delivery then goes on."""
+
+
+class Sender(Generic[T]):
+    """An output of one node.
+
+    Args:
+        name: ``node.port``.
+        event: The declared type of event.
+    """
+
+    __slots__ = (
+        "_candidates",
+        "_fault",
+        "_listeners",
+        "_routes",
+        "_sent",
+        "_taps",
+        "_waiting",
+        "event",
+        "name",
+        "send",
+    )
+
+    def __init__(self, name: str, event: type[T]) -> None:
+        self.name = name
+        self.event = event
+        self._sent = 0
+        self.send: Callable[[T], bool] = self._refuse
+        """Deliver an event now; True if a handler ended the delivery."""
+        self._listeners: tuple[Deliver, ...] = ()
+        self._candidates: tuple[Listener, ...] = ()
+        self._routes: dict[tuple[type[Event], str], Route] = {}
+        self._waiting: tuple[Stream[Any], ...] = ()
+        self._taps: tuple[Tap, ...] = ()
+        self._fault: Fault = _raise
+
+    def connect(
+        self, candidates: Iterable[Listener], taps: Iterable[Tap] = (), fault: Fault | None = None
+    ) -> None:
+        """Freeze who listens, in order, and pick the shortest way to deliver to them."""
+        self._candidates = tuple(c for c in candidates if c.may_hear(self.event))
+        self._listeners = tuple(c.deliver for c in self._candidates)
+        for route in self._routes.values():
+            route.listeners = self._heard_by(*route.key)
+        self._waiting = tuple(
+            c.stream
+            for c in self._candidates
+            if c.stream is not None and c.stream.overflow == "wait"
+        )
+        self._taps = tuple(taps)
+        self._fault = fault or _raise
+        if self._taps:
+            self.send = self._send_tapped
+        elif not self.event.__subclasses__() and all(
+            c.hears_all(self.event) for c in self._candidates
+        ):
+            self.send = self._send_to_all
+        else:
+            self.send = self._send_routed
+
+    def send_soon(self, event: T) -> None:
+        """Deliver an event when the loop next turns; the sender goes on at once."""
+        asyncio.get_running_loop().call_soon(self.send, event)
+
+    async def send_wait(self, event: T) -> bool:
+        """Wait until every input declared with ``overflow="wait"`` has room, then send."""
+        for stream in self._waiting:
+            await stream.wait_for_room()
+        return self.send(event)
+
+    def _send_to_all(self, event: T) -> bool:
+        self._sent += 1
+        try:
+            for deliver in self._listeners:
+                if deliver(event):
+                    return True
+        except Exception as error:
+            return self._go_on(self._listeners, deliver, error, event)
+        return False
+
+    def _send_routed(self, event: T) -> bool:
+        try:
+            route = self._routes[type(event), event.source]
+        except KeyError:
+            route = self._route(type(event), event.source)
+        route.sent += 1
+        try:
+            for deliver in route.listeners:
+                if deliver(event):
+                    return True
+        except Exception as error:
+            return self._go_on(route.listeners, deliver, error, event)
+        return False
+
+    def _send_tapped(self, event: T) -> bool:
+        for tap in self._taps:
+            tap(self, event)
+        return self._send_routed(event)
+
+    def _route(self, event: type[Event], source: str) -> Route:
+        """Remember who hears events of this type and source."""
+        route = Route((event, source), self._heard_by(event, source))
+        self._routes[event, source] = route
+        return route
+
+    def _heard_by(self, event: type[Event], source: str) -> tuple[Deliver, ...]:
+        return tuple(c.deliver for c in self._candidates if c.hears(event, source))
+
+    def sent(self) -> Counter[type[Event]]:
+        """Count what was sent, by type."""
+        counts: Counter[type[Event]] = Counter({self.event: self._sent})
+        for route in self._routes.values():
+            counts[route.key[0]] += route.sent
+        return +counts
+
+    def _go_on(
+        self, listeners: tuple[Deliver, ...], failed: Deliver, error: Exception, event: T
+    ) -> bool:
+        """Report the listener that raised, and deliver to those after it."""
+        self._fault(failed, error)
+        for deliver in listeners[listeners.index(failed) + 1 :]:
+            try:
+                if deliver(event):
+                    return True
+            except Exception as another:
+                self._fault(deliver, another)
+        return False
+
+    def _refuse(self, event: T) -> bool:
+        raise ChannelClosedError(
+            f"{self.name}: {type(event).__name__} sent before the first update; "
+            "send from run(), a tick or a handler, or announce it"
+        )
+
+
+class Listener:
+    """One handler or stream, and which events it hears.
+
+    Args:
+        node: Name of the node it belongs to.
+        deliver: What to call with an event.
+        events: The types that it hears, with their subclasses.
+        source: Only this source and those below it; `None` for all.
+        stream: The stream, if it is one.
+    """
+
+    __slots__ = ("deliver", "events", "node", "source", "stream")
+
+    def __init__(
+        self,
+        node: str,
+        deliver: Deliver,
+        events: tuple[type[Event], ...],
+        source: str | None = None,
+        stream: Stream[Any] | None = None,
+    ) -> None:
+        self.node = node
+        self.deliver = deliver
+        self.events = events
+        self.source = source
+        self.stream = stream
+
+    def may_hear(self, event: type[Event]) -> bool:
+        """Tell whether an output of this type can send what this listener hears."""
+        return issubclass(event, self.events) or any(issubclass(e, event) for e in self.events)
+
+    def hears_all(self, event: type[Event]) -> bool:
+        """Tell whether this listener hears whatever an output of this type sends."""
+        return self.source is None and issubclass(event, self.events)
+
+    def hears(self, event: type[Event], source: str) -> bool:
+        """Tell whether this listener hears events of this very type from this source."""
+        return issubclass(event, self.events) and (
+            self.source is None or source == self.source or source.startswith(self.source + "/")
+        )
+
+
+class Route:
+    """Who hears one type of event from one source, and how often it was sent."""
+
+    __slots__ = ("key", "listeners", "sent")
+
+    def __init__(self, key: tuple[type[Event], str], listeners: tuple[Deliver, ...]) -> None:
+        self.key = key
+        self.listeners = listeners
+        self.sent = 0
+
+
+def _raise(_: Deliver, error: Exception) -> None:
+    """Pass a listener's error on to the sender: the default outside a run."""
+    raise error

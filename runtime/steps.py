@@ -1,0 +1,213 @@
+"""Resuming a waiting coroutine at once, inside the `send()` that it waits for.
+
+A stock task is woken through the loop's ready queue, which costs a future, a handle and a turn
+of the loop. `Steps` wraps a task's coroutine so that a stream can step it directly: the task
+itself stays parked on a future (the *gate*) all the while, and takes over again when the
+coroutine waits for anything but a stream, ends, or is cancelled. The task is asyncio's own, so
+`asyncio.timeout`, `TaskGroup`, `cancel`, `uncancel`, names and stacks are the stock ones; and the
+coroutine is stepped in the task's own context with the task as the current one, so it cannot
+tell in which of the two ways it was resumed.
+
+`install(loop)` makes every task of a loop such a task. Not here: buffers (`runtime.streams`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import sys
+from collections.abc import Coroutine, Generator
+from typing import Any
+
+from runtime.streams import Stream
+
+DEPTH_LIMIT = 32
+"""Resumptions nested deeper go through the loop: a relay of hundreds must not overflow the
+stack, nor keep the loop to itself."""
+
+_NOTHING: Any = object()
+_depth = 0
+
+if sys.version_info >= (3, 14):
+    from asyncio.tasks import _swap_current_task
+
+    class _CurrentTasks:
+        """The mapping from loop to running task that Python had up to 3.13."""
+
+        get = staticmethod(asyncio.current_task)
+        __setitem__ = staticmethod(_swap_current_task)
+
+    _current_tasks: Any = _CurrentTasks()
+else:
+    # One dictionary access is a tenth of `_leave_task` and `_enter_task` together.
+    from asyncio.tasks import _current_tasks  # type: ignore[attr-defined]
+
+
+class _Gate(asyncio.Future[None]):
+    """What a task waits on while streams step its coroutine."""
+
+    steps: Steps
+
+    def cancel(self, msg: Any = None) -> bool:
+        """Cancel the wait: from now on an event is kept, not given to the cancelled reader."""
+        self.steps.leave_stream()
+        return super().cancel(msg)
+
+
+class Steps(Coroutine[Any, Any, Any]):
+    """A task's coroutine that can be stepped by streams as well as by the task."""
+
+    __slots__ = (
+        "__name__",
+        "_coro",
+        "_gate",
+        "_later",
+        "_loop",
+        "_outcome",
+        "_run",
+        "_step",
+        "_stream",
+        "_task",
+    )
+
+    def __init__(
+        self,
+        coro: Coroutine[Any, Any, Any],
+        loop: asyncio.AbstractEventLoop,
+        context: contextvars.Context,
+    ) -> None:
+        self.__name__: str = getattr(coro, "__qualname__", "?")
+        self._coro = coro
+        self._step = coro.send
+        self._run = context.run
+        self._loop = loop
+        self._task: asyncio.Task[Any] | None = None
+        self._gate: _Gate | None = None
+        self._stream: Stream[Any] | None = None
+        self._later: asyncio.Handle | None = None
+        self._outcome: Any = _NOTHING  # of a step by a stream, for the task to deal with
+
+    # For streams.
+
+    def resume(self, event: Any) -> None:
+        """Step the coroutine now; called by the stream on which it is parked."""
+        global _depth
+        if _depth >= DEPTH_LIMIT:
+            self._stream.keep(event)  # type: ignore[union-attr]
+            self.resume_soon()
+            return
+        loop = self._loop
+        sender = _current_tasks.get(loop)
+        _depth += 1
+        _current_tasks[loop] = self._task
+        try:
+            waits_for = self._run(self._step, event)
+        except BaseException as error:
+            self._hand_over(error)
+        else:
+            if type(waits_for) is Stream:
+                self._stream = waits_for
+                waits_for.waiter = self
+            else:
+                self._hand_over(waits_for)
+        finally:
+            if sender is None:
+                del _current_tasks[loop]
+            else:
+                _current_tasks[loop] = sender
+            _depth -= 1
+
+    def resume_soon(self) -> None:
+        """Step the coroutine when the loop next turns."""
+        self._later = self._loop.call_soon(self._resume_later)
+
+    def _resume_later(self) -> None:
+        self._later = None
+        self.resume(None)
+
+    def leave_stream(self) -> None:
+        """Be resumed by no stream any more: the task is being cancelled."""
+        if self._later is not None:
+            self._later.cancel()
+            self._later = None
+        if self._stream is not None:
+            self._stream.waiter = None
+            self._stream = None
+
+    def _hand_over(self, outcome: Any) -> None:
+        """Leave what the coroutine yielded or raised to the task, which the gate lets through."""
+        self._stream = None
+        self._outcome = outcome
+        if self._gate is not None and not self._gate.done():
+            self._gate.set_result(None)
+
+    # For the task.
+
+    def send(self, value: Any) -> Any:
+        """Step the coroutine, or tell the task what the last step by a stream came to."""
+        if self._task is None:
+            self._task = asyncio.current_task(self._loop)
+        self._gate = None
+        outcome, self._outcome = self._outcome, _NOTHING
+        if outcome is _NOTHING:
+            return self._park(self._step(value))
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome
+
+    def throw(self, error: Any, *_: Any) -> Any:
+        """Raise an error, most often a cancellation, where the coroutine waits."""
+        self.leave_stream()
+        self._gate = None
+        outcome, self._outcome = self._outcome, _NOTHING
+        if isinstance(outcome, BaseException):  # it had ended before the cancellation came
+            raise outcome
+        if isinstance(outcome, asyncio.Future):  # as `Task.cancel` does with what it waits on
+            outcome.cancel()
+        return self._park(self._coro.throw(error))
+
+    def _park(self, waits_for: Any) -> Any:
+        if type(waits_for) is not Stream:
+            return waits_for
+        self._stream = waits_for
+        waits_for.waiter = self
+        self._gate = gate = _Gate(loop=self._loop)
+        gate.steps = self
+        gate._asyncio_future_blocking = True  # the mark that tells a task to wait on what it got
+        return gate
+
+    def close(self) -> None:
+        """Close the coroutine."""
+        self._coro.close()
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        return self._coro.__await__()
+
+    # What asyncio reads to print a task. (A `__getattr__` would switch off the interpreter's
+    # fast attribute access for the whole class.)
+    cr_frame = property(lambda self: self._coro.cr_frame)
+    cr_code = property(lambda self: self._coro.cr_code)
+    cr_running = property(lambda self: self._coro.cr_running)
+    cr_await = property(lambda self: self._coro.cr_await)
+
+
+def task_factory(
+    loop: asyncio.AbstractEventLoop,
+    coro: Coroutine[Any, Any, Any],
+    context: contextvars.Context | None = None,
+    **options: Any,
+) -> asyncio.Task[Any]:
+    """Make a task whose coroutine streams can step.
+
+    A task that is given a context shares it, and a context cannot be entered twice; such a task
+    stays a stock one, which streams wake through the loop.
+    """
+    if context is None:
+        context = contextvars.copy_context()
+        coro = Steps(coro, loop, context)
+    return asyncio.Task(coro, loop=loop, context=context, **options)
+
+
+def install(loop: asyncio.AbstractEventLoop) -> None:
+    """Make every task created on `loop` from now on one that streams can step."""
+    loop.set_task_factory(task_factory)  # type: ignore[arg-type]

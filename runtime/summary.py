@@ -1,0 +1,172 @@
+"""What a run leaves to say about itself: ``summary.json`` and the table at its end."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from collections import Counter
+from typing import Any
+
+import msgspec
+
+from runtime.node import senders, streams
+from runtime.schedule import SECOND
+from runtime.supervisor import Supervisor
+from runtime.watchdog import Stall
+
+
+class TickSummary(msgspec.Struct, frozen=True):
+    """How punctual one ticker was; microseconds of the run's clock."""
+
+    hz: float
+    calls: int
+    late_p50_us: float
+    late_p99_us: float
+    late_max_us: float
+    missed: int
+
+
+class StreamSummary(msgspec.Struct, frozen=True):
+    """How full one input got, and what it dropped."""
+
+    bound: int
+    peak: int
+    dropped: int
+
+
+class Summary(msgspec.Struct, frozen=True, kw_only=True):
+    """One run.
+
+    Attributes:
+        name: Of the run.
+        clock: ``lockstep`` or ``real``.
+        seed: Of the run's random numbers.
+        reason: What ended it.
+        error: What went wrong, or `None`.
+        sim_seconds: Seconds of the run's clock.
+        wall_seconds: Real seconds, from the first update to the end of the last `on_shutdown`.
+        digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels
+            depend on the graphics driver, so digests compare on one machine.)
+        events: Events sent, by type.
+        outputs: Events sent, by output.
+        drops: Events dropped, by input.
+        streams: Inputs' bounds and peaks.
+        ticks: Punctuality, by ticker.
+        stalls: Times the loop did not turn, by node.
+        longest_stalls: The worst of them, by node.
+        announcements: What nodes said they provide.
+        environment: Machine and versions.
+    """
+
+    name: str
+    clock: str
+    seed: int
+    reason: str
+    error: str | None
+    sim_seconds: float
+    wall_seconds: float
+    digest: str
+    events: dict[str, int]
+    outputs: dict[str, int]
+    drops: dict[str, int]
+    streams: dict[str, StreamSummary]
+    ticks: dict[str, TickSummary]
+    stalls: dict[str, int]
+    longest_stalls: dict[str, Stall]
+    announcements: list[dict[str, Any]]
+    environment: dict[str, str]
+
+
+def count_events(supervisor: Supervisor) -> tuple[Counter[str], Counter[str]]:
+    """Count what was sent so far, by type of event and by output."""
+    by_type: Counter[str] = Counter()
+    by_output: Counter[str] = Counter()
+    for node in supervisor.ever:
+        for sender in senders(node).values():
+            for event, count in sender.sent().items():
+                by_type[event.__name__] += count
+                by_output[sender.name] += count
+    return by_type, by_output
+
+
+def count_drops(supervisor: Supervisor) -> dict[str, StreamSummary]:
+    """Return how full each input got and what it dropped."""
+    found: dict[str, StreamSummary] = {}
+    for node in supervisor.ever:
+        for stream in streams(node).values():
+            before = found.get(stream.name, StreamSummary(stream.bound, 0, 0))
+            now = stream.statistics()
+            found[stream.name] = StreamSummary(
+                stream.bound, max(before.peak, now.peak), before.dropped + now.dropped
+            )
+    return found
+
+
+def tick_summaries(supervisor: Supervisor) -> dict[str, TickSummary]:
+    """Return how punctual each ticker was."""
+    return {
+        name: TickSummary(
+            hz=ticker.hz,
+            calls=ticker.calls,
+            late_p50_us=ticker.late.quantile(0.5) / 1e3,
+            late_p99_us=ticker.late.quantile(0.99) / 1e3,
+            late_max_us=ticker.late.maximum / 1e3,
+            missed=ticker.missed,
+        )
+        for name, ticker in supervisor.tickers.items()
+    }
+
+
+def summarise(
+    supervisor: Supervisor,
+    *,
+    name: str,
+    wall_seconds: float,
+    sim_ns: int,
+    digest: str,
+    stalls: Counter[str],
+    longest_stalls: dict[str, Stall],
+) -> Summary:
+    """Put together what is known at the end of a run."""
+    by_type, by_output = count_events(supervisor)
+    by_input = count_drops(supervisor)
+    return Summary(
+        name=name,
+        clock=supervisor.clock.kind,
+        seed=supervisor.seed,
+        reason=supervisor.reason,
+        error=None if supervisor.error is None else str(supervisor.error),
+        sim_seconds=sim_ns / SECOND,
+        wall_seconds=round(wall_seconds, 3),
+        digest=digest,
+        events=dict(sorted(by_type.items())),
+        outputs=dict(by_output),
+        drops={port: s.dropped for port, s in by_input.items()},
+        streams=by_input,
+        ticks=tick_summaries(supervisor),
+        stalls=dict(stalls),
+        longest_stalls=longest_stalls,
+        announcements=[
+            {"type": type(a).__name__, **msgspec.to_builtins(a)} for a in supervisor.announcements
+        ],
+        environment=environment(),
+    )
+
+
+def environment() -> dict[str, str]:
+    """Return what a figure depends on: machine, Python and the libraries' versions."""
+    libraries = ["visnav-runtime", "numpy", "mujoco", "opencv-python-headless", "uvloop", "msgspec"]
+    versions = {}
+    for library in libraries:
+        try:
+            versions[library] = importlib.metadata.version(library)
+        except importlib.metadata.PackageNotFoundError:
+            versions[library] = "not installed"
+    return {
+        "system": platform.platform(),
+        "processor": platform.machine(),
+        "cores": str(os.cpu_count()),
+        "python": platform.python_version(),
+        **versions,
+    }

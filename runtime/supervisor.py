@@ -1,0 +1,361 @@
+"""The life of a run's nodes: started in order, watched over, ended in reverse order.
+
+    construct → on_startup, in file order
+    announce, heard by all
+    connect; ticks and run() begin: the first update
+    …
+    cancel run(), on_shutdown: in reverse order, always, each with a time limit
+
+One task group owns every task. What an exception in a node does is up to the node's `on_error`.
+Not here: loops, signals and files (`runtime.execute`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import functools
+import inspect
+import logging
+import time
+from collections.abc import Callable, Coroutine, Sequence
+from pathlib import Path
+from typing import Any
+
+from typing_extensions import TypeVar
+
+from events import Announcement, Event, Shutdown, WindowClosed
+from runtime import graph
+from runtime.clock import Clock
+from runtime.config import Config, NodeSpec
+from runtime.errors import FatalError, NodeError, NodeTimeoutError, RefusedError
+from runtime.limits import real_time_limit
+from runtime.node import Node, make_node, streams
+from runtime.schedule import Once, Tick, Ticker
+from runtime.sender import Deliver, Listener, Tap
+from runtime.streams import Stream
+from runtime.worker import Worker
+
+W = TypeVar("W")
+
+log = logging.getLogger("visnav.runtime")
+
+FIRST_BACKOFF = 0.5
+LONGEST_BACKOFF = 30.0
+"""Seconds of the clock before a restart: doubled from the first at each failure."""
+
+
+class _Life:
+    """What belongs to one node while it runs."""
+
+    def __init__(self, spec: NodeSpec) -> None:
+        self.spec = spec
+        self.node: Node[Any] | None = None
+        self.tasks: set[asyncio.Task[None]] = set()
+        self.tickers: list[Ticker] = []
+        self.workers: list[Worker[Any]] = []
+        self.started = False
+        self.failures = 0
+        self.recovering = False
+
+
+class Supervisor:
+    """Runs the nodes of a configuration on the running loop; the `Host` of its nodes.
+
+    Args:
+        config: What to run.
+        clock: The run's clock.
+        taps: See every event before its listeners do.
+        out: Folder for what nodes write, or `None`.
+    """
+
+    def __init__(
+        self, config: Config, clock: Clock, taps: Sequence[Tap] = (), out: Path | None = None
+    ) -> None:
+        self.out = out
+        self.seed = config.run.seed
+        self.clock = clock
+        self.executor: concurrent.futures.Executor = concurrent.futures.ThreadPoolExecutor(
+            max_workers=8, thread_name_prefix="offload"
+        )
+        self.announcements: list[Announcement] = []
+        self.first_update: float | None = None
+        """When the first update was, on `time.monotonic`."""
+        self.reason = ""
+        self.error: Exception | None = None
+        self.ever: list[Node[Any]] = []
+        """All nodes there have been, those restarted or dropped included."""
+        self.tickers: dict[str, Ticker] = {}
+        self._config = config
+        self._taps = tuple(taps)
+        self._lives = {spec.name: _Life(spec) for spec in config.nodes}
+        self._running = False
+        self._ended = asyncio.Event()
+        self._begin: asyncio.Task[None] | None = None
+        self._group = asyncio.TaskGroup()
+        self._recoveries: set[asyncio.Task[None]] = set()
+
+    async def main(self) -> None:
+        """Run until something ends the run; `reason` and `error` then say what did."""
+        async with self._group:
+            self._begin = self._group.create_task(self._start_all(), name="start")
+            await self._ended.wait()
+            await asyncio.wait([self._begin])
+            await self._end_all()
+        self.executor.shutdown(wait=False, cancel_futures=True)
+
+    # The host of the nodes.
+
+    def stop(self, reason: str, error: Exception | None = None) -> None:
+        """End the run in order; the first reason counts."""
+        if self._ended.is_set():
+            return
+        self.reason = reason
+        self.error = error
+        self._ended.set()
+        if self._begin is not None and not self._begin.done():
+            self._begin.cancel()
+
+    def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
+        """Run a coroutine as part of a node."""
+        life = self._lives[node.name]
+        task = self._group.create_task(self._guard(node, coro), name=node.name)
+        life.tasks.add(task)
+        task.add_done_callback(life.tasks.discard)
+
+    def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
+        """Call a function of a node at a rate, from the first update on."""
+        if inspect.iscoroutinefunction(call):
+            call = self._in_background(node, call, name)
+        full_name = f"{node.name}.{name}"
+        fault = functools.partial(self.fault, node.name)
+        ticker = Ticker(full_name, hz, call, fault, before=self.tickers.get(full_name))
+        self.tickers[full_name] = ticker
+        self._lives[node.name].tickers.append(ticker)
+        if self._running and self._lives[node.name].started:
+            self._add(ticker)
+        return ticker
+
+    async def worker(
+        self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
+    ) -> Worker[W]:
+        """Make a worker that ends with the node."""
+        loop = asyncio.get_running_loop()
+
+        def died(error: Exception) -> None:
+            loop.call_soon_threadsafe(self.fault, node.name, error)
+
+        name = f"{node.name}.{getattr(factory, '__name__', 'worker')}"
+        worker = await asyncio.to_thread(  # starting a process takes the loop's whole patience
+            Worker,
+            name,
+            self.clock,
+            factory,
+            *args,
+            printed=lambda line: node.log.debug("%s printed: %s", name, line),
+            died=died,
+            **options,
+        )
+        self._lives[node.name].workers.append(worker)
+        await worker.ready()
+        return worker
+
+    def fault(self, name: str, error: Exception) -> None:
+        """Deal with an exception in a node as its `on_error` says."""
+        life = self._lives[name]
+        if life.recovering:
+            return
+        log.error("%s: %s: %s", name, type(error).__name__, error, exc_info=error)
+        wrapped = error if isinstance(error, NodeError) else _wrap(name, error)
+        if self._ended.is_set():
+            self.error = self.error or wrapped
+        elif isinstance(error, FatalError) or life.spec.on_error == "stop" or not self._running:
+            self.stop(f"{name} failed", wrapped)
+        else:
+            life.recovering = True
+            task = self._group.create_task(self._recover(life), name=f"recover {name}")
+            self._recoveries.add(task)
+            task.add_done_callback(self._recoveries.discard)
+
+    # Beginning.
+
+    async def _start_all(self) -> None:
+        try:
+            for life in self._lives.values():
+                await self._start_up(life)
+            for life in self._lives.values():
+                announced = list(life.node.announce()) if life.node else []
+                self.announcements += announced
+            for life in self._lives.values():
+                self._hear(life)
+        except NodeError as error:
+            log.error("%s", error, exc_info=error.__cause__)
+            self.stop("start-up failed", error)
+            return
+        for announcement in self.announcements:
+            for tap in self._taps:
+                tap(None, announcement)
+        self._connect()
+        self._running = True
+        self.first_update = time.monotonic()
+        self.clock.start()
+        if self._config.run.duration:
+            end = self.clock.now() + round(self._config.run.duration * 1e9)
+            self.clock.schedule.add(end, Once(lambda: self.stop("duration")))
+        for life in self._lives.values():
+            self._begin_node(life)
+
+    async def _start_up(self, life: _Life) -> None:
+        spec = life.spec
+        try:
+            life.node = node = make_node(spec.node, spec.name, spec.config, self)
+            self.ever.append(node)
+            async with real_time_limit(self._config.run.startup_limit):
+                await node.on_startup()
+            life.started = True
+        except NodeError:
+            raise
+        except TimeoutError:
+            limit = f"expected on_startup to end within {self._config.run.startup_limit:g} s"
+            raise NodeTimeoutError(spec.name, f"{limit}, found it still running") from None
+        except Exception as error:
+            raise _wrap(spec.name, error) from error
+
+    def _hear(self, life: _Life) -> None:
+        """Let a node hear all announcements, and turn a refusal into an error."""
+        assert life.node is not None
+        for announcement in self.announcements:
+            try:
+                life.node.on_announcement(announcement)
+            except ValueError as error:
+                raise RefusedError(
+                    life.spec.name, f"cannot work with {announcement.source}: {error}"
+                ) from error
+            except Exception as error:
+                raise _wrap(life.spec.name, error) from error
+
+    def _connect(self) -> None:
+        nodes = [life.node for life in self._lives.values() if life.node and life.started]
+        sources = {spec.name: spec.inputs for spec in self._config.nodes}
+        end = Listener("run", self._hear_end, (Shutdown, WindowClosed))
+        graph.connect(nodes, sources, self._taps, self._listener_failed, [end])
+
+    def _begin_node(self, life: _Life) -> None:
+        node = life.node
+        assert node is not None
+        for ticker in life.tickers:
+            self._add(ticker)
+        for method, ticks in node.declared.ticks.items():
+            hz = getattr(node.config, ticks.hz) if isinstance(ticks.hz, str) else ticks.hz
+            self.every(node, hz, getattr(node, method), method)
+        if type(node).run is not Node.run:
+            self.start(node, node.run())
+
+    def _add(self, ticker: Ticker) -> None:
+        ticker.begin(self.clock.now())
+        self.clock.schedule.add(ticker.due, ticker)
+
+    def _in_background(
+        self, node: Node[Any], call: Callable[[Tick], Any], name: str
+    ) -> Callable[[Tick], None]:
+        """Return a function that hands ticks to a coroutine, and skips those it is too busy for."""
+        ticks: Stream[Tick] = Stream(f"{node.name}.{name}", bound=1, overflow="drop_oldest")
+
+        async def serve() -> None:
+            async for tick in ticks:
+                await call(tick)
+
+        def hand_over(tick: Tick) -> None:
+            if ticks.waiter is None:
+                self.tickers[ticks.name].missed += 1
+            else:
+                ticks.offer(tick)
+
+        self.start(node, serve())
+        return hand_over
+
+    # Going wrong.
+
+    async def _guard(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
+        try:
+            await coro
+        except Exception as error:
+            if self._lives[node.name].node is node:
+                self.fault(node.name, error)
+
+    def _listener_failed(self, deliver: Deliver, error: Exception) -> None:
+        owner: Any = deliver.__self__  # type: ignore[attr-defined]  # a node, or a stream of one
+        self.fault(owner.name.partition(".")[0], error)
+
+    def _hear_end(self, event: Event) -> None:
+        reason = getattr(event, "reason", "") or type(event).__name__
+        self.stop(f"{event.source}: {reason}")
+
+    async def _recover(self, life: _Life) -> None:
+        """Take a failed node out, and bring up a new one in its place if that is wanted."""
+        await self._retire(life)
+        if life.spec.on_error == "drop":
+            log.warning("%s: left out from here on", life.spec.name)
+            return
+        while not self._ended.is_set():
+            pause = min(FIRST_BACKOFF * 2**life.failures, LONGEST_BACKOFF)
+            life.failures += 1
+            log.warning("%s: restarts in %g s", life.spec.name, pause)
+            await self.clock.sleep(pause)
+            try:
+                await self._start_up(life)
+                self._hear(life)
+            except NodeError as error:
+                log.error("%s", error)
+                await self._retire(life)
+                continue
+            life.recovering = False
+            self._connect()
+            self._begin_node(life)
+            return
+
+    # Ending.
+
+    async def _end_all(self) -> None:
+        for ticker in self.tickers.values():
+            ticker.stopped = True
+        for life in reversed(self._lives.values()):
+            await self._retire(life)
+        for task in self._recoveries:
+            task.cancel()
+
+    async def _retire(self, life: _Life) -> None:
+        """End one node: its ticks, tasks and workers; it hears nothing afterwards."""
+        node, limit = life.node, self._config.run.shutdown_limit
+        for ticker in life.tickers:
+            ticker.stopped = True
+        life.tickers.clear()
+        for task in life.tasks:
+            task.cancel()
+        try:
+            async with real_time_limit(limit):
+                if life.tasks:
+                    await asyncio.wait(life.tasks)
+                if node is not None and life.started:
+                    await node.on_shutdown()
+        except TimeoutError:
+            late = NodeTimeoutError(life.spec.name, f"expected to end within {limit:g} s")
+            self.error = self.error or late
+            log.error("%s", late)
+        except Exception as error:
+            self.error = self.error or _wrap(life.spec.name, error)
+            log.error("%s: on_shutdown: %s", life.spec.name, error, exc_info=error)
+        for worker in life.workers:
+            await asyncio.to_thread(worker.close)
+        life.workers.clear()
+        life.started = False
+        if node is not None:
+            for stream in streams(node).values():
+                stream.close()
+        self._connect()
+
+
+def _wrap(name: str, error: Exception) -> NodeError:
+    wrapped = NodeError(name, f"{type(error).__name__}: {error}")
+    wrapped.__cause__ = error
+    return wrapped

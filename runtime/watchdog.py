@@ -1,0 +1,114 @@
+"""Notices a loop that does not turn, and says which node stands on which line.
+
+A thread looks at the loop's thread a few times per limit. Only where it finds the loop busy does
+it ask it to sign a note; a note that stays unsigned for the limit is a stall. An idle loop is
+never woken, and events cost nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from types import FrameType
+
+import msgspec
+
+from runtime.node import Node
+
+_IDLE = {"select", "wait", "run_forever", "run_until_complete", "_wait_until"}
+"""Functions in which a loop that has nothing to do spends its time."""
+
+
+class Stall(msgspec.Struct, frozen=True):
+    """One time the loop did not turn.
+
+    Attributes:
+        node: The node that ran, or ``runtime``.
+        line: ``file:line in function``, the innermost line of the node.
+        seconds: How long, in real time.
+    """
+
+    node: str
+    line: str
+    seconds: float
+
+
+class Watchdog:
+    """Watches the loop of the thread that makes it.
+
+    Args:
+        loop: The loop.
+        limit: Real seconds without a turn that are a stall.
+        report: Told of each stall once it is over; from the watchdog's thread.
+    """
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, limit: float, report: Callable[[Stall], None]
+    ) -> None:
+        self._loop = loop
+        self._limit = limit
+        self._report = report
+        self._thread_id = threading.get_ident()
+        self._signed = threading.Event()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self.stalls: Counter[str] = Counter()
+        self.longest: dict[str, Stall] = {}
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Watch no more."""
+        self._end.set()
+        self._signed.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        pause = self._limit / 4
+        while not self._end.wait(pause):
+            frame = sys._current_frames().get(self._thread_id)
+            if frame is None or frame.f_code.co_name in _IDLE:
+                continue
+            del frame
+            self._signed.clear()
+            asked = time.monotonic()
+            try:
+                self._loop.call_soon_threadsafe(self._signed.set)
+            except RuntimeError:  # closed
+                return
+            if self._signed.wait(self._limit) or self._end.is_set():
+                continue
+            node, line = self._where()
+            self._signed.wait()
+            if not self._end.is_set():
+                self._count(Stall(node, line, time.monotonic() - asked))
+
+    def _where(self) -> tuple[str, str]:
+        """Return the node and the line of it that the loop's thread is in."""
+        frame = sys._current_frames().get(self._thread_id)
+        innermost = _place(frame) if frame is not None else "?"
+        while frame is not None:
+            owner = frame.f_locals.get("self") if "self" in frame.f_code.co_varnames else None
+            if isinstance(owner, Node) and not frame.f_code.co_filename.endswith("runtime/node.py"):
+                return owner.name, _place(frame)
+            frame = frame.f_back
+        return "runtime", innermost
+
+    def _count(self, stall: Stall) -> None:
+        self.stalls[stall.node] += 1
+        longest = self.longest.get(stall.node)
+        if longest is None or stall.seconds > longest.seconds:
+            self.longest[stall.node] = stall
+        with contextlib.suppress(Exception):  # a report that fails must not end the watch
+            self._report(stall)
+
+
+def _place(frame: FrameType) -> str:
+    return f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_name}"
