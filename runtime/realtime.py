@@ -65,6 +65,13 @@ class RealClock(Clock):
             await self.sleep_until(due)
         return result
 
+    async def sleep_until(self, stamp: int) -> None:
+        """Wait until a time (ns) of this clock; before the first update, that long in real time."""
+        if self._origin is None:
+            await asyncio.sleep(stamp / self._speed / SECOND)
+        else:
+            await super().sleep_until(stamp)
+
     def close(self) -> None:
         """Ring no more."""
         self._alarm.close()

@@ -146,8 +146,9 @@ class Supervisor:
             loop.call_soon_threadsafe(self.fault, node.name, error)
 
         name = f"{node.name}.{getattr(factory, '__name__', 'worker')}"
-        worker = await asyncio.to_thread(  # starting a process takes the loop's whole patience
-            Worker,
+        make: Callable[..., Worker[W]] = Worker
+        worker = await asyncio.to_thread(  # starting a process takes milliseconds
+            make,
             name,
             self.clock,
             factory,

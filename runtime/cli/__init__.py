@@ -1,0 +1,40 @@
+"""The command line: ``python -m runtime run config.toml`` and its companions.
+
+One module a command; what a command needs is imported when it runs, so that help comes at once.
+Errors that the project raises on purpose become one line on standard error and exit code 2.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from runtime.cli.check import check
+from runtime.cli.graph import graph
+from runtime.cli.nodes import nodes
+from runtime.cli.run import run
+from runtime.errors import VisnavError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Fly a simulated vehicle, feed a visual-navigation system, and measure it.",
+)
+app.command()(run)
+app.command()(check)
+app.command()(graph)
+app.command()(nodes)
+
+
+def main() -> None:
+    """Run the command line; the process ends here."""
+    try:
+        app()
+    except VisnavError as error:
+        message = str(error)
+        print(f"error: {message}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,51 @@
+"""Tables for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rich.table import Table
+
+from runtime.summary import Summary
+
+
+def run_tables(summary: Summary) -> Iterator[Table]:
+    """Return what was sent, what was dropped, how late ticks were, and where the loop stood."""
+    seconds = max(summary.sim_seconds, 1e-9)
+    sent = Table("output", "events", "per second", title="sent")
+    for output, count in sorted(summary.outputs.items()):
+        sent.add_row(output, f"{count}", f"{count / seconds:.1f}")
+    yield _numbers(sent)
+    streams = Table("input", "dropped", "fullest", "holds", title="inputs")
+    for port, stream in sorted(summary.streams.items()):
+        streams.add_row(port, f"{stream.dropped}", f"{stream.peak}", f"{stream.bound}")
+    if streams.row_count:
+        yield _numbers(streams)
+    ticks = Table("tick", "Hz", "calls", "late p50 µs", "p99 µs", "max µs", "missed", title="ticks")
+    for name, tick in sorted(summary.ticks.items()):
+        ticks.add_row(
+            name,
+            f"{tick.hz:g}",
+            f"{tick.calls}",
+            f"{tick.late_p50_us:.0f}",
+            f"{tick.late_p99_us:.0f}",
+            f"{tick.late_max_us:.0f}",
+            f"{tick.missed}",
+        )
+    if ticks.row_count:
+        yield _numbers(ticks)
+    stalls = Table("node", "times", "longest ms", "where", title="the loop stood still")
+    for node, count in sorted(summary.stalls.items()):
+        worst = summary.longest_stalls[node]
+        stalls.add_row(node, f"{count}", f"{worst.seconds * 1e3:.0f}", worst.line)
+    if stalls.row_count:
+        yield _numbers(stalls)
+
+
+def _numbers(table: Table) -> Table:
+    """Align all but the first column to the right, unless it is text."""
+    table.title_justify = "left"
+    for column in table.columns[1:]:
+        if column.header != "where":
+            column.justify = "right"
+    return table

@@ -1,0 +1,179 @@
+"""For tests of nodes: simulated time, scripted inputs, collected outputs.
+
+    result = run_node(Brightness, inputs=[image(stamp=0), image(stamp=10_000_000)], duration=0.1)
+    assert [score.value for score in result.of(Score)] == [0.0, 255.0]
+
+Nothing here sleeps: a test of an hour's flight takes as long as its computing does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Coroutine, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from events import Announcement, Event
+from runtime import steps
+from runtime.config import Config, NodeSpec, OnError, RunConfig, convert
+from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.node import Node
+from runtime.ports import Output
+from runtime.sender import Sender
+from runtime.summary import StreamSummary, TickSummary, count_drops, tick_summaries
+from runtime.supervisor import Supervisor
+from runtime.units import Duration
+
+R = TypeVar("R")
+E = TypeVar("E", bound=Event)
+
+__all__ = ["NodeResult", "run_in_lockstep", "run_node", "run_nodes", "spec"]
+
+
+class NodeResult(msgspec.Struct, frozen=True):
+    """What came of a node's run.
+
+    Attributes:
+        sent: Every event that the nodes under test sent, in order; announcements first.
+        reason: What ended the run.
+        drops: Inputs' peaks and drops, by ``node.port``.
+        ticks: Punctuality, by ``node.method``.
+        seconds: On the simulated clock.
+    """
+
+    sent: list[Event]
+    reason: str
+    drops: dict[str, StreamSummary]
+    ticks: dict[str, TickSummary]
+    seconds: float
+
+    def of(self, event: type[E]) -> list[E]:
+        """Return those events that are of this type."""
+        return [e for e in self.sent if isinstance(e, event)]
+
+
+def run_in_lockstep(main: Coroutine[Any, Any, R]) -> R:
+    """Run a coroutine on a jumping loop: `asyncio.sleep` and time-outs take no real time."""
+
+    async def prepared() -> R:
+        loop = asyncio.get_running_loop()
+        steps.install(loop)
+        return await loop.create_task(main)
+
+    with asyncio.Runner(loop_factory=LockstepLoop) as runner:
+        return runner.run(prepared())
+
+
+def run_node(
+    node: type[Node[Any]],
+    *,
+    inputs: Iterable[Event] = (),
+    config: Mapping[str, Any] | None = None,
+    duration: float = 1.0,
+    name: str = "node",
+    seed: int = 0,
+    out: Path | None = None,
+) -> NodeResult:
+    """Run one node on the jumping clock.
+
+    Args:
+        node: Its class.
+        inputs: Events to send to it, each at its own stamp; announcements before all.
+        config: Its settings, as they would stand in the file.
+        duration: Seconds after which the run ends, if nothing ends it before.
+        name: Its name.
+        seed: Of its random numbers.
+        out: Folder for its files.
+
+    Raises:
+        ConfigError: The settings are wrong.
+        NodeError: The node failed.
+    """
+    return run_nodes(
+        [spec(node, name, config)], inputs=inputs, duration=duration, seed=seed, out=out
+    )
+
+
+def run_nodes(
+    nodes: Iterable[NodeSpec],
+    *,
+    inputs: Iterable[Event] = (),
+    duration: float = 1.0,
+    seed: int = 0,
+    out: Path | None = None,
+) -> NodeResult:
+    """Run several nodes together; see `run_node`."""
+    script = spec(_script(list(inputs)), "script")
+    run = RunConfig(duration=Duration(duration), seed=seed)
+    settings = Config(run=run, nodes=(script, *nodes))
+    sent: list[Event] = []
+
+    def collect(sender: Sender[Any] | None, event: Event) -> None:
+        scripted = sender.name.startswith("script.") if sender else event in announced
+        if not scripted:
+            sent.append(event)
+
+    announced = [e for e in inputs if isinstance(e, Announcement)]
+
+    async def main() -> NodeResult:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, LockstepLoop)
+        supervisor = Supervisor(settings, LockstepClock(loop), [collect], out)
+        await supervisor.main()
+        if supervisor.error is not None:
+            raise supervisor.error
+        return NodeResult(
+            sent,
+            supervisor.reason,
+            count_drops(supervisor),
+            tick_summaries(supervisor),
+            loop.now / 1e9,
+        )
+
+    # A test that expects an error reads it from the exception, not from the terminal.
+    runtime_log = logging.getLogger("visnav.runtime")
+    before, runtime_log.disabled = runtime_log.disabled, True
+    try:
+        return run_in_lockstep(main())
+    finally:
+        runtime_log.disabled = before
+
+
+def spec(
+    node: type[Node[Any]],
+    name: str,
+    config: Mapping[str, Any] | None = None,
+    on_error: OnError = "stop",
+    inputs: Mapping[str, str] | None = None,
+) -> NodeSpec:
+    """Return what the file's table for a node would become."""
+    return NodeSpec(
+        name=name,
+        type_name=f"{node.__module__}:{node.__name__}",
+        on_error=on_error,
+        inputs=dict(inputs or {}),
+        node=node,
+        config=convert(dict(config or {}), node.config_type, name),
+    )
+
+
+def _script(inputs: list[Event]) -> type[Node[Any]]:
+    """Return a class of node that says what the script says."""
+
+    class Script(Node):
+        script = Output(Event)
+
+        def announce(self) -> Iterable[Announcement]:
+            return [e for e in inputs if isinstance(e, Announcement)]
+
+        async def run(self) -> None:
+            for event in inputs:
+                if not isinstance(event, Announcement):
+                    if event.stamp > self.clock.now():
+                        await self.clock.sleep_until(event.stamp)
+                    self.script.send(event)
+
+    return Script
