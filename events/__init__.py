@@ -18,6 +18,7 @@ from events.control import (
     Disarm,
     Hover,
     Land,
+    PoseSetpoint,
     PositionSetpoint,
     Takeoff,
     VelocitySetpoint,
@@ -39,7 +40,7 @@ from events.sensors import (
     Range,
     SegmentationImage,
 )
-from events.vehicle import Armed, Collision, Disarmed, Landed, TakenOff
+from events.vehicle import Armed, Collision, Disarmed, Landed, TakenOff, VehicleEvent
 from events.window import KeyPressed, KeyReleased, WindowClosed, WindowResized
 
 __all__ = [
@@ -71,6 +72,7 @@ __all__ = [
     "Odometry",
     "PointCloud",
     "PoseEstimate",
+    "PoseSetpoint",
     "PoseStamped",
     "PositionSetpoint",
     "Quaternion",
@@ -85,6 +87,7 @@ __all__ = [
     "TransformStamped",
     "Vector3",
     "VehicleAnnouncement",
+    "VehicleEvent",
     "VelocitySetpoint",
     "WindowClosed",
     "WindowResized",

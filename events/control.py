@@ -66,6 +66,20 @@ class PositionSetpoint(Event):
     yaw_rate: float = 0.0
 
 
+class PoseSetpoint(Event):
+    """Be at a place in an attitude; for what can be in any, such as a free camera.
+
+    Attributes:
+        position: Metres in ``map``.
+        orientation: Rotation from body to ``map``.
+    """
+
+    category: ClassVar[Category] = Category.CONTROL
+
+    position: Vector3
+    orientation: Quaternion
+
+
 class VelocitySetpoint(Event):
     """Move at a speed.
 

@@ -7,31 +7,29 @@ from typing import ClassVar
 from events.base import Category, Event, Vector3
 
 
-class Armed(Event):
+class VehicleEvent(Event):
+    """Base of all that can happen to a vehicle."""
+
+    category: ClassVar[Category] = Category.VEHICLE
+
+
+class Armed(VehicleEvent):
     """The motors may turn."""
 
-    category: ClassVar[Category] = Category.VEHICLE
 
-
-class Disarmed(Event):
+class Disarmed(VehicleEvent):
     """The motors are stopped."""
 
-    category: ClassVar[Category] = Category.VEHICLE
 
-
-class TakenOff(Event):
+class TakenOff(VehicleEvent):
     """The vehicle has reached the altitude it was asked to take off to."""
 
-    category: ClassVar[Category] = Category.VEHICLE
 
-
-class Landed(Event):
+class Landed(VehicleEvent):
     """The vehicle stands on the ground."""
 
-    category: ClassVar[Category] = Category.VEHICLE
 
-
-class Collision(Event):
+class Collision(VehicleEvent):
     """The vehicle touched something; sent once when the contact begins.
 
     Attributes:
@@ -40,8 +38,6 @@ class Collision(Event):
         normal: Unit vector in ``map``, from the other towards the vehicle.
         speed: Closing speed along the normal, metres per second.
     """
-
-    category: ClassVar[Category] = Category.VEHICLE
 
     other: str
     position: Vector3

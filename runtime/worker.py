@@ -74,7 +74,7 @@ class Worker(Generic[W]):
             )
         self.name = name
         self._clock = clock
-        self._latency = round(latency * SECOND)
+        self._latency = latency
         environment = {**os.environ, **(env or {})}
         self._processes = [
             _Process(f"{name}[{n}]" if processes > 1 else name, timeout, environment, printed, died)
@@ -105,9 +105,19 @@ class Worker(Generic[W]):
             WorkerDiedError: The process ended.
             WorkerTimeoutError: It did not answer within its time limit, and was killed.
         """
+        return await self.call_for(self._latency, method, *args, **kwargs)
+
+    async def call_for(
+        self,
+        latency: float,
+        method: Callable[Concatenate[W, P], R],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> R:
+        """Call a method as `call` does, with a latency (seconds of the clock) of its own."""
         process = min(self._processes, key=_Process.outstanding)
         work = process.request((method.__name__, args, kwargs))
-        result: R = await self._clock.beside(work, self._latency)
+        result: R = await self._clock.beside(work, round(latency * SECOND))
         return result
 
     def outstanding(self) -> int:

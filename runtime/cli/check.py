@@ -1,4 +1,4 @@
-"""``check``: is the file right?"""
+"""The command ``check``: find mistakes in a file without running it."""
 
 from __future__ import annotations
 

@@ -65,11 +65,12 @@ def draw(names: list[str], edges: list[tuple[str, str, str, str, str]], out: Pat
         axes.add_patch(arrow)
         dx, dy = x1 - x0, y1 - y0
         middle = ((x0 + x1) / 2 + 0.09 * dy, (y0 + y1) / 2 - 0.09 * dx)  # where the arc bulges
-        axes.text(*middle, "\n".join(events), fontsize=7, ha="center", va="center",
-                  bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85})  # fmt: skip
+        label = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
+        text = "\n".join(events)
+        axes.text(*middle, text, fontsize=7, ha="center", va="center", bbox=label)
     for name, (x, y) in place.items():
-        axes.text(x, y, name, ha="center", va="center", fontsize=11, weight="bold",
-                  bbox={"boxstyle": "round,pad=0.6", "fc": "#dcebf7", "ec": "#2f6690"})  # fmt: skip
+        box = {"boxstyle": "round,pad=0.6", "fc": "#dcebf7", "ec": "#2f6690"}
+        axes.text(x, y, name, ha="center", va="center", fontsize=11, weight="bold", bbox=box)
     figure.savefig(out, dpi=150)
 
 

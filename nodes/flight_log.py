@@ -1,0 +1,88 @@
+"""What a flight leaves to look at: the true trajectory, a plot of it, and a sheet of pictures."""
+
+from __future__ import annotations
+
+from typing import IO, Annotated
+
+import cv2
+import msgspec
+import numpy as np
+
+from events import Collision, Image, Odometry
+from nodes.pictures import Row, Thumbnail, draw_contact_sheet, draw_flight
+from runtime import Duration, Node, NodeConfig, on
+
+Count = Annotated[int, msgspec.Meta(ge=1, le=100)]
+
+
+class FlightLogConfig(NodeConfig):
+    """Settings of the flight log.
+
+    Attributes:
+        trajectory: File for the trajectory, in the run's folder.
+        plot: File for the plot of the flight.
+        sheet: File for the sheet of pictures.
+        interval: Seconds between two pictures on the sheet; doubled whenever it is full.
+        pictures: How many pictures it holds.
+    """
+
+    trajectory: str = "trajectory.tum"
+    plot: str = "flight.png"
+    sheet: str = "pictures.png"
+    interval: Duration = Duration(1)  # immutable
+    pictures: Count = 20
+
+
+class FlightLog(Node[FlightLogConfig]):
+    """Writes the ground truth as a TUM trajectory, and draws the flight when it is over."""
+
+    async def on_startup(self) -> None:
+        """Open the trajectory: it grows as the vehicle flies."""
+        self._rows: list[Row] = []
+        self._thumbnails: list[Thumbnail] = []
+        self._collisions: list[Collision] = []
+        self._interval = round(self.config.interval * 1e9)
+        self._next_picture = 0
+        self._file: IO[str] | None = None
+        if self.out is not None:
+            self._file = (self.out / self.config.trajectory).open("w", encoding="ascii")
+            self._file.write("# timestamp[s] x y z[m, NED] qx qy qz qw (FRD to NED)\n")
+
+    @on(Odometry)
+    def moved(self, event: Odometry) -> None:
+        """Note where the vehicle is."""
+        (x, y, z), (qw, qx, qy, qz) = event.position, event.orientation
+        self._rows.append((event.stamp, x, y, z, *event.linear_velocity))
+        if self._file is not None:
+            # TUM's format (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): xyzw.
+            seconds, rest = divmod(event.stamp, 1_000_000_000)
+            pose = f"{x:.9f} {y:.9f} {z:.9f} {qx:.9f} {qy:.9f} {qz:.9f} {qw:.9f}"
+            self._file.write(f"{seconds}.{rest:09d} {pose}\n")
+
+    @on(Image)
+    def saw(self, event: Image) -> None:
+        """Keep a small copy of a picture now and then."""
+        if event.stamp < self._next_picture:
+            return
+        self._next_picture = event.stamp + self._interval
+        small = cv2.resize(event.data, (256, 256), interpolation=cv2.INTER_AREA)
+        self._thumbnails.append((event.stamp, event.source, np.atleast_3d(small)))
+        if len(self._thumbnails) > self.config.pictures:
+            self._thumbnails = self._thumbnails[::2]
+            self._interval *= 2
+
+    @on(Collision)
+    def hit(self, event: Collision) -> None:
+        """Note a collision."""
+        self._collisions.append(event)
+
+    async def on_shutdown(self) -> None:
+        """Close the trajectory and draw the pictures."""
+        if self._file is None or self.out is None:
+            return
+        self._file.close()
+        if self._rows:
+            places = [(c.position[0], c.position[1]) for c in self._collisions]
+            await self.offload(draw_flight, self._rows, places, self.out / self.config.plot)
+        if self._thumbnails:
+            await self.offload(draw_contact_sheet, self._thumbnails, self.out / self.config.sheet)

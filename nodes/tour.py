@@ -1,0 +1,143 @@
+"""A scripted flight: take off, follow waypoints, land, end the run."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import math
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from events import (
+    Event,
+    Hover,
+    Land,
+    Landed,
+    Odometry,
+    PositionSetpoint,
+    Shutdown,
+    TakenOff,
+    Takeoff,
+    Vector3,
+)
+from nodes.path import Path, plan
+from runtime import Duration, Node, NodeConfig, Output, on
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class TourConfig(NodeConfig):
+    """Settings of a tour.
+
+    Attributes:
+        waypoints: Places to pass, metres in ``map`` (x north, y east, z down: heights are
+            negative). The tour begins above the place where the vehicle stands.
+        speed: Metres per second that it never exceeds.
+        acceleration: Metres per second squared, along the path and across it.
+        corner: Metres from a waypoint at which its corner is cut.
+        turn_time: Seconds over which changes of heading are smoothed.
+        rate: Set-points per second.
+        wait: Seconds before take-off.
+        end_run: Whether the run ends once it has landed.
+    """
+
+    waypoints: Annotated[tuple[Vector3, ...], msgspec.Meta(min_length=1)]
+    speed: Positive = 1.3
+    acceleration: Positive = 1.0
+    corner: Positive = 0.8
+    turn_time: Duration = Duration(0.5)  # immutable
+    rate: Positive = 50
+    wait: Duration = Duration(0.5)
+    end_run: bool = True
+
+
+class Tour(Node[TourConfig]):
+    """Flies a vehicle along waypoints, looking where it goes."""
+
+    orders = Output(Event)
+    setpoints = Output(PositionSetpoint)
+    end = Output(Shutdown)
+
+    def __init__(self) -> None:
+        self._here: Odometry | None = None
+        self._placed = asyncio.Event()
+        self._taken_off = asyncio.Event()
+        self._landed = asyncio.Event()
+
+    @on(Odometry)
+    def moved(self, event: Odometry) -> None:
+        """Note where the vehicle is."""
+        if self._here is None:
+            self._placed.set()
+        self._here = event
+
+    @on(TakenOff)
+    def taken_off(self, _: TakenOff) -> None:
+        """Begin to follow the path."""
+        self._taken_off.set()
+
+    @on(Landed)
+    def landed(self, _: Landed) -> None:
+        """Be done."""
+        self._landed.set()
+
+    async def run(self) -> None:
+        """Fly the tour."""
+        clock, name = self.clock, self.name
+        await self._placed.wait()
+        await clock.sleep(self.config.wait)
+        assert self._here is not None
+        height = self._here.position[2] - self.config.waypoints[0][2]
+        self.orders.send(Takeoff(stamp=clock.now(), source=name, altitude=max(height, 0.5)))
+        await self._taken_off.wait()
+        path = await self.offload(self._plan, self._here)
+        self.log.info("a path of %.1f m in %.1f s", path.length, path.seconds)
+        await self._follow(path)
+        self.orders.send(Hover(stamp=clock.now(), source=name))
+        self.orders.send(Land(stamp=clock.now(), source=name))
+        await self._landed.wait()
+        self.log.info("landed")
+        await clock.sleep(0.5)
+        if self.config.end_run:
+            self.end.send(Shutdown(stamp=clock.now(), source=name, reason="tour flown"))
+
+    def _plan(self, start: Odometry) -> Path:
+        config = self.config
+        w, x, y, z = start.orientation
+        points = [start.position, *config.waypoints]
+        far = [b for a, b in itertools.pairwise(points) if math.dist(a, b) > 0.05]
+        return plan(
+            np.array([start.position, *far]),
+            speed=config.speed,
+            acceleration=config.acceleration,
+            radius=config.corner,
+            yaw=math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+            turn_time=config.turn_time,
+            step=1 / config.rate,
+        )
+
+    async def _follow(self, path: Path) -> None:
+        begin = self.clock.now()
+        rows = zip(
+            path.position.tolist(),
+            path.velocity.tolist(),
+            path.acceleration.tolist(),
+            path.yaw.tolist(),
+            path.yaw_rate.tolist(),
+            strict=True,
+        )
+        for index, (position, velocity, acceleration, yaw, yaw_rate) in enumerate(rows):
+            await self.clock.sleep_until(begin + round(index * path.step * 1e9))
+            self.setpoints.send(
+                PositionSetpoint(
+                    stamp=self.clock.now(),
+                    source=self.name,
+                    position=tuple(position),
+                    velocity=tuple(velocity),
+                    acceleration=tuple(acceleration),
+                    yaw=yaw,
+                    yaw_rate=yaw_rate,
+                )
+            )

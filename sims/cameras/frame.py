@@ -1,0 +1,35 @@
+"""What one exposure of one camera gives."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events.base import Quaternion, Vector3
+
+
+class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """One exposure: all its pictures and its pose are of the same instant.
+
+    A picture that the camera's spec doesn't ask for is None.
+
+    Attributes:
+        stamp: Nanoseconds on the run's clock: the instant of exposure.
+        position: The optical frame's origin, metres in ``map`` (NED).
+        orientation: Rotation from the optical frame to ``map``.
+        rgb: uint8, shape (height, width, 3).
+        grey: uint8, shape (height, width).
+        depth: float32 metres along the optical z axis, shape (height, width); ``inf`` where
+            nothing was hit.
+        segmentation: int32 object numbers (geom ids), shape (height, width); -1 where nothing
+            was hit.
+    """
+
+    stamp: int
+    position: Vector3
+    orientation: Quaternion
+    rgb: npt.NDArray[np.uint8] | None = None
+    grey: npt.NDArray[np.uint8] | None = None
+    depth: npt.NDArray[np.float32] | None = None
+    segmentation: npt.NDArray[np.int32] | None = None

@@ -1,0 +1,53 @@
+"""A camera without a vehicle: its state is a pose, and nothing moves it but the user."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from events.base import Quaternion, Vector3
+from sims.cameras.spec import CameraSpec, add_camera
+from sims.frames import half_turn_quaternion, half_turn_vector, normalize
+
+
+def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ...]) -> str:
+    """Add a body that carries cameras, meets nothing and falls nowhere.
+
+    Args:
+        world: Is changed. Of a world that holds nothing else that moves, the whole state is
+            then `pose_to_qpos`.
+        name: The body's; the cameras are called ``<name>/<camera>``.
+        specs: The cameras.
+
+    Returns:
+        The prefix of the cameras' names, as `CameraRenderer` takes it.
+
+    Raises:
+        ValueError: The world has a body of that name, or two specs share theirs.
+    """
+    if world.body(name) is not None:
+        raise ValueError(f"free camera {name}: expected a name of its own, but the world has one")
+    # A free joint, because the renderer takes qpos; a mass, because a free joint needs one.
+    body = world.worldbody.add_body(
+        name=name, gravcomp=1.0, explicitinertial=True, mass=0.1, inertia=[1e-4, 1e-4, 1e-4]
+    )
+    body.add_freejoint(name=name)
+    prefix = f"{name}/"
+    for spec in specs:
+        add_camera(world, name, spec, prefix)
+    return prefix
+
+
+def pose_to_qpos(position: Vector3, orientation: Quaternion) -> npt.NDArray[np.float64]:
+    """Return a free camera's qpos, shape (7,), from its body's pose.
+
+    Args:
+        position: The body's origin, metres in ``map`` (NED).
+        orientation: Rotation from the body (FRD) to ``map``; needn't be of unit length.
+
+    Raises:
+        ValueError: The quaternion is zero.
+    """
+    turn = half_turn_quaternion(normalize(orientation))
+    return np.array([*half_turn_vector(position), *turn])

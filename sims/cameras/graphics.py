@@ -1,0 +1,44 @@
+"""Opening a GL context without a screen, and saying what is missing where that fails.
+
+Nothing happens on import: the environment is changed by `open_context`, which must run in the
+thread that will render, before any other GL context of the process.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from typing import Any
+
+INSTALL = "apt-get install libegl1 libgl1 libgl1-mesa-dri"
+
+
+class GraphicsError(RuntimeError):
+    """Rendering is impossible here: the machine's GL libraries or drivers are missing or broken."""
+
+
+def open_context(width: int, height: int, threads: int) -> Any:
+    """Return a current off-screen GL context: EGL's, or OSMesa's where MUJOCO_GL asks for it.
+
+    Args:
+        width: Largest picture, pixels.
+        height: Largest picture, pixels.
+        threads: Threads of the software renderer; takes effect with the first context only.
+
+    Raises:
+        GraphicsError: There is none to be had; the message says what to install.
+    """
+    # Read by llvmpipe when its first screen is made; by default it takes every core.
+    os.environ["LP_NUM_THREADS"] = str(threads)
+    backend = "osmesa" if os.environ.get("MUJOCO_GL", "").lower() == "osmesa" else "egl"
+    os.environ.setdefault("MUJOCO_GL", backend)
+    try:
+        context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+        context.make_current()
+    except Exception as error:  # PyOpenGL and the drivers fail in many ways
+        raise GraphicsError(
+            f"cannot render: expected a working {backend.upper()}, found none "
+            f"({type(error).__name__}: {error}). On Debian or Ubuntu: {INSTALL} "
+            "(or libosmesa6, and MUJOCO_GL=osmesa in the environment)"
+        ) from error
+    return context

@@ -1,0 +1,169 @@
+"""From a physics state to image events: the cameras of one vehicle, rendered beside the loop.
+
+Used by the nodes of `sims`; the drawing itself is in `sims.cameras.renderer`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraAnnouncement, DepthImage, Image, PoseStamped, SegmentationImage
+from runtime import Node, Worker
+from runtime.sender import Sender
+from sims.cameras.frame import Frame
+from sims.cameras.renderer import CameraRenderer, model_to_bytes
+from sims.cameras.spec import CameraSpec, announcement, optical_frame
+
+
+class CameraOutputs(msgspec.Struct, frozen=True):
+    """Where a rig sends what its cameras see."""
+
+    images: Sender[Image]
+    depth: Sender[DepthImage]
+    segmentation: Sender[SegmentationImage]
+    poses: Sender[PoseStamped]
+
+
+class CameraRig:
+    """All cameras of one body.
+
+    Every image is sent `latency` seconds after its exposure with the stamp of the exposure, and
+    before it, with the same stamp, the pose of the camera (source and frame as the image's).
+    A camera with both ``rgb`` and ``grey`` sends the grey ones as ``<source>/grey``.
+
+    Args:
+        node: The node whose rig it is; a camera's source is ``<node>/<camera>``.
+        specs: The cameras, which the model has under the names ``<node>/<camera>``.
+        outputs: Where the events go.
+        processes: How many render. Alternate frames go to alternate processes.
+        threads: Of the software renderer in each of them.
+    """
+
+    def __init__(
+        self,
+        node: Node[Any],
+        specs: tuple[CameraSpec, ...],
+        outputs: CameraOutputs,
+        processes: int,
+        threads: int,
+    ) -> None:
+        self._node = node
+        self._specs = {spec.name: spec for spec in specs}
+        self._outputs = outputs
+        self._processes = processes
+        self._threads = threads
+        self._renderer: Worker[CameraRenderer] | None = None
+        self._last: dict[str, asyncio.Future[None]] = {}
+        self._in_flight = dict.fromkeys(self._specs, 0)
+        self.skipped = dict.fromkeys(self._specs, 0)
+        """Exposures left out because the renderer was behind; never in lockstep."""
+
+    async def start(self, model: Any) -> None:
+        """Start the renderers with a compiled model.
+
+        Raises:
+            GraphicsError: This machine cannot render.
+        """
+        if not self._specs:
+            return
+        self._renderer = await self._node.worker(
+            CameraRenderer,
+            model_to_bytes(model),
+            tuple(self._specs.values()),
+            f"{self._node.name}/",
+            int(self._node.rng.integers(1 << 31)),
+            self._threads,
+            processes=self._processes,
+        )
+
+    def announcements(self, parent_frame_id: str) -> Iterable[CameraAnnouncement]:
+        """Say what the cameras will provide."""
+        name = self._node.name
+        for spec in self._specs.values():
+            yield announcement(
+                spec,
+                source=f"{name}/{spec.name}",
+                prefix=f"{name}/",
+                parent_frame_id=parent_frame_id,
+                stamp=self._node.clock.now(),
+            )
+
+    def expose(self, camera: str, stamp: int, qpos: npt.NDArray[np.float64]) -> None:
+        """Have a camera take a picture of a state; the events follow when it is due.
+
+        Args:
+            camera: Its name.
+            stamp: Time of the state (ns).
+            qpos: The state, shape (nq,); not copied.
+        """
+        spec = self._specs[camera]
+        on_their_way = math.ceil(spec.latency * spec.rate) + self._processes
+        if self._in_flight[camera] > on_their_way:  # in real time the renderer may fall behind
+            self.skipped[camera] += 1
+            return
+        self._in_flight[camera] += 1
+        done = asyncio.get_running_loop().create_future()
+        before = self._last.get(camera)
+        self._last[camera] = done
+        self._node.start(self._deliver(spec, stamp, qpos, before, done))
+
+    async def _deliver(
+        self,
+        spec: CameraSpec,
+        stamp: int,
+        qpos: npt.NDArray[np.float64],
+        before: asyncio.Future[None] | None,
+        done: asyncio.Future[None],
+    ) -> None:
+        assert self._renderer is not None
+        due = stamp + round(spec.latency * 1e9)
+        wait = max(due - self._node.clock.now(), 0) / 1e9
+        try:
+            frames = await self._renderer.call_for(
+                wait, CameraRenderer.render, stamp, qpos, (spec.name,)
+            )
+            if before is not None and not before.done():  # two processes: keep the order
+                await asyncio.wait([before])
+            self._send(spec, frames[spec.name])
+        finally:
+            self._in_flight[spec.name] -= 1
+            done.set_result(None)
+
+    def _send(self, spec: CameraSpec, frame: Frame) -> None:
+        source = f"{self._node.name}/{spec.name}"
+        frame_id = optical_frame(spec, f"{self._node.name}/")
+        out, stamp = self._outputs, frame.stamp
+        out.poses.send(
+            PoseStamped(
+                stamp=stamp, source=source, position=frame.position, orientation=frame.orientation
+            )
+        )
+        if frame.depth is not None:
+            out.depth.send(
+                DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=frame.depth)
+            )
+        if frame.segmentation is not None:
+            out.segmentation.send(
+                SegmentationImage(
+                    stamp=stamp, source=source, frame_id=frame_id, data=frame.segmentation
+                )
+            )
+        if frame.grey is not None:
+            out.images.send(
+                Image(
+                    stamp=stamp,
+                    source=source if frame.rgb is None else f"{source}/grey",
+                    frame_id=frame_id,
+                    encoding="mono8",
+                    data=frame.grey,
+                )
+            )
+        if frame.rgb is not None:
+            out.images.send(Image(stamp=stamp, source=source, frame_id=frame_id, data=frame.rgb))

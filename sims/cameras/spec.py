@@ -1,0 +1,147 @@
+"""What a camera is: how it is written down, what it announces, how it enters a model.
+
+No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.free`, the vehicles).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+import mujoco
+
+import events
+from events.base import Quaternion, Vector3
+from runtime import Duration
+from sims.frames import from_euler, half_turn_quaternion, half_turn_vector, multiply
+
+ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
+Pixels = Annotated[int, msgspec.Meta(ge=1, le=8192)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+
+OPTICAL_TO_CAMERA: Quaternion = (0.5, 0.5, 0.5, 0.5)
+"""Optical axes (right, down, forward) to camera body axes (forward, right, down): REP 103."""
+
+
+class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An ideal pinhole camera, as it stands in a TOML file.
+
+    Attributes:
+        name: Its name, unique on its body.
+        images: What it gives.
+        width: Pixels.
+        height: Pixels.
+        fov: **Horizontal** field of view, degrees.
+        rate: Frames per second.
+        position: Where it sits on the body, metres in FRD.
+        orientation: Roll, pitch, yaw of the camera's body frame in the body's, degrees, applied
+            yaw first (Z-Y-X). Positive pitch is nose up: -90 looks straight down.
+        noise: Standard deviation of additive Gaussian noise, grey levels (0 to 255).
+        depth_noise: k in sigma = k z²: standard deviation (metres) of the noise at depth z.
+        latency: Seconds from exposure to delivery.
+    """
+
+    name: Annotated[str, msgspec.Meta(min_length=1, pattern="^[A-Za-z0-9_]+$")]
+    images: tuple[ImageKind, ...] = ("rgb", "depth")
+    width: Pixels = 512
+    height: Pixels = 512
+    fov: Annotated[float, msgspec.Meta(ge=1.0, le=170.0)] = 90.0
+    rate: Annotated[float, msgspec.Meta(gt=0.0)] = 30.0
+    position: Vector3 = (0.15, 0.0, 0.0)
+    orientation: Vector3 = (0.0, 0.0, 0.0)
+    noise: NonNegative = 0.0
+    depth_noise: NonNegative = 0.0
+    latency: Duration = Duration(0.04)  # immutable
+
+    def __post_init__(self) -> None:
+        if not self.images or len(set(self.images)) != len(self.images):
+            found = ", ".join(self.images) or "none"
+            raise ValueError(f"images: expected one or more kinds, each once, found {found}")
+
+
+def camera_info(spec: CameraSpec) -> events.CameraInfo:
+    """Return the camera's intrinsics: square pixels, the principal point at the centre."""
+    return events.CameraInfo.from_fov(spec.width, spec.height, math.radians(spec.fov))
+
+
+def optical_in_body(spec: CameraSpec) -> tuple[Vector3, Quaternion]:
+    """Return the optical frame's pose on the body: metres in FRD, rotation optical to body."""
+    roll, pitch, yaw = (math.radians(angle) for angle in spec.orientation)
+    return spec.position, multiply(from_euler(yaw, pitch, roll), OPTICAL_TO_CAMERA)
+
+
+def optical_frame(spec: CameraSpec, prefix: str) -> str:
+    """Return the name of the camera's optical frame."""
+    return f"{prefix}{spec.name}_optical"
+
+
+def announcement(
+    spec: CameraSpec, *, source: str, prefix: str, parent_frame_id: str, stamp: int = 0
+) -> events.CameraAnnouncement:
+    """Say what this camera will provide and where it sits.
+
+    Args:
+        spec: The camera.
+        source: Who says it, and later its images: ``drone/front``.
+        prefix: Goes before the camera's name in the names of its frames: ``drone/``.
+        parent_frame_id: Frame of the body that it is mounted on.
+        stamp: Nanoseconds on the run's clock.
+    """
+    position, orientation = optical_in_body(spec)
+    return events.CameraAnnouncement(
+        stamp=stamp,
+        source=source,
+        images=spec.images,
+        info=camera_info(spec),
+        rate=spec.rate,
+        latency=float(spec.latency),
+        frame_id=optical_frame(spec, prefix),
+        parent_frame_id=parent_frame_id,
+        position=position,
+        orientation=orientation,
+    )
+
+
+def vertical_fov(spec: CameraSpec) -> float:
+    """Return the vertical field of view in degrees, which is what MuJoCo's cameras are given."""
+    half = math.tan(math.radians(spec.fov) / 2.0) * spec.height / spec.width
+    return math.degrees(2.0 * math.atan(half))
+
+
+def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: str) -> str:
+    """Mount a camera on a body of the world and make room for its picture.
+
+    Args:
+        world: Is changed.
+        body_name: The body that carries it; its axes are forward, left, up (FLU), as are all
+            bodies' in MuJoCo, whose half turn about x is our FRD.
+        spec: The camera.
+        prefix: Goes before the camera's name: ``drone/``.
+
+    Returns:
+        The camera's name in the model.
+
+    Raises:
+        ValueError: The world has no such body, or has a camera of that name already.
+    """
+    name = f"{prefix}{spec.name}"
+    body = world.body(body_name)
+    if body is None:
+        known = ", ".join(other.name for other in world.bodies)
+        raise ValueError(f"camera {name}: expected a body of the world ({known}), got {body_name}")
+    if world.camera(name) is not None:
+        raise ValueError(f"camera {name}: expected a name of its own, but the world has one so")
+    position, orientation = optical_in_body(spec)
+    # MuJoCo's camera looks along -z with y up: the half turn about x on both sides of the
+    # rotation takes optical-in-FRD to camera-in-FLU.
+    body.add_camera(
+        name=name,
+        pos=half_turn_vector(position),
+        quat=half_turn_quaternion(orientation),
+        fovy=vertical_fov(spec),
+    )
+    screen = world.visual.global_
+    screen.offwidth = max(screen.offwidth, spec.width)
+    screen.offheight = max(screen.offheight, spec.height)
+    return name

@@ -1,0 +1,77 @@
+"""The numbers a pilot may tune: gains of the cascade and limits of the flight. No behaviour."""
+
+from __future__ import annotations
+
+from math import radians
+
+import msgspec
+
+
+class Gains(msgspec.Struct, frozen=True, kw_only=True):
+    """Gains of the cascade, for a vehicle whose motors lag by about 40 ms.
+
+    None depends on mass, inertia or thrust: those come from the vehicle's parameters.
+
+    Attributes:
+        position_xy: Velocity per position error, 1/s.
+        position_z: The same along the vertical.
+        velocity_xy_p: Acceleration per velocity error, 1/s.
+        velocity_xy_i: Acceleration per integrated velocity error, 1/s².
+        velocity_xy_d: Acceleration per measured acceleration, which it opposes; without unit.
+        velocity_z_p: Along the vertical, 1/s.
+        velocity_z_i: Along the vertical, 1/s².
+        velocity_z_d: Along the vertical, without unit.
+        tilt: Body rate per angle of tilt error, 1/s.
+        yaw: Body rate per angle of yaw error, 1/s.
+        rate_xy_p: Angular acceleration per error in roll or pitch rate, 1/s.
+        rate_xy_i: Angular acceleration per integrated error, 1/s².
+        rate_xy_d: Angular acceleration per measured angular acceleration, without unit.
+        rate_z_p: The same for the yaw rate, 1/s.
+        rate_z_i: The same for the yaw rate, 1/s².
+        derivative_cutoff: Hertz, of the low-pass filter on every derivative.
+    """
+
+    position_xy: float = 1.5
+    position_z: float = 2.0
+    velocity_xy_p: float = 3.4
+    velocity_xy_i: float = 1.0
+    velocity_xy_d: float = 0.1
+    velocity_z_p: float = 6.0
+    velocity_z_i: float = 2.0
+    velocity_z_d: float = 0.0
+    tilt: float = 8.0
+    yaw: float = 3.0
+    rate_xy_p: float = 20.0
+    rate_xy_i: float = 10.0
+    rate_xy_d: float = 0.4
+    rate_z_p: float = 6.0
+    rate_z_i: float = 2.0
+    derivative_cutoff: float = 40.0
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True):
+    """What the cascade never asks for, whatever the set-point says.
+
+    Attributes:
+        tilt: Radians between the thrust and the vertical, in position and velocity flight.
+        speed: Metres per second over ground.
+        climb: Metres per second upwards.
+        descent: Metres per second downwards.
+        approach: Metres per second squared with which it slows down towards a place.
+        integral: Metres per second squared that the velocity integrators may add.
+        tilt_rate: Radians per second about x and y.
+        yaw_rate: Radians per second about z.
+        min_thrust: Least thrust in position and velocity flight, of all motors' maximum.
+        max_thrust: Greatest thrust upwards there, of the same: what is left steers.
+    """
+
+    tilt: float = radians(35.0)
+    speed: float = 12.0
+    climb: float = 4.0
+    descent: float = 2.0
+    approach: float = 3.0
+    integral: float = 3.0
+    tilt_rate: float = 8.0
+    yaw_rate: float = 2.0
+    min_thrust: float = 0.08
+    max_thrust: float = 0.9

@@ -1,0 +1,138 @@
+"""The vehicle as a MuJoCo model: how it gets into a world, and what it weighs and can give.
+
+The numbers stand in ``vehicle.xml`` only; whoever needs them reads them from the compiled model
+with `read_parameters`. Stepping is in `physics`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import mujoco
+import numpy as np
+
+from events import Vector3
+from sims import frames
+
+TIMESTEP_NS = 1_000_000
+"""Nanoseconds of one physics step."""
+
+GRAVITY = 9.81
+"""Metres per second squared."""
+
+STANDING_HEIGHT = 0.1
+"""Metres from the ground to the origin of ``base_link`` when the vehicle stands on its feet."""
+
+AIR_DENSITY = 1.225
+"""Kilograms per cubic metre, at sea level in the standard atmosphere."""
+
+AIR_VISCOSITY = 1.8e-5
+"""Pascal seconds."""
+
+_VEHICLE = Path(__file__).with_name("vehicle.xml")
+
+
+class Motor(msgspec.Struct, frozen=True, kw_only=True):
+    """One rotor.
+
+    Attributes:
+        position: Metres from the centre of mass, FRD.
+        max_thrust: Newtons at full control, along the body's -z.
+        max_torque: Newton metres that the body feels about its z (FRD: positive turns the nose
+            right) at full control.
+    """
+
+    position: Vector3
+    max_thrust: float
+    max_torque: float
+
+
+class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What a controller must know of its vehicle.
+
+    Attributes:
+        mass: Kilograms.
+        inertia: Principal moments about x, y, z (FRD), kg m².
+        motors: In the order of the commands.
+        motor_time_constant: Seconds.
+        gravity: Metres per second squared.
+    """
+
+    mass: float
+    inertia: Vector3
+    motors: tuple[Motor, Motor, Motor, Motor]
+    motor_time_constant: float
+    gravity: float
+
+    @property
+    def max_thrust(self) -> float:
+        """Newtons, all motors together."""
+        return sum(motor.max_thrust for motor in self.motors)
+
+    @property
+    def hover_thrust(self) -> float:
+        """What holds the weight, 0 to 1 of `max_thrust`."""
+        return self.mass * self.gravity / self.max_thrust
+
+
+def attach_vehicle(world: mujoco.MjSpec, name: str, position: Vector3, yaw: float) -> None:
+    """Put a vehicle into a world, and set the world's time step, gravity and air.
+
+    All names of the vehicle's parts get the prefix ``name/``.
+
+    Args:
+        world: The world, in MuJoCo's axes read as NWU. Changed in place.
+        name: The vehicle's name, such as ``drone``.
+        position: Where the origin of ``base_link`` starts, metres NED. Standing on flat ground at
+            z = 0 is (x, y, -`STANDING_HEIGHT`).
+        yaw: Where it starts to look, radians clockwise from north seen from above.
+
+    Raises:
+        ValueError: The name is empty, contains a slash, or is taken.
+    """
+    if not name or "/" in name:
+        raise ValueError(f"expected a vehicle's name without a slash, found {name!r}")
+    if any(body.name == f"{name}/base_link" for body in world.bodies):
+        raise ValueError(f"the world already has a vehicle named {name!r}")
+    vehicle = mujoco.MjSpec.from_file(str(_VEHICLE))
+    frame = world.worldbody.add_frame(
+        pos=frames.half_turn_vector(position),
+        quat=frames.half_turn_quaternion(frames.from_euler(yaw, 0.0, 0.0)),
+    )
+    world.attach(vehicle, prefix=f"{name}/", frame=frame)
+    option: Any = world.option
+    option.timestep = TIMESTEP_NS * 1e-9
+    option.gravity = [0.0, 0.0, -GRAVITY]
+    option.density = AIR_DENSITY
+    option.viscosity = AIR_VISCOSITY
+    # Semi-implicit Euler: nothing here is stiff, and MuJoCo's implicit integrators cost more.
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+
+
+def read_parameters(model: mujoco.MjModel, name: str) -> VehicleParameters:
+    """Read a vehicle's parameters from a compiled model.
+
+    Raises:
+        ValueError: The model has no vehicle of this name.
+    """
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{name}/base_link")
+    if body < 0:
+        raise ValueError(f"expected a vehicle named {name!r} in the world, found no such body")
+    motors = tuple(_read_motor(model, f"{name}/motor{i}") for i in (1, 2, 3, 4))
+    actuator = model.actuator(f"{name}/motor1")
+    ix, iy, iz = model.body_inertia[body].tolist()
+    return VehicleParameters(
+        mass=float(model.body_mass[body]),
+        inertia=(ix, iy, iz),
+        motors=(motors[0], motors[1], motors[2], motors[3]),
+        motor_time_constant=float(actuator.dynprm[0]),
+        gravity=float(np.linalg.norm(model.opt.gravity)),
+    )
+
+
+def _read_motor(model: mujoco.MjModel, name: str) -> Motor:
+    gear = model.actuator(name).gear.tolist()
+    x, y, z = model.site(name).pos.tolist()
+    return Motor(position=(x, -y, -z), max_thrust=gear[2], max_torque=-gear[5])

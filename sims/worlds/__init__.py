@@ -1,0 +1,10 @@
+"""Worlds to fly in: where the walls are and what they look like. Vehicles and cameras are not here.
+
+A built-in world costs physics little (primitives, all in the world body) and is made to be seen:
+textures are drawn from a seed, and nothing repeats for long.
+"""
+
+from sims.worlds.loading import WORLDS, WorldError, load_world
+from sims.worlds.tours import CLEARANCE, TOURS, tour_length
+
+__all__ = ["CLEARANCE", "TOURS", "WORLDS", "WorldError", "load_world", "tour_length"]

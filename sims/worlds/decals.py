@@ -1,0 +1,216 @@
+"""Things that are painted or hung on a surface: posters, crates' faces, windows, letters.
+
+Each function returns a picture (float32 RGB in 0..1) or changes one; the materials below them are
+in `sims.worlds.materials`.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from sims.worlds.materials import planks
+from sims.worlds.patterns import Colour, Picture, fractal, mix, shade, share, smooth, specks
+
+WORDS = (
+    "DEPTH", "PARALLAX", "HORIZON", "LOOP", "FLOW", "EPIPOLE", "INERTIA", "KEYFRAME", "ORBIT",
+    "VECTOR", "SCALE", "RANSAC",
+)  # fmt: skip
+INKS: tuple[tuple[Colour, Colour, Colour], ...] = (
+    ((0.91, 0.86, 0.74), (0.76, 0.22, 0.16), (0.12, 0.18, 0.26)),
+    ((0.14, 0.24, 0.34), (0.93, 0.68, 0.24), (0.90, 0.88, 0.80)),
+    ((0.83, 0.83, 0.76), (0.16, 0.42, 0.40), (0.84, 0.36, 0.16)),
+    ((0.82, 0.40, 0.22), (0.95, 0.88, 0.70), (0.16, 0.13, 0.15)),
+    ((0.22, 0.36, 0.27), (0.92, 0.84, 0.60), (0.80, 0.28, 0.22)),
+    ((0.88, 0.78, 0.40), (0.20, 0.24, 0.38), (0.72, 0.24, 0.22)),
+)
+Box = tuple[int, int, int, int]
+"""Left, top, right, bottom; pixels."""
+
+
+def letters(picture: Picture, text: str, where: Box, colour: Colour, worn: Picture | None) -> None:
+    """Write `text` as large as `where` allows; `worn` (h, w of the picture) thins the paint."""
+    left, top, right, bottom = where
+    face = cv2.FONT_HERSHEY_DUPLEX
+    (wide, high), _ = cv2.getTextSize(text, face, 1.0, 2)
+    scale = min((right - left) / wide, (bottom - top) / (high * 1.1))
+    stencil = np.zeros(picture.shape[:2], np.uint8)
+    start = (
+        int((left + right - wide * scale) / 2.0),
+        int((top + bottom + high * scale) / 2.0),
+    )
+    thick = max(1, round(3.2 * scale))
+    cv2.putText(stencil, text, start, face, scale, 255, thick, cv2.LINE_AA)
+    mask = share(stencil)
+    if worn is not None:
+        mask = mask * worn
+    picture[:] = mix(picture, colour, mask)
+
+
+def poster(shape: tuple[int, int], random: np.random.Generator, number: int) -> Picture:
+    """Return a printed poster: one of several compositions, its inks and word by `number`."""
+    height, width = shape
+    paper, ink, second = INKS[number % len(INKS)]
+    sheet = share(_composition(shape, random, number))
+    margin = width // 12
+    word = WORDS[number % len(WORDS)]
+    letters(
+        sheet, word, (margin, int(height * 0.74), width - margin, int(height * 0.87)), second, None
+    )
+    for line in range(3):
+        y = int(height * (0.90 + 0.025 * line))
+        end = int(width * random.uniform(0.5, 0.9))
+        cv2.line(sheet, (margin, y), (end, y), ink, 1)
+    sheet = shade(sheet, 0.05 * fractal(shape, random, coarse=width / 2))
+    sheet = shade(sheet, 0.18 * specks(shape, random, count=40, radius=(1.0, 4.0)))
+    sheet = mix(sheet, paper, 0.06)
+    cv2.rectangle(sheet, (0, 0), (width - 1, height - 1), (0.15, 0.13, 0.12), 4)
+    return sheet
+
+
+def _composition(
+    shape: tuple[int, int], random: np.random.Generator, number: int
+) -> npt.NDArray[np.uint8]:
+    """Return a poster's picture: rings, towers, shards or dots; bytes, for soft edges."""
+    height, width = shape
+    paper, ink, second = (
+        tuple(round(255 * part) for part in colour) for colour in INKS[number % len(INKS)]
+    )
+    sheet = np.full((height, width, 3), paper, np.uint8)
+    centre = (int(width * random.uniform(0.35, 0.65)), int(height * random.uniform(0.3, 0.45)))
+    kind = number % 4
+    if kind == 0:
+        for index, radius in enumerate(np.linspace(0.42, 0.06, 6) * width):
+            colour = (ink, paper, second)[index % 3]
+            cv2.circle(sheet, centre, int(radius), colour, -1, cv2.LINE_AA)
+    elif kind == 1:
+        for index in range(9):
+            x = int(width * index / 9)
+            y = int(height * random.uniform(0.15, 0.62))
+            colour = (ink, second)[index % 2]
+            cv2.rectangle(sheet, (x, y), (x + width // 11, int(height * 0.7)), colour, -1)
+        cv2.circle(sheet, (int(width * 0.75), int(height * 0.18)), width // 9, ink, -1, cv2.LINE_AA)
+    elif kind == 2:
+        for index in range(14):
+            points = random.uniform((0.05, 0.05), (0.95, 0.68), (3, 2)) * (width, height)
+            colour = (ink, second, paper)[index % 3]
+            cv2.fillPoly(sheet, [points.astype(np.int32)], colour, cv2.LINE_AA)
+    else:
+        for row in range(7):
+            for column in range(6):
+                at = (int(width * (column + 0.6) / 6.2), int(height * (row + 0.7) / 10.5))
+                radius = int(width * random.uniform(0.02, 0.075))
+                cv2.circle(sheet, at, radius, (ink, second)[(row + column) % 2], -1, cv2.LINE_AA)
+    return sheet
+
+
+def sheets(pictures: list[Picture], columns: int) -> Picture:
+    """Lay pictures of one size out in rows."""
+    rows = [np.concatenate(pictures[i : i + columns], 1) for i in range(0, len(pictures), columns)]
+    return np.concatenate(rows, 0)
+
+
+def crate_face(size: int, random: np.random.Generator, number: int) -> Picture:
+    """Return one side of a wooden crate: boards, a frame, a brace, a stencilled mark."""
+    shape = (size, size)
+    tint = random.uniform(0.85, 1.12, 3)
+    tone = tuple(
+        tuple(float(c) for c in np.asarray(colour) * tint)
+        for colour in ((0.66, 0.50, 0.31), (0.58, 0.42, 0.26), (0.72, 0.56, 0.37))
+    )
+    face = planks(shape, random, size * 0.9, palette=tone, width=0.19)  # type: ignore[arg-type]
+    if number % 2:
+        face = np.ascontiguousarray(face.transpose(1, 0, 2))
+    frame = planks(shape, random, size * 0.9, palette=tone, width=0.5)  # type: ignore[arg-type]
+    edge = int(size * 0.11)
+    boards = np.zeros(shape, np.uint8)
+    if number % 3 != 2:
+        band = int(size * 0.10)
+        cv2.line(boards, (edge, size - edge), (size - edge, edge), 255, band, cv2.LINE_AA)
+    boards[:edge] = boards[-edge:] = 255
+    boards[:, :edge] = boards[:, -edge:] = 255
+    mask = share(boards)
+    rim = cv2.dilate(mask, np.ones((3, 3), np.uint8)) - mask
+    rim = np.maximum(rim, np.roll(np.roll(rim, 2, 0), 1, 1) * (1.0 - mask))
+    face = mix(mix(face, frame * 0.92, mask), (0.12, 0.08, 0.05), rim * 0.85)
+    for x in (edge // 2, size - edge // 2):
+        for y in np.linspace(edge // 2, size - edge // 2, 5):
+            cv2.circle(face, (x, int(y)), max(1, size // 110), (0.15, 0.13, 0.12), -1)
+    worn = smooth(-1.6, -0.2, fractal(shape, random, coarse=size / 6))
+    ink = ((0.10, 0.10, 0.10), (0.55, 0.12, 0.10), (0.12, 0.20, 0.36))[number % 3]
+    text = f"{'ABCDEFGH'[number % 8]}-{random.integers(100, 999)}"
+    inset = int(size * 0.2)
+    low = int(size * (0.25 if number % 2 else 0.6))
+    letters(face, text, (inset, low, size - inset, low + size // 6), ink, worn)
+    return face
+
+
+def window_pane(shape: tuple[int, int], random: np.random.Generator, lit: bool) -> Picture:
+    """Return a framed window with panes that reflect the sky, or are lit from within."""
+    height, width = shape
+    fall = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
+    top, bottom = (
+        ((0.98, 0.86, 0.58), (0.80, 0.62, 0.36))
+        if lit
+        else ((0.68, 0.78, 0.86), (0.30, 0.38, 0.46))
+    )
+    glass = np.asarray(top, np.float32) * (1 - fall) + np.asarray(bottom, np.float32) * fall
+    glass = np.ascontiguousarray(np.broadcast_to(glass, (height, width, 3)))
+    columns, rows = max(2, width // 26), max(2, height // 30)
+    panes = random.uniform(0.68, 1.12, (rows, columns)).astype(np.float32)
+    glass *= cv2.resize(panes, (width, height), interpolation=cv2.INTER_NEAREST)[..., None]
+    streak = fractal(shape, random, coarse=width / 3, stretch=(2.0, 1.0))
+    glass = shade(glass, 0.10 * streak)
+    bar = (0.22, 0.23, 0.24)
+    for column in range(columns + 1):
+        x = round(column * (width - 1) / columns)
+        cv2.line(glass, (x, 0), (x, height), bar, 2)
+    for row in range(rows + 1):
+        y = round(row * (height - 1) / rows)
+        cv2.line(glass, (0, y), (width, y), bar, 2)
+    return glass
+
+
+def paste(picture: Picture, piece: Picture, left: int, top: int, border: int = 0) -> None:
+    """Put a piece into a picture, with a shadow line around it."""
+    height, width = piece.shape[:2]
+    if border:
+        cv2.rectangle(
+            picture,
+            (left - border, top - border),
+            (left + width + border - 1, top + height + border - 1),
+            (0.30, 0.28, 0.26),
+            -1,
+        )
+    picture[top : top + height, left : left + width] = piece
+
+
+def stripes(picture: Picture, where: Box, worn: Picture) -> None:
+    """Paint yellow and black warning stripes."""
+    left, top, right, bottom = where
+    ys, xs = np.mgrid[top:bottom, left:right].astype(np.float32)
+    phase = ((xs + ys) / 14.0) % 1.0
+    soft = smooth(0.42, 0.5, phase) - smooth(0.92, 1.0, phase)
+    band = mix(np.full((*phase.shape, 3), (0.88, 0.68, 0.14), np.float32), (0.12, 0.12, 0.12), soft)
+    part = picture[top:bottom, left:right]
+    part[:] = mix(part, band, worn[top:bottom, left:right] * 0.9)
+
+
+def contact_shadow(picture: Picture, footprints: Picture, reach: float, strength: float) -> Picture:
+    """Darken a floor under and around what stands on it; `footprints` is a mask in 0..1."""
+    wide = cv2.GaussianBlur(footprints, (0, 0), reach)
+    close = cv2.GaussianBlur(footprints, (0, 0), reach / 4.0)
+    return shade(picture, -strength * np.clip(0.6 * wide + 0.5 * close, 0.0, 1.0))
+
+
+def tile(number: int, columns: int, rows: int) -> tuple[float, float, float, float]:
+    """Return the window of one picture of `sheets`, by its number, a hair inside its edges."""
+    row, column = divmod(number % (columns * rows), columns)
+    hair = 0.002
+    return (
+        column / columns + hair,
+        row / rows + hair,
+        (column + 1) / columns - hair,
+        (row + 1) / rows - hair,
+    )

@@ -1,0 +1,63 @@
+"""Finding a world by its name or by its path, and saying clearly why there is none."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from sims.worlds.hall import hall
+from sims.worlds.yard import yard
+
+WORLDS: dict[str, Callable[[int], Any]] = {"hall": hall, "yard": yard}
+"""The worlds that are built in: name to the function that makes one from a seed."""
+
+
+class WorldError(ValueError):
+    """The world that was asked for isn't there, or isn't one."""
+
+
+def load_world(name_or_path: str | Path, seed: int = 0) -> mujoco.MjSpec:
+    """Return a world, ready for vehicles and cameras to be added.
+
+    Args:
+        name_or_path: A name in `WORLDS`, or the path of an MJCF file (what ends in ``.xml``,
+            contains a slash, or is a `Path`).
+        seed: Of a built-in world's looks; its geometry is the same for every seed, but for
+            what lies on shelves. A file has none.
+
+    Raises:
+        WorldError: No such name or file, or the file is no MJCF that compiles.
+    """
+    text = str(name_or_path)
+    is_path = isinstance(name_or_path, Path) or "/" in text or text.lower().endswith(".xml")
+    if is_path:
+        return _from_file(Path(name_or_path))
+    if text not in WORLDS:
+        known = ", ".join(sorted(WORLDS))
+        near = difflib.get_close_matches(text, WORLDS, n=2, cutoff=0.5)
+        hint = f"; did you mean {' or '.join(near)}?" if near else ""
+        raise WorldError(
+            f'world: expected one of {known}, or a path to an .xml file, found "{text}"{hint}'
+        )
+    return WORLDS[text](seed)
+
+
+def _from_file(path: Path) -> Any:
+    place = path.expanduser()
+    if not place.is_file():
+        what = "a directory" if place.is_dir() else "nothing"
+        raise WorldError(f"world: {place}: expected an MJCF file, found {what}")
+    try:
+        spec = mujoco.MjSpec.from_file(str(place))
+        # Compiled here once, so that a mistake is reported as the file's and not as a vehicle's.
+        spec.copy().compile()
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise WorldError(
+            f"world: {place}: expected an MJCF file that compiles, found: {reason}"
+        ) from error
+    return spec

@@ -1,0 +1,203 @@
+"""Materials: brick, planks, concrete, tiles, metal, plaster, grass, leaves.
+
+Each function draws one, of any size, at `density` pixels per metre, and never twice alike. Things
+painted on them (posters, windows, letters) are in `sims.worlds.decals`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.worlds.patterns import (
+    Colour,
+    Picture,
+    cells,
+    cracks,
+    fractal,
+    mix,
+    per_cell,
+    shade,
+    smooth,
+    specks,
+)
+
+RED_BRICK: tuple[Colour, ...] = (
+    (0.62, 0.32, 0.23), (0.55, 0.27, 0.20), (0.68, 0.39, 0.28), (0.46, 0.24, 0.20),
+    (0.72, 0.46, 0.33), (0.38, 0.22, 0.20),
+)  # fmt: skip
+YELLOW_BRICK: tuple[Colour, ...] = (
+    (0.76, 0.66, 0.46), (0.68, 0.57, 0.38), (0.82, 0.74, 0.56), (0.58, 0.47, 0.33),
+    (0.72, 0.58, 0.44),
+)  # fmt: skip
+GREY_STONE: tuple[Colour, ...] = (
+    (0.58, 0.57, 0.54), (0.50, 0.50, 0.50), (0.66, 0.64, 0.59), (0.44, 0.44, 0.45),
+    (0.60, 0.55, 0.48),
+)  # fmt: skip
+OAK: tuple[Colour, ...] = (
+    (0.62, 0.44, 0.27), (0.55, 0.38, 0.23), (0.70, 0.52, 0.34), (0.48, 0.33, 0.21),
+)  # fmt: skip
+
+
+def brick(
+    shape: tuple[int, int],
+    random: np.random.Generator,
+    density: float,
+    palette: tuple[Colour, ...] = RED_BRICK,
+    block: tuple[float, float] = (0.12, 0.28),
+    mortar: Colour = (0.70, 0.67, 0.61),
+) -> Picture:
+    """Return masonry in running bond; `block` is a brick's height and length in metres."""
+    high, wide = block[0] * density, block[1] * density
+    layout = cells(shape, random, high=high, wide=wide, stagger=0.5, uneven=0.12)
+    joint = 0.010 * density + 0.5 * fractal(shape, random, coarse=12, fine=4)
+    stone = per_cell(layout, random, palette, 0.13)
+    stone = shade(stone, 0.07 * fractal(shape, random, coarse=16))
+    grime = fractal(shape, random, coarse=2.0 * density, fine=16)
+    wall = mix(stone, mortar, 1.0 - smooth(0.0, 1.5, layout.edge - joint))
+    soot = smooth(0.3, 2.2, grime) * 0.45
+    chalk = smooth(0.9, 2.4, -grime) * 0.35
+    return mix(mix(wall, (0.20, 0.17, 0.16), soot), (0.86, 0.83, 0.78), chalk)
+
+
+def concrete(
+    shape: tuple[int, int],
+    random: np.random.Generator,
+    density: float,
+    base: Colour = (0.60, 0.59, 0.56),
+) -> Picture:
+    """Return cast concrete: clouds, pores, patches of repair, drips, a few cracks."""
+    area = shape[0] * shape[1] / density**2
+    ground = np.full((*shape, 3), base, np.float32)
+    ground = shade(ground, 0.08 * fractal(shape, random, coarse=1.5 * density, gain=0.85))
+    drips = fractal(shape, random, coarse=0.2 * density, fine=3, stretch=(7.0, 1.0))
+    ground = mix(ground, (0.33, 0.30, 0.27), smooth(0.8, 2.6, drips) * 0.5)
+    ground = shade(
+        ground, 0.30 * specks(shape, random, count=int(70 * area), radius=(1.0, 0.045 * density))
+    )
+    lines = cracks(shape, random, count=max(2, int(area / 2.0)))
+    return mix(ground, (0.16, 0.15, 0.14), lines * 0.7)
+
+
+def planks(
+    shape: tuple[int, int],
+    random: np.random.Generator,
+    density: float,
+    palette: tuple[Colour, ...] = OAK,
+    width: float = 0.16,
+) -> Picture:
+    """Return boards that run across the picture, with grain, knots and nails."""
+    layout = cells(shape, random, high=width * density, wide=1.9 * density, stagger=1.0, uneven=0.3)
+    wood = per_cell(layout, random, palette, 0.13)
+    grain = fractal(shape, random, coarse=0.06 * density, fine=2, stretch=(1.0, 14.0), gain=0.9)
+    wood = shade(wood, 0.13 * grain)
+    area = shape[0] * shape[1] / density**2
+    knots = specks(shape, random, count=int(9 * area), radius=(1.2, 0.03 * density))
+    wood = mix(wood, (0.18, 0.11, 0.07), np.abs(knots) * 0.75)
+    wear = fractal(shape, random, coarse=density, fine=12)
+    wood = mix(wood, (0.66, 0.61, 0.54), smooth(0.8, 2.4, wear) * 0.45)
+    return mix(wood, (0.10, 0.07, 0.05), 1.0 - smooth(0.3, 1.7, layout.edge))
+
+
+def tiles(
+    shape: tuple[int, int],
+    random: np.random.Generator,
+    density: float,
+    palette: tuple[Colour, ...],
+    size: tuple[float, float] = (0.4, 0.4),
+    joint: Colour = (0.30, 0.29, 0.28),
+    stagger: float = 0.0,
+    spread: float = 0.09,
+) -> Picture:
+    """Return slabs or tiles of `size` (height, width, metres) with chips, wear and dirty joints."""
+    layout = cells(
+        shape, random, high=size[0] * density, wide=size[1] * density, stagger=stagger,
+        uneven=0.0 if stagger == 0.0 else 0.15,
+    )  # fmt: skip
+    area = shape[0] * shape[1] / density**2
+    floor = per_cell(layout, random, palette, spread)
+    floor = shade(floor, 0.05 * fractal(shape, random, coarse=0.5 * density, gain=0.9))
+    blots = specks(shape, random, count=int(45 * area), radius=(1.0, 0.04 * density))
+    floor = shade(floor, 0.30 * blots)
+    wear = fractal(shape, random, coarse=2.5 * density, fine=8)
+    floor = mix(floor, (0.33, 0.30, 0.27), smooth(0.4, 2.4, wear) * 0.4)
+    ragged = 0.6 * fractal(shape, random, coarse=10, fine=3)
+    return mix(floor, joint, 1.0 - smooth(0.4, 1.9, layout.edge - 0.008 * density + ragged))
+
+
+def plaster(
+    shape: tuple[int, int],
+    random: np.random.Generator,
+    density: float,
+    colour: Colour,
+    under: Picture,
+) -> Picture:
+    """Return old paint over `under` (same shape): it has flaked off in places."""
+    coat = np.full((*shape, 3), colour, np.float32)
+    coat = shade(coat, 0.06 * fractal(shape, random, coarse=1.2 * density, gain=0.85))
+    area = shape[0] * shape[1] / density**2
+    coat = shade(
+        coat, 0.26 * specks(shape, random, count=int(38 * area), radius=(1.0, 0.05 * density))
+    )
+    coat = mix(coat, (0.25, 0.22, 0.20), 0.6 * cracks(shape, random, count=int(area / 1.5) + 1))
+    flakes = fractal(shape, random, coarse=1.4 * density, fine=4, gain=0.62)
+    bare = smooth(0.95, 1.05, flakes)
+    rim = smooth(0.78, 0.95, flakes) * (1.0 - bare)
+    return mix(mix(coat, (0.90, 0.88, 0.83), rim * 0.6), under, bare)
+
+
+def metal(
+    shape: tuple[int, int],
+    random: np.random.Generator,
+    density: float,
+    colour: Colour,
+    pitch: float = 0.2,
+) -> Picture:
+    """Return painted corrugated sheet (ribs every `pitch` metres, upright), scratched and rusty."""
+    across = np.arange(shape[1], dtype=np.float32) / np.float32(pitch * density)
+    wave = np.abs((across % 1.0) - 0.5) * 2.0
+    ribs = smooth(0.25, 0.45, wave) - smooth(0.65, 0.85, np.roll(wave, 3)) * 0.45
+    sheet = np.full((*shape, 3), colour, np.float32)
+    sheet = shade(sheet, np.broadcast_to(0.30 * ribs - 0.15, shape).astype(np.float32))
+    area = shape[0] * shape[1] / density**2
+    dents = specks(shape, random, count=int(30 * area), radius=(1.0, 0.04 * density))
+    sheet = shade(sheet, 0.28 * dents + 0.05 * fractal(shape, random, coarse=density))
+    rust = fractal(shape, random, coarse=0.7 * density, fine=2, stretch=(2.5, 1.0), gain=0.72)
+    sheet = mix(sheet, (0.40, 0.21, 0.12), smooth(1.15, 1.9, rust) * 0.9)
+    return mix(sheet, (0.85, 0.83, 0.80), 0.5 * cracks(shape, random, count=int(area)))
+
+
+def grass(shape: tuple[int, int], random: np.random.Generator, density: float) -> Picture:
+    """Return a worn lawn: tufts, dry patches, bare soil."""
+    tufts = fractal(shape, random, coarse=0.35 * density, fine=2, gain=0.95)
+    lawn = np.full((*shape, 3), (0.30, 0.42, 0.18), np.float32)
+    lawn = shade(lawn, 0.24 * tufts)
+    dry = fractal(shape, random, coarse=3.0 * density, fine=6)
+    lawn = mix(lawn, (0.58, 0.53, 0.30), smooth(0.1, 1.6, dry) * 0.6)
+    soil = smooth(0.9, 1.5, -dry + 0.25 * tufts)
+    return mix(lawn, (0.40, 0.31, 0.22), soil * 0.8)
+
+
+def leaves(shape: tuple[int, int], random: np.random.Generator, density: float) -> Picture:
+    """Return dense foliage: light leaves over dark gaps."""
+    area = shape[0] * shape[1] / density**2
+    green = np.full((*shape, 3), (0.20, 0.31, 0.13), np.float32)
+    green = shade(green, 0.30 * fractal(shape, random, coarse=0.5 * density, fine=3, gain=0.9))
+    near = specks(shape, random, count=int(150 * area), radius=(2.0, 0.07 * density))
+    green = mix(green, (0.48, 0.58, 0.24), np.maximum(near, 0.0) * 0.75)
+    return mix(green, (0.05, 0.09, 0.04), np.maximum(-near, 0.0) * 0.8)
+
+
+def asphalt(shape: tuple[int, int], random: np.random.Generator, density: float) -> Picture:
+    """Return old asphalt: grit, patches, sealed cracks, oil."""
+    area = shape[0] * shape[1] / density**2
+    road = np.full((*shape, 3), (0.47, 0.46, 0.45), np.float32)
+    road = shade(road, 0.10 * fractal(shape, random, coarse=2.0 * density, gain=0.95))
+    grit = specks(shape, random, count=int(26 * area), radius=(1.0, 0.05 * density))
+    fine = fractal(shape, random, coarse=0.12 * density, fine=2, gain=1.0)
+    road = shade(road, 0.42 * grit + 0.07 * fine)
+    patch = cells(shape, random, high=1.7 * density, wide=2.6 * density, stagger=1.0, uneven=0.4)
+    tone = (random.uniform(0, 1, patch.count) < 0.16).astype(np.float32)[patch.index]
+    road = shade(road, -0.22 * tone * smooth(0.0, 2.0, patch.edge))
+    oil = fractal(shape, random, coarse=1.2 * density, fine=6)
+    road = mix(road, (0.13, 0.13, 0.14), smooth(1.2, 2.4, oil) * 0.6)
+    return mix(road, (0.12, 0.12, 0.12), cracks(shape, random, count=int(area / 4.5)) * 0.8)

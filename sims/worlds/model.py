@@ -1,0 +1,199 @@
+"""Puts materials, surfaces, solids and lights into a model, under names.
+
+The world here is MuJoCo's: x north, y **west**, z up (NWU), metres. What is put together of these
+(boxes, arches, walls) is in `sims.worlds.builder`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from sims.worlds.patterns import Picture, to_bytes
+from sims.worlds.shapes import Surface, Window
+
+LOOK_GROUP, SOLID_GROUP = 0, 3
+Vector = tuple[float, float, float]
+
+
+class Material(NamedTuple):
+    """A texture in the model.
+
+    Attributes:
+        name: The material's.
+        width: How much it covers, metres.
+        height: As above.
+        module: Pieces that are cut out of it start at a multiple of this, metres down: a course
+            of bricks.
+    """
+
+    name: str
+    width: float
+    height: float
+    module: float = 0.0
+
+
+class Model:
+    """Collects a world.
+
+    Args:
+        name: The model's.
+        seed: Everything random follows from it.
+    """
+
+    def __init__(self, name: str, seed: int) -> None:
+        self.random = np.random.default_rng([seed, len(name), *name.encode()])
+        self.spec = mujoco.MjSpec()
+        self.spec.modelname = name
+        # A light shade everywhere, so that nothing is black.
+        self.spec.visual.headlight.diffuse = [0.0, 0.0, 0.0]
+        self.spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+        self.spec.visual.quality.shadowsize = 0
+        self.spec.visual.quality.offsamples = 0
+
+    def material(
+        self, name: str, picture: Picture, density: float, module: float = 0.0, glow: float = 0.0
+    ) -> Material:
+        """Add a material drawn at `density` pixels per metre.
+
+        Args:
+            name: Its name and its texture's.
+            picture: Shape (h, w, 3).
+            density: Pixels per metre.
+            module: See `Material`.
+            glow: How much it shines by itself, 0..1.
+        """
+        height, width = picture.shape[:2]
+        texture = self.spec.add_texture(
+            name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3
+        )
+        texture.data = to_bytes(picture).tobytes()
+        material = self.spec.add_material(
+            name=name, specular=0.05, shininess=0.1, reflectance=0.0, emission=glow
+        )
+        textures = list(material.textures)
+        textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+        material.textures = textures
+        return Material(name, width / density, height / density, module)
+
+    def cut(self, material: Material, width: float, height: float) -> Window:
+        """Return a piece of a material from a random place, of a size in metres.
+
+        A piece larger than the material is all of it, drawn larger.
+        """
+        width, height = min(width, material.width), min(height, material.height)
+        left = self.random.uniform(0.0, material.width - width)
+        top = self.random.uniform(0.0, material.height - height)
+        if material.module > 0.0:
+            top = math.floor(top / material.module) * material.module
+        return (
+            left / material.width,
+            top / material.height,
+            (left + width) / material.width,
+            (top + height) / material.height,
+        )
+
+    def look(
+        self,
+        name: str,
+        surface: Surface,
+        material: Material,
+        place: Vector,
+        turn: float = 0.0,
+        tilt: float = 0.0,
+    ) -> None:
+        """Add a surface that is seen and not felt."""
+        self.spec.add_mesh(
+            name=name,
+            uservert=surface.points.ravel(),
+            usernormal=surface.normals.ravel(),
+            usertexcoord=surface.texture.ravel(),
+            userface=surface.faces.ravel(),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )
+        self.spec.worldbody.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=name,
+            material=material.name,
+            pos=place,
+            quat=_rotation(turn, tilt),
+            contype=0,
+            conaffinity=0,
+            group=LOOK_GROUP,
+        )
+
+    def solid(
+        self,
+        name: str,
+        kind: Any,
+        size: Sequence[float],
+        place: Vector,
+        turn: float = 0.0,
+        tilt: float = 0.0,
+        roll: float = 0.0,
+    ) -> None:
+        """Add a primitive that is felt and not seen; `size` is MuJoCo's (half lengths)."""
+        quat = np.empty(4)
+        mujoco.mju_mulQuat(
+            quat,
+            np.asarray(_rotation(turn, tilt)),
+            np.array([math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0]),
+        )
+        self.spec.worldbody.add_geom(
+            name=name,
+            type=kind,
+            size=[*size, 0.0, 0.0][:3],
+            pos=place,
+            quat=quat,
+            group=SOLID_GROUP,
+            rgba=[0.6, 0.6, 0.6, 1.0],
+        )
+
+    def light(
+        self,
+        name: str,
+        place: Vector,
+        colour: Vector,
+        *,
+        towards: Vector = (0.0, 0.0, -1.0),
+        sun: bool = False,
+        fall_off: float = 0.0,
+    ) -> None:
+        """Add a light.
+
+        Args:
+            name: Its name.
+            place: Where it hangs, metres.
+            colour: Strength in red, green, blue.
+            towards: Its direction.
+            sun: Parallel rays from very far away.
+            fall_off: 1/m² in 1 / (1 + fall_off r²).
+        """
+        kind = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL if sun else mujoco.mjtLightType.mjLIGHT_POINT
+        self.spec.worldbody.add_light(
+            name=name,
+            type=kind,
+            pos=place,
+            dir=towards,
+            diffuse=colour,
+            specular=[0.0, 0.0, 0.0],
+            ambient=[0.0, 0.0, 0.0],
+            attenuation=[1.0, 0.0, fall_off],
+            castshadow=False,
+        )
+
+
+def _rotation(turn: float, tilt: float) -> list[float]:
+    """Return the quaternion of a turn about z after a tilt about y, degrees."""
+    a, b = math.radians(turn) / 2.0, math.radians(tilt) / 2.0
+    return [
+        math.cos(a) * math.cos(b),
+        -math.sin(a) * math.sin(b),
+        math.cos(a) * math.sin(b),
+        math.sin(a) * math.cos(b),
+    ]

@@ -1,0 +1,215 @@
+"""Surfaces with texture coordinates, and the solids' outlines they are cut from.
+
+A surface is a grid of points seen from outside: rows run down, columns run to the right. The world
+here is MuJoCo's: z up, metres. Putting them into a model is in `sims.worlds.builder`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Window = tuple[float, float, float, float]
+"""A part of a texture: left, top, right, bottom, in 0..1, rows counted from the top."""
+
+STEP = 1.0
+"""Surfaces are cut at least this fine (metres): MuJoCo lights vertices, not pixels."""
+
+
+class Surface(NamedTuple):
+    """Triangles, with everything that MuJoCo needs to draw them.
+
+    Attributes:
+        points: Metres, shape (n, 3).
+        normals: Outward unit vectors, shape (n, 3).
+        texture: Texture coordinates, shape (n, 2).
+        faces: Indices, anticlockwise from outside, shape (m, 3).
+    """
+
+    points: Array
+    normals: Array
+    texture: Array
+    faces: npt.NDArray[np.int32]
+
+
+def grid(points: Array, texture: Array) -> Surface:
+    """Return the surface through a grid of points.
+
+    Args:
+        points: Shape (rows, columns, 3).
+        texture: Coordinates, shape (rows, columns, 2).
+    """
+    rows, columns = points.shape[:2]
+    right = np.gradient(points, axis=1)
+    up = -np.gradient(points, axis=0)
+    normals = np.cross(right, up)
+    # Where a grid closes in a point (a pole) the neighbours' normal serves.
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    normals = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    number = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.concatenate(
+        [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]
+    )
+    return Surface(points.reshape(-1, 3), normals.reshape(-1, 3), texture.reshape(-1, 2), faces)
+
+
+def join(surfaces: list[Surface]) -> Surface:
+    """Return several surfaces as one."""
+    starts = np.cumsum([0] + [len(surface.points) for surface in surfaces[:-1]])
+    return Surface(
+        np.concatenate([surface.points for surface in surfaces]),
+        np.concatenate([surface.normals for surface in surfaces]),
+        np.concatenate([surface.texture for surface in surfaces]),
+        np.concatenate(
+            [surface.faces + start for surface, start in zip(surfaces, starts, strict=True)]
+        ).astype(np.int32),
+    )
+
+
+def quad(corner: Array, right: Array, down: Array, window: Window, step: float = STEP) -> Surface:
+    """Return a flat rectangle: its top left corner, and its two edges, metres."""
+    columns = max(1, math.ceil(float(np.linalg.norm(right)) / step))
+    rows = max(1, math.ceil(float(np.linalg.norm(down)) / step))
+    across = np.linspace(0.0, 1.0, columns + 1)[None, :, None]
+    along = np.linspace(0.0, 1.0, rows + 1)[:, None, None]
+    left, top, far_right, bottom = window
+    texture = np.concatenate(
+        [
+            np.broadcast_to(left + (far_right - left) * across, (rows + 1, columns + 1, 1)),
+            np.broadcast_to(top + (bottom - top) * along, (rows + 1, columns + 1, 1)),
+        ],
+        axis=2,
+    )
+    return grid(corner + right * across + down * along, texture)
+
+
+FACES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]] = {
+    "front": ((-1, 1, 1), (0, -1, 0), (0, 0, -1)),
+    "left": ((1, 1, 1), (-1, 0, 0), (0, 0, -1)),
+    "back": ((1, -1, 1), (0, 1, 0), (0, 0, -1)),
+    "right": ((-1, -1, 1), (1, 0, 0), (0, 0, -1)),
+    "top": ((-1, -1, 1), (0, 1, 0), (1, 0, 0)),
+    "bottom": ((-1, 1, -1), (0, -1, 0), (1, 0, 0)),
+}
+"""A box's faces: the sign of the top left corner, the way to the right, the way down. The front
+looks to -x: it is what a vehicle that flies north sees."""
+
+
+def face_size(name: str, size: tuple[float, float, float]) -> tuple[float, float]:
+    """Return the width and the height of a box's face, metres."""
+    _, right, down = FACES[name]
+    return float(np.abs(right) @ np.asarray(size)), float(np.abs(down) @ np.asarray(size))
+
+
+def box(size: tuple[float, float, float], windows: dict[str, Window]) -> Surface:
+    """Return those faces of a box about the origin that `windows` names."""
+    extent = np.asarray(size)
+    return join(
+        [
+            quad(
+                np.array(FACES[name][0]) * extent / 2.0,
+                np.array(FACES[name][1]) * extent,
+                np.array(FACES[name][2]) * extent,
+                window,
+            )
+            for name, window in windows.items()
+        ]
+    )
+
+
+def cylinder(radius: float, height: float, side: Window, top: Window | None) -> Surface:
+    """Return an upright cylinder about the origin, its top closed if it has a window."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)[None, :]  # seen from outside it grows to the right
+    levels = np.linspace(0.5, -0.5, max(1, math.ceil(height / STEP)) + 1)[:, None]
+    ones = np.ones((len(levels), 1))
+    points = np.stack(
+        [
+            radius * np.cos(angle) * ones,
+            radius * np.sin(angle) * ones,
+            height * levels * np.ones_like(angle),
+        ],
+        axis=2,
+    )
+    u = side[0] + (side[2] - side[0]) * np.linspace(0, 1, 25)[None, :] * ones
+    v = side[1] + (side[3] - side[1]) * (0.5 - levels) * np.ones_like(angle)
+    parts = [grid(points, np.stack([u, v], axis=2))]
+    if top is not None:
+        parts.append(disc(radius, height / 2.0, top))
+    return join(parts)
+
+
+def disc(radius: float, level: float, window: Window) -> Surface:
+    """Return a flat round lid that looks up, at height `level`."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = np.concatenate([[[0.0, 0.0]], rim])
+    centre = np.array([window[0] + window[2], window[1] + window[3]]) / 2.0
+    scale = np.array([window[2] - window[0], window[3] - window[1]]) / 2.0
+    faces = np.array([[0, i, i + 1] for i in range(1, 25)], np.int32)
+    solid = np.concatenate([points * radius, np.full((26, 1), level)], axis=1)
+    return Surface(solid, np.tile([0.0, 0.0, 1.0], (26, 1)), centre + points * scale, faces)
+
+
+def blob(radii: tuple[float, float, float], bumps: Array, window: Window) -> Surface:
+    """Return an ellipsoid about the origin whose radius `bumps` (rows, columns) multiplies."""
+    rows, columns = bumps.shape
+    polar = np.linspace(0.0, np.pi, rows)[:, None]
+    angle = np.linspace(0.0, 2.0 * np.pi, columns)[None, :]
+    bumps = bumps.copy()
+    bumps[:, -1] = bumps[:, 0]
+    bumps[0], bumps[-1] = bumps[0, 0], bumps[-1, 0]
+    points = np.stack(
+        [
+            radii[0] * bumps * np.sin(polar) * np.cos(angle),
+            radii[1] * bumps * np.sin(polar) * np.sin(angle),
+            radii[2] * bumps * np.cos(polar) * np.ones_like(angle),
+        ],
+        axis=2,
+    )
+    u = np.broadcast_to(np.linspace(window[0], window[2], columns)[None, :], bumps.shape)
+    v = np.broadcast_to(np.linspace(window[1], window[3], rows)[:, None], bumps.shape)
+    return grid(points, np.stack([u, v], axis=2))
+
+
+def arch(
+    inner: float, outer: float, depth: float, angles: int, per_metre: tuple[float, float]
+) -> Surface:
+    """Return a half ring that stands on its feet, with the opening along x.
+
+    Args:
+        inner: Radius of the opening, metres.
+        outer: Radius of the outer edge, metres.
+        depth: Thickness along x, metres.
+        angles: How many pieces the ring is cut into.
+        per_metre: What a metre is in texture coordinates, across and down.
+    """
+    turn = np.linspace(np.pi, 0.0, angles + 1)
+    rims = {radius: np.stack([np.cos(turn), np.sin(turn)], 1) * radius for radius in (inner, outer)}
+    around = turn[::-1] * (inner + outer) / 2.0 * per_metre[0]
+    parts = []
+    for x, sign in ((-depth / 2.0, 1), (depth / 2.0, -1)):
+        # The front looks to -x, and there the left is +y.
+        points = np.zeros((2, angles + 1, 3))
+        points[..., 0] = x
+        for row, radius in enumerate((outer, inner)):
+            points[row, :, 1] = -sign * rims[radius][:, 0]
+            points[row, :, 2] = rims[radius][:, 1]
+        texture = np.zeros((2, angles + 1, 2))
+        texture[..., 0] = around
+        texture[1, :, 1] = (outer - inner) * per_metre[1]
+        parts.append(grid(points, texture))
+    for radius, flip in ((outer, False), (inner, True)):
+        points = np.zeros((2, angles + 1, 3))
+        points[0, :, 0], points[1, :, 0] = depth / 2.0, -depth / 2.0
+        points[..., 1] = -rims[radius][:, 0]
+        points[..., 2] = rims[radius][:, 1]
+        texture = np.zeros((2, angles + 1, 2))
+        texture[..., 0] = around
+        texture[1, :, 1] = depth * per_metre[1]
+        parts.append(grid(points[::-1] if flip else points, texture))
+    return join(parts)

@@ -1,0 +1,59 @@
+"""A standard flight through each world: a closed path that keeps its distance from everything."""
+
+from __future__ import annotations
+
+import math
+
+from events.base import Vector3
+
+CLEARANCE = 0.8
+"""How far (metres) the straight lines between a tour's points keep from every solid, at least."""
+
+TOURS: dict[str, tuple[Vector3, ...]] = {
+    # Round the hall, through the brick arch and the timber portal.
+    "hall": (
+        (0.0, 0.0, -1.5),
+        (4.4, 0.2, -1.5),
+        (6.0, -2.0, -1.7),
+        (5.4, -4.1, -1.6),
+        (0.6, -4.2, -1.5),
+        (-2.4, -4.0, -1.3),
+        (-5.6, -3.9, -1.7),
+        (-6.4, -1.6, -2.0),
+        (-4.4, 0.0, -1.8),
+        (-5.0, 3.4, -1.6),
+        (-3.2, 4.25, -1.5),
+        (1.6, 4.25, -1.5),
+        (5.2, 3.9, -1.4),
+        (6.1, 1.8, -1.8),
+        (3.9, 0.6, -2.0),
+        (0.4, 1.0, -1.9),
+        (-2.6, 0.3, -1.7),
+    ),
+    # Round the yard, through the stone arch and the brick arch.
+    "yard": (
+        (0.0, 0.0, -1.5),
+        (2.9, 1.4, -1.6),
+        (6.1, 3.2, -1.8),
+        (6.5, 6.5, -1.6),
+        (3.2, 7.6, -1.5),
+        (-2.9, 6.1, -1.5),
+        (-6.5, 6.8, -1.7),
+        (-7.9, 2.9, -2.0),
+        (-5.6, -0.4, -1.7),
+        (-6.5, -4.3, -1.5),
+        (-4.2, -7.05, -1.5),
+        (0.7, -5.8, -1.5),
+        (4.3, -6.8, -1.7),
+        (5.8, -3.2, -1.9),
+        (2.5, -2.2, -1.7),
+    ),
+}
+"""Each world's tour: places in NED (metres), flown in order and from the last to the first again.
+They stand about 50 to 60 m long."""
+
+
+def tour_length(name: str) -> float:
+    """Return the length of a world's tour, once round, in metres."""
+    points = TOURS[name]
+    return sum(math.dist(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True))

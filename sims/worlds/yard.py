@@ -1,0 +1,202 @@
+"""`yard`: a courtyard in the sun, 30 x 30 m, among houses, with containers, trees and arches.
+
+Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres, from the middle. What
+things are made of is in `materials`, `facades` and `decals`; how they get into the model, in
+`builder`; the ground's picture, in `yard_ground`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sims.worlds import decals, facades, materials, yard_ground
+from sims.worlds.builder import WHOLE, Builder
+from sims.worlds.model import Material
+from sims.worlds.patterns import Picture, fractal, shade, smooth
+from sims.worlds.shapes import quad
+from sims.worlds.sky import add_sky
+from sims.worlds.yard_ground import CONTAINERS, CRATES, POSTS, TREES
+
+SUN = (0.50, 0.42, -0.76)
+HOUSE_DENSITY = 36.0
+SIDES = {  # the houses' line, how they are turned, widths and storeys from the left
+    "north": (17.5, 0.0, ((9.5, 4), (11.0, 3), (8.0, 4), (9.5, 3))),
+    "east": (17.5, -90.0, ((10.0, 3), (8.5, 4), (10.5, 3), (9.0, 4))),
+    "south": (17.5, 180.0, ((8.5, 4), (10.0, 3), (9.0, 4), (10.5, 3))),
+    "west": (17.5, 90.0, ((11.0, 3), (9.0, 4), (8.0, 3), (10.0, 4))),
+}
+
+
+def yard(seed: int = 0) -> Any:
+    """Return the yard as a `mujoco.MjSpec`; every seed has its own houses, ground and trees."""
+    b = Builder("yard", seed)
+    b.spec.visual.headlight.ambient = [0.56, 0.59, 0.66]
+    red = b.material("brick", materials.brick((384, 768), b.random, 80.0), 80.0, 0.12)
+    stone = materials.brick((512, 768), b.random, 96.0, materials.GREY_STONE, (0.22, 0.46))
+    ashlar = b.material("ashlar", stone, 96.0, 0.22)
+    cast = b.material("concrete", materials.concrete((512, 512), b.random, 96.0), 96.0)
+    wood = b.material("wood", materials.planks((256, 512), b.random, 96.0), 96.0)
+    faces = decals.sheets([decals.crate_face(192, b.random, n) for n in range(9)], 3)
+    crates = b.material("crates", faces, 192.0)
+    steel = b.material("steel", _containers(b.random), 80.0)
+    _containers_and_crates(b, steel, crates)
+    _masonry(b, red, ashlar, cast)
+    _furniture(b, wood, cast)
+    _trees(b)
+    _walls(b, red)
+    _houses(b)
+    ground = b.material("ground", yard_ground.picture(b.random, SUN), yard_ground.DENSITY)
+    half = yard_ground.HALF
+    surface = quad(
+        np.array([half, half, 0.0]),
+        np.array([0.0, -2.0 * half, 0.0]),
+        np.array([-2.0 * half, 0.0, 0.0]),
+        WHOLE,
+        step=2.2,
+    )
+    b.look("ground.look", surface, ground, (0.0, 0.0, 0.0))
+    b.solid("ground", mujoco.mjtGeom.mjGEOM_PLANE, [half, half, 0.1], (0.0, 0.0, 0.0))
+    add_sky(b.spec, b.random)
+    b.light("sun", (-10.0, -10.0, 20.0), (0.72, 0.66, 0.54), towards=SUN, sun=True)
+    b.light("sky_light", (10.0, 10.0, 20.0), (0.16, 0.18, 0.22), towards=(-0.6, -0.5, -0.4),
+            sun=True)  # fmt: skip
+    b.light("bounce", (0.0, 0.0, 6.0), (0.14, 0.12, 0.09), towards=(-0.2, 0.7, 0.5), sun=True)
+    b.spec.stat.center = [0.0, 0.0, 2.0]
+    b.spec.stat.extent = 20.0
+    return b.spec
+
+
+def _containers_and_crates(b: Builder, steel: Material, crates: Material) -> None:
+    for number, (x, y, base, turn) in enumerate(CONTAINERS):
+        top, bottom = number % 4 / 4.0 + 0.001, (number % 4 + 1) / 4.0 - 0.001
+        end = 2.44 / 8.6
+        windows = {
+            "right": (0.0, top, 6.06 / 8.6, bottom),
+            "left": (0.0, top, 6.06 / 8.6, bottom),
+            "front": (1.0 - end, top, 1.0, bottom),
+            "back": (1.0 - end, top, 1.0, bottom),
+        }
+        b.box(f"container_{number}", steel, (6.06, 2.44, 2.59), (x, y, base), turn=turn,
+              windows=windows)  # fmt: skip
+    for number, (x, y, base, edge, turn) in enumerate(CRATES):
+        tiles = {
+            face: decals.tile(int(b.random.integers(9)), 3, 3)
+            for face in ("front", "left", "back", "right", "top")
+        }
+        b.box(f"crate_{number}", crates, (edge, edge, edge), (x, y, base), turn=turn,
+              windows=tiles)  # fmt: skip
+
+
+def _masonry(b: Builder, red: Material, ashlar: Material, cast: Material) -> None:
+    b.arch("stone_arch", ashlar, opening=(2.6, 1.5), leg=0.55, depth=0.8,
+           place=(0.15, -6.85, 0.0), turn=-14.0)  # fmt: skip
+    b.arch("brick_arch", red, opening=(2.6, 1.5), leg=0.45, depth=0.6,
+           place=(-1.25, 6.3, 0.0), turn=-14.4)  # fmt: skip
+    b.box("low_wall_0", red, (4.0, 0.32, 1.5), (-1.6, 3.3, 0.0), turn=6.0)
+    b.box("low_wall_1", ashlar, (2.4, 0.4, 1.2), (3.6, -4.9, 0.0), turn=48.0)
+    # A platform with three steps on its south side and a ramp on its north.
+    b.box("platform", cast, (3.0, 2.6, 0.9), (2.6, 10.0, 0.0))
+    for step in range(3):
+        b.box(f"step_{step}", cast, (0.36, 2.6, 0.225 * (step + 1)),
+              (0.2 + 0.36 * step, 10.0, 0.0))  # fmt: skip
+    length = float(np.hypot(3.6, 0.9))
+    slope = float(np.degrees(np.arctan2(0.9, 3.6)))
+    lower = 0.1  # half its thickness, so that its upper side meets the platform's edge
+    tilt = np.radians(slope)
+    middle = (4.1 + 1.8 - lower * np.sin(tilt), 10.0, 0.45 - lower * np.cos(tilt))
+    b.box("ramp", cast, (length, 2.6, 2.0 * lower), (float(middle[0]), 10.0, float(middle[2])),
+          tilt=slope)  # fmt: skip
+    for number, (x, y) in enumerate(((6.0, -11.5), (-4.0, -11.8), (-11.8, -4.5))):
+        b.box(f"planter_{number}", cast, (1.5, 1.5, 0.6), (x, y, 0.0), turn=9.0 * number)
+
+
+def _furniture(b: Builder, wood: Material, cast: Material) -> None:
+    for number, (x, y, turn) in enumerate(
+        ((13.5, -6.0, 90.0), (13.2, 6.5, 90.0), (-3.0, -13.6, 0))
+    ):
+        b.box(f"bench_{number}/seat", wood, (1.9, 0.5, 0.1), (x, y, 0.42), turn=turn, hidden=())
+        b.box(f"bench_{number}/foot", cast, (1.3, 0.36, 0.42), (x, y, 0.0), turn=turn)
+    for number, (x, y) in enumerate(POSTS):
+        b.cylinder(f"post_{number}", cast, 0.09, 4.2, (x, y, 0.0))
+        b.box(f"post_{number}/lamp", cast, (0.36, 0.36, 0.3), (x, y, 4.2), hidden=())
+
+
+def _trees(b: Builder) -> None:
+    picture = materials.planks((192, 384), b.random, 96.0, width=0.07, palette=(
+        (0.40, 0.31, 0.23), (0.33, 0.26, 0.20), (0.46, 0.38, 0.29),
+    ))  # fmt: skip
+    bark = b.material("bark", np.ascontiguousarray(picture.transpose(1, 0, 2)), 96.0)
+    green = b.material("leaves", materials.leaves((512, 768), b.random, 72.0), 72.0)
+    for number, (x, y, height, radius) in enumerate(TREES):
+        b.cylinder(f"tree_{number}/trunk", bark, 0.17, height, (x, y, 0.0))
+        flat = 0.85 * radius
+        b.crown(f"tree_{number}/crown", green, (radius, radius, flat), (x, y, height + 0.8 * flat))
+        off = b.random.uniform(-0.5, 0.5, 2) * radius
+        small = 0.66 * radius
+        top = height + 1.6 * flat
+        b.crown(f"tree_{number}/top", green, (small, small, 0.8 * small),
+                (x + float(off[0]), y + float(off[1]), top))  # fmt: skip
+
+
+def _walls(b: Builder, red: Material) -> None:
+    """Add the yard's own wall, on the two sides where the houses stand further back."""
+    for number, start in enumerate(np.arange(-15.0, 15.0, 6.0)):
+        b.box(f"wall_south_{number}", red, (0.3, 6.0, 2.3), (-15.15, float(start) + 3.0, 0.0))
+        b.box(f"wall_west_{number}", red, (6.0, 0.3, 2.3), (float(start) + 3.0, 15.15, 0.0))
+
+
+def _houses(b: Builder) -> None:
+    """Add four rows of houses, each with one texture for its fronts."""
+    for side, (line, turn, row) in SIDES.items():
+        fronts = [
+            facades.house(width, storeys, b.random, HOUSE_DENSITY, number + len(side))
+            for number, (width, storeys) in enumerate(row)
+        ]
+        tall = max(len(front) for front in fronts)
+        sheet = np.concatenate(
+            [np.pad(front, ((tall - len(front), 0), (0, 0), (0, 0)), "edge") for front in fronts], 1
+        )
+        material = b.material(f"houses_{side}", sheet, HOUSE_DENSITY)
+        angle = np.radians(turn)
+        total = sum(width for width, _ in row)
+        left = 0.0
+        for number, ((width, _), front) in enumerate(zip(row, fronts, strict=True)):
+            high = len(front) / HOUSE_DENSITY
+            window = (
+                left / total + 1e-3, 1.0 - len(front) / tall, (left + width) / total - 1e-3, 1.0,
+            )  # fmt: skip
+            # In the box's own axes the front looks to -x, and the left is +y.
+            x, y = line + 2.0, total / 2.0 - left - width / 2.0
+            place = (
+                float(x * np.cos(angle) - y * np.sin(angle)),
+                float(x * np.sin(angle) + y * np.cos(angle)),
+                0.0,
+            )
+            b.box(f"house_{side}_{number}", material, (4.0, width, high), place, turn=turn,
+                  windows={"front": window, "left": window, "right": window},
+                  hidden=("bottom", "back", "top"))  # fmt: skip
+            left += width
+
+
+def _containers(random: np.random.Generator) -> Picture:
+    """Four containers' long side and end, one below the other, each with its name."""
+    rows = []
+    paints = ((0.20, 0.36, 0.50), (0.66, 0.30, 0.18), (0.30, 0.44, 0.34), (0.74, 0.58, 0.24))
+    for number, paint in enumerate(paints):
+        shape = (208, 688)
+        sheet = materials.metal(shape, random, 80.0, paint, pitch=0.28)
+        worn = smooth(-1.5, 0.1, fractal(shape, random, coarse=30))
+        word = decals.WORDS[(3 * number + 2) % 12]
+        decals.letters(sheet, word, (50, 50, 360, 120), (0.88, 0.86, 0.80), worn)
+        code = f"VNRU {random.integers(100000, 999999)}"
+        decals.letters(sheet, code, (330, 140, 470, 180), (0.88, 0.86, 0.80), worn)
+        decals.letters(sheet, f"{number + 1}", (510, 40, 670, 150), (0.88, 0.86, 0.80), worn)
+        frame = np.zeros(shape, np.float32)
+        frame[:9] = frame[-12:] = 1.0
+        for x in (0, 476, 486, 680):
+            frame[:, x : x + 8] = 1.0
+        rows.append(shade(sheet, -0.45 * frame))
+    return np.concatenate(rows, 0)

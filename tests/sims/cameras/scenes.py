@@ -1,0 +1,58 @@
+"""The built-in worlds with a free camera in them, each built once for all tests."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import mujoco
+
+from sims.cameras import CameraSpec, add_free_camera, model_to_bytes
+from sims.worlds import load_world
+
+ALL = CameraSpec(
+    name="all",
+    images=("rgb", "grey", "depth", "segmentation"),
+    width=320,
+    height=240,
+    position=(0.0, 0.0, 0.0),
+)
+WIDE = CameraSpec(name="wide", position=(0.0, 0.0, 0.0))
+NOISY = CameraSpec(
+    name="noisy",
+    images=("rgb", "depth"),
+    width=160,
+    height=120,
+    position=(0.0, 0.0, 0.0),
+    noise=4.0,
+    depth_noise=0.002,
+)
+CAMERAS = (ALL, WIDE, NOISY)
+
+
+class Scene(NamedTuple):
+    model: Any
+    data: Any
+    prefix: str
+    packed: bytes
+
+
+@cache
+def _built(name: str) -> Any:
+    return load_world(name)
+
+
+def fresh(name: str) -> Any:
+    """Return a world to change at will; drawing its textures, which takes long, is done once."""
+    return _built(name).copy()
+
+
+@cache
+def scene(name: str) -> Scene:
+    """Return a world by its name, with the cameras above on a free body."""
+    world = fresh(name)
+    prefix = add_free_camera(world, "free", CAMERAS)
+    model = world.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return Scene(model, data, prefix, model_to_bytes(model))
