@@ -15,6 +15,10 @@ from runtime import Duration, Node, NodeConfig, on
 Count = Annotated[int, msgspec.Meta(ge=1, le=100)]
 
 
+_WIDTH = 256
+"""Pixels of a small picture."""
+
+
 class FlightLogConfig(NodeConfig):
     """Settings of the flight log.
 
@@ -42,7 +46,7 @@ class FlightLog(Node[FlightLogConfig]):
         self._thumbnails: list[Thumbnail] = []
         self._collisions: list[Collision] = []
         self._interval = round(self.config.interval * 1e9)
-        self._next_picture = 0
+        self._next_picture: dict[str, int] = {}  # by camera
         self._file: IO[str] | None = None
         if self.out is not None:
             self._file = (self.out / self.config.trajectory).open("w", encoding="ascii")
@@ -62,14 +66,18 @@ class FlightLog(Node[FlightLogConfig]):
     @on(Image)
     def saw(self, event: Image) -> None:
         """Keep a small copy of a picture now and then."""
-        if event.stamp < self._next_picture:
+        if event.stamp < self._next_picture.get(event.source, 0):
             return
-        self._next_picture = event.stamp + self._interval
-        small = cv2.resize(event.data, (256, 256), interpolation=cv2.INTER_AREA)
+        self._next_picture[event.source] = event.stamp + self._interval
+        height, width = event.data.shape[:2]
+        scale = _WIDTH / width
+        size = (_WIDTH, max(round(height * scale), 1))
+        small = cv2.resize(event.data, size, interpolation=cv2.INTER_AREA)
         self._thumbnails.append((event.stamp, event.source, np.atleast_3d(small)))
         if len(self._thumbnails) > self.config.pictures:
-            self._thumbnails = self._thumbnails[::2]
             self._interval *= 2
+            kept = (t for t in self._thumbnails if t[0] % self._interval < self._interval // 2)
+            self._thumbnails = list(kept)
 
     @on(Collision)
     def hit(self, event: Collision) -> None:

@@ -8,7 +8,6 @@ import gc
 import logging
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -116,14 +115,12 @@ async def _run(
             await supervisor.main()
         finally:
             watchdog.stop()
-        wall_seconds = time.monotonic() - (supervisor.first_update or time.monotonic())
         sim_ns = clock.now()
         clock.close()
     return (
         summarise(
             supervisor,
             name=config.run.name,
-            wall_seconds=wall_seconds,
             sim_ns=sim_ns,
             digest=digest.hexdigest(),
             stalls=watchdog.stalls,

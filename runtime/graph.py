@@ -82,13 +82,16 @@ def heard_types(cls: type[Node[Any]]) -> dict[str, tuple[Any, ...]]:
 
 
 def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str]]:
-    """Return the inputs and handlers that no node can send to, as (node, port, event)."""
+    """Return the inputs that no node can send to, as (node, port, event).
+
+    A handler that is never called is nothing to warn of: most nodes can do more than is asked.
+    """
     connected = {(receiver, port) for *_, receiver, port in edges(nodes)}
     return [
         (name, port, " or ".join(e.__name__ for e in events))
         for name, cls in nodes
         for port, events in heard_types(cls).items()
-        if (name, port) not in connected
+        if port in cls.declared.inputs and (name, port) not in connected
     ]
 
 

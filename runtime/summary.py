@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import time
 from collections import Counter
 from typing import Any
 
@@ -45,7 +46,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         reason: What ended it.
         error: What went wrong, or `None`.
         sim_seconds: Seconds of the run's clock.
-        wall_seconds: Real seconds, from the first update to the end of the last `on_shutdown`.
+        wall_seconds: Real seconds, from the first update to when the end was asked for.
         digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels
             depend on the graphics driver, so digests compare on one machine.)
         events: Events sent, by type.
@@ -122,7 +123,6 @@ def summarise(
     supervisor: Supervisor,
     *,
     name: str,
-    wall_seconds: float,
     sim_ns: int,
     digest: str,
     stalls: Counter[str],
@@ -131,6 +131,7 @@ def summarise(
     """Put together what is known at the end of a run."""
     by_type, by_output = count_events(supervisor)
     by_input = count_drops(supervisor)
+    ended = supervisor.ended or time.monotonic()
     return Summary(
         name=name,
         clock=supervisor.clock.kind,
@@ -138,7 +139,7 @@ def summarise(
         reason=supervisor.reason,
         error=None if supervisor.error is None else str(supervisor.error),
         sim_seconds=sim_ns / SECOND,
-        wall_seconds=round(wall_seconds, 3),
+        wall_seconds=round(ended - (supervisor.first_update or ended), 3),
         digest=digest,
         events=dict(sorted(by_type.items())),
         outputs=dict(by_output),

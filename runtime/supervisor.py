@@ -81,6 +81,8 @@ class Supervisor:
         self.announcements: list[Announcement] = []
         self.first_update: float | None = None
         """When the first update was, on `time.monotonic`."""
+        self.ended: float | None = None
+        """When the end of the run was asked for, on `time.monotonic`."""
         self.reason = ""
         self.error: Exception | None = None
         self.ever: list[Node[Any]] = []
@@ -112,6 +114,7 @@ class Supervisor:
             return
         self.reason = reason
         self.error = error
+        self.ended = time.monotonic()
         self._ended.set()
         if self._begin is not None and not self._begin.done():
             self._begin.cancel()

@@ -1,0 +1,45 @@
+# Bare `make` lists the targets.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-all check fix bench clean
+
+help:  ## List the targets.
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: $(READY)  ## Make a virtual environment with all that is needed (the others do it too).
+
+# MuJoCo renders through EGL; where its libraries are missing, install them if we may.
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "expected Python 3.11 or later, found $$($(PYTHON) --version): set PYTHON="; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet -e '.[dev]'
+	@sh tools/install_gl.sh $(BIN)/python
+	@touch $@
+
+demo: $(READY)  ## Fly the standard tour and leave its results in runs/tour.
+	$(BIN)/python -m runtime run config.toml
+
+test: $(READY)  ## Run the quick tests.
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-all: $(READY)  ## Run all tests.
+	$(BIN)/python -m pytest
+
+check: $(READY)  ## Check style and types.
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+fix: $(READY)  ## Mend what style checks can mend.
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:  ## Remove the environment, results and caches.
+	rm -rf $(VENV) runs .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

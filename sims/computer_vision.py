@@ -1,0 +1,210 @@
+"""Computer-vision mode: a free camera in a world, with no vehicle and no physics.
+
+For calibration and fast data sets. The camera goes where it is told: to a set-point at once,
+along with a velocity, or along a trajectory file; one set of images for each update.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import (
+    Announcement,
+    DepthImage,
+    Image,
+    Odometry,
+    PoseSetpoint,
+    PoseStamped,
+    PositionSetpoint,
+    Quaternion,
+    SegmentationImage,
+    Vector3,
+    VelocitySetpoint,
+)
+from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
+from sims.cameras import CameraSpec, add_free_camera, pose_to_qpos
+from sims.cameras.rig import CameraOutputs, CameraRig
+from sims.frames import from_euler, multiply, normalize, rotate, yaw_of
+from sims.worlds import load_world
+
+Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+Count = Annotated[int, msgspec.Meta(ge=1, le=16)]
+
+
+class FreeCameraConfig(NodeConfig):
+    """Settings of a free camera.
+
+    Attributes:
+        world: Name of a built-in world, or path of an MJCF file.
+        position: Where it starts, metres in ``map`` (NED).
+        orientation: Roll, pitch, yaw at the start, degrees.
+        rate: Updates per second; each exposes all cameras, whatever rate their own settings name.
+        cameras: What it carries.
+        trajectory: TUM file (stamp x y z qx qy qz qw; NED, FRD) to follow from its first stamp
+            on; the run ends with it. Empty for none.
+        setpoint_timeout: After this long a velocity is void.
+        camera_processes: How many processes render.
+        render_threads: Threads of the software renderer in each of them.
+    """
+
+    world: str = "hall"
+    position: Vector3 = (0.0, 0.0, -1.5)
+    orientation: Vector3 = (0.0, 0.0, 0.0)
+    rate: Rate = 30
+    cameras: Annotated[tuple[CameraSpec, ...], msgspec.Meta(min_length=1)]
+    trajectory: str = ""
+    setpoint_timeout: Duration = Duration(0.5)  # immutable
+    camera_processes: Count = 2
+    render_threads: Count = 1
+
+
+class FreeCamera(Node[FreeCameraConfig]):
+    """Cameras that go where they are told, with no vehicle and no physics."""
+
+    images = Output(Image)
+    depth = Output(DepthImage)
+    segmentation = Output(SegmentationImage)
+    camera_poses = Output(PoseStamped)
+    odometry = Output(Odometry)
+
+    async def on_startup(self) -> None:
+        """Build the world, and start what renders it."""
+        config = self.config
+        roll, pitch, yaw = (math.radians(angle) for angle in config.orientation)
+        self._position = config.position
+        self._orientation: Quaternion = from_euler(yaw, pitch, roll)
+        self._velocity: VelocitySetpoint | None = None
+        self._stamp = 0
+        self._rows = (
+            await self.offload(read_tum, Path(config.trajectory)) if (config.trajectory) else None
+        )
+        specs = tuple(msgspec.structs.replace(c, rate=config.rate) for c in config.cameras)
+        self._cameras = [spec.name for spec in specs]
+        outputs = CameraOutputs(self.images, self.depth, self.segmentation, self.camera_poses)
+        self._rig = CameraRig(self, specs, outputs, config.camera_processes, config.render_threads)
+        await self._rig.start(await self.offload(self._build, specs))
+
+    def _build(self, specs: tuple[CameraSpec, ...]) -> Any:
+        world = load_world(self.config.world)
+        add_free_camera(world, self.name, specs)
+        return world.compile()
+
+    def announce(self) -> Iterable[Announcement]:
+        """Say what cameras these are."""
+        return self._rig.announcements(self.name)
+
+    @on(PoseSetpoint)
+    def pose(self, event: PoseSetpoint) -> None:
+        """Be there."""
+        self._position, self._orientation = event.position, normalize(event.orientation)
+        self._velocity = None
+
+    @on(PositionSetpoint)
+    def place(self, event: PositionSetpoint) -> None:
+        """Be there, level."""
+        self._position, self._orientation = event.position, from_euler(event.yaw, 0.0, 0.0)
+        self._velocity = None
+
+    @on(VelocitySetpoint)
+    def velocity(self, event: VelocitySetpoint) -> None:
+        """Move like that until told otherwise, or until it is void."""
+        self._velocity = event
+
+    @every(hz="rate")
+    def update(self, tick: Tick) -> None:
+        """Move, say where, and expose."""
+        if self._rows is not None and not self._follow(tick.stamp):
+            self.stop("trajectory ended")
+            return
+        self._drift(tick.stamp)
+        self._stamp = tick.stamp
+        self.odometry.send(
+            Odometry(
+                stamp=tick.stamp,
+                source=self.name,
+                child_frame_id=self.name,
+                position=self._position,
+                orientation=self._orientation,
+                linear_velocity=(0.0, 0.0, 0.0),
+                angular_velocity=(0.0, 0.0, 0.0),
+            )
+        )
+        for camera in self._cameras:
+            self._rig.expose(camera, tick.stamp, pose_to_qpos(self._position, self._orientation))
+
+    def _drift(self, stamp: int) -> None:
+        """Move with the last velocity since the last update."""
+        order = self._velocity
+        if order is None or stamp - order.stamp > self.config.setpoint_timeout * 1e9:
+            return
+        seconds = (stamp - self._stamp) / 1e9
+        velocity = order.velocity
+        if order.frame_id == "heading":
+            velocity = rotate(from_euler(yaw_of(self._orientation), 0.0, 0.0), velocity)
+        x, y, z = self._position
+        vx, vy, vz = velocity
+        self._position = (x + vx * seconds, y + vy * seconds, z + vz * seconds)
+        turn = from_euler(order.yaw_rate * seconds, 0.0, 0.0)
+        self._orientation = normalize(multiply(turn, self._orientation))
+
+    def _follow(self, stamp: int) -> bool:
+        """Take the pose of this time from the trajectory; False when it is over."""
+        assert self._rows is not None
+        seconds = self._rows[0, 0] + stamp / 1e9
+        if seconds > self._rows[-1, 0]:
+            return False
+        self._position, self._orientation = pose_at(self._rows, seconds)
+        return True
+
+
+def read_tum(path: Path) -> npt.NDArray[np.float64]:
+    """Read a TUM trajectory.
+
+    Returns:
+        Rows of stamp (s), x, y, z, qx, qy, qz, qw; shape (n, 8), n ≥ 2, in order of time.
+
+    Raises:
+        ValueError: The file is missing or holds something else.
+    """
+    try:
+        rows = np.loadtxt(path, ndmin=2, comments="#")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"trajectory: {path}: expected a TUM file, found: {error}") from None
+    if rows.shape[0] < 2 or rows.shape[1] != 8:
+        raise ValueError(
+            f"trajectory: {path}: expected 2 or more rows of 8 numbers, found shape {rows.shape}"
+        )
+    if not (np.diff(rows[:, 0]) > 0).all():
+        raise ValueError(f"trajectory: {path}: expected rising stamps, found a step back")
+    return rows
+
+
+def pose_at(rows: npt.NDArray[np.float64], seconds: float) -> tuple[Vector3, Quaternion]:
+    """Return a trajectory's pose at a time within it: positions linear, orientations by slerp.
+
+    Args:
+        rows: As from `read_tum`.
+        seconds: On the file's clock.
+    """
+    after = int(np.clip(np.searchsorted(rows[:, 0], seconds), 1, len(rows) - 1))
+    a, b = rows[after - 1], rows[after]
+    share = (seconds - a[0]) / (b[0] - a[0])
+    x, y, z = (a[1:4] + share * (b[1:4] - a[1:4])).tolist()
+    # K. Shoemake, "Animating rotation with quaternion curves", 1985; along the shorter arc.
+    q0, q1 = a[4:8] / np.linalg.norm(a[4:8]), b[4:8] / np.linalg.norm(b[4:8])
+    if q0 @ q1 < 0:
+        q1 = -q1
+    angle = math.acos(min(float(q0 @ q1), 1.0))
+    if angle < 1e-6:
+        q = q1
+    else:
+        q = (math.sin((1 - share) * angle) * q0 + math.sin(share * angle) * q1) / math.sin(angle)
+    qx, qy, qz, qw = q.tolist()
+    return (x, y, z), (qw, qx, qy, qz)
