@@ -57,6 +57,7 @@ class _Life:
         self.started = False
         self.failures = 0
         self.recovering = False
+        self.ending = asyncio.Lock()
 
 
 class Supervisor:
@@ -187,9 +188,10 @@ class Supervisor:
         try:
             for life in self._lives.values():
                 await self._start_up(life)
+                if self._ended.is_set():  # it stopped the run and did not wait for anything after
+                    return
             for life in self._lives.values():
-                announced = list(life.node.announce()) if life.node else []
-                self.announcements += announced
+                self.announcements += self._announced(life)
             for life in self._lives.values():
                 self._hear(life)
         except NodeError as error:
@@ -225,6 +227,15 @@ class Supervisor:
         except Exception as error:
             raise _wrap(spec.name, error) from error
 
+    def _announced(self, life: _Life) -> list[Announcement]:
+        assert life.node is not None
+        try:
+            return list(life.node.announce())
+        except NodeError:
+            raise
+        except Exception as error:
+            raise _wrap(life.spec.name, error) from error
+
     def _hear(self, life: _Life) -> None:
         """Let a node hear all announcements, and turn a refusal into an error."""
         assert life.node is not None
@@ -235,6 +246,8 @@ class Supervisor:
                 raise RefusedError(
                     life.spec.name, f"cannot work with {announcement.source}: {error}"
                 ) from error
+            except NodeError:
+                raise
             except Exception as error:
                 raise _wrap(life.spec.name, error) from error
 
@@ -297,7 +310,8 @@ class Supervisor:
 
     async def _recover(self, life: _Life) -> None:
         """Take a failed node out, and bring up a new one in its place if that is wanted."""
-        await self._retire(life)
+        # Shielded: the end of the run ends this task, but must not cut an on_shutdown short.
+        await asyncio.shield(self._group.create_task(self._retire(life)))
         if life.spec.on_error == "drop":
             log.warning("%s: left out from here on", life.spec.name)
             return
@@ -310,8 +324,11 @@ class Supervisor:
                 await self._start_up(life)
                 self._hear(life)
             except NodeError as error:
+                if isinstance(error, FatalError):
+                    self.stop(f"{life.spec.name} failed", error)
+                    return
                 log.error("%s", error)
-                await self._retire(life)
+                await asyncio.shield(self._group.create_task(self._retire(life)))
                 continue
             life.recovering = False
             self._connect()
@@ -323,13 +340,22 @@ class Supervisor:
     async def _end_all(self) -> None:
         for ticker in self.tickers.values():
             ticker.stopped = True
-        for life in reversed(self._lives.values()):
-            await self._retire(life)
         for task in self._recoveries:
             task.cancel()
+        if self._recoveries:
+            await asyncio.wait(self._recoveries)
+        if not self._running:  # what has started may still send farewells to what has, too
+            self._connect()
+        for life in reversed(self._lives.values()):
+            await self._retire(life)
 
     async def _retire(self, life: _Life) -> None:
-        """End one node: its ticks, tasks and workers; it hears nothing afterwards."""
+        """End one node, unless that is done: it hears nothing afterwards."""
+        async with life.ending:
+            await self._end_node(life)
+
+    async def _end_node(self, life: _Life) -> None:
+        """End a node's ticks, tasks and workers."""
         node, limit = life.node, self._config.run.shutdown_limit
         for ticker in life.tickers:
             ticker.stopped = True

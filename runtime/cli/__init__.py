@@ -10,6 +10,7 @@ import sys
 
 import typer
 
+from runtime.cli.bench import bench
 from runtime.cli.check import check
 from runtime.cli.graph import graph
 from runtime.cli.nodes import nodes
@@ -26,6 +27,13 @@ app.command()(run)
 app.command()(check)
 app.command()(graph)
 app.command()(nodes)
+app.command(  # the arguments, --help among them, are the benchmarks' own
+    context_settings={
+        "ignore_unknown_options": True,
+        "allow_extra_args": True,
+        "help_option_names": [],
+    }
+)(bench)
 
 
 def main() -> None:

@@ -1,0 +1,239 @@
+"""How late a 400 Hz controller gets while pictures are fetched: the thesis's table 6.3, done right.
+
+A multirotor hovers on the real clock, controlled at 400 Hz, while a 512×512 RGB-D camera at 10 Hz
+is rendered in one of four ways: not at all, inline on the loop (as the thesis did), in a thread,
+and in a worker process (as this project does). Short runs of all ways are interleaved and pooled,
+so that whatever else the machine does falls on all alike.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import random
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from events import Odometry, Takeoff
+from runtime import Input, Node, NodeConfig, Output, Tick, Worker, every
+from runtime.config import parse
+from runtime.execute import execute
+from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
+from sims.worlds import load_world
+
+Mode = Literal["none", "inline", "thread", "worker"]
+MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker")
+
+
+class StallRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One way of fetching pictures.
+
+    Attributes:
+        mode: Which.
+        ticks: How many ticks were measured.
+        late_p50_us: Median lateness of the 400 Hz tick, microseconds.
+        late_p99_us: Its 99th percentile.
+        late_max_us: Its maximum.
+        missed: Ticks left out because an earlier one came too late.
+        update_mean_ms: Mean time from one tick to the next, milliseconds.
+        update_median_ms: Its median.
+        update_sd_ms: Its standard deviation.
+        frames: How many pairs of images came.
+        fetch_ms_median: Median milliseconds from asking for a pair to having it; 0 without any.
+    """
+
+    mode: str
+    ticks: int
+    late_p50_us: float
+    late_p99_us: float
+    late_max_us: float
+    missed: int
+    update_mean_ms: float
+    update_median_ms: float
+    update_sd_ms: float
+    frames: int
+    fetch_ms_median: float
+
+
+class _Samples(msgspec.Struct):
+    """What one mode's runs collect; nanoseconds."""
+
+    late: list[int] = []
+    update: list[int] = []
+    fetch: list[int] = []
+    missed: int = 0
+
+
+_collected: dict[str, _Samples] = {}
+
+
+class ProbeConfig(NodeConfig):
+    """Settings of the probe: the mode it collects for, and seconds to leave out at the start."""
+
+    mode: Mode
+    warm_up: float = 1.0
+
+
+class Probe(Node[ProbeConfig]):
+    """Measures how late a 400 Hz tick comes, and sends the vehicle up."""
+
+    orders = Output(Takeoff)
+
+    def __init__(self) -> None:
+        self._samples = _collected.setdefault(self.config.mode, _Samples())
+        self._last = 0
+
+    async def run(self) -> None:
+        """Take off."""
+        self.orders.send(Takeoff(stamp=self.clock.now(), source=self.name))
+
+    @every(hz=400)
+    def tick(self, tick: Tick) -> None:
+        """Note how late it is."""
+        now = time.monotonic_ns()
+        if tick.stamp > self.config.warm_up * 1e9:
+            self._samples.late.append(tick.late)
+            self._samples.missed += tick.missed
+            self._samples.update.append(now - self._last)
+        self._last = now
+
+
+class CameraConfig(NodeConfig):
+    """Settings of the camera under test."""
+
+    mode: Mode
+    width: int = 512
+    height: int = 512
+    rate: float = 10.0
+    world: str = "hall"
+    warm_up: float = 1.0
+
+
+class Camera(Node[CameraConfig]):
+    """Fetches an RGB-D pair of what the vehicle sees, in one of the ways that are compared."""
+
+    odometry = Input(Odometry, keep="latest")
+
+    async def on_startup(self) -> None:
+        """Start the renderer where the mode wants it."""
+        config = self.config
+        self._samples = _collected.setdefault(config.mode, _Samples())
+        self._fetch: Callable[..., Any] | None = None
+        if config.mode == "none":
+            return
+        spec = CameraSpec(name="eye", width=config.width, height=config.height)
+        arguments = (await self.offload(_model, config.world, spec), (spec,), "free/", 0)
+        if config.mode == "worker":
+            worker: Worker[CameraRenderer] = await self.worker(CameraRenderer, *arguments)
+            self._fetch = lambda *args: worker.call(CameraRenderer.render, *args)
+            return
+        # An OpenGL context belongs to one thread: the pool's, or the loop's for `inline`.
+        self._pool = concurrent.futures.ThreadPoolExecutor(1)
+        if config.mode == "thread":
+            renderer = await self.clock.beside(self._pool.submit(CameraRenderer, *arguments))
+            self._fetch = lambda *args: self.clock.beside(self._pool.submit(renderer.render, *args))
+            self._close = renderer.close
+        else:
+            renderer = CameraRenderer(*arguments)
+
+            async def render(*args: Any) -> Any:
+                return renderer.render(*args)
+
+            self._fetch = render
+            self._close = renderer.close
+
+    @every(hz="rate")
+    async def expose(self, tick: Tick) -> None:
+        """Fetch a pair."""
+        here = self.odometry.peek()
+        if self._fetch is None or here is None:
+            return
+        asked = time.monotonic_ns()
+        await self._fetch(here.stamp, pose_to_qpos(here.position, here.orientation), ("eye",))
+        if tick.stamp > self.config.warm_up * 1e9:
+            self._samples.fetch.append(time.monotonic_ns() - asked)
+
+    async def on_shutdown(self) -> None:
+        """Close the renderer in the thread that made it."""
+        if self.config.mode == "thread":
+            await self.clock.beside(self._pool.submit(self._close))
+            self._pool.shutdown()
+        elif self.config.mode == "inline":
+            self._close()
+
+
+def _model(world: str, camera: CameraSpec) -> bytes:
+    spec = load_world(world)
+    add_free_camera(spec, "free", (camera,))
+    return model_to_bytes(spec.compile())
+
+
+def measure(
+    *,
+    seconds: float,
+    repeats: int,
+    modes: tuple[Mode, ...] = MODES,
+    rate: float = 10.0,
+    size: int = 512,
+    progress: Callable[[str], None] = lambda _: None,
+) -> list[StallRow]:
+    """Measure all modes.
+
+    Args:
+        seconds: Of each run, after a second of warm-up.
+        repeats: Runs of each mode; their order is shuffled in each round.
+        modes: Which to measure.
+        rate: Hertz of the camera.
+        size: Width and height of its pictures.
+        progress: Told what is being measured.
+    """
+    _collected.clear()
+    shuffle = random.Random(0).shuffle
+    for round_ in range(repeats):
+        order = list(modes)
+        shuffle(order)
+        for mode in order:
+            progress(f"round {round_ + 1} of {repeats}: {mode}")
+            execute(parse(_settings(mode, seconds, rate, size), "bench stall"))
+    return [_row(mode, _collected[mode]) for mode in modes]
+
+
+def _settings(mode: Mode, seconds: float, rate: float, size: int) -> dict[str, Any]:
+    here = __name__
+    return {
+        "run": {"clock": "real", "duration": seconds + 1.0, "log": "error"},
+        "nodes": [
+            {"name": "probe", "type": f"{here}:Probe", "mode": mode},
+            {"name": "drone", "type": "sims.multirotor.node:Multirotor"},
+            {
+                "name": "camera",
+                "type": f"{here}:Camera",
+                "mode": mode,
+                "rate": rate,
+                "width": size,
+                "height": size,
+            },
+        ],
+    }
+
+
+def _row(mode: str, samples: _Samples) -> StallRow:
+    late = np.array(samples.late) / 1e3
+    update = np.array(samples.update) / 1e6
+    p50, p99 = np.percentile(late, [50, 99]).tolist()
+    return StallRow(
+        mode=mode,
+        ticks=len(late),
+        late_p50_us=p50,
+        late_p99_us=p99,
+        late_max_us=float(late.max()),
+        missed=samples.missed,
+        update_mean_ms=float(update.mean()),
+        update_median_ms=float(np.median(update)),
+        update_sd_ms=float(update.std()),
+        frames=len(samples.fetch),
+        fetch_ms_median=float(np.median(samples.fetch) / 1e6) if samples.fetch else 0.0,
+    )
