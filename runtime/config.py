@@ -14,12 +14,15 @@ rate = 30                               # all other keys: the node's own setting
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import itertools
+import math
 import re
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 
@@ -42,6 +45,8 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         speed: Seconds of the clock per real second; ``max`` (lockstep only) is as fast as it can.
         seed: Of every random number in the run.
         duration: Seconds of the clock after which the run ends; 0 for no limit.
+        digest: Whether to fingerprint all events; if not given, in lockstep only, since no two
+            runs in real time are alike.
         stall: Real seconds without a turn of the loop that the watchdog reports.
         startup_limit: Real seconds a node's `on_startup` may take.
         shutdown_limit: Real seconds a node's `on_shutdown` may take.
@@ -53,6 +58,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     speed: Annotated[float, msgspec.Meta(gt=0)] | Literal["max"] | None = None
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
     duration: Duration = Duration(0)  # immutable
+    digest: bool | None = None
     stall: Duration = Duration(0.02)
     startup_limit: Duration = Duration(60)
     shutdown_limit: Duration = Duration(10)
@@ -134,8 +140,10 @@ def parse(table: Mapping[str, Any], where: str) -> Config:
                 + suggest(key, ["run", "nodes"])
             )
     run = convert(table.get("run", {}), RunConfig, f"{where}: run")
-    if run.clock == "real" and run.speed == "max":
-        raise ConfigError(f'{where}: run.speed: expected a number with clock "real", found "max"')
+    if run.clock == "real" and run.speed in {"max", math.inf}:
+        raise ConfigError(
+            f'{where}: run.speed: expected a number with clock "real", found {_show(run.speed)}'
+        )
     nodes = table.get("nodes", [])
     if not isinstance(nodes, list) or not nodes:
         raise ConfigError(f"{where}: nodes: expected at least one [[nodes]] table, found none")
@@ -144,8 +152,8 @@ def parse(table: Mapping[str, Any], where: str) -> Config:
         spec = _node(entry, f"{where}: nodes[{index}]")
         if spec.name in {other.name for other in specs}:
             raise ConfigError(
-                f"{where}: nodes[{index}].name: expected a name of its own, "
-                f"found {spec.name!r} a second time"
+                f"{where}: nodes[{index}].name: expected a name that no other node has, "
+                f"found {_show(spec.name)} a second time"
             )
         specs.append(spec)
     return Config(run=run, nodes=tuple(specs))
@@ -158,25 +166,30 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
         ConfigError: There is no such module or class, or it is not a node.
     """
     module_name, _, class_name = type_.partition(":")
-    if not re.fullmatch(r"[\w.]+:\w+", type_):
-        raise ConfigError(f'{where}: expected "module:Class", found {type_!r}')
+    if not re.fullmatch(r"\w+(\.\w+)*:\w+", type_):
+        raise ConfigError(f'{where}: expected "module:Class", found {_show(type_)}')
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not module_name.startswith(error.name):
             raise ConfigError(f"{where}: {module_name} needs a module {error.name!r}") from error
         raise ConfigError(
-            f"{where}: expected a module that can be imported, found {module_name!r}"
+            f"{where}: expected a module that can be imported, found {_show(module_name)}"
             + suggest(module_name, _known_modules())
         ) from None
-    found = getattr(module, class_name, None)
-    known = [n for n, v in vars(module).items() if isinstance(v, type) and issubclass(v, Node)]
-    if not (isinstance(found, type) and issubclass(found, Node)):
+    except ImportError as error:
+        raise ConfigError(f"{where}: {module_name} cannot be imported: {error}") from error
+    known = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Node) and value is not Node
+    }
+    if class_name not in known:
         raise ConfigError(
-            f"{where}: expected a node of {module_name}, found {class_name!r}"
+            f"{where}: expected a node of {module_name}, found {_show(class_name)}"
             + suggest(class_name, known)
         )
-    return found
+    return known[class_name]
 
 
 def convert(value: Any, type_: type[S], where: str) -> S:
@@ -220,24 +233,28 @@ def _node(entry: Any, where: str) -> NodeSpec:
     keys = {f.name for f in msgspec.structs.fields(_NodeHead)}
     head = convert({k: v for k, v in entry.items() if k in keys}, _NodeHead, where)
     if not re.fullmatch(r"[A-Za-z_][\w-]*", head.name):
-        raise ConfigError(f"{where}.name: expected letters, digits, _ and -, found {head.name!r}")
+        raise ConfigError(
+            f"{where}.name: expected a letter, then letters, digits, _ and -, "
+            f"found {_show(head.name)}"
+        )
     if head.name == "run":
         raise ConfigError(f'{where}.name: expected any name but "run", which is the run itself')
-    cls = find_node(head.type, f"{where}.type")
+    where = f"{where} ({head.name})"
+    cls = find_node(head.type, f"{where}: type")
     rest = {k: v for k, v in entry.items() if k not in keys}
     config = convert(rest, cls.config_type, where)
     for port in head.inputs:
         if port not in cls.declared.listening:
             raise ConfigError(
-                f"{where}.inputs: expected an input or handler of {head.type}, found {port!r}"
-                + suggest(port, cls.declared.listening)
+                f"{where}: inputs: expected an input or handler of {head.type}, "
+                f"found {_show(port)}" + suggest(port, cls.declared.listening)
             )
     for method, ticks in cls.declared.ticks.items():
         if isinstance(ticks.hz, str):
             rate = getattr(config, ticks.hz, None)
             if not isinstance(rate, int | float) or not 0 < rate <= MAX_HZ:
                 raise ConfigError(
-                    f"{where}.{ticks.hz}: expected a rate above 0, up to {MAX_HZ} Hz, "
+                    f"{where}: {ticks.hz}: expected a rate above 0, up to {MAX_HZ} Hz, "
                     f"for {method}, found {_show(rate)}"
                 )
     return NodeSpec(
@@ -254,33 +271,50 @@ def _override(table: dict[str, Any], override: str) -> None:
     path, equals, text = override.partition("=")
     keys = path.strip().split(".")
     where = f"--set {override}"
-    if not equals or len(keys) < 2:
+    if not equals or len(keys) < 2 or not all(keys):
         raise ConfigError(f"{where}: expected node.key=value or run.key=value")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text.strip()
-    names = [n.get("name") for n in table.get("nodes", []) if isinstance(n, dict)]
+    nodes = _by_name(table.get("nodes"))
     if keys[0] == "run":
         target = table.setdefault("run", {})
-    elif keys[0] in names:
-        target = table["nodes"][names.index(keys[0])]
+    elif keys[0] in nodes:
+        target = nodes[keys[0]]
     else:
-        known = ["run", *(str(n) for n in names)]
         raise ConfigError(
-            f"{where}: expected the name of a node or run, found {keys[0]!r}"
-            + suggest(keys[0], known)
+            f'{where}: expected "run" or the name of a node, found {_show(keys[0])}'
+            + suggest(keys[0], ["run", *nodes])
         )
-    for key in keys[1:-1]:
+    for before, key in itertools.pairwise(keys[:-1]):
         if isinstance(target, list):  # an entry of a list of tables, by its name
-            target = next((t for t in target if t.get("name") == key), None)
-        else:
+            target = _entry(target, key, f"{where}: {before}")
+        elif isinstance(target, dict):
             target = target.setdefault(key, {})
-        if not isinstance(target, dict | list):
-            raise ConfigError(f"{where}: expected a table at {key!r}, found {_show(target)}")
+    if isinstance(target, list):
+        _entry(target, keys[-1], f"{where}: {keys[-2]}")
     if not isinstance(target, dict):
-        raise ConfigError(f"{where}: expected a table before {keys[-1]!r}")
+        raise ConfigError(
+            f"{where}: {keys[-2]}: expected a table, since .{keys[-1]} follows, "
+            f"found {_show(target)}"
+        )
     target[keys[-1]] = value
+
+
+def _entry(entries: list[Any], name: str, where: str) -> dict[str, Any]:
+    named = _by_name(entries)
+    if name not in named:
+        listed = ", ".join(named) or "a table with a name"
+        raise ConfigError(
+            f"{where}: expected one of {listed}; found {_show(name)}" + suggest(name, named)
+        )
+    return named[name]
+
+
+def _by_name(entries: Any) -> dict[str, dict[str, Any]]:
+    tables = [e for e in entries if isinstance(e, dict)] if isinstance(entries, list) else []
+    return {str(table["name"]): table for table in tables if "name" in table}
 
 
 def _decode(type_: type[Any], value: Any) -> Any:
@@ -290,14 +324,12 @@ def _decode(type_: type[Any], value: Any) -> Any:
 
 
 _NAMES = {
-    "`float`": "a number",
-    "`int`": "a whole number",
-    "`str`": "a text",
-    "`bool`": "true or false",
-    "`array`": "a list",
-    "`object`": "a table",
-    "`null`": "nothing",
-    " | a whole number | ": " or ",
+    "float": "a number",
+    "int": "a whole number",
+    "str": "a text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "a table",
 }
 
 
@@ -305,21 +337,38 @@ def _explain(message: str, value: Any, type_: type[msgspec.Struct], where: str) 
     """Rewrite one of msgspec's messages as place, expected, found."""
     text, _, path = message.partition(" - at `$")
     path = path.rstrip("`")
-    for theirs, ours in _NAMES.items():
-        text = text.replace(theirs, ours)
+    place = where + path if not where.endswith(")") or not path else f"{where}: {path[1:]}"
     if match := re.fullmatch(r"Object contains unknown field `(.*)`", text):
         known = _fields_at(type_, path)
         listed = ", ".join(known) or "no settings"
-        return f"{where}{path}: expected one of {listed}; found unknown key {match[1]!r}" + suggest(
-            match[1], known
-        )
+        found = f"found unknown key {_show(match[1])}" + suggest(match[1], known)
+        return f"{place}: expected one of {listed}; {found}"
     if match := re.fullmatch(r"Object missing required field `(.*)`", text):
-        return f"{where}{path}: expected a setting {match[1]!r}, found none"
+        return f"{place}: expected a setting {_show(match[1])}, found none"
+    if "found" in text:  # a check of our own, which has said it all
+        return f"{place}: {text}"
+    if text.startswith("Invalid enum value"):
+        text = "expected " + " or ".join(_choices(_type_at(type_, path)))
     expected = re.sub(r", got .*", "", text)
+    expected = re.sub(r"`([\w| ]+)`", lambda match: _translate(match[1]), expected)
+    expected = re.sub(r"(\d)\.0\b", r"\1", expected)
+    expected = expected.replace("matching regex '", "that matches '")
     expected = expected[0].lower() + expected[1:]
-    if not expected.startswith("expected"):
-        expected = f"expected another value ({expected})"
-    return f"{where}{path}: {expected}, found {_show(_at(value, path))}"
+    return f"{place}: {expected}, found {_show(_at(value, path))}"
+
+
+def _translate(types: str) -> str:
+    return " or ".join(_NAMES.get(name, name) for name in types.split(" | ") if name != "null")
+
+
+def _choices(type_: Any) -> list[str]:
+    """Return what a setting of a type may be."""
+    if get_origin(type_) is Literal:
+        return [_show(value) for value in get_args(type_)]
+    if get_args(type_):
+        return [choice for inner in get_args(type_) for choice in _choices(inner)]
+    name = getattr(type_, "__name__", "")
+    return [_NAMES[name]] if name in _NAMES else []
 
 
 def _at(value: Any, path: str) -> Any:
@@ -334,20 +383,42 @@ def _at(value: Any, path: str) -> Any:
 
 def _fields_at(type_: Any, path: str) -> list[str]:
     """Return the names of the settings that are known at a path."""
+    struct = _struct_in(_type_at(type_, path))
+    return [] if struct is None else list(struct.__struct_encode_fields__)
+
+
+def _type_at(type_: Any, path: str) -> Any:
+    """Return the type of the setting at a path; `None` if there is none."""
     for name in re.findall(r"\.([\w-]+)", path):
-        field = next((f for f in msgspec.structs.fields(type_) if f.name == name), None)
-        inner = getattr(field, "type", None)
-        while inner is not None and not hasattr(inner, "__struct_fields__"):
-            inner = next((a for a in getattr(inner, "__args__", ())), None)
-        if inner is None:
-            return []
-        type_ = inner
-    return list(type_.__struct_encode_fields__)
+        struct = _struct_in(type_)
+        fields = () if struct is None else msgspec.structs.fields(struct)
+        type_ = next((f.type for f in fields if f.encode_name == name), None)
+    return type_
+
+
+def _struct_in(type_: Any) -> type[msgspec.Struct] | None:
+    """Return the struct that a type is, or is a list of."""
+    while type_ is not None and not hasattr(type_, "__struct_fields__"):
+        type_ = next(iter(get_args(type_)), None)
+    return type_  # type: ignore[no-any-return]
 
 
 def _show(value: Any) -> str:
-    return f'"{value}"' if isinstance(value, str) else str(value)
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, bool):
+        return str(value).lower()
+    text = str(value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _known_modules() -> list[str]:
-    return [name for name in sys.modules if name.startswith(("sims.", "nodes."))]
+    """Return the names of the modules in our rooms for nodes, without importing them."""
+    names = []
+    for room in ("sims", "nodes"):
+        spec = importlib.util.find_spec(room)
+        for folder in (spec and spec.submodule_search_locations) or ():
+            for file in Path(folder).rglob("*.py"):
+                inside = file.relative_to(folder).with_suffix("").parts
+                names.append(".".join((room, *inside)).removesuffix(".__init__"))
+    return names

@@ -11,6 +11,8 @@ import xxhash
 from events import Event
 from runtime.sender import Sender
 
+_CHUNK = 1 << 16
+
 
 class Digest:
     """Hashes every event: its type, stamp, source and content, arrays included.
@@ -21,7 +23,8 @@ class Digest:
 
     def __init__(self) -> None:
         self._hash = xxhash.xxh3_128()
-        self._encode = msgspec.msgpack.Encoder(enc_hook=_encode_array).encode
+        self._encode_into = msgspec.msgpack.Encoder(enc_hook=_encode_array).encode_into
+        self._pending = bytearray()
 
     def __call__(self, sender: Sender[Any] | None, event: Event) -> None:  # noqa: ARG002
         """Take in one event; a tap on every sender."""
@@ -29,11 +32,17 @@ class Digest:
 
     def add(self, event: Event) -> None:
         """Take in one event."""
-        self._hash.update(type(event).__name__.encode())
-        self._hash.update(self._encode(event))
+        pending = self._pending
+        pending += type(event).__name__.encode()
+        self._encode_into(event, pending, -1)
+        if len(pending) > _CHUNK:  # one call of the hash for many small events
+            self._hash.update(pending)
+            pending.clear()
 
     def hexdigest(self) -> str:
         """Return the fingerprint of all events so far, 32 hexadecimal digits."""
+        self._hash.update(self._pending)
+        self._pending.clear()
         return self._hash.hexdigest()
 
 

@@ -98,8 +98,9 @@ async def _run(
     loop = asyncio.get_running_loop()
     steps.install(loop)
     clock = make_clock(config.run, loop)
-    digest = Digest()
-    taps: list[Tap] = [digest]
+    wanted = config.run.clock == "lockstep" if config.run.digest is None else config.run.digest
+    digest = Digest() if wanted else None
+    taps: list[Tap] = [digest] if digest else []
     if log_events:
         taps.append(_log_event)
     supervisor = Supervisor(config, clock, taps, out)
@@ -122,7 +123,7 @@ async def _run(
             supervisor,
             name=config.run.name,
             sim_ns=sim_ns,
-            digest=digest.hexdigest(),
+            digest=digest.hexdigest() if digest else None,
             stalls=watchdog.stalls,
             longest_stalls=watchdog.longest,
         ),

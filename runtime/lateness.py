@@ -12,15 +12,18 @@ _STEPS = 5  # bits of a value that are kept below its leading one
 class Lateness:
     """Durations in nanoseconds, counted by size."""
 
-    __slots__ = ("_counts", "maximum")
+    __slots__ = ("_counts", "_none", "maximum")
 
     def __init__(self) -> None:
         self._counts: dict[int, int] = {}
+        self._none = 0
         self.maximum = 0
 
     def add(self, duration: int) -> None:
         """Count one duration (ns); negative ones count as 0."""
-        duration = max(duration, 0)
+        if duration <= 0:  # always so in lockstep
+            self._none += 1
+            return
         self.maximum = max(self.maximum, duration)
         shift = max(duration.bit_length() - _STEPS - 1, 0)
         bucket = (duration >> shift) + (shift << (_STEPS + 1))
@@ -28,12 +31,14 @@ class Lateness:
 
     def count(self) -> int:
         """Return how many durations were added."""
-        return sum(self._counts.values())
+        return self._none + sum(self._counts.values())
 
     def quantile(self, q: float) -> int:
         """Return the duration (ns) below or at which a share `q` of them lies; 0 if none."""
         rank = q * self.count()
-        seen = 0
+        seen = self._none
+        if seen >= rank:
+            return 0
         for bucket in sorted(self._counts, key=_upper_edge):
             seen += self._counts[bucket]
             if seen >= rank:

@@ -98,29 +98,32 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         ready: Any = self._ready  # type: ignore[attr-defined]
         timers: Any = self._scheduled  # type: ignore[attr-defined]
         wait = self._jumping.wait
-        schedule = self.schedule
+        held_work = self._held
+        schedule, entries = self.schedule, self.schedule.heap
         while not ready and timeout != 0:
             self._jumps += 1
             if self._jumps % _POLL_EVERY == 0 and (events := wait(0)):
                 return events
+            entry = entries[0][0] if entries else _NEVER
+            held = held_work[0][0] if held_work else _NEVER
             timer = round(timers[0].when() * SECOND) if timers else _NEVER
-            held = self._held[0][0] if self._held else _NEVER
-            entry = schedule.next_due()
-            if entry is None:
-                entry = _NEVER
-            due = max(min(timer, held, entry), self.now)
-            if due == _NEVER:
+            due = entry if entry < held else held
+            if timer < due:
+                due = timer
+            if due <= self.now:
+                due = self.now
+            elif due == _NEVER:
                 return wait(None)
-            if self._pace and due > self.now and (events := self._wait_until(due)):
+            elif self._pace and (events := self._wait_until(due)):
                 return events
             if timer <= due:
                 self.now = due
                 return []
             if held <= due:
-                if not self._held[0][2].done():
+                if not held_work[0][2].done():
                     return wait(None)
                 self.now = due
-                _, _, work, future = heapq.heappop(self._held)
+                _, _, work, future = heapq.heappop(held_work)
                 _settle(future, work)
             else:
                 self.now = due

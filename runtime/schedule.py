@@ -47,7 +47,7 @@ class Schedule:
     """A queue of due times."""
 
     def __init__(self) -> None:
-        self._heap: list[tuple[int, int, Entry]] = []
+        self.heap: list[tuple[int, int, Entry]] = []
         self._orders = itertools.count()
         self.on_sooner: Callable[[int], None] = _ignore
         """Called when something is added that is due before all else."""
@@ -58,23 +58,30 @@ class Schedule:
 
     def next_due(self) -> int | None:
         """Return the earliest due time, or `None` if nothing is due ever."""
-        return self._heap[0][0] if self._heap else None
+        return self.heap[0][0] if self.heap else None
 
     def run_first(self, now: int) -> None:
         """Run the entry due first; it keeps its place among its equals when it comes again."""
-        due, order, entry = heapq.heappop(self._heap)
+        heap = self.heap
+        item = due, order, entry = heap[0]
         again = entry.fire(due, now)
-        if again is not None:
-            self._push((again, order, entry))
+        if heap[0] is not item:  # it added something for an earlier time
+            heap.remove(item)
+            heapq.heapify(heap)
+            heapq.heappush(heap, item := (-1, order, entry))
+        if again is None:
+            heapq.heappop(heap)
+        else:
+            heapq.heapreplace(heap, (again, order, entry))
 
     def run_due(self, now: Callable[[], int]) -> None:
         """Run all that is due by now, in order."""
-        while self._heap and self._heap[0][0] <= (time := now()):
+        while self.heap and self.heap[0][0] <= (time := now()):
             self.run_first(time)
 
     def _push(self, item: tuple[int, int, Entry]) -> None:
-        heapq.heappush(self._heap, item)
-        if self._heap[0] is item:
+        heapq.heappush(self.heap, item)
+        if self.heap[0] is item:
             self.on_sooner(item[0])
 
 
@@ -112,6 +119,7 @@ class Ticker:
         "_fault",
         "_hz",
         "_index",
+        "_period",
         "_start",
         "calls",
         "late",
@@ -134,6 +142,7 @@ class Ticker:
         self.late: Lateness = before.late if before else Lateness()
         self.stopped = False
         self._hz = Fraction(hz).limit_denominator(1_000_000)
+        self._period = SECOND * self._hz.denominator  # times the numerator: an integer
         self._call = call
         self._fault = fault
         self._start = 0
@@ -152,7 +161,7 @@ class Ticker:
     @property
     def due(self) -> int:
         """When the next tick is due (ns)."""
-        return self._start + self._index * SECOND * self._hz.denominator // self._hz.numerator
+        return self._start + self._index * self._period // self._hz.numerator
 
     def fire(self, due: int, now: int) -> int | None:
         """Call the function, and return when it is due again."""
@@ -161,7 +170,7 @@ class Ticker:
         late = now - due
         missed = 0
         if late > 0:
-            last = (now - self._start) * self._hz.numerator // (SECOND * self._hz.denominator)
+            last = (now - self._start) * self._hz.numerator // self._period
             missed = max(last - self._index, 0)
             if missed:
                 self._index += missed

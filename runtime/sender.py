@@ -38,6 +38,7 @@ class Sender(Generic[T]):
 
     __slots__ = (
         "_candidates",
+        "_deliver",
         "_fault",
         "_listeners",
         "_routes",
@@ -55,6 +56,7 @@ class Sender(Generic[T]):
         self._sent = 0
         self.send: Callable[[T], bool] = self._refuse
         """Deliver an event now; True if a handler ended the delivery."""
+        self._deliver: Callable[[T], bool] = self._refuse
         self._listeners: tuple[Deliver, ...] = ()
         self._candidates: tuple[Listener, ...] = ()
         self._routes: dict[tuple[type[Event], str], Route] = {}
@@ -77,14 +79,12 @@ class Sender(Generic[T]):
         )
         self._taps = tuple(taps)
         self._fault = fault or _raise
-        if self._taps:
-            self.send = self._send_tapped
-        elif not self.event.__subclasses__() and all(
+        self._deliver = self._send_routed
+        if not self.event.__subclasses__() and all(
             c.hears_all(self.event) for c in self._candidates
         ):
-            self.send = self._send_to_all
-        else:
-            self.send = self._send_routed
+            self._deliver = self._send_to_all
+        self.send = self._send_tapped if self._taps else self._deliver
 
     def send_soon(self, event: T) -> None:
         """Deliver an event when the loop next turns; the sender goes on at once."""
@@ -123,7 +123,7 @@ class Sender(Generic[T]):
     def _send_tapped(self, event: T) -> bool:
         for tap in self._taps:
             tap(self, event)
-        return self._send_routed(event)
+        return self._deliver(event)
 
     def _route(self, event: type[Event], source: str) -> Route:
         """Remember who hears events of this type and source."""

@@ -144,7 +144,12 @@ class SharedPipe:
             spans.append((offset, raw.nbytes))
             return False
 
-        body = pickle.dumps(message, protocol=5, buffer_callback=place)
+        try:
+            body = pickle.dumps(message, protocol=5, buffer_callback=place)
+        except BaseException:
+            for offset, _ in spans:
+                self._arena.free(offset)
+            raise
         freed = [self._window.freed.popleft() for _ in range(len(self._window.freed))]
         self._connection.send_bytes(pickle.dumps((freed, spans, body)))
 

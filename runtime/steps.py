@@ -131,7 +131,8 @@ class Steps(Coroutine[Any, Any, Any]):
             self._later.cancel()
             self._later = None
         if self._stream is not None:
-            self._stream.waiter = None
+            if self._stream.waiter is self:
+                self._stream.waiter = None
             self._stream = None
 
     def _hand_over(self, outcome: Any) -> None:
@@ -162,8 +163,9 @@ class Steps(Coroutine[Any, Any, Any]):
         outcome, self._outcome = self._outcome, _NOTHING
         if isinstance(outcome, BaseException):  # it had ended before the cancellation came
             raise outcome
-        if isinstance(outcome, asyncio.Future):  # as `Task.cancel` does with what it waits on
-            outcome.cancel()
+        # As `Task.cancel` does: what the coroutine waits for is cancelled, and hands that on.
+        if isinstance(outcome, asyncio.Future) and outcome.cancel(*error.args):
+            return outcome
         return self._park(self._coro.throw(error))
 
     def _park(self, waits_for: Any) -> Any:

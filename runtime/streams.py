@@ -106,6 +106,10 @@ class Stream(Generic[T]):
     def __anext__(self) -> Generator[Any, Any, T]:
         """Wait for the next event and take it; a closed stream ends once it has been read."""
         buffer = self._buffer
+        if buffer:
+            self._taken += 1
+            if self._taken % TURN == 0:  # a reader that never runs dry must not keep the loop
+                yield
         while not buffer:
             if self._closed:
                 raise StopAsyncIteration
@@ -114,9 +118,6 @@ class Stream(Generic[T]):
             event = yield self  # the reader's driver becomes our `waiter`
             if event is not _WOKEN:
                 return event  # type: ignore[no-any-return]
-        self._taken += 1
-        if self._taken % TURN == 0:  # a reader that never runs dry must not keep the loop
-            yield
         event = buffer.popleft()
         if self._room is not None:
             self._room.set()

@@ -48,7 +48,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         sim_seconds: Seconds of the run's clock.
         wall_seconds: Real seconds, from the first update to when the end was asked for.
         digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels
-            depend on the graphics driver, so digests compare on one machine.)
+            depend on the graphics driver, so digests compare on one machine.) `None` if off.
         events: Events sent, by type.
         outputs: Events sent, by output.
         drops: Events dropped, by input.
@@ -67,7 +67,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     error: str | None
     sim_seconds: float
     wall_seconds: float
-    digest: str
+    digest: str | None
     events: dict[str, int]
     outputs: dict[str, int]
     drops: dict[str, int]
@@ -124,7 +124,7 @@ def summarise(
     *,
     name: str,
     sim_ns: int,
-    digest: str,
+    digest: str | None,
     stalls: Counter[str],
     longest_stalls: dict[str, Stall],
 ) -> Summary:

@@ -28,7 +28,7 @@ from events import Announcement, Event, Shutdown, WindowClosed
 from runtime import graph
 from runtime.clock import Clock
 from runtime.config import Config, NodeSpec
-from runtime.errors import FatalError, NodeError, NodeTimeoutError, RefusedError
+from runtime.errors import FatalError, NodeError, NodeTimeoutError, RefusedError, VisnavError
 from runtime.limits import real_time_limit
 from runtime.node import Node, make_node, streams
 from runtime.schedule import Once, Tick, Ticker
@@ -195,7 +195,8 @@ class Supervisor:
             for life in self._lives.values():
                 self._hear(life)
         except NodeError as error:
-            log.error("%s", error, exc_info=error.__cause__)
+            cause = error.__cause__
+            log.error("%s", error, exc_info=None if isinstance(cause, VisnavError) else cause)
             self.stop("start-up failed", error)
             return
         for announcement in self.announcements:
@@ -386,6 +387,7 @@ class Supervisor:
 
 
 def _wrap(name: str, error: Exception) -> NodeError:
-    wrapped = NodeError(name, f"{type(error).__name__}: {error}")
+    ours = isinstance(error, VisnavError)  # says all there is to say; others need their type
+    wrapped = NodeError(name, str(error) if ours else f"{type(error).__name__}: {error}")
     wrapped.__cause__ = error
     return wrapped

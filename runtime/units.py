@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 _UNITS = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
@@ -18,9 +19,11 @@ class Duration(float):
         Raises:
             ValueError: It is neither a non-negative number nor a text like ``"80ms"``.
         """
-        if isinstance(value, int | float) and not isinstance(value, bool) and value >= 0:
-            return cls(value)
-        match = _DURATION.fullmatch(value) if isinstance(value, str) else None
-        if match is None:
+        seconds = math.nan
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            seconds = value
+        elif isinstance(value, str) and (match := _DURATION.fullmatch(value)):
+            seconds = float(match[1]) * _UNITS[match[2].lower()]
+        if not 0 <= seconds < math.inf:
             raise ValueError('expected a duration such as 0.5, "80ms" or "2min"')
-        return cls(float(match[1]) * _UNITS[match[2].lower()])
+        return cls(seconds)

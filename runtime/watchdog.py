@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import selectors
 import sys
 import threading
 import time
@@ -18,10 +19,15 @@ from types import FrameType
 
 import msgspec
 
+from runtime import lockstep
 from runtime.node import Node
 
-_IDLE = {"select", "wait", "run_forever", "run_until_complete", "_wait_until"}
-"""Functions in which a loop that has nothing to do spends its time."""
+_WAITING = {selectors.__file__, lockstep.__file__}
+"""Modules in which a loop that has nothing to do waits…"""
+
+_LOOPS = {asyncio.base_events.__file__, asyncio.runners.__file__}
+"""…when called from these. (uvloop, being compiled, shows nothing but `Runner.run`.) A node that
+waits for a lock or a child's output is not idle: it blocks the loop."""
 
 
 class Stall(msgspec.Struct, frozen=True):
@@ -74,7 +80,7 @@ class Watchdog:
         pause = self._limit / 4
         while not self._end.wait(pause):
             frame = sys._current_frames().get(self._thread_id)
-            if frame is None or frame.f_code.co_name in _IDLE:
+            if frame is None or _idle(frame):
                 continue
             del frame
             self._signed.clear()
@@ -108,6 +114,12 @@ class Watchdog:
             self.longest[stall.node] = stall
         with contextlib.suppress(Exception):  # a report that fails must not end the watch
             self._report(stall)
+
+
+def _idle(frame: FrameType | None) -> bool:
+    while frame is not None and frame.f_code.co_filename in _WAITING:
+        frame = frame.f_back
+    return frame is None or frame.f_code.co_filename in _LOOPS
 
 
 def _place(frame: FrameType) -> str:

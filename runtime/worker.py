@@ -163,6 +163,7 @@ class _Process:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
+            process_group=0,  # so that a terminal's Ctrl-C does not reach it
             env={**environment, "PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
         )
         theirs.close()
@@ -187,6 +188,7 @@ class _Process:
     def request(self, message: Any) -> concurrent.futures.Future[Any]:
         """Send a message and return the future of its answer; from the loop's thread only."""
         work: concurrent.futures.Future[Any] = concurrent.futures.Future()
+        work.set_running_or_notify_cancel()  # whoever stops waiting does not cancel it
         with self._lock:
             if self._error is not None:
                 work.set_exception(self._error)
@@ -210,7 +212,7 @@ class _Process:
                         self._child.kill()
                         raise WorkerTimeoutError(self._story(f"no answer in {self._timeout:g} s"))
                     continue
-                succeeded, result = self._pipe.receive()
+                succeeded, result = self._receive()
                 with self._lock:
                     _, work = self._calls.popleft()
                 if succeeded:
@@ -224,13 +226,23 @@ class _Process:
             error = hung
         self._fail(error)
 
+    def _receive(self) -> tuple[bool, Any]:
+        try:
+            answer: tuple[bool, Any] = self._pipe.receive()
+        except (EOFError, OSError):
+            raise
+        except Exception as error:  # it cannot be unpickled: this call fails, the next may not
+            return False, error
+        return answer
+
     def _fail(self, error: WorkerError) -> None:
+        expected = self._closing
         with self._lock:
             self._error = error
             calls, self._calls = self._calls, collections.deque()
         for _, work in calls:
             work.set_exception(error)
-        if not self._closing:
+        if not expected:
             self._died(error)
 
     def _exit(self) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -19,29 +20,47 @@ def main(socket_fd: int, in_fd: int, out_fd: int) -> None:
     """Make the object, then answer calls until the other side closes the connection."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the run's business
     pipe = SharedPipe(Connection(socket_fd), out_fd, in_fd)
-    target: Any = None
+    made, target = False, None
     try:
         sys.path[:] = pipe.receive()  # first, because the next message names what to import
-        factory, args, niceness = pipe.receive()
-        os.nice(niceness)
-        target = factory(*args)
-        pipe.send((True, None))
-        while True:
-            method, args, kwargs = pipe.receive()
-            try:
-                outcome = (True, getattr(target, method)(*args, **kwargs))
-            except Exception as error:
-                outcome = (False, _portable(error))
-            args = kwargs = None  # frees the arrays that came with the call
-            pipe.send(outcome)
-            outcome = (True, None)
+        made, target = _attempt(lambda: _make(*pipe.receive()))
+        pipe.send((made, None if made else target))
+        while made:
+            _answer(pipe, *_attempt(lambda: _call(target, *pipe.receive())))
     except (EOFError, OSError):
         pass  # the run closed the connection, or is gone
-    except Exception as error:  # the object could not be made
-        pipe.send((False, _portable(error)))
     finally:
-        if hasattr(target, "close"):
+        if made and hasattr(target, "close"):
             target.close()
+
+
+def _make(factory: Callable[..., Any], args: tuple[Any, ...], niceness: int) -> Any:
+    os.nice(niceness)
+    return factory(*args)
+
+
+def _call(target: Any, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    return getattr(target, method)(*args, **kwargs)
+
+
+def _attempt(do: Callable[[], Any]) -> tuple[bool, Any]:
+    """Return True and a result, or False and an error.
+
+    At the end of the connection the error is its own, and sending it fails.
+    """
+    try:
+        return True, do()
+    except Exception as error:
+        return False, _portable(error)
+
+
+def _answer(pipe: SharedPipe, succeeded: bool, result: Any) -> None:
+    try:
+        pipe.send((succeeded, result))
+    except OSError:
+        raise
+    except Exception as error:  # the result cannot be pickled
+        pipe.send((False, _portable(error)))
 
 
 def _portable(error: Exception) -> Exception:

@@ -14,7 +14,7 @@ from runtime.cli.bench import bench
 from runtime.cli.check import check
 from runtime.cli.graph import graph
 from runtime.cli.nodes import nodes
-from runtime.cli.run import run
+from runtime.cli.run import leave_threads_behind, run
 from runtime.errors import VisnavError
 
 app = typer.Typer(
@@ -43,6 +43,7 @@ def main() -> None:
     except VisnavError as error:
         message = str(error)
         print(f"error: {message}", file=sys.stderr)
+        leave_threads_behind(2)
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

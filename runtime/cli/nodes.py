@@ -29,7 +29,8 @@ def nodes(
     }
     if not shown:
         raise ConfigError(
-            f"expected the name of a node, found {which!r}" + suggest(str(which), found)
+            f"expected the name of a node, found {which!r}"
+            + suggest(str(which), [*found, *(name.partition(":")[2] for name in found)])
         )
     console = Console()
     for name, cls in shown.items():

@@ -68,7 +68,7 @@ def run(
     )
     if not quiet:
         report(summary, folder)
-    leave(0)
+    leave_threads_behind(0)
 
 
 def warn_unconnected(config: Path, overrides: list[str]) -> None:
@@ -94,13 +94,13 @@ def report(summary: Summary, folder: Path) -> None:
     console.print(
         f"{summary.sim_seconds:.1f} s on the {summary.clock} clock in "
         f"{summary.wall_seconds:.1f} s ({speed:.1f} × real time), ended by: {summary.reason}\n"
-        f"digest {summary.digest}   results in [bold]{folder}[/bold]",
+        f"digest {summary.digest or 'off'}   results in [bold]{folder}[/bold]",
         highlight=False,
     )
 
 
-def leave(code: int) -> None:
-    """End the process even where offloaded work of a node never returns."""
+def leave_threads_behind(code: int) -> None:
+    """End the process if offloaded work of a node never returns; else Python would wait for it."""
     stuck = [t.name for t in threading.enumerate() if t.name.startswith(("offload", "node"))]
     alive = [t for t in threading.enumerate() if t.name in stuck and t.is_alive()]
     for thread in alive:
@@ -110,4 +110,3 @@ def leave(code: int) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
-    raise typer.Exit(code)

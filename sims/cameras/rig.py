@@ -75,7 +75,7 @@ class CameraRig:
             return
         self._renderer = await self._node.worker(
             CameraRenderer,
-            model_to_bytes(model),
+            await self._node.offload(model_to_bytes, model),
             tuple(self._specs.values()),
             f"{self._node.name}/",
             int(self._node.rng.integers(1 << 31)),

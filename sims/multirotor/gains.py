@@ -7,7 +7,7 @@ from math import radians
 import msgspec
 
 
-class Gains(msgspec.Struct, frozen=True, kw_only=True):
+class Gains(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Gains of the cascade, for a vehicle whose motors lag by about 40 ms.
 
     None depends on mass, inertia or thrust: those come from the vehicle's parameters.
@@ -49,7 +49,7 @@ class Gains(msgspec.Struct, frozen=True, kw_only=True):
     derivative_cutoff: float = 40.0
 
 
-class Limits(msgspec.Struct, frozen=True, kw_only=True):
+class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What the cascade never asks for, whatever the set-point says.
 
     Attributes:

@@ -13,7 +13,7 @@ _BLOCK = 512
 """Samples drawn at once: numpy's cost per call is that of a few hundred random numbers."""
 
 
-class ImuParameters(msgspec.Struct, frozen=True, kw_only=True):
+class ImuParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Noise of an IMU, named as in `events.ImuAnnouncement`; by default a usual MEMS.
 
     Attributes:

@@ -198,21 +198,25 @@ class Physics:
         contact = self.data.contact[index]
         geom = int(contact.geom[1 - own])
         # The contact's first axis points from its first geom to its second.
-        normal = contact.frame[:3] * (1.0 if own == 1 else -1.0)
-        relative = self._velocity_at(self._body, contact.pos) - self._velocity_at(
-            int(self.model.geom_bodyid[geom]), contact.pos
-        )
-        x, y, z = contact.pos.tolist()
-        nx, ny, nz = normal.tolist()
-        return Contact(self._name_of(geom), (x, -y, -z), (nx, -ny, -nz), -float(relative @ normal))
+        sign = 1.0 if own == 1 else -1.0
+        nx, ny, nz = (sign * component for component in contact.frame[:3].tolist())
+        point = tuple(contact.pos.tolist())
+        ax, ay, az = self._velocity_at(self._body, point)
+        bx, by, bz = self._velocity_at(int(self.model.geom_bodyid[geom]), point)
+        closing = -((ax - bx) * nx + (ay - by) * ny + (az - bz) * nz)
+        x, y, z = point
+        return Contact(self._name_of(geom), (x, -y, -z), (nx, -ny, -nz), closing)
 
-    def _velocity_at(self, body: int, point: npt.NDArray[np.float64]) -> Any:
+    def _velocity_at(self, body: int, point: Vector3) -> Vector3:
         """Return the velocity (m/s, NWU) of a body's material at a point of the world."""
         velocity = np.zeros(6)  # angular, then linear, at the body's origin, in the world's axes
         mujoco.mj_objectVelocity(
             self.model, self.data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0
         )
-        return velocity[3:] + np.cross(velocity[:3], point - self.data.xpos[body])
+        wx, wy, wz, vx, vy, vz = velocity.tolist()
+        ox, oy, oz = self.data.xpos[body].tolist()
+        x, y, z = point[0] - ox, point[1] - oy, point[2] - oz
+        return vx + wy * z - wz * y, vy + wz * x - wx * z, vz + wx * y - wy * x
 
     def _name_of(self, geom: int) -> str:
         name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_GEOM, geom)

@@ -1,0 +1,200 @@
+"""Runs measurements in processes of their own, shuffled and repeated, and sums them up.
+
+Every (system, mode, N) is measured once a round; each round has an order of its own, so that a
+busy minute of the machine falls on all systems alike. Samples of all rounds are pooled; the
+medians of the rounds are kept, because their spread is the noise that a comparison must exceed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import random
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+import bench.peers
+from bench.system import Case, CaseName, Mode, Samples, System
+
+_LIMIT = 120.0
+"""Seconds that one measurement may take."""
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """One system at one number of nodes; times in microseconds.
+
+    Attributes:
+        case: As in `Case`; so `mode` and `nodes`.
+        system: Its name.
+        mode: ``handler``, ``stream`` or ``routed``.
+        nodes: N.
+        place: Whether its nodes share a process.
+        samples: How many round trips, in all rounds.
+        median_us: Of all samples.
+        mean_us: Of all samples.
+        q1_us: First quartile.
+        q3_us: Third quartile.
+        p99_us: 99th percentile.
+        max_us: The longest.
+        rounds_us: The median of each round.
+    """
+
+    case: str
+    system: str
+    mode: str
+    nodes: int
+    place: str
+    samples: int
+    median_us: float
+    mean_us: float
+    q1_us: float
+    q3_us: float
+    p99_us: float
+    max_us: float
+    rounds_us: tuple[float, ...]
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """What a whole benchmark came to.
+
+    Attributes:
+        rows: What was measured.
+        missing: System to the reason why it was not.
+        versions: System to what was measured.
+    """
+
+    rows: list[Row]
+    missing: dict[str, str]
+    versions: dict[str, str]
+
+
+def systems() -> dict[str, list[System]]:
+    """Return all systems by module, ours first."""
+    modules = ["bench.ours"]
+    modules += [f"bench.peers.{m.name}" for m in pkgutil.iter_modules(bench.peers.__path__)]
+    found = {}
+    for module in modules:
+        entries = getattr(importlib.import_module(module), "SYSTEMS", ())
+        if entries:
+            found[module] = list(entries)
+    return found
+
+
+def measure_all(
+    case: CaseName,
+    *,
+    nodes: Sequence[int],
+    samples: int,
+    warm_up: int,
+    repeats: int,
+    only: Iterable[str] = (),
+    budget: float = 1.0,
+    progress: Callable[[str, float], None] = lambda *_: None,
+) -> Outcome:
+    """Measure one case with all systems that are installed.
+
+    Args:
+        case: Which.
+        nodes: The numbers of nodes.
+        samples: Round trips of each measurement, fewer for slow systems: see `budget`.
+        warm_up: Round trips left out before them.
+        repeats: Rounds.
+        only: Parts of names; systems whose name has none of them are left out. Empty: all.
+        budget: About how many seconds of round trips one measurement may take.
+        progress: Told what is measured, and the share that is done.
+    """
+    wanted = tuple(part.lower() for part in only)
+    missing: dict[str, str] = {}
+    versions: dict[str, str] = {}
+    jobs: list[tuple[str, System, Mode, int]] = []
+    for module, entries in systems().items():
+        for system in entries:
+            if wanted and not any(part in system.name.lower() for part in wanted):
+                continue
+            if case not in system.cases:
+                continue
+            if reason := system.missing():
+                missing[system.name] = reason
+                continue
+            versions[system.name] = system.version()
+            jobs += [
+                (module, system, mode, n)
+                for mode in system.modes
+                for n in nodes
+                if n <= system.max_nodes
+            ]
+    taken: dict[tuple[str, Mode, int], list[Samples]] = {}
+    shuffle = random.Random(1).shuffle
+    for round_ in range(repeats):
+        shuffle(jobs)
+        for index, (module, system, mode, n) in enumerate(jobs):
+            progress(f"{system.name}, {mode}, {n} nodes", (round_ + index / len(jobs)) / repeats)
+            count = _affordable(samples, system, case, n, budget)
+            asked = Case(
+                case=case, mode=mode, nodes=n, samples=count, warm_up=min(warm_up, count // 5 + 1)
+            )
+            try:
+                taken.setdefault((system.name, mode, n), []).append(
+                    _measure(module, system.name, asked)
+                )
+            except (subprocess.SubprocessError, OSError) as error:
+                missing[f"{system.name}, {mode}, {n} nodes"] = _reason(error)
+    places = {s.name: s.place for entries in systems().values() for s in entries}
+    rows = [_row(case, *key, places[key[0]], runs) for key, runs in taken.items()]
+    rows.sort(key=lambda r: (r.mode, r.nodes, r.median_us))
+    return Outcome(rows, missing, versions)
+
+
+def _affordable(samples: int, system: System, case: str, nodes: int, budget: float) -> int:
+    """Return how many round trips fit the budget, at least 30."""
+    round_trip = system.slowness * 1e-6 * max(nodes / 2, 1.0)
+    if case == "large":
+        round_trip += 2e-3
+    return max(min(samples, int(budget / round_trip)), 30)
+
+
+def _measure(module: str, name: str, case: Case) -> Samples:
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "samples.npy"
+        encoded = msgspec.json.encode(case).decode()
+        subprocess.run(
+            [sys.executable, "-m", "bench.measure", module, name, encoded, str(out)],
+            check=True,
+            capture_output=True,
+            timeout=_LIMIT,
+        )
+        samples: Samples = np.load(out)
+    return samples
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, subprocess.CalledProcessError):
+        lines = error.stderr.decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else f"exit code {error.returncode}"
+    return f"no result within {_LIMIT:g} s"
+
+
+def _row(case: str, system: str, mode: str, nodes: int, place: str, runs: Sequence[Samples]) -> Row:
+    pooled = np.concatenate(runs) / 1e3
+    q1, median, q3, p99 = np.percentile(pooled, [25, 50, 75, 99]).tolist()
+    return Row(
+        case=case,
+        system=system,
+        mode=mode,
+        nodes=nodes,
+        place=place,
+        samples=len(pooled),
+        median_us=median,
+        mean_us=float(pooled.mean()),
+        q1_us=q1,
+        q3_us=q3,
+        p99_us=p99,
+        max_us=float(pooled.max()),
+        rounds_us=tuple(float(np.median(run)) / 1e3 for run in runs),
+    )

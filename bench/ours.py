@@ -1,0 +1,178 @@
+"""Our own runtime, measured as its users meet it: nodes, ports and a supervisor, on uvloop."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import importlib.metadata
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import uvloop
+
+from bench.messages import Ping, Pong
+from bench.system import Case, Samples, System, large_array
+from runtime import Input, Node, NodeConfig, Output, on, steps
+from runtime.config import Config, RunConfig
+from runtime.digest import Digest
+from runtime.realtime import RealClock
+from runtime.supervisor import Supervisor
+from runtime.testing import spec
+
+
+class OneConfig(NodeConfig):
+    """What to measure."""
+
+    case: Case
+
+
+class _One(Node[OneConfig]):
+    """Node 1: sends pings, and notes when the replies come."""
+
+    pings = Output(Ping)
+
+    def __init__(self) -> None:
+        case = self.config.case
+        self.array = None if case.case == "small" else large_array()
+        self.taken: npt.NDArray[np.int64] = np.empty(case.warm_up + case.samples, np.int64)
+        self.target = "one" if case.mode != "routed" else f"one/{case.nodes}"
+
+    def ping(self, number: int) -> Ping:
+        """Make the next ping; a copy of the large array is part of it."""
+        case = self.config.case
+        payload = self.array
+        if case.case == "large" and payload is not None:
+            payload = payload.copy()
+        return Ping(
+            stamp=0, source=self.target, receiver=case.nodes, number=number, payload=payload
+        )
+
+
+class HandlerOne(_One):
+    """Node 1 with a handler for the replies."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.arrived = 0
+
+    @on(Pong)
+    def pong(self, _: Pong) -> None:
+        """Note the time."""
+        self.arrived = time.perf_counter_ns()
+
+    async def run(self) -> None:
+        """Measure; nothing here waits, so one sample is one call of `send`."""
+        now, send, taken, ping = time.perf_counter_ns, self.pings.send, self.taken, self.ping
+        for number in range(len(taken)):
+            begin = now()
+            send(ping(number))
+            taken[number] = self.arrived - begin
+        self.stop("measured")
+
+
+class StreamOne(_One):
+    """Node 1 awaiting the replies."""
+
+    pongs = Input(Pong)
+
+    async def run(self) -> None:
+        """Measure."""
+        now, send, taken, ping = time.perf_counter_ns, self.pings.send, self.taken, self.ping
+        for number in range(len(taken)):
+            begin = now()
+            send(ping(number))
+            await self.pongs.receive()
+            taken[number] = now() - begin
+        self.stop("measured")
+
+
+class OtherConfig(NodeConfig):
+    """Settings of the nodes that listen."""
+
+    number: int
+
+
+class HandlerOther(Node[OtherConfig]):
+    """Nodes 2 to N with handlers."""
+
+    pongs = Output(Pong)
+
+    def __init__(self) -> None:
+        self.number = self.config.number
+
+    @on(Ping)
+    def ping(self, event: Ping) -> bool | None:
+        """Reply, if it is meant."""
+        if event.receiver == self.number:
+            self.pongs.send(Pong(stamp=event.stamp, source="other", number=event.number))
+            return True
+        return None
+
+
+class StreamOther(Node[OtherConfig]):
+    """Nodes 2 to N with coroutines."""
+
+    pings = Input(Ping)
+    pongs = Output(Pong)
+
+    async def run(self) -> None:
+        """Reply, if it is meant."""
+        number = self.config.number
+        async for event in self.pings:
+            if event.receiver == number:
+                self.pongs.send(Pong(stamp=event.stamp, source="other", number=event.number))
+
+
+def measure(case: Case, digest: bool = False) -> Samples:
+    """Measure a case with real nodes; with `digest`, as a lockstep run would fingerprint them."""
+    one, other = (StreamOne, StreamOther) if case.mode == "stream" else (HandlerOne, HandlerOther)
+    others = [
+        spec(
+            other,
+            f"n{n}",
+            {"number": n},
+            inputs={"ping": f"one/{n}"} if case.mode == "routed" else {},
+        )
+        for n in range(2, case.nodes + 1)
+    ]
+    config = Config(run=RunConfig(clock="real"), nodes=(spec(one, "one", {"case": case}), *others))
+
+    async def main() -> Any:
+        loop = asyncio.get_running_loop()
+        steps.install(loop)
+        clock = RealClock(loop)
+        supervisor = Supervisor(config, clock, [Digest()] if digest else [])
+        await supervisor.main()
+        clock.close()
+        if supervisor.error is not None:
+            raise supervisor.error
+        return supervisor.ever[0]
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        samples: Samples = runner.run(main()).taken[case.warm_up :]
+    return samples
+
+
+def _version() -> str:
+    return f"visnav-runtime {importlib.metadata.version('visnav-runtime')}"
+
+
+SYSTEMS = (
+    System(
+        name="visnav",
+        modes=("handler", "stream", "routed"),
+        slowness=0.6,
+        version=_version,
+        measure=measure,
+    ),
+    System(
+        name="visnav, fingerprinted",
+        modes=("handler", "stream"),
+        cases=("small",),
+        slowness=3.0,
+        version=_version,
+        measure=functools.partial(measure, digest=True),
+    ),
+)

@@ -1,0 +1,153 @@
+"""How much gets through: events through handlers and streams, images through streams and workers.
+
+Times are of whole bursts, divided by their size; each figure is the median of many bursts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import uvloop
+
+from bench.messages import Ping
+from events import Event, Image
+from runtime import steps
+from runtime.realtime import RealClock
+from runtime.sender import Listener, Sender
+from runtime.streams import Stream
+from runtime.worker import Worker
+
+
+class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One way through.
+
+    Attributes:
+        case: What passed, and how.
+        batch: How many at a time.
+        per_event_us: Microseconds each.
+        events_per_second: The same the other way round.
+        bytes_per_second: Of payload.
+    """
+
+    case: str
+    batch: int
+    per_event_us: float
+    events_per_second: float
+    bytes_per_second: float
+
+
+BATCH = 256
+"""Events of a burst: as many as a reader may take before the loop gets a turn."""
+
+
+class Mirror:
+    """Lives in a worker; gives back what it gets."""
+
+    def echo(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """Return the image, which crosses shared memory both ways."""
+        return image
+
+
+def measure(bursts: int = 400) -> list[ThroughputRow]:
+    """Measure all ways."""
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        return runner.run(_measure(bursts))
+
+
+async def _measure(bursts: int) -> list[ThroughputRow]:
+    steps.install(asyncio.get_running_loop())
+    event = Ping(stamp=0, source="one", receiver=2, number=0)
+    picture = np.zeros((512, 512, 3), np.uint8)
+    image = Image(stamp=0, source="drone/front", frame_id="f", data=picture)
+    at_once = "events, stream, reader resumed by each"
+    in_one_wake = "events, stream, all in one wake"
+    return [
+        _row("events, handler", BATCH, _by_handler(event, bursts), 0),
+        _row(at_once, BATCH, await _by_stream(event, bursts, soon=False), 0),
+        _row(in_one_wake, BATCH, await _by_stream(event, bursts, soon=True), 0),
+        _row(
+            "images by reference, stream",
+            BATCH,
+            await _by_stream(image, bursts, soon=False),
+            picture.nbytes,
+        ),
+        *await _worker_rows(picture),
+    ]
+
+
+def _by_handler(event: Event, bursts: int) -> float:
+    """Return nanoseconds an event."""
+    sender: Sender[Event] = Sender("one.out", type(event))
+    sender.connect([Listener("two", lambda _: None, (type(event),))])
+    send, taken = sender.send, []
+    for _ in range(bursts):
+        begin = time.perf_counter_ns()
+        for _ in range(BATCH):
+            send(event)
+        taken.append((time.perf_counter_ns() - begin) / BATCH)
+    return float(np.median(taken))
+
+
+async def _by_stream(event: Event, bursts: int, *, soon: bool) -> float:
+    """Return nanoseconds an event, until the reader has had the last of a burst."""
+    stream: Stream[Event] = Stream("two.in", bound=BATCH, soon=soon)
+    sender: Sender[Event] = Sender("one.out", type(event))
+    sender.connect([Listener("two", stream.offer, (type(event),), None, stream)])
+    read_all = asyncio.Event()
+
+    async def read() -> None:
+        seen = 0
+        async for _ in stream:
+            seen += 1
+            if seen % BATCH == 0:
+                read_all.set()
+
+    reader = asyncio.create_task(read())
+    await asyncio.sleep(0)
+    send, taken = sender.send, []
+    for _ in range(bursts):
+        read_all.clear()
+        begin = time.perf_counter_ns()
+        for _ in range(BATCH):
+            send(event)
+        await read_all.wait()
+        taken.append((time.perf_counter_ns() - begin) / BATCH)
+        await asyncio.sleep(0)
+    stream.close()
+    await reader
+    return float(np.median(taken))
+
+
+async def _worker_rows(picture: npt.NDArray[np.uint8]) -> list[ThroughputRow]:
+    loop = asyncio.get_running_loop()
+    clock = RealClock(loop)
+    worker = Worker("mirror", clock, Mirror)
+    try:
+        await worker.ready()
+        rows = []
+        for batch in (1, 4):
+            taken = []
+            for _ in range(100):
+                begin = time.perf_counter_ns()
+                await asyncio.gather(*(worker.call(Mirror.echo, picture) for _ in range(batch)))
+                taken.append((time.perf_counter_ns() - begin) / batch)
+            case = "images to a worker and back"
+            rows.append(_row(case, batch, float(np.median(taken)), 2 * picture.nbytes))
+        return rows
+    finally:
+        await asyncio.to_thread(worker.close)
+        clock.close()
+
+
+def _row(case: str, batch: int, nanoseconds: float, size: int) -> ThroughputRow:
+    return ThroughputRow(
+        case=case,
+        batch=batch,
+        per_event_us=nanoseconds / 1e3,
+        events_per_second=1e9 / nanoseconds,
+        bytes_per_second=size * 1e9 / nanoseconds,
+    )
