@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check fix pictures clean
+.PHONY: help setup demo test test-all check fix bench bench-quick pictures clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -40,6 +40,12 @@ check: $(READY)  ## Check style and types.
 fix: $(READY)  ## Mend what style checks can mend.
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (about 20 minutes).
+	$(BIN)/python -m runtime bench all --out bench/results
+
+bench-quick: $(READY)  ## Run the quick benchmarks (under two minutes).
+	$(BIN)/python -m runtime bench all --quick --out runs/bench-quick
 
 pictures: demo  ## Make the README's pictures anew.
 	$(BIN)/python tools/readme_pictures.py

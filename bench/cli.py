@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from bench.system import CaseName
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -15,11 +22,50 @@ app = typer.Typer(
 )
 
 Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file, too.")]
+Nodes = Annotated[str, typer.Option(help="Numbers of nodes, with commas.")]
+SampleCount = Annotated[
+    int, typer.Option(min=30, help="Round trips of each measurement; fewer for slow systems.")
+]
+WarmUp = Annotated[int, typer.Option(min=0, help="Round trips left out before them.")]
+Repeats = Annotated[int, typer.Option(min=1, help="Rounds, each in an order of its own.")]
+Only = Annotated[
+    list[str] | None, typer.Option("--system", help="Only systems with this in their name.")
+]
+Plots = Annotated[Path | None, typer.Option(help="Folder for box and scaling plots (PNG).")]
+
+ALL_NODES = "2,4,8,10,16,32,50,64,100,128"
 
 
-@app.callback()
-def bench() -> None:
-    """Measure latency and throughput on this machine."""
+@app.command()
+def small(
+    json: Json = None,
+    nodes: Nodes = ALL_NODES,
+    samples: SampleCount = 20_000,
+    warm_up: WarmUp = 2_000,
+    repeats: Repeats = 3,
+    only: Only = None,
+    plots: Plots = None,
+) -> None:
+    """Measure the round trip from node 1 to N-1 listeners, the last of which replies."""
+    _latency("small", json, nodes, samples, warm_up, repeats, only, plots)
+
+
+@app.command()
+def large(
+    json: Json = None,
+    shared: Annotated[
+        bool, typer.Option("--shared", help="Pass the array by reference instead of copying it.")
+    ] = False,
+    nodes: Nodes = "2,16,128",
+    samples: SampleCount = 2_000,
+    warm_up: WarmUp = 200,
+    repeats: Repeats = 3,
+    only: Only = None,
+    plots: Plots = None,
+) -> None:
+    """Measure the same with 1080×1080 float32 (4.67 MB) in each ping."""
+    case: CaseName = "large-shared" if shared else "large"
+    _latency(case, json, nodes, samples, warm_up, repeats, only, plots)
 
 
 @app.command()
@@ -30,18 +76,153 @@ def stall(
     rate: Annotated[float, typer.Option(min=0.1, help="Hertz of the camera.")] = 10.0,
     size: Annotated[int, typer.Option(min=16, help="Width and height of its pictures.")] = 512,
 ) -> None:
-    """Lateness of a 400 Hz tick with no camera, and with one inline, in a thread, in a worker."""
-    from rich.console import Console
-
-    from bench.results import write_json
+    """Measure how late a 400 Hz tick is without a camera, with one inline and beside the loop."""
     from bench.stall import measure
     from bench.tables import stall_table
 
-    console = Console()
-    with console.status("stall") as status:
-        rows = measure(
-            seconds=seconds, repeats=repeats, rate=rate, size=size, progress=status.update
+    with _status() as say:
+        rows = measure(seconds=seconds, repeats=repeats, rate=rate, size=size, progress=say)
+    _finish(stall_table(rows), json, rows, seconds=seconds, repeats=repeats, rate=rate, size=size)
+
+
+@app.command()
+def throughput(json: Json = None) -> None:
+    """Measure events and images a second, through handlers, streams and workers."""
+    from bench.tables import throughput_table
+    from bench.throughput import measure
+
+    with _status() as say:
+        say("throughput")
+        rows = measure()
+    _finish(throughput_table(rows), json, rows)
+
+
+@app.command()
+def idle(
+    json: Json = None,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Length of the run.")] = 10.0,
+) -> None:
+    """Measure the processor time of one 100 Hz timer node."""
+    from bench.idle import measure
+    from bench.tables import idle_table
+
+    with _status() as say:
+        say("idle")
+        row = measure(seconds)
+    _finish(idle_table(row), json, [row])
+
+
+@app.command()
+def lockstep(
+    json: Json = None,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Simulated, of each run.")] = 30.0,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 5,
+) -> None:
+    """Measure simulated seconds a second, with and without cameras, beside a bare loop."""
+    from bench.lockstep import measure
+    from bench.tables import lockstep_table
+
+    with _status() as say:
+        rows = measure(seconds=seconds, repeats=repeats, progress=say)
+    _finish(lockstep_table(rows), json, rows)
+
+
+@app.command("all")
+def everything(
+    out: Annotated[Path, typer.Option(help="Folder for results.json, RESULTS.md and plots.")],
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer nodes, rounds, samples.")] = False,
+) -> None:
+    """Run every benchmark, and write the page of results."""
+    from bench.suite import run
+
+    with _status() as say:
+        run(out, quick=quick, progress=say)
+    print(out / "RESULTS.md")
+
+
+@app.command()
+def compare(
+    before: Annotated[Path, typer.Argument(help="A result file.")],
+    after: Annotated[Path, typer.Argument(help="Another.")],
+) -> None:
+    """Say what got faster or slower between two result files, beyond the noise of both."""
+    from rich.console import Console
+
+    from bench.compare import compare as changes_between
+    from bench.tables import changes_table
+
+    changes = changes_between(before, after)
+    real = [change for change in changes if change.real]
+    if real:
+        Console().print(changes_table(real))
+    print(f"{len(real)} of {len(changes)} figures changed beyond the noise")
+
+
+def _latency(
+    case: CaseName,
+    json: Path | None,
+    nodes: str,
+    samples: int,
+    warm_up: int,
+    repeats: int,
+    only: list[str] | None,
+    plots: Path | None,
+) -> None:
+    from bench.driver import measure_all
+    from bench.plots import plot_boxes, plot_scaling
+    from bench.tables import latency_table, missing_lines
+
+    counts = _counts(nodes)
+    with _status() as say:
+        outcome = measure_all(
+            case,
+            nodes=counts,
+            samples=samples,
+            warm_up=warm_up,
+            repeats=repeats,
+            only=only or (),
+            progress=say,
         )
-    console.print(stall_table(rows))
+    if plots is not None and outcome.rows:
+        plots.mkdir(parents=True, exist_ok=True)
+        plot_scaling(outcome.rows, case, plots / f"{case}-scaling.png")
+        for n in counts:
+            rows = [row for row in outcome.rows if row.nodes == n]
+            if rows:
+                plot_boxes(rows, f"{case}, {n} nodes", plots / f"{case}-{n}.png")
+    more = {"missing": outcome.missing, "versions": outcome.versions}
+    _finish(latency_table(outcome.rows), json, outcome.rows, **more)
+    print("\n".join(missing_lines(outcome.missing)))
+
+
+def _counts(nodes: str) -> list[int]:
+    from runtime.errors import ConfigError
+
+    try:
+        counts = [int(n) for n in nodes.split(",")]
+    except ValueError:
+        counts = []
+    if not counts or min(counts) < 2:
+        raise ConfigError(f"--nodes: expected numbers above 1 with commas, found {nodes!r}")
+    return counts
+
+
+@contextlib.contextmanager
+def _status() -> Iterator[Callable[..., None]]:
+    """Show one line of what is being done, where there is a terminal to show it."""
+    from rich.console import Console
+
+    with Console(stderr=True).status("…") as status:
+        yield lambda what, share=None: status.update(
+            what if share is None else f"{share:4.0%}  {what}"
+        )
+
+
+def _finish(table: Table, json: Path | None, rows: list[Any], **more: Any) -> None:
+    from rich.console import Console
+
+    from bench.results import write_json
+
+    Console().print(table)
     if json is not None:
-        write_json(json, rows, seconds=seconds, repeats=repeats, rate=rate, size=size)
+        write_json(json, rows, **more)

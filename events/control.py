@@ -10,43 +10,45 @@ from typing import ClassVar
 from events.base import Category, Event, Quaternion, Vector3
 
 
-class Arm(Event):
+class Command(Event):
+    """Base of the orders that are given once."""
+
+    category: ClassVar[Category] = Category.CONTROL
+
+
+class Setpoint(Event):
+    """Base of what is sent again and again, and where only the newest counts."""
+
+    category: ClassVar[Category] = Category.CONTROL
+
+
+class Arm(Command):
     """Let the motors turn."""
 
-    category: ClassVar[Category] = Category.CONTROL
 
-
-class Disarm(Event):
+class Disarm(Command):
     """Stop the motors."""
 
-    category: ClassVar[Category] = Category.CONTROL
 
-
-class Takeoff(Event):
+class Takeoff(Command):
     """Arm if need be, climb straight up and hover.
 
     Attributes:
         altitude: Metres above the point of take-off.
     """
 
-    category: ClassVar[Category] = Category.CONTROL
-
     altitude: float = 1.5
 
 
-class Land(Event):
+class Land(Command):
     """Go straight down, and disarm when the ground is felt."""
 
-    category: ClassVar[Category] = Category.CONTROL
 
-
-class Hover(Event):
+class Hover(Command):
     """Stop and hold the position."""
 
-    category: ClassVar[Category] = Category.CONTROL
 
-
-class PositionSetpoint(Event):
+class PositionSetpoint(Setpoint):
     """Be at a place; velocity and acceleration are feed-forward for those who follow a path.
 
     Attributes:
@@ -57,8 +59,6 @@ class PositionSetpoint(Event):
         yaw_rate: Radians per second, expected at that place.
     """
 
-    category: ClassVar[Category] = Category.CONTROL
-
     position: Vector3
     velocity: Vector3 = (0.0, 0.0, 0.0)
     acceleration: Vector3 = (0.0, 0.0, 0.0)
@@ -66,7 +66,7 @@ class PositionSetpoint(Event):
     yaw_rate: float = 0.0
 
 
-class PoseSetpoint(Event):
+class PoseSetpoint(Setpoint):
     """Be at a place in an attitude; for what can be in any, such as a free camera.
 
     Attributes:
@@ -74,13 +74,11 @@ class PoseSetpoint(Event):
         orientation: Rotation from body to ``map``.
     """
 
-    category: ClassVar[Category] = Category.CONTROL
-
     position: Vector3
     orientation: Quaternion
 
 
-class VelocitySetpoint(Event):
+class VelocitySetpoint(Setpoint):
     """Move at a speed.
 
     Attributes:
@@ -89,14 +87,12 @@ class VelocitySetpoint(Event):
         yaw_rate: Radians per second, clockwise seen from above.
     """
 
-    category: ClassVar[Category] = Category.CONTROL
-
     frame_id: str = "map"
     velocity: Vector3
     yaw_rate: float = 0.0
 
 
-class AttitudeSetpoint(Event):
+class AttitudeSetpoint(Setpoint):
     """Hold an attitude at a thrust.
 
     Attributes:
@@ -104,21 +100,17 @@ class AttitudeSetpoint(Event):
         thrust: 0 to 1 of what all motors can give together.
     """
 
-    category: ClassVar[Category] = Category.CONTROL
-
     orientation: Quaternion
     thrust: float
 
 
-class BodyRateSetpoint(Event):
+class BodyRateSetpoint(Setpoint):
     """Turn at given rates at a thrust.
 
     Attributes:
         angular_velocity: Radians per second in the body frame.
         thrust: 0 to 1 of what all motors can give together.
     """
-
-    category: ClassVar[Category] = Category.CONTROL
 
     angular_velocity: Vector3
     thrust: float

@@ -14,6 +14,10 @@ Floats = npt.NDArray[np.float64]
 _SPACING = 0.02
 """Metres between the points at which a path is computed."""
 
+_REST = 1.0
+"""Seconds at rest at both ends, so that smoothing neither cuts the path short nor starts it with
+a jerk."""
+
 
 class Path(msgspec.Struct, frozen=True, eq=False):
     """A path in time, at regular steps.
@@ -72,8 +76,10 @@ def plan(
     pace = _speeds(points, along, speed, acceleration)
     # Time at each point: each stretch at the mean of its ends' speeds.
     time = np.concatenate([[0.0], np.cumsum(np.diff(along) / ((pace[1:] + pace[:-1]) / 2))])
-    rest = np.full(round(2 * turn_time / step), along[-1])  # stand still until the nose is there
-    arc = np.concatenate([np.interp(np.arange(0.0, time[-1], step), time, along), rest])
+    moving = np.interp(np.arange(0.0, time[-1], step), time, along)
+    before = np.zeros(round(_REST / step))
+    after = np.full(round(max(2 * turn_time, _REST) / step), along[-1])  # until the nose is there
+    arc = np.concatenate([before, moving, after])
     arc = _smooth(arc, round(0.3 / step))
     position = np.stack([np.interp(arc, along, axis) for axis in points.T], axis=1)
     position = np.apply_along_axis(_smooth, 0, position, round(0.3 / step))

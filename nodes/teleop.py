@@ -78,12 +78,12 @@ class Keys(NodeConfig):
             for key in getattr(self, action).split():
                 if key not in KEYS:
                     raise ValueError(
-                        f"expected names of keys, such as w, 7, space or page_up, for {action} "
-                        f"(not {key!r}{suggest(key, KEYS)})"
+                        f"expected names of keys, such as w, 7, space or page_up, for {action}; "
+                        f"there is no {key!r}{suggest(key, KEYS)}"
                     )
                 if key in found:
                     raise ValueError(
-                        f"expected a key of its own for {action} ({key!r} is for {found[key]})"
+                        f"expected a key of its own for {action}; {key!r} is for {found[key]}"
                     )
                 found[key] = action
         return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import math
 from typing import Annotated
 
@@ -11,7 +10,7 @@ import msgspec
 import numpy as np
 
 from events import (
-    Event,
+    Command,
     Hover,
     Land,
     Landed,
@@ -56,7 +55,7 @@ class TourConfig(NodeConfig):
 class Tour(Node[TourConfig]):
     """Flies a vehicle along waypoints, looking where it goes."""
 
-    orders = Output(Event)
+    orders = Output(Command)
     setpoints = Output(PositionSetpoint)
     end = Output(Shutdown)
 
@@ -93,8 +92,9 @@ class Tour(Node[TourConfig]):
         self.orders.send(Takeoff(stamp=clock.now(), source=name, altitude=max(height, 0.5)))
         await self._taken_off.wait()
         path = await self.offload(self._plan, self._here)
-        self.log.info("a path of %.1f m in %.1f s", path.length, path.seconds)
-        await self._follow(path)
+        if path is not None:
+            self.log.info("a path of %.1f m in %.1f s", path.length, path.seconds)
+            await self._follow(path)
         self.orders.send(Hover(stamp=clock.now(), source=name))
         self.orders.send(Land(stamp=clock.now(), source=name))
         await self._landed.wait()
@@ -103,13 +103,18 @@ class Tour(Node[TourConfig]):
         if self.config.end_run:
             self.end.send(Shutdown(stamp=clock.now(), source=name, reason="tour flown"))
 
-    def _plan(self, start: Odometry) -> Path:
+    def _plan(self, start: Odometry) -> Path | None:
+        """Return the path from here; `None` if the only waypoint is where the vehicle is."""
         config = self.config
         w, x, y, z = start.orientation
-        points = [start.position, *config.waypoints]
-        far = [b for a, b in itertools.pairwise(points) if math.dist(a, b) > 0.05]
+        points = [start.position]
+        for place in config.waypoints:
+            if math.dist(points[-1], place) > 0.05:
+                points.append(place)
+        if len(points) == 1:
+            return None
         return plan(
-            np.array([start.position, *far]),
+            np.array(points),
             speed=config.speed,
             acceleration=config.acceleration,
             radius=config.corner,

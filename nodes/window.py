@@ -151,13 +151,14 @@ class Window:
         return _LABELS.get(label.lower(), position)
 
     def _on_focus(self, _: Any, focused: int) -> None:
-        if not focused:  # nobody will say when they come up, and a stuck key flies a vehicle away
+        # Nobody will say when they come up, and a stuck key flies a vehicle away. GLFW releases
+        # the keys that it knows, after this.
+        if not focused:
             self._happened += [Key(name, down=False) for name in self._held.values()]
             self._held.clear()
 
     def _on_close(self, _: Any) -> None:
-        self._happened.append(Close())
-        self._glfw.set_window_should_close(self._window, False)  # the run decides, not GLFW
+        self._happened.append(Close())  # and the window stays until the run ends
 
     def _on_size(self, _: Any, width: int, height: int) -> None:
         self._happened.append(Size(width, height))

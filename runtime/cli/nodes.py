@@ -40,8 +40,6 @@ def nodes(
 def _describe(name: str, cls: type[Node[Any]]) -> Tree:
     import inspect
 
-    import msgspec
-    from rich.markup import escape
     from rich.tree import Tree
 
     from runtime.graph import heard_types
@@ -55,10 +53,29 @@ def _describe(name: str, cls: type[Node[Any]]) -> Tree:
     for method, ticks in cls.declared.ticks.items():
         rate = f"{ticks.hz:g} Hz" if isinstance(ticks.hz, float | int) else f"the rate {ticks.hz!r}"
         tree.add(f"calls {method} at {rate}")
-    for field in msgspec.structs.fields(cls.config_type):
-        default = "required" if field.required else f"= {_default(field)}"
-        tree.add(escape(f"setting {field.encode_name}: {_type_name(field.type)} {default}"))
+    _add_settings(tree, cls.config_type)
     return tree
+
+
+def _add_settings(tree: Tree, config: type[Any]) -> None:
+    """Add a line a setting, and below it the settings of a table or of a list of tables."""
+    import msgspec
+    from rich.markup import escape
+
+    for field in msgspec.structs.fields(config):
+        inner = _struct(field.type)
+        default = "required" if field.required else "" if inner else f"= {_default(field)}"
+        line = f"setting {field.encode_name}: {_type_name(field.type)} {default}"
+        branch = tree.add(escape(line.rstrip()))
+        if inner is not None:
+            _add_settings(branch, inner)
+
+
+def _struct(type_: Any) -> type[Any] | None:
+    """Return the struct that a type is or holds."""
+    if hasattr(type_, "__struct_fields__"):
+        return type_  # type: ignore[no-any-return]
+    return next((s for a in getattr(type_, "__args__", ()) if (s := _struct(a))), None)
 
 
 def _default(field: Any) -> str:
@@ -74,4 +91,8 @@ def _type_name(type_: Any) -> str:
         return _type_name(type_.__origin__)
     if isinstance(type_, type) and not getattr(type_, "__args__", None):
         return type_.__name__
-    return str(type_).replace("typing.", "")
+    inner = ", ".join("…" if a is ... else _type_name(a) for a in getattr(type_, "__args__", ()))
+    name = {"tuple": "list of ", "Literal": "one of ", "Union": "", "UnionType": ""}.get(
+        getattr(getattr(type_, "__origin__", type_), "__name__", type(type_).__name__)
+    )
+    return f"{name}{inner}" if name is not None else repr(type_)

@@ -13,26 +13,18 @@ import msgspec
 
 from events import (
     Announcement,
-    Arm,
-    AttitudeSetpoint,
-    BodyRateSetpoint,
     Collision,
+    Command,
     DepthImage,
-    Disarm,
-    Event,
-    Hover,
     Image,
     Imu,
     ImuAnnouncement,
-    Land,
     Odometry,
     PoseStamped,
-    PositionSetpoint,
     SegmentationImage,
-    Takeoff,
+    Setpoint,
     VehicleAnnouncement,
     VehicleEvent,
-    VelocitySetpoint,
 )
 from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
 from sims.cameras import CameraSpec, add_camera
@@ -161,14 +153,14 @@ class Multirotor(Node[MultirotorConfig]):
         )
         yield from self._rig.announcements(FRAME)
 
-    @on(Arm, Disarm, Takeoff, Land, Hover)
-    def command(self, event: Event) -> None:
+    @on(Command)
+    def command(self, event: Command) -> None:
         """Obey, or say why not."""
         if reason := self._autopilot.command(event):
             self.log.warning("%s refused: %s", type(event).__name__, reason)
 
-    @on(PositionSetpoint, VelocitySetpoint, AttitudeSetpoint, BodyRateSetpoint)
-    def setpoint(self, event: Event) -> None:
+    @on(Setpoint)
+    def setpoint(self, event: Setpoint) -> None:
         """Follow it; say why not at the first of a row of refused ones."""
         reason = self._autopilot.command(event) or ""
         if reason and reason != self._refused:

@@ -1,0 +1,173 @@
+"""``RESULTS.md``: what the numbers do not show, then the numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from bench.driver import Row
+from bench.tables import number
+
+if TYPE_CHECKING:
+    from bench.suite import Results
+
+CAVEATS = """\
+# Results
+
+Made by `make bench`; do not edit.
+
+## What these numbers do not show
+
+- **Latency inside one process is not what a rig mostly waits for.** An estimator that takes 15 ms
+  a frame hides every microsecond below. What counts more is that nothing waits for it: see the
+  table of stalls.
+- **Systems differ in what they do for their time.** ROS, Zenoh, DDS and their like cross processes
+  and machines, serialise, discover and survive each other's crashes; a function call does none of
+  it. Rows of one process and of several are in tables of their own.
+- **Ours are measured without a fingerprint of the events**, as real-time runs are. In lockstep
+  each event is hashed, too: rows named *fingerprinted*.
+- **Synchronous delivery has a price:** `send` returns when all receivers have run. A slow handler
+  is slow for its sender.
+- **C++ in one process is out of reach** of anything in Python but delivery to one addressed
+  receiver among many.
+- **The machine is small, shared and noisy.** Compare rows of one table; they were measured
+  interleaved, in one run. Do not compare absolute times with other machines'.
+- Pings never overlap, so nothing here is about throughput under load, except the table of that
+  name. The first round trips of each process are left out: start-up costs do not show.
+"""
+
+
+def page(results: Results, pictures: Sequence[str]) -> str:
+    """Return the whole page as Markdown."""
+    parts = [CAVEATS, "\n".join(_goals(results)), "\n".join(_stall(results))]
+    parts += ["\n".join(_lockstep(results)), "\n".join(_throughput(results))]
+    for case, title in (
+        ("small", "Small message"),
+        ("large", "Large message (4.67 MB), copied"),
+        ("large-shared", "Large message, by reference or shared memory"),
+    ):
+        parts.append("\n".join(_latency(results.rows, case, title, pictures)))
+    parts.append("\n".join(_measured(results)))
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def _median(rows: Iterable[Row], case: str, system: str, mode: str, nodes: int) -> float | None:
+    for r in rows:
+        if (r.case, r.system, r.mode, r.nodes) == (case, system, mode, nodes):
+            return r.median_us
+    return None
+
+
+def _goals(results: Results) -> Iterator[str]:
+    """Compare with the marks that the project sets itself, as ratios of medians."""
+    rows = results.rows
+    yield "## In short\n"
+    yield "Ratios of medians of this run.\n"
+    yield "| what | beside | N | ratio | mark |"
+    yield "|---|---|--:|--:|--:|"
+    nodes = sorted({r.nodes for r in rows if r.case == "small"})
+    comparisons = [
+        ("small, handlers", "handler", "plain calls", "handler", nodes, "≤ 1.3"),
+        ("small, streams", "stream", "asyncio.Queue (uvloop)", "stream", (2, 16, 128), "≤ 0.33"),
+        ("small, handlers", "handler", "thesis client", "handler", (2, 16, 64, 128), "as it is"),
+        ("small, addressed", "routed", "thesis client", "handler", (2, 16, 64, 128), "as it is"),
+    ]
+    for what, mode, peer, peer_mode, counts, mark in comparisons:
+        for n in counts:
+            ours = _median(rows, "small", "visnav", mode, n)
+            theirs = _median(rows, "small", peer, peer_mode, n)
+            if ours and theirs:
+                yield f"| {what} | {peer} | {n} | {ours / theirs:.2f} | {mark} |"
+    first = _median(rows, "small", "visnav", "routed", nodes[0])
+    last = _median(rows, "small", "visnav", "routed", nodes[-1])
+    if first and last:
+        yield f"| small, addressed | itself at N = {nodes[0]} | {nodes[-1]} | {last / first:.2f} | ≤ 1.2 |"  # noqa: E501
+    for case, peer, mark in (("large-shared", "small", "≤ 1.1"), ("large", "plain calls", "≤ 1.1")):
+        ours = _median(rows, case, "visnav", "handler", 2)
+        theirs = (
+            _median(rows, "small", "visnav", "handler", 2)
+            if peer == "small"
+            else _median(rows, "large", "plain calls", "handler", 2)
+        )
+        if ours and theirs:
+            name = "our small message" if peer == "small" else "a copy and a plain call"
+            yield f"| {case}, handlers | {name} | 2 | {ours / theirs:.2f} | {mark} |"
+    by_mode = {row.mode: row for row in results.stall}
+    ratio = by_mode["worker"].late_p99_us / by_mode["none"].late_p99_us
+    yield f"| p99 lateness of a 400 Hz tick, camera in a worker | no camera | | {ratio:.2f} | ≤ 1.25 |"  # noqa: E501
+    yield f"| processor time of a 100 Hz timer | one core | | {results.idle.cpu_percent:.2f} % | ≤ 1 % |"  # noqa: E501
+    yield ""
+
+
+def _stall(results: Results) -> Iterator[str]:
+    yield "## Stalls: lateness of a 400 Hz tick while a 512×512 RGB-D camera runs at 10 Hz\n"
+    yield "| camera | late p50 µs | p99 µs | max µs | between ticks: mean ms | median | sd | missed | fetch ms |"  # noqa: E501
+    yield "|---|--:|--:|--:|--:|--:|--:|--:|--:|"
+    for r in results.stall:
+        fetch = f"{r.fetch_ms_median:.1f}" if r.frames else ""
+        yield (
+            f"| {r.mode} | {r.late_p50_us:.0f} | {r.late_p99_us:.0f} | {r.late_max_us:.0f} "
+            f"| {r.update_mean_ms:.2f} | {r.update_median_ms:.2f} | {r.update_sd_ms:.2f} "
+            f"| {r.missed} | {fetch} |"
+        )
+    yield ""
+
+
+def _lockstep(results: Results) -> Iterator[str]:
+    yield "## Simulated time\n"
+    yield "1 kHz physics, 400 Hz control, 200 Hz IMU; the camera is 512×512 RGB-D at 30 Hz.\n"
+    yield "| case | simulated seconds a second | the runtime's own share of the time |"
+    yield "|---|--:|--:|"
+    for r in results.lockstep:
+        share = "" if r.share is None else f"{r.share:.0%}"
+        yield f"| {r.case} | {r.speed:.1f} | {share} |"
+    yield ""
+
+
+def _throughput(results: Results) -> Iterator[str]:
+    yield "## Throughput\n"
+    yield "| what | at once | µs each | a second | MB a second |"
+    yield "|---|--:|--:|--:|--:|"
+    for r in results.throughput:
+        size = f"{r.bytes_per_second / 1e6:,.0f}" if r.bytes_per_second else ""
+        yield (
+            f"| {r.case} | {r.batch} | {number(r.per_event_us)} "
+            f"| {r.events_per_second:,.0f} | {size} |"
+        )
+    yield ""
+
+
+def _latency(rows: Sequence[Row], case: str, title: str, pictures: Sequence[str]) -> Iterator[str]:
+    yield f"## {title}: median round trip, µs\n"
+    for place in ("one process", "processes"):
+        own = [r for r in rows if r.case == case and r.place == place]
+        if not own:
+            continue
+        nodes = sorted({r.nodes for r in own})
+        yield f"Nodes in {'one process' if place == 'one process' else 'processes of their own'}:\n"
+        yield f"| system | mode | {' | '.join(map(str, nodes))} |"
+        yield f"|---|---|{'--:|' * len(nodes)}"
+        by_system: dict[tuple[str, str], dict[int, float]] = {}
+        for r in own:
+            by_system.setdefault((r.system, r.mode), {})[r.nodes] = r.median_us
+        for (system, mode), medians in sorted(by_system.items(), key=lambda s: min(s[1].values())):
+            cells = " | ".join(number(medians.get(n)) for n in nodes)
+            yield f"| {system} | {mode} | {cells} |"
+        yield ""
+    for picture in pictures:
+        if picture.startswith(f"{case}-") and picture.removeprefix(f"{case}-")[0] in "s1234567890":
+            yield f"![{picture.removesuffix('.png')}]({picture})\n"
+
+
+def _measured(results: Results) -> Iterator[str]:
+    yield "## Measured with\n"
+    for key, value in results.environment.items():
+        yield f"- {key}: {value}"
+    for system, version in results.versions.items():
+        if version and not system.startswith("visnav"):
+            yield f"- {system}: {version}"
+    if results.missing:
+        yield "\nNot measured:\n"
+        for system, reason in results.missing.items():
+            yield f"- {system}: {reason}"
+    yield ""

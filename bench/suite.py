@@ -1,0 +1,104 @@
+"""All benchmarks in one go, and the page that shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from bench import idle, lockstep, stall, throughput
+from bench.driver import Outcome, Row, measure_all
+from bench.page import page
+from bench.plots import plot_boxes, plot_scaling
+from bench.results import environment
+from bench.system import NODES, CaseName
+
+
+class Results(msgspec.Struct, frozen=True, kw_only=True):
+    """Everything that was measured; the content of ``results.json``."""
+
+    environment: dict[str, str]
+    quick: bool
+    rows: list[Row]
+    stall: list[stall.StallRow]
+    throughput: list[throughput.ThroughputRow]
+    idle: idle.IdleRow
+    lockstep: list[lockstep.LockstepRow]
+    missing: dict[str, str]
+    versions: dict[str, str]
+
+
+QUICK_SYSTEMS = ("visnav", "plain", "asyncio.queue", "pyee", "thesis")
+"""Parts of the names of what a quick run measures: what is quick to start."""
+
+
+def run(out: Path, *, quick: bool, progress: Callable[..., None] = lambda *_: None) -> Results:
+    """Measure everything and write results.json, RESULTS.md and the plots.
+
+    Args:
+        out: Folder, made if missing.
+        quick: Measure less: under two minutes.
+        progress: Told what is being measured, and the share of its part that is done.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    few = (2, 16, 128)
+    outcomes: list[Outcome] = []
+    cases: list[tuple[CaseName, Sequence[int]]] = [
+        ("small", few if quick else NODES),
+        ("large", (2,) if quick else few),
+        ("large-shared", (2,) if quick else few),
+    ]
+    for case, nodes in cases:
+        outcome = measure_all(
+            case,
+            nodes=nodes,
+            samples=20_000 if case == "small" else 1_000,
+            warm_up=2_000 if case == "small" else 100,
+            repeats=2 if quick else 3,
+            only=QUICK_SYSTEMS if quick else (),
+            budget=0.3 if quick else 1.0,
+            progress=progress,
+        )
+        outcomes.append(outcome)
+    progress("throughput")
+    through = throughput.measure()
+    progress("idle")
+    idling = idle.measure(3.0 if quick else 10.0)
+    results = Results(
+        environment=environment(),
+        quick=quick,
+        rows=[row for outcome in outcomes for row in outcome.rows],
+        stall=stall.measure(
+            seconds=2.0 if quick else 6.0, repeats=2 if quick else 5, progress=progress
+        ),
+        throughput=through,
+        idle=idling,
+        lockstep=lockstep.measure(repeats=2 if quick else 5, progress=progress),
+        missing={k: v for outcome in outcomes for k, v in outcome.missing.items()},
+        versions={k: v for outcome in outcomes for k, v in outcome.versions.items()},
+    )
+    write(results, out)
+    return results
+
+
+def write(results: Results, out: Path) -> None:
+    """Write the page of results, its plots, and the figures themselves."""
+    encoded = msgspec.json.format(msgspec.json.encode(results), indent=1)
+    (out / "results.json").write_bytes(encoded + b"\n")
+    pictures = list(_plots(results.rows, out))
+    (out / "RESULTS.md").write_text(page(results, pictures), encoding="utf-8")
+
+
+def _plots(rows: Sequence[Row], out: Path) -> Any:
+    for case in dict.fromkeys(row.case for row in rows):
+        own = [row for row in rows if row.case == case]
+        if len({row.nodes for row in own}) > 1:
+            plot_scaling(own, f"{case} message", out / f"{case}-scaling.png")
+            yield f"{case}-scaling.png"
+        for n in (2, 128):
+            boxed = [row for row in own if row.nodes == n]
+            if boxed:
+                plot_boxes(boxed, f"{case} message, {n} nodes", out / f"{case}-{n}.png")
+                yield f"{case}-{n}.png"
