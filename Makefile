@@ -20,16 +20,18 @@ $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet -e '.[dev]'
-	@sh tools/install_gl.sh $(BIN)/python
+	@sh tools/system_packages.sh gl $(BIN)/python
 	@touch $@
 
 demo: $(READY)  ## Fly the standard tour and leave its results in runs/tour.
 	$(BIN)/python -m runtime run config.toml
 
 test: $(READY)  ## Run the quick tests.
+	@sh tools/system_packages.sh display
 	$(BIN)/python -m pytest -m 'not slow'
 
 test-all: $(READY)  ## Run all tests.
+	@sh tools/system_packages.sh display
 	$(BIN)/python -m pytest
 
 check: $(READY)  ## Check style and types.

@@ -1,0 +1,7 @@
+"""The display of the tests of windows, for the example that has one."""
+
+from __future__ import annotations
+
+from tests.nodes.conftest import display
+
+__all__ = ["display"]

@@ -1,0 +1,26 @@
+#!/bin/sh
+# Install system packages that are missing, if we may; otherwise say which.
+# Usage: system_packages.sh gl PYTHON     what MuJoCo renders with, without a screen
+#        system_packages.sh display       what the tests of windows need
+set -u
+
+has_what_it_takes() {
+    case "$1" in
+    gl) "$2" -c 'from sims.cameras.graphics import open_context; open_context(8, 8, 1).free()' ;;
+    display) command -v Xvfb && command -v xdotool ;;
+    esac >/dev/null 2>&1
+}
+
+case "$1" in
+gl) packages="libegl1 libgl1 libgl1-mesa-dri" without="MuJoCo cannot render" ;;
+display) packages="xvfb xdotool" without="tests of windows are skipped" ;;
+esac
+
+has_what_it_takes "$@" && exit 0
+if command -v apt-get >/dev/null && [ "$(id -u)" = 0 ]; then
+    apt-get update -qq >/dev/null
+    # shellcheck disable=SC2086  # a list of packages
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $packages >/dev/null
+    has_what_it_takes "$@" && exit 0
+fi
+echo "Without $packages, $without. On Debian or Ubuntu: sudo apt-get install $packages" >&2
