@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check fix bench bench-quick pictures clean
+.PHONY: help setup demo test test-all check fix peers bench bench-quick pictures clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -42,6 +42,10 @@ check: $(READY)  ## Check style and types.
 fix: $(READY)  ## Mend what style checks can mend.
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+peers: $(READY)  ## Install what the benchmarks compare with (PyPI, and Debian's ROS 1 and C++).
+	$(BIN)/python -m pip install --quiet -e '.[peers]'
+	@sh tools/system_packages.sh peers
 
 bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (about 20 minutes).
 	$(BIN)/python -m runtime bench all --out bench/results

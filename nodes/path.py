@@ -71,8 +71,7 @@ def plan(
             where it goes.
         step: Seconds between rows.
     """
-    points = _resample(_round_corners(waypoints, radius), _SPACING)
-    along = _arc_length(points)
+    points, along = _resample(_round_corners(waypoints, radius), _SPACING)
     pace = _speeds(points, along, speed, acceleration)
     # Time at each point: each stretch at the mean of its ends' speeds.
     time = np.concatenate([[0.0], np.cumsum(np.diff(along) / ((pace[1:] + pace[:-1]) / 2))])
@@ -115,11 +114,12 @@ def _arc_length(points: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
-def _resample(points: Floats, spacing: float) -> Floats:
+def _resample(points: Floats, spacing: float) -> tuple[Floats, Floats]:
+    """Return points at equal distances along the path, and those distances."""
     along = _arc_length(points)
     keep = np.concatenate([[True], np.diff(along) > 0])
     at = np.linspace(0.0, along[-1], max(int(along[-1] / spacing), 2))
-    return np.stack([np.interp(at, along[keep], axis) for axis in points[keep].T], axis=1)
+    return np.stack([np.interp(at, along[keep], axis) for axis in points[keep].T], axis=1), at
 
 
 def _speeds(points: Floats, along: Floats, speed: float, acceleration: float) -> Floats:

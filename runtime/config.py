@@ -341,7 +341,7 @@ def _explain(message: str, value: Any, type_: type[msgspec.Struct], where: str) 
     if match := re.fullmatch(r"Object contains unknown field `(.*)`", text):
         known = _fields_at(type_, path)
         listed = ", ".join(known) or "no settings"
-        found = f"found unknown key {_show(match[1])}" + suggest(match[1], known)
+        found = f"found unknown key {match[1]!r}" + suggest(match[1], known)
         return f"{place}: expected one of {listed}; {found}"
     if match := re.fullmatch(r"Object missing required field `(.*)`", text):
         return f"{place}: expected a setting {_show(match[1])}, found none"

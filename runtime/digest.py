@@ -23,7 +23,10 @@ class Digest:
 
     def __init__(self) -> None:
         self._hash = xxhash.xxh3_128()
-        self._encode_into = msgspec.msgpack.Encoder(enc_hook=_encode_array).encode_into
+        self._encode_into = msgspec.msgpack.Encoder(
+            enc_hook=_encode_array,
+            order="deterministic",  # equal sets and mappings are encoded equally
+        ).encode_into
         self._pending = bytearray()
 
     def __call__(self, sender: Sender[Any] | None, event: Event) -> None:  # noqa: ARG002

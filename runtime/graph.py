@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from runtime.node import Node, senders
-from runtime.sender import Fault, Listener, Tap
+from runtime.sender import Listener, Tap
+from runtime.steps import Fault
 
 Sources = Mapping[str, Mapping[str, str]]
 """Node to port to the source that the port is narrowed to."""

@@ -17,7 +17,8 @@ async def real_time_limit(seconds: float) -> AsyncIterator[None]:
     loop = asyncio.get_running_loop()
     task = asyncio.current_task()
     assert task is not None
-    expired = False
+    cancelled_before = task.cancelling()
+    expired = cancelled = False
 
     def expire() -> None:
         nonlocal expired
@@ -36,9 +37,10 @@ async def real_time_limit(seconds: float) -> AsyncIterator[None]:
     try:
         yield
     except asyncio.CancelledError:
-        if expired and task.uncancel() == 0:
-            raise TimeoutError from None
+        cancelled = True
         raise
     finally:
         over = True
         timer.cancel()
+        if expired and task.uncancel() <= cancelled_before and cancelled:
+            raise TimeoutError from None

@@ -17,6 +17,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import contextvars
 import heapq
 import itertools
 import selectors
@@ -49,6 +50,18 @@ class _JumpingSelector(selectors.DefaultSelector):
         return super().select(timeout)
 
 
+class _Timer(asyncio.TimerHandle):
+    """A timer that comes after those set before it for the same time; a bare heap mixes them."""
+
+    __slots__ = ("order",)
+
+    order: int
+
+    def __lt__(self, other: _Timer) -> bool:  # type: ignore[override]
+        mine, others = self.when(), other.when()
+        return mine < others or (mine == others and self.order < other.order)
+
+
 class LockstepLoop(asyncio.SelectorEventLoop):
     """A loop on simulated time.
 
@@ -74,6 +87,21 @@ class LockstepLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         """Return simulated seconds."""
         return self.now / SECOND
+
+    def call_at(  # type: ignore[override]
+        self,
+        when: float,
+        callback: Callable[..., Any],
+        *args: Any,
+        context: contextvars.Context | None = None,
+    ) -> asyncio.TimerHandle:
+        """Call a function at a simulated time, after what was set for that time before."""
+        self._check_closed()  # type: ignore[attr-defined]
+        timer = _Timer(when, callback, args, self, context)
+        timer.order = next(self._orders)
+        timer._scheduled = True  # type: ignore[attr-defined]  # it is in the heap
+        heapq.heappush(self._scheduled, timer)  # type: ignore[attr-defined]
+        return timer
 
     def hold(self, work: _Work, due: int) -> asyncio.Future[Any]:
         """Return a future that gets the outcome of `work` at simulated time `due`, exactly."""
@@ -117,10 +145,11 @@ class LockstepLoop(asyncio.SelectorEventLoop):
             elif self._pace and (events := self._wait_until(due)):
                 return events
             if timer <= due:
-                self.now = due
+                if not timers[0].cancelled():  # the loop throws those out
+                    self.now = due
                 return []
             if held <= due:
-                if not held_work[0][2].done():
+                if not (held_work[0][2].done() or held_work[0][3].cancelled()):
                     return wait(None)
                 self.now = due
                 _, _, work, future = heapq.heappop(held_work)

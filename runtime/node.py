@@ -13,7 +13,7 @@ import functools
 import zlib
 from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
-from typing import Any, ClassVar, Generic, ParamSpec, Protocol, dataclass_transform, get_origin
+from typing import Any, ClassVar, Generic, ParamSpec, Protocol, dataclass_transform, get_args
 
 import msgspec
 import numpy as np
@@ -124,9 +124,10 @@ class Node(Generic[C]):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        for base in getattr(cls, "__orig_bases__", ()):
-            if get_origin(base) is Node and isinstance(base.__args__[0], type):
-                cls.config_type = base.__args__[0]
+        for base in vars(cls).get("__orig_bases__", ()):
+            for argument in get_args(base):
+                if isinstance(argument, type) and issubclass(argument, NodeConfig):
+                    cls.config_type = argument
         cls.declared = _declared(cls)
 
     # Phases, in order. Override those you need.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import ctypes
+import math
 import os
 import sys
 import time
@@ -88,7 +89,7 @@ class RealClock(Clock):
 
     def _set_alarm(self, due: int) -> None:
         if self._origin is not None:
-            self._alarm.set(self._origin + int(due / self._speed))
+            self._alarm.set(self._origin + math.ceil(due / self._speed))
 
 
 class TimerFd:

@@ -64,20 +64,24 @@ class Schedule:
         """Run the entry due first; it keeps its place among its equals when it comes again."""
         heap = self.heap
         item = due, order, entry = heap[0]
-        again = entry.fire(due, now)
-        if heap[0] is not item:  # it added something for an earlier time
-            heap.remove(item)
-            heapq.heapify(heap)
-            heapq.heappush(heap, item := (-1, order, entry))
-        if again is None:
-            heapq.heappop(heap)
-        else:
-            heapq.heapreplace(heap, (again, order, entry))
+        again = None
+        try:
+            again = entry.fire(due, now)
+        finally:
+            if heap[0] is not item:  # it added something for an earlier time
+                heap.remove(item)
+                heapq.heapify(heap)
+                heapq.heappush(heap, item := (-1, order, entry))
+            if again is None:
+                heapq.heappop(heap)
+            else:
+                heapq.heapreplace(heap, (again, order, entry))
 
     def run_due(self, now: Callable[[], int]) -> None:
-        """Run all that is due by now, in order."""
-        while self.heap and self.heap[0][0] <= (time := now()):
-            self.run_first(time)
+        """Run all that is due by now, in order; what falls due meanwhile is left for later."""
+        limit = now()
+        while self.heap and self.heap[0][0] <= limit:
+            self.run_first(now())
 
     def _push(self, item: tuple[int, int, Entry]) -> None:
         heapq.heappush(self.heap, item)
@@ -141,7 +145,7 @@ class Ticker:
         self.missed: int = before.missed if before else 0
         self.late: Lateness = before.late if before else Lateness()
         self.stopped = False
-        self._hz = Fraction(hz).limit_denominator(1_000_000)
+        self._hz = Fraction(hz).limit_denominator(1_000_000) or Fraction(hz)
         self._period = SECOND * self._hz.denominator  # times the numerator: an integer
         self._call = call
         self._fault = fault

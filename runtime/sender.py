@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from events import Event
 from runtime.errors import ChannelClosedError
+from runtime.steps import FanOut, Fault
 from runtime.streams import Stream
 
 T = TypeVar("T", bound=Event)
@@ -23,9 +24,6 @@ Deliver = Callable[[Any], Any]
 Tap = Callable[["Sender[Any] | None", Event], None]
 """Sees every event before its listeners do: the digest, the event log. (An announcement has no
 sender.)"""
-
-Fault = Callable[[Deliver, Exception], None]
-"""Told which listener raised what; the delivery then goes on."""
 
 
 class Sender(Generic[T]):
@@ -44,6 +42,7 @@ class Sender(Generic[T]):
         "_routes",
         "_sent",
         "_taps",
+        "_to_streams",
         "_waiting",
         "event",
         "name",
@@ -58,6 +57,7 @@ class Sender(Generic[T]):
         """Deliver an event now; True if a handler ended the delivery."""
         self._deliver: Callable[[T], bool] = self._refuse
         self._listeners: tuple[Deliver, ...] = ()
+        self._to_streams = FanOut(())
         self._candidates: tuple[Listener, ...] = ()
         self._routes: dict[tuple[type[Event], str], Route] = {}
         self._waiting: tuple[Stream[Any], ...] = ()
@@ -84,26 +84,33 @@ class Sender(Generic[T]):
             c.hears_all(self.event) for c in self._candidates
         ):
             self._deliver = self._send_to_all
+            streams = tuple(c.stream for c in self._candidates if c.stream and not c.stream.soon)
+            if streams and len(streams) == len(self._candidates):
+                self._to_streams, before = FanOut(streams, self._fault), self._to_streams
+                self._to_streams.sent = before.sent
+                self._deliver = self._to_streams.send
         self.send = self._send_tapped if self._taps else self._deliver
 
     def send_soon(self, event: T) -> None:
         """Deliver an event when the loop next turns; the sender goes on at once."""
-        asyncio.get_running_loop().call_soon(self.send, event)
+        asyncio.get_running_loop().call_soon(lambda: self.send(event))
 
     async def send_wait(self, event: T) -> bool:
         """Wait until every input declared with ``overflow="wait"`` has room, then send."""
-        for stream in self._waiting:
-            await stream.wait_for_room()
+        while not all(stream.has_room() for stream in self._waiting):
+            for stream in self._waiting:
+                await stream.wait_for_room()
         return self.send(event)
 
     def _send_to_all(self, event: T) -> bool:
         self._sent += 1
+        listeners = self._listeners  # a listener may connect anew meanwhile
         try:
-            for deliver in self._listeners:
+            for deliver in listeners:
                 if deliver(event):
                     return True
         except Exception as error:
-            return self._go_on(self._listeners, deliver, error, event)
+            return self._go_on(listeners, deliver, error, event)
         return False
 
     def _send_routed(self, event: T) -> bool:
@@ -112,12 +119,13 @@ class Sender(Generic[T]):
         except KeyError:
             route = self._route(type(event), event.source)
         route.sent += 1
+        listeners = route.listeners
         try:
-            for deliver in route.listeners:
+            for deliver in listeners:
                 if deliver(event):
                     return True
         except Exception as error:
-            return self._go_on(route.listeners, deliver, error, event)
+            return self._go_on(listeners, deliver, error, event)
         return False
 
     def _send_tapped(self, event: T) -> bool:
@@ -136,7 +144,7 @@ class Sender(Generic[T]):
 
     def sent(self) -> Counter[type[Event]]:
         """Count what was sent, by type."""
-        counts: Counter[type[Event]] = Counter({self.event: self._sent})
+        counts: Counter[type[Event]] = Counter({self.event: self._sent + self._to_streams.sent})
         for route in self._routes.values():
             counts[route.key[0]] += route.sent
         return +counts

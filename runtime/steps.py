@@ -16,7 +16,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import sys
-from collections.abc import Coroutine, Generator
+from collections.abc import Callable, Coroutine, Generator
 from typing import Any
 
 from runtime.streams import Stream
@@ -24,6 +24,9 @@ from runtime.streams import Stream
 DEPTH_LIMIT = 32
 """Resumptions nested deeper go through the loop: a relay of hundreds must not overflow the
 stack, nor keep the loop to itself."""
+
+Fault = Callable[[Callable[[Any], Any], Exception], None]
+"""Told which listener raised what; the delivery then goes on."""
 
 _NOTHING: Any = object()
 _depth = 0
@@ -36,6 +39,10 @@ if sys.version_info >= (3, 14):
 
         get = staticmethod(asyncio.current_task)
         __setitem__ = staticmethod(_swap_current_task)
+
+        @staticmethod
+        def pop(loop: asyncio.AbstractEventLoop, _: None) -> None:
+            _swap_current_task(loop, None)
 
     _current_tasks: Any = _CurrentTasks()
 else:
@@ -91,31 +98,10 @@ class Steps(Coroutine[Any, Any, Any]):
 
     def resume(self, event: Any) -> None:
         """Step the coroutine now; called by the stream on which it is parked."""
-        global _depth
-        if _depth >= DEPTH_LIMIT:
-            self._stream.keep(event)  # type: ignore[union-attr]
-            self.resume_soon()
-            return
-        loop = self._loop
-        sender = _current_tasks.get(loop)
-        _depth += 1
-        _current_tasks[loop] = self._task
-        try:
-            waits_for = self._run(self._step, event)
-        except BaseException as error:
-            self._hand_over(error)
-        else:
-            if type(waits_for) is Stream:
-                self._stream = waits_for
-                waits_for.waiter = self
-            else:
-                self._hand_over(waits_for)
-        finally:
-            if sender is None:
-                del _current_tasks[loop]
-            else:
-                _current_tasks[loop] = sender
-            _depth -= 1
+        stream = self._stream
+        assert stream is not None
+        stream.waiter = self
+        FanOut((stream,)).send(event)
 
     def resume_soon(self) -> None:
         """Step the coroutine when the loop next turns."""
@@ -123,7 +109,7 @@ class Steps(Coroutine[Any, Any, Any]):
 
     def _resume_later(self) -> None:
         self._later = None
-        self.resume(None)
+        FanOut((_WakeUp(self),)).send(None)  # not the stream: another reader may wait there now
 
     def leave_stream(self) -> None:
         """Be resumed by no stream any more: the task is being cancelled."""
@@ -191,6 +177,100 @@ class Steps(Coroutine[Any, Any, Any]):
     cr_code = property(lambda self: self._coro.cr_code)
     cr_running = property(lambda self: self._coro.cr_running)
     cr_await = property(lambda self: self._coro.cr_await)
+
+
+class _WakeUp:
+    """Stands for a stream whose reader is to look into the buffer again."""
+
+    __slots__ = ("waiter",)
+
+    def __init__(self, waiter: Steps) -> None:
+        self.waiter: Steps | None = waiter
+
+
+class FanOut:
+    """Offers events to streams, in order, and steps the readers that wait.
+
+    Args:
+        streams: None of them declared with ``wake="soon"``.
+        fault: Told which stream could not take an event; without it, that is raised.
+
+    Attributes:
+        sent: How many events were offered.
+    """
+
+    __slots__ = ("_fault", "sent", "streams")
+
+    def __init__(
+        self, streams: tuple[Stream[Any] | _WakeUp, ...], fault: Fault | None = None
+    ) -> None:
+        self.streams: tuple[Any, ...] = streams
+        self.sent = 0
+        self._fault = fault
+
+    def send(self, event: Any) -> bool:
+        """Offer an event; return False, because a stream never ends a delivery.
+
+        One function does it all: a call or two a receiver would cost as much as the receivers.
+        """
+        global _depth
+        self.sent += 1
+        if _depth >= DEPTH_LIMIT:
+            for stream in self.streams:
+                try:
+                    stream.offer_soon(event)
+                except Exception as error:
+                    self._report(stream, error)
+            return False
+        tasks, loop, sender = _current_tasks, None, None
+        _depth += 1
+        try:
+            for stream in self.streams:
+                steps = stream.waiter
+                if type(steps) is not Steps:
+                    try:
+                        if steps is None:
+                            stream.keep(event)
+                        else:  # a task that is not ours
+                            stream.offer(event)
+                    except Exception as error:
+                        _set_current_task(loop, sender)
+                        self._report(stream, error)
+                    continue
+                stream.waiter = None
+                if loop is None:
+                    loop = steps._loop
+                    sender = tasks.get(loop)
+                tasks[loop] = steps._task
+                try:
+                    waits_for = steps._run(steps._step, event)
+                except BaseException as error:
+                    steps._hand_over(error)
+                    continue
+                if type(waits_for) is Stream:
+                    steps._stream = waits_for
+                    waits_for.waiter = steps
+                else:
+                    steps._hand_over(waits_for)
+        finally:
+            _depth -= 1
+            _set_current_task(loop, sender)
+        return False
+
+    def _report(self, stream: Stream[Any], error: Exception) -> None:
+        if self._fault is None:
+            raise error
+        self._fault(stream.offer, error)
+
+
+def _set_current_task(
+    loop: asyncio.AbstractEventLoop | None, task: asyncio.Task[Any] | None
+) -> None:
+    """Put a task back in its place as the running one; without a loop it never left that."""
+    if task is not None:
+        _current_tasks[loop] = task
+    elif loop is not None:
+        _current_tasks.pop(loop, None)
 
 
 def task_factory(

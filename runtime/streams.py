@@ -78,6 +78,7 @@ class Stream(Generic[T]):
         "offer",
         "overflow",
         "peak",
+        "soon",
         "waiter",
     )
 
@@ -87,9 +88,10 @@ class Stream(Generic[T]):
         self.name = name
         self.bound = bound
         self.overflow = overflow
+        self.soon = soon
         self.peak = 0
         self.dropped = 0
-        self.offer: Callable[[T], None] = self._offer_soon if soon else self._offer_now
+        self.offer: Callable[[T], None] = self.offer_soon if soon else self._offer_now
         self._buffer: deque[T] = deque()
         self.waiter: Waiter | None = None  # set by whoever a reader yielded this stream to
         self._taken = 0
@@ -103,8 +105,15 @@ class Stream(Generic[T]):
         return self
 
     @types.coroutine
-    def __anext__(self) -> Generator[Any, Any, T]:
-        """Wait for the next event and take it; a closed stream ends once it has been read."""
+    def receive(self) -> Generator[Any, Any, T]:
+        """Wait for the next event and take it.
+
+        Cancelling loses nothing: an event that comes afterwards is kept for the next call.
+
+        Raises:
+            ChannelClosedError: The stream is closed and has been read.
+            ChannelBusyError: Another coroutine waits here already.
+        """
         buffer = self._buffer
         if buffer:
             self._taken += 1
@@ -112,7 +121,7 @@ class Stream(Generic[T]):
                 yield
         while not buffer:
             if self._closed:
-                raise StopAsyncIteration
+                raise ChannelClosedError(f"{self.name} is closed")
             if self.waiter is not None:
                 raise ChannelBusyError(f"{self.name}: another coroutine waits here already")
             event = yield self  # the reader's driver becomes our `waiter`
@@ -123,19 +132,7 @@ class Stream(Generic[T]):
             self._room.set()
         return event
 
-    async def receive(self) -> T:
-        """Wait for the next event and take it.
-
-        Cancelling loses nothing: an event that comes afterwards is kept for the next call.
-
-        Raises:
-            ChannelClosedError: The stream is closed and has been read.
-            ChannelBusyError: Another coroutine waits here already.
-        """
-        try:
-            return await self.__anext__()
-        except StopAsyncIteration:
-            raise ChannelClosedError(f"{self.name} is closed") from None
+    __anext__ = receive
 
     def receive_nowait(self) -> T:
         """Take the next event if one waits.
@@ -163,7 +160,7 @@ class Stream(Generic[T]):
         self._seen = self._buffer[-1]
         return self._seen
 
-    # Writing. `offer` is one of the next two; it stands in an output's tuple of listeners, and
+    # Writing. `offer` is one of the next two. It stands in an output's tuple of listeners, and
     # returns None because a stream never ends a delivery.
 
     def _offer_now(self, event: T) -> None:
@@ -174,7 +171,8 @@ class Stream(Generic[T]):
             self.waiter = None
             waiter.resume(event)
 
-    def _offer_soon(self, event: T) -> None:
+    def offer_soon(self, event: T) -> None:
+        """Keep an event, and have the reader resumed when the loop next turns."""
         self.keep(event)
         self._wake()
 
@@ -201,11 +199,16 @@ class Stream(Generic[T]):
             if buffer.popleft() is not self._seen:
                 self.dropped += 1
         buffer.append(event)
-        self.peak = max(self.peak, len(buffer))
+        if len(buffer) > self.peak:
+            self.peak = len(buffer)
+
+    def has_room(self) -> bool:
+        """Tell whether an event would fit (or the stream is closed, and takes no more)."""
+        return len(self._buffer) < self.bound or self._closed
 
     async def wait_for_room(self) -> None:
-        """Return when an event would fit (or the stream is closed)."""
-        while len(self._buffer) >= self.bound and not self._closed:
+        """Return when `has_room`."""
+        while not self.has_room():
             if self._room is None:
                 self._room = asyncio.Event()
             self._room.clear()

@@ -139,7 +139,7 @@ def summarise(
         reason=supervisor.reason,
         error=None if supervisor.error is None else str(supervisor.error),
         sim_seconds=sim_ns / SECOND,
-        wall_seconds=round(ended - (supervisor.first_update or ended), 3),
+        wall_seconds=round(ended - (supervisor.first_update or ended), 6),
         digest=digest,
         events=dict(sorted(by_type.items())),
         outputs=dict(by_output),

@@ -106,17 +106,18 @@ def run_nodes(
     out: Path | None = None,
 ) -> NodeResult:
     """Run several nodes together; see `run_node`."""
-    script = spec(_script(list(inputs)), "script")
+    inputs = list(inputs)
+    script = spec(_script(inputs), "script")
     run = RunConfig(duration=Duration(duration), seed=seed)
     settings = Config(run=run, nodes=(script, *nodes))
     sent: list[Event] = []
 
     def collect(sender: Sender[Any] | None, event: Event) -> None:
-        scripted = sender.name.startswith("script.") if sender else event in announced
+        scripted = sender.name.startswith("script.") if sender else id(event) in from_script
         if not scripted:
             sent.append(event)
 
-    announced = [e for e in inputs if isinstance(e, Announcement)]
+    from_script = {id(e) for e in inputs}
 
     async def main() -> NodeResult:
         loop = asyncio.get_running_loop()

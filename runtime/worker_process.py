@@ -20,7 +20,8 @@ def main(socket_fd: int, in_fd: int, out_fd: int) -> None:
     """Make the object, then answer calls until the other side closes the connection."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the run's business
     pipe = SharedPipe(Connection(socket_fd), out_fd, in_fd)
-    made, target = False, None
+    made = False
+    target: Any = None
     try:
         sys.path[:] = pipe.receive()  # first, because the next message names what to import
         made, target = _attempt(lambda: _make(*pipe.receive()))

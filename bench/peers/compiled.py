@@ -1,0 +1,155 @@
+"""Helper programs: compiling them into a cache, running them, and reading their samples.
+
+Sources are in ``bench/peers/cpp``. A program is compiled again when a source, the compiler or what
+it is linked with has changed. Programs write their samples as raw int64.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from bench.system import Case, Samples
+
+SOURCES = Path(__file__).parent / "cpp"
+
+KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": "33554432", "MALLOC_TRIM_THRESHOLD_": "1073741824"}
+"""For the environment: glibc keeps freed memory rather than returning it.
+
+Otherwise each large message may land on pages that the kernel first has to clear, which costs more
+than copying it: a property of the allocator's defaults and not of what is measured.
+"""
+
+
+class CompiledError(RuntimeError):
+    """A program cannot be compiled, failed, or did not end in time."""
+
+
+class Program(msgspec.Struct, frozen=True, kw_only=True):
+    """A program in one source file.
+
+    Attributes:
+        source: Name of the file in `SOURCES`.
+        libraries: To link with.
+        built_for: Version of what it is linked with.
+    """
+
+    source: str
+    libraries: tuple[str, ...] = ()
+    built_for: str = ""
+
+
+def missing_compiler() -> str | None:
+    """Return why nothing can be compiled here, or `None`."""
+    command = _compiler()
+    if shutil.which(command[0]) is None:
+        return f"no compiler: expected {command[0]}; `apt-get install g++`, or set CXX"
+    return None
+
+
+def compiler_version() -> str:
+    """Return the compiler and its version, as ``g++ (Debian 12.2.0-14) 12.2.0``."""
+    command = [*_compiler(), "--version"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")[0]
+
+
+def build(program: Program) -> Path:
+    """Return the compiled program, from the cache if it is there.
+
+    Raises:
+        CompiledError: It does not compile.
+    """
+    command = [*_compiler(), "-std=c++17", "-O2", "-DNDEBUG", "-Wall", "-Wextra"]
+    libraries = [f"-l{library}" for library in program.libraries]
+    key = hashlib.sha256(repr((command, libraries, program, compiler_version())).encode())
+    for source in (SOURCES / program.source, *sorted(SOURCES.glob("*.hpp"))):
+        key.update(source.read_bytes())
+    cache = _cache()
+    built = cache / f"{Path(program.source).stem}-{key.hexdigest()[:16]}"
+    if built.exists():
+        return built
+    cache.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=cache) as directory:
+        fresh = Path(directory) / "program"
+        command += [str(SOURCES / program.source), "-o", str(fresh), *libraries]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        if done.returncode:
+            raise CompiledError(f"{shlex.join(command)}: {done.stderr[:2000]}")
+        fresh.replace(built)  # At once: another process may be at the same.
+    return built
+
+
+def run(command: Sequence[str | Path], deadline: float, env: dict[str, str] | None = None) -> str:
+    """Run a program, end it with this process or when the deadline is over; return its output.
+
+    Args:
+        command: With arguments.
+        deadline: Seconds.
+        env: More variables for its environment.
+
+    Raises:
+        CompiledError: It failed or did not end in time.
+    """
+    try:
+        done = subprocess.run(
+            guarded(command),
+            env={**os.environ, **KEEP_MEMORY, **(env or {})},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=deadline,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise CompiledError(f"{command[0]}: expected to end within {deadline:g} s") from None
+    if done.returncode:
+        raise CompiledError(f"{command[0]} ended with {done.returncode}: {done.stderr[-2000:]}")
+    return done.stdout
+
+
+def guarded(command: Sequence[str | Path]) -> list[str]:
+    """Return the command such that the kernel ends it with the process that started it."""
+    words = [str(word) for word in command]
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", "KILL", "--", *words] if setpriv else words
+
+
+def arguments(case: Case, out: Path) -> list[str]:
+    """Return a case as every program's arguments: CASE NODES SAMPLES WARM_UP OUT."""
+    return [case.case, str(case.nodes), str(case.samples), str(case.warm_up), str(out)]
+
+
+def deadline_for(case: Case) -> float:
+    """Return seconds that only a hang exceeds: 30, and 20 ms for each small round trip."""
+    each = 0.02 if case.case == "small" else 0.2
+    return 30 + each * (case.samples + case.warm_up)
+
+
+def read(out: Path, case: Case) -> Samples:
+    """Read what a program has written.
+
+    Raises:
+        CompiledError: Not as many samples as expected.
+    """
+    samples = np.fromfile(out, np.int64)
+    if len(samples) != case.samples:
+        raise CompiledError(f"{out.name}: expected {case.samples} samples, found {len(samples)}")
+    return samples
+
+
+def _compiler() -> list[str]:
+    return shlex.split(os.environ.get("CXX", "")) or ["g++"]
+
+
+def _cache() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME")
+    return (Path(home) if home else Path.home() / ".cache") / "visnav-runtime"

@@ -1,0 +1,194 @@
+"""ezmsg: a unit a node, all in one process, or each of nodes 2 to N in a process of its own.
+
+Units are run by `ezmsg.core.run` with a graph server of our own; ezmsg brings its own loop of
+asyncio. Node 1 sends the next ping from the method that gets the pong. In one process messages go
+by reference, as inputs that are not leaky do; between processes ezmsg pickles them into shared
+memory, large arrays out of band, in buffers that are large enough from the start.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import importlib
+import multiprocessing
+import os
+import time
+from collections.abc import AsyncGenerator, Callable
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from bench.messages import Ping, Pong
+from bench.peers.children import ALL, PATIENCE, PeerError
+from bench.peers.parts import needs, payloads, versions
+from bench.system import Case, Samples, System
+
+_BUFFER = 1 << 23
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+class Exchange:
+    """What node 1 has to remember between one message and the next."""
+
+    def __init__(self, case: Case) -> None:
+        self.taken = np.zeros(case.warm_up + case.samples, np.int64)
+        self.absent = set(range(2, case.nodes + 1))
+        self.done = False
+        self._payload = payloads(case)
+        self._receiver = case.nodes
+        self._number = -1
+        self._begin = 0
+
+    def ping(self) -> Ping:
+        """Return the next ping, or a call of the roll as long as nodes are absent."""
+        self._begin = time.perf_counter_ns()
+        return Ping(
+            stamp=self._begin,
+            source="1",
+            receiver=ALL if self.absent else self._receiver,
+            number=self._number,
+            payload=self._payload(),
+        )
+
+    def pong(self, pong: Pong) -> bool:
+        """Take note of a pong, and return whether it is time for the next ping."""
+        arrived = time.perf_counter_ns()
+        if self.absent:
+            self.absent.discard(-pong.number)
+            self._number += not self.absent
+            return not self.absent
+        if pong.number != self._number:
+            return False
+        self.taken[self._number] = arrived - self._begin
+        self._number += 1
+        self.done = self._number == len(self.taken)
+        return not self.done
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """What changes as long as anything comes."""
+        return self._number, len(self.absent)
+
+
+class _OfStream(Protocol):
+    """How ezmsg marks methods that take from or put into a stream."""
+
+    def __call__(self, stream: Any, /) -> Callable[[_Method], _Method]: ...
+
+
+def _units(ez: Any) -> tuple[Any, Any]:
+    publisher: _OfStream = ez.publisher
+    subscriber: _OfStream = ez.subscriber
+    task: Callable[[_Method], _Method] = ez.task
+
+    class Sender(ez.Unit):  # type: ignore[misc]
+        PING = ez.OutputStream(Ping, buf_size=_BUFFER)
+        PONG = ez.InputStream(Pong)
+        exchange: Exchange
+
+        @publisher(PING)
+        async def call_roll(self) -> AsyncGenerator[tuple[Any, Ping]]:
+            while self.exchange.absent:
+                yield self.PING, self.exchange.ping()
+                await asyncio.sleep(0.1)
+
+        @task
+        async def watch(self) -> None:
+            before, since = self.exchange.progress, time.monotonic()
+            while time.monotonic() - since < PATIENCE:
+                await asyncio.sleep(1.0)
+                if self.exchange.progress != before:
+                    before, since = self.exchange.progress, time.monotonic()
+            raise ez.NormalTermination
+
+        @subscriber(PONG)
+        @publisher(PING)
+        async def on_pong(self, pong: Pong) -> AsyncGenerator[tuple[Any, Ping]]:
+            if self.exchange.pong(pong):
+                yield self.PING, self.exchange.ping()
+            elif self.exchange.done:
+                raise ez.NormalTermination
+
+    class Listener(ez.Unit):  # type: ignore[misc]
+        PING = ez.InputStream(Ping)
+        PONG = ez.OutputStream(Pong)
+        number: int
+        measuring: int = 0
+
+        @subscriber(PING)
+        @publisher(PONG)
+        async def on_ping(self, ping: Ping) -> AsyncGenerator[tuple[Any, Pong]]:
+            if ping.receiver in (self.number, ALL):
+                number = -self.number if ping.receiver == ALL else ping.number
+                yield self.PONG, Pong(stamp=ping.stamp, source="n", number=number)
+
+        @task
+        async def end_with_parent(self) -> None:
+            while self.measuring:
+                await asyncio.sleep(1.0)
+                if os.getppid() != self.measuring:
+                    os._exit(1)
+
+    return Sender, Listener
+
+
+def measure(case: Case, *, processes: bool) -> Samples:
+    """Measure round trips between units.
+
+    Raises:
+        PeerError: Messages ceased to come.
+    """
+    os.environ["EZMSG_LOGLEVEL"] = "ERROR"
+    # The units' classes are made here, and reach the other processes with a fork only.
+    multiprocessing.set_start_method("fork", force=True)
+    ez: Any = importlib.import_module("ezmsg.core")
+    server: Any = importlib.import_module("ezmsg.core.graphserver").GraphServer()
+    make_sender, make_listener = _units(ez)
+    sender = make_sender()
+    sender.exchange = Exchange(case)
+    components = {"NODE1": sender}
+    connections = []
+    for number in range(2, case.nodes + 1):
+        components[f"NODE{number}"] = listener = make_listener()
+        listener.number = number
+        listener.measuring = os.getpid() if processes else 0
+        connections += [(sender.PING, listener.PING), (listener.PONG, sender.PONG)]
+    server.start(("127.0.0.1", 0))
+    try:
+        ez.run(
+            components=components,
+            connections=connections,
+            process_components=[*components.values()][1:] if processes else None,
+            graph_address=server.address,
+            force_single_process=not processes,
+        )
+    finally:
+        server.stop()
+    if not sender.exchange.done:
+        raise PeerError(f"ezmsg: ended after {sender.exchange.progress[0]} pings")
+    taken: Samples = sender.exchange.taken[case.warm_up :]
+    return taken
+
+
+SYSTEMS = (
+    System(
+        name="ezmsg (one process)",
+        modes=("handler",),
+        slowness=30,
+        missing=needs(ezmsg="ezmsg"),
+        version=versions("ezmsg"),
+        measure=functools.partial(measure, processes=False),
+    ),
+    System(
+        name="ezmsg (processes)",
+        modes=("handler",),
+        cases=("small", "large"),
+        place="processes",
+        max_nodes=16,
+        slowness=250,
+        missing=needs(ezmsg="ezmsg"),
+        version=versions("ezmsg"),
+        measure=functools.partial(measure, processes=True),
+    ),
+)

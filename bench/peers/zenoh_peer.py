@@ -1,0 +1,184 @@
+"""Zenoh: one session with callbacks, and peers in processes joined over TCP on the loopback.
+
+What Zenoh passes is bytes, in one process too. A large ping has its header as attachment and the
+array as payload: `put` copies it in, each receiver copies it out into bytes, and the memory of each
+copy is new to the process, which costs more than the copying. Publishers are express: they send at
+once, batching nothing.
+
+In one process all subscribers belong to one session and their callbacks run within `put` (a way
+that Zenoh calls unstable; its usual way is a thread). Between processes, nodes connect to node 1
+alone, without scouting, and answer from the callback; node 1 waits on a `queue.SimpleQueue`. Large
+payloads then travel through shared memory where Zenoh sees fit, as is its default.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bench.peers.children import PING, PONG, Job, PeerError, children, number_of, reply_to
+from bench.peers.parts import needs, versions
+from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+
+
+def config(zenoh: Any, **endpoints: str) -> Any:
+    """Return the configuration of a peer that finds nobody but by an endpoint.
+
+    Args:
+        zenoh: The module.
+        endpoints: ``listen`` or ``connect``, as locators.
+    """
+    made = zenoh.Config()
+    made.insert_json5("mode", '"peer"')
+    made.insert_json5("scouting/multicast/enabled", "false")
+    made.insert_json5("scouting/gossip/enabled", "false")
+    for way in ("listen", "connect"):
+        locators = [endpoints[way]] if way in endpoints else []
+        made.insert_json5(f"{way}/endpoints", json.dumps(locators))
+    return made
+
+
+def free_locator() -> str:
+    """Return a TCP locator on the loopback whose port nobody had a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def publisher(zenoh: Any, session: Any, key: str) -> Any:
+    """Return a publisher that sends at once and never drops."""
+    block = zenoh.CongestionControl.BLOCK
+    return session.declare_publisher(key, express=True, congestion_control=block)
+
+
+def subscribe(zenoh: Any, session: Any, key: str, callback: Any) -> Any:
+    """Return a subscriber whose callback runs where Zenoh delivers, with no thread between."""
+    direct = zenoh.handlers.Callback(callback, indirect=False)
+    return session.declare_subscriber(key, direct)
+
+
+def pinger(pings: Any, case: Case) -> Callable[[int, int, int], None]:
+    """Return what puts a ping, given its stamp, receiver and number."""
+    if case.case == "small":
+        return lambda stamp, receiver, number: pings.put(PING.pack(stamp, 1, receiver, number))
+    # Zenoh takes bytearrays, which an array may be a view of, but no arrays.
+    frame = bytearray(large_array().tobytes())
+    return lambda stamp, receiver, number: pings.put(
+        frame, attachment=PING.pack(stamp, 1, receiver, number)
+    )
+
+
+def header(sample: Any, *, large: bool) -> bytes:
+    """Return the header of a ping, having made an array of the payload of a large one."""
+    payload: bytes = sample.payload.to_bytes()
+    if not large:
+        return payload
+    np.frombuffer(payload, np.float32).reshape(LARGE_SHAPE)
+    attachment: bytes = sample.attachment.to_bytes()
+    return attachment
+
+
+def measure_callbacks(case: Case) -> Samples:
+    """Measure round trips through one session."""
+    zenoh: Any = importlib.import_module("zenoh")
+    with zenoh.open(config(zenoh)) as session:
+        pings, pongs = (publisher(zenoh, session, key) for key in ("ping", "pong"))
+        large = case.case != "small"
+        latest, landed = -1, 0
+        now = time.perf_counter_ns
+
+        def listen(node: int) -> Any:
+            def ping(sample: Any) -> None:
+                _, _, receiver, number = PING.unpack(header(sample, large=large))
+                if receiver == node:
+                    pongs.put(PONG.pack(0, number))
+
+            return subscribe(zenoh, session, "ping", ping)
+
+        def pong(sample: Any) -> None:
+            nonlocal latest, landed
+            latest = number_of(sample.payload.to_bytes())
+            landed = now()
+
+        _kept = [listen(node) for node in range(2, case.nodes + 1)]
+        _kept.append(subscribe(zenoh, session, "pong", pong))
+        put = pinger(pings, case)
+        taken = np.empty(case.warm_up + case.samples, np.int64)
+        for number in range(len(taken)):
+            begin = now()
+            put(begin, case.nodes, number)
+            if latest != number:
+                raise PeerError(f"zenoh: ping {number} was not answered within put")
+            taken[number] = landed - begin
+        return taken[case.warm_up :]
+
+
+def serve(job: Job) -> None:
+    """Be a node."""
+    zenoh: Any = importlib.import_module("zenoh")
+    large = job.case != "small"
+    with zenoh.open(config(zenoh, connect=job.address)) as session:
+        pongs = publisher(zenoh, session, "pong")
+
+        def ping(sample: Any) -> None:
+            pong = reply_to(job.node, header(sample, large=large))
+            if pong is not None:
+                pongs.put(pong)
+
+        _kept = session.declare_subscriber("ping", ping)
+        threading.Event().wait()
+
+
+def measure_processes(case: Case) -> Samples:
+    """Measure round trips between processes."""
+    zenoh: Any = importlib.import_module("zenoh")
+    locator = free_locator()
+    with zenoh.open(config(zenoh, listen=locator)) as session:
+        pings = publisher(zenoh, session, "ping")
+        heard: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+        def pong(sample: Any) -> None:
+            heard.put(number_of(sample.payload.to_bytes()))
+
+        _kept = session.declare_subscriber("pong", pong)
+
+        def receive() -> int | None:
+            try:
+                return heard.get(timeout=1.0)
+            except queue.Empty:
+                return None
+
+        with children(__name__, case, locator) as crew:
+            return crew.exchange(case, pinger(pings, case), receive)
+
+
+SYSTEMS = (
+    System(
+        name="zenoh (one session)",
+        modes=("handler",),
+        cases=("small", "large"),
+        slowness=4,
+        missing=needs(zenoh="eclipse-zenoh"),
+        version=versions("eclipse-zenoh"),
+        measure=measure_callbacks,
+    ),
+    System(
+        name="zenoh (tcp)",
+        modes=("handler",),
+        cases=("small", "large"),
+        place="processes",
+        max_nodes=16,
+        slowness=200,
+        missing=needs(zenoh="eclipse-zenoh"),
+        version=versions("eclipse-zenoh"),
+        measure=measure_processes,
+    ),
+)

@@ -1,0 +1,133 @@
+"""What the flight log leaves: a trajectory that other tools read, and pictures."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from events import Collision, Event, Image, Odometry
+from nodes.flight_log import FlightLog
+from runtime import Duration
+from runtime.config import Config, RunConfig
+from runtime.errors import NodeError
+from runtime.execute import execute
+from runtime.testing import run_node, spec
+from tests.nodes.test_tour import Vehicle
+
+
+def odometry(stamp: int, x: float = 0.0, yaw: float = 0.0) -> Odometry:
+    return Odometry(
+        stamp=stamp,
+        source="drone",
+        position=(x, 2.0, -1.5),
+        orientation=(math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)),
+        linear_velocity=(1.0, 0.0, 0.0),
+        angular_velocity=(0.0, 0.0, 0.0),
+    )
+
+
+def image(stamp: int, *, grey: bool = False) -> Image:
+    data = np.full((30, 40) if grey else (30, 40, 3), 80, np.uint8)
+    encoding = "mono8" if grey else "rgb8"
+    return Image(stamp=stamp, source="drone/front", frame_id="f", encoding=encoding, data=data)
+
+
+def collision(stamp: int) -> Collision:
+    where, normal = (0.1, 2.0, -1.5), (0.0, 0.0, -1.0)
+    return Collision(
+        stamp=stamp, source="drone", other="wall", position=where, normal=normal, speed=1.0
+    )
+
+
+def log(out: Path, inputs: list[Event], **config: object) -> None:
+    run_node(FlightLog, inputs=inputs, out=out, config=config, duration=20)
+
+
+def trajectory(path: Path) -> list[list[float]]:
+    """Read a TUM file as any tool does: numbers between blanks, # for comments."""
+    text = path.read_text(encoding="ascii")
+    assert text.endswith("\n")
+    return [[float(v) for v in line.split()] for line in text.splitlines() if line[0] != "#"]
+
+
+def test_the_trajectory_is_in_tums_format(tmp_path: Path) -> None:
+    log(tmp_path, [odometry(5_000_000 * k, 0.1 * k, yaw=0.2 * k) for k in range(4)])
+    rows = trajectory(tmp_path / "trajectory.tum")
+    assert [row[0] for row in rows] == [0.0, 0.005, 0.01, 0.015]
+    assert [len(row) for row in rows] == [8] * 4
+    assert rows[3][1:4] == [0.3, 2.0, -1.5]
+    assert rows[3][4:] == pytest.approx([0, 0, math.sin(0.3), math.cos(0.3)], abs=1e-9)
+
+
+def test_stamps_keep_their_nanoseconds(tmp_path: Path) -> None:
+    log(tmp_path, [odometry(12_000_000_001)])
+    assert "\n12.000000001 " in (tmp_path / "trajectory.tum").read_text()
+
+
+def test_pictures_are_drawn(tmp_path: Path) -> None:
+    inputs: list[Event] = [odometry(500_000_000 * k, k) for k in range(20)]
+    inputs += [image(500_000_000 * k, grey=k % 2 == 1) for k in range(20)]
+    inputs.append(collision(9_000_000_000))
+    log(tmp_path, sorted(inputs, key=lambda e: e.stamp), interval="500ms")
+    for name in ("flight.png", "pictures.png"):
+        picture = cv2.imread(str(tmp_path / name))
+        assert picture is not None
+        assert min(picture.shape[:2]) > 300
+        assert picture.std() > 5
+
+
+def test_the_sheet_never_holds_more_than_it_should() -> None:
+    """A long flight halves what the sheet holds and doubles the interval."""
+    kept: list[int] = []
+
+    class Peeking(FlightLog):
+        async def on_shutdown(self) -> None:
+            kept.extend(stamp for stamp, *_ in self._thumbnails)
+            await super().on_shutdown()
+
+    frames = [image(100_000_000 * k) for k in range(150)]
+    run_node(Peeking, inputs=frames, config={"pictures": 4, "interval": "1s"}, duration=20)
+    assert len(kept) <= 4
+    assert kept[0] == 0
+    assert kept[-1] >= 8_000_000_000
+
+
+def test_a_flight_without_pictures_or_movement_leaves_what_there_is(tmp_path: Path) -> None:
+    log(tmp_path, [odometry(0)])
+    assert {p.name for p in tmp_path.iterdir()} == {"trajectory.tum", "flight.png"}
+    other = tmp_path / "other"
+    other.mkdir()
+    log(other, [])
+    assert [p.name for p in other.iterdir()] == ["trajectory.tum"]
+    assert trajectory(other / "trajectory.tum") == []
+
+
+def test_without_a_folder_it_writes_nothing() -> None:
+    before = set(Path.cwd().iterdir())
+    run_node(FlightLog, inputs=[odometry(0), image(0)])
+    assert set(Path.cwd().iterdir()) == before
+
+
+def test_folders_and_files_may_have_any_name(tmp_path: Path) -> None:
+    out = tmp_path / "Flug über Köln 飛行"
+    out.mkdir()
+    log(out, [odometry(0), image(0)], trajectory="Weg ä.tum", plot="Flug ß.png", sheet="絵.png")
+    assert {p.name for p in out.iterdir()} == {"Weg ä.tum", "Flug ß.png", "絵.png"}
+
+
+def test_a_file_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
+    with pytest.raises(NodeError, match=r"node: FileNotFoundError: .*missing/t\.tum"):
+        log(tmp_path, [], trajectory="missing/t.tum")
+
+
+def test_a_run_that_is_stopped_leaves_a_whole_file(tmp_path: Path) -> None:
+    run = RunConfig(duration=Duration(2.011))
+    execute(Config(run=run, nodes=(spec(Vehicle, "v"), spec(FlightLog, "log"))), tmp_path)
+    rows = trajectory(tmp_path / "trajectory.tum")
+    assert len(rows) == 101
+    assert all(len(row) == 8 for row in rows)
+    assert (tmp_path / "flight.png").exists()

@@ -1,0 +1,71 @@
+"""Small events for tests, and a host that gives nodes no more than they need to be made."""
+
+from __future__ import annotations
+
+import concurrent.futures
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, TypeVar
+
+from events import Event
+from runtime.clock import Clock
+from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.node import Node, NodeConfig, make_node
+from runtime.schedule import Tick, Ticker
+from runtime.worker import Worker
+
+N = TypeVar("N", bound=Node[Any])
+W = TypeVar("W")
+
+
+class Said(Event):
+    """Something was said."""
+
+    text: str = ""
+
+
+class Shouted(Said):
+    """Something was said loudly."""
+
+
+class Sung(Event):
+    """Something was sung."""
+
+
+def said(text: str = "", source: str = "drone", stamp: int = 0) -> Said:
+    return Said(stamp=stamp, source=source, text=text)
+
+
+def shouted(text: str = "", source: str = "drone") -> Shouted:
+    return Shouted(stamp=0, source=source, text=text)
+
+
+class NoHost:
+    """A host for nodes that ask nothing of it."""
+
+    def __init__(self, seed: int = 0) -> None:
+        self.seed = seed
+        with_loop = LockstepLoop()
+        self.clock: Clock = LockstepClock(with_loop)
+        with_loop.close()
+        self.executor: concurrent.futures.Executor = concurrent.futures.ThreadPoolExecutor()
+        self.out: Path | None = None
+
+    def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
+        raise NotImplementedError
+
+    def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
+        raise NotImplementedError
+
+    async def worker(
+        self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
+    ) -> Worker[W]:
+        raise NotImplementedError
+
+    def stop(self, reason: str) -> None:
+        raise NotImplementedError
+
+
+def make(cls: type[N], name: str = "node", config: NodeConfig | None = None, seed: int = 0) -> N:
+    """Make a node as a run would."""
+    return make_node(cls, name, config or cls.config_type(), NoHost(seed))

@@ -1,0 +1,53 @@
+"""Running a supervisor to its end on any clock, for tests."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from events import Event
+from runtime import Duration, steps
+from runtime.config import Config, NodeSpec, RunConfig
+from runtime.execute import make_clock, make_loop
+from runtime.sender import Sender
+from runtime.supervisor import Supervisor
+
+
+class Outcome:
+    """A supervisor whose run is over, and every event of that run."""
+
+    def __init__(self, supervisor: Supervisor, sent: list[Event], seconds: float) -> None:
+        self.supervisor = supervisor
+        self.reason = supervisor.reason
+        self.error = supervisor.error
+        self.sent = sent
+        self.seconds = seconds
+
+
+def supervise(
+    nodes: Iterable[NodeSpec], *, duration: float = 1.0, out: Path | None = None, **run: Any
+) -> Outcome:
+    """Run nodes to their end; keywords are settings of the run."""
+    durations = {"stall", "startup_limit", "shutdown_limit"}
+    run = {key: Duration(v) if key in durations else v for key, v in run.items()}
+    config = Config(run=RunConfig(duration=Duration(duration), **run), nodes=tuple(nodes))
+    loop = make_loop(config.run)
+    sent: list[Event] = []
+
+    def tap(_: Sender[Any] | None, event: Event) -> None:
+        sent.append(event)
+
+    async def main() -> Outcome:
+        steps.install(loop)
+        clock = make_clock(config.run, loop)
+        supervisor = Supervisor(config, clock, [tap], out)
+        try:
+            await supervisor.main()
+        finally:
+            clock.close()
+        return Outcome(supervisor, sent, clock.now() / 1e9)
+
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        return runner.run(main())

@@ -1,0 +1,86 @@
+"""Objects that tests run in worker processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+
+class UnpicklableError(Exception):
+    """An error that cannot be made again from its arguments."""
+
+    def __init__(self, first: int, second: int) -> None:
+        super().__init__(f"{first} and {second}")
+
+
+class Plant:
+    """Does as it is told."""
+
+    def __init__(self, trouble: str = "") -> None:
+        if trouble == "value":
+            raise ValueError("no such plant")
+        if trouble == "file":
+            raise FileNotFoundError(2, "No such file or directory", "plant.xml")
+        if trouble == "exit":
+            print("seed not found", flush=True)
+            sys.exit(3)
+        if trouble == "hang":
+            time.sleep(1000)
+        self._kept: list[Any] = []
+
+    def echo(self, *args: Any) -> Any:
+        return args if len(args) != 1 else args[0]
+
+    def keep(self, array: Any) -> int:
+        self._kept.append(array)
+        return len(self._kept)
+
+    def kept(self, index: int) -> Any:
+        return self._kept[index]
+
+    def drop(self) -> None:
+        self._kept.clear()
+
+    def big(self, size: int, value: int) -> Any:
+        return np.full(size, value, np.uint8)
+
+    def pid(self) -> int:
+        return os.getpid()
+
+    def variable(self, name: str) -> str | None:
+        return os.environ.get(name)
+
+    def sleep(self, seconds: float) -> float:
+        time.sleep(seconds)
+        return seconds
+
+    def die(self, code: int) -> None:
+        print("goodbye", flush=True)
+        os._exit(code)
+
+    def fall(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def fail(self) -> None:
+        raise LookupError("not here")
+
+    def fail_oddly(self) -> None:
+        raise UnpicklableError(1, 2)
+
+    def lock(self) -> Any:
+        import threading
+
+        return threading.Lock()
+
+    def say(self, text: str) -> None:
+        print(text, flush=True)
+
+
+def plain() -> Plant:
+    """Make a plant, as a function instead of a class."""
+    return Plant()

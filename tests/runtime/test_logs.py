@@ -1,0 +1,101 @@
+"""Log records: whose they are, at what time of the run, and that none is lost."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from runtime import Duration, Node, NodeConfig, Tick, every
+from runtime.config import Config, RunConfig
+from runtime.errors import FatalError
+from runtime.execute import execute
+from runtime.logs import LEVELS, NodeLogger, file_handler, logging_to
+from runtime.testing import run_node, spec
+
+
+class Keeper(logging.Handler):
+    """Keeps records."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.records: list[logging.LogRecord] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.records.append(record)
+
+
+class ChattyConfig(NodeConfig):
+    """Settings of the chatty node."""
+
+    hz: float = 10.0
+
+
+class Chatty(Node[ChattyConfig]):
+    """Says something at each tick."""
+
+    @every(hz="hz")
+    def talk(self, tick: Tick) -> None:
+        self.log.info("tick %d", tick.index)
+
+
+def chat(tmp_path: Path, hz: float, level: str = "info", duration: float = 1.0) -> Keeper:
+    keeper = Keeper()
+    run = RunConfig(duration=Duration(duration), log=level)  # type: ignore[arg-type]
+    config = Config(run=run, nodes=(spec(Chatty, "chatty", {"hz": hz}),))
+    execute(config, tmp_path, handlers=[keeper])
+    return keeper
+
+
+def test_records_carry_the_runs_clock_and_the_node(tmp_path: Path) -> None:
+    records = chat(tmp_path, 4).records
+    said = [(vars(r)["seconds"], vars(r)["speaker"], r.getMessage()) for r in records]
+    assert said == [(k / 4, "chatty", f"tick {k}") for k in range(4)]
+
+
+def test_the_file_is_complete_when_the_run_is_over(tmp_path: Path) -> None:
+    chat(tmp_path, 5000)
+    lines = (tmp_path / "log.txt").read_text(encoding="utf-8").splitlines()
+    assert len(lines) == 5000
+    assert lines[-1] == "    0.999800 INFO     chatty: tick 4999"
+
+
+def test_the_level_is_the_runs(tmp_path: Path) -> None:
+    before = logging.getLogger("visnav").level
+    assert chat(tmp_path, 10, level="warning").records == []
+    assert logging.getLogger("visnav").level == before
+    assert not [h for h in logging.getLogger().handlers if isinstance(h, Keeper)]
+
+
+def test_fatal_logs_and_raises_with_the_nodes_name() -> None:
+    keeper = Keeper()
+    with logging_to([keeper], "info", lambda: 0), pytest.raises(FatalError, match="n: no 3 of x"):
+        NodeLogger("n").fatal("no %d of %s", 3, "x")
+    assert [r.levelno for r in keeper.records] == [LEVELS["fatal"]]
+
+
+def test_trace_is_below_debug() -> None:
+    for level, count in [("trace", 1), ("debug", 0)]:
+        keeper = Keeper()
+        with logging_to([keeper], level, lambda: 0):
+            NodeLogger("n").trace("there were %d", 3)
+        assert [r.getMessage() for r in keeper.records] == ["there were 3"] * count
+
+
+def test_a_node_may_end_its_test_with_fatal() -> None:
+    class Doomed(Node):
+        async def run(self) -> None:
+            self.log.fatal("100% done")
+
+    with pytest.raises(FatalError, match="node: 100% done"):
+        run_node(Doomed)
+
+
+def test_libraries_log_warnings_only(tmp_path: Path) -> None:
+    handler = file_handler(tmp_path / "log.txt")
+    with logging_to([handler], "trace", lambda: 1_500_000_000):
+        logging.getLogger("some.library").info("chatter")
+        logging.getLogger("some.library").warning("größer als erwartet")
+    text = (tmp_path / "log.txt").read_text(encoding="utf-8")
+    assert text == "    1.500000 WARNING  some.library: größer als erwartet\n"

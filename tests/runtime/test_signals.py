@@ -1,0 +1,100 @@
+"""Ctrl-C and SIGTERM, sent to real processes: an orderly end first, an immediate one if pressed."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.runtime.samples_cli import config_file, start, summary
+
+pytestmark = pytest.mark.timeout(30)
+CLOCKS = ["lockstep", "real"]
+PACED = {"lockstep": "clock = 'lockstep'\nspeed = 1.0", "real": "clock = 'real'"}
+
+
+@contextmanager
+def running(folder: Path, path: Path, word: str) -> Iterator[subprocess.Popen[str]]:
+    """Start a run and wait until it has printed a word."""
+    with start(["run", path, "-q"], folder) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().strip() == word
+            yield process
+        finally:
+            process.kill()
+
+
+def ends(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Wait for the end; return exit code and standard error."""
+    _, err = process.communicate(timeout=10)
+    return process.returncode, err
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+@pytest.mark.parametrize(
+    ("number", "reason"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")]
+)
+def test_a_signal_ends_a_run_in_order(
+    clock: str, number: signal.Signals, reason: str, tmp_path: Path
+) -> None:
+    path = config_file(tmp_path, "Reader", "Lively", run=PACED[clock])
+    with running(tmp_path, path, "running") as process:
+        time.sleep(0.3)  # some seconds of the run's clock, so that it has something to lose
+        process.send_signal(number)
+        code, err = ends(process)
+    assert (code, err) == (0, "")
+    found = summary(tmp_path / "runs" / "sample")
+    assert (found["reason"], found["error"]) == (reason, None)
+    assert found["sim_seconds"] >= 0.2
+    lines = (tmp_path / "runs" / "sample" / "pings.txt").read_text().splitlines(keepends=True)
+    assert len(lines) == found["events"]["Ping"]
+    assert all(line.endswith("\n") for line in lines)
+
+
+def test_a_run_that_goes_as_fast_as_it_can_hears_ctrl_c(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "Lively", settings="rate = 1000")
+    with running(tmp_path, path, "running") as process:
+        process.send_signal(signal.SIGINT)
+        assert ends(process) == (0, "")
+    assert summary(tmp_path / "runs" / "sample")["reason"] == "Ctrl-C"
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_ctrl_c_during_a_slow_start_ends_in_order(clock: str, tmp_path: Path) -> None:
+    path = config_file(tmp_path, "Speaker", "SlowStart", run=PACED[clock])
+    with running(tmp_path, path, "starting") as process:
+        process.send_signal(signal.SIGINT)
+        assert ends(process) == (0, "")
+    found = summary(tmp_path / "runs" / "sample")
+    assert (found["reason"], found["sim_seconds"]) == ("Ctrl-C", 0.0)
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_a_second_ctrl_c_ends_at_once(clock: str, tmp_path: Path) -> None:
+    path = config_file(tmp_path, "SlowEnd", run=PACED[clock] + "\nshutdown_limit = 100")
+    with running(tmp_path, path, "running") as process:
+        process.send_signal(signal.SIGINT)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ending\n"
+        begin = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        code, _ = ends(process)
+    assert time.monotonic() - begin < 2
+    assert code in {-signal.SIGINT, 130}
+
+
+def test_ctrl_c_wakes_an_idle_run(tmp_path: Path) -> None:
+    for clock in CLOCKS:
+        run = f"clock = '{clock}'\nshutdown_limit = 0.2"
+        path = config_file(tmp_path, "SlowEnd", run=run)
+        with running(tmp_path, path, "running") as process:
+            process.send_signal(signal.SIGINT)
+            code, err = ends(process)
+        assert code == 2
+        assert err.splitlines()[-1] == "error: slowend: expected to end within 0.2 s"

@@ -1,0 +1,78 @@
+"""Durations as they stand in a file."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime import Duration
+
+FACTORS = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+@given(
+    number=st.floats(0, 1e5).map(repr) | st.integers(0, 10**5).map(str),
+    unit=st.sampled_from(list(FACTORS)),
+    space=st.sampled_from(["", " ", "  "]),
+    change=st.sampled_from([str.lower, str.upper, str.title]),
+)
+def test_a_number_with_a_unit_is_so_many_seconds(
+    number: str, unit: str, space: str, change: type[str]
+) -> None:
+    parsed = Duration.parse(f"{space}{number}{space}{change(unit)}{space}")
+    assert parsed == pytest.approx(float(number) * FACTORS[unit])
+
+
+@given(st.floats(0, 1e9) | st.integers(0, 10**9))
+def test_a_bare_number_is_seconds(number: float) -> None:
+    parsed = Duration.parse(number)
+    assert parsed == number
+    assert isinstance(parsed, Duration)
+
+
+@pytest.mark.parametrize(
+    "text", ["80\N{MICRO SIGN}s", "80\N{GREEK SMALL LETTER MU}s", "80us", "80 US"]
+)
+def test_both_letters_mu_are_micro(text: str) -> None:
+    assert Duration.parse(text) == pytest.approx(80e-6)
+
+
+@given(st.floats(0, 1e9))
+def test_what_was_parsed_parses_again(number: float) -> None:
+    assert Duration.parse(f"{Duration.parse(number)!r}s") == number
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        -1,
+        -0.5,
+        True,
+        None,
+        [],
+        float("nan"),
+        float("inf"),
+        10**400,
+        "",
+        "5",
+        "s",
+        "-5s",
+        "5 parsecs",
+        "5s 5s",
+        "1e400s",
+        "5 m s",
+        "nan s",
+    ],
+)
+def test_anything_else_is_refused_with_examples(value: object) -> None:
+    with pytest.raises(ValueError, match=r'expected a duration such as 0\.5, "80ms" or "2min"'):
+        Duration.parse(value)
+
+
+@given(st.text())
+def test_no_text_raises_anything_else(text: str) -> None:
+    with contextlib.suppress(ValueError):
+        assert Duration.parse(text) >= 0.0
