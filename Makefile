@@ -28,7 +28,7 @@ demo: $(READY)  ## Fly the standard tour and leave its results in runs/tour.
 
 test: $(READY)  ## Run the quick tests.
 	@sh tools/system_packages.sh display
-	$(BIN)/python -m pytest -m 'not slow'
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow'
 
 test-all: $(READY)  ## Run all tests.
 	@sh tools/system_packages.sh display

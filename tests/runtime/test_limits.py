@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 
 import pytest
 
 from runtime.limits import real_time_limit
-from tests.runtime.loops import Run
+from tests.runtime.loops import Run, turns
 
 # Real, here and below, for it is real time that is limited; short enough to wait for.
 SOON = 0.005
@@ -50,6 +51,29 @@ def test_a_limit_has_no_effect_after_it_was_left(run: Run) -> None:
         return current().cancelling() == 0
 
     assert run(main())
+
+
+def test_a_limit_that_rings_while_it_is_being_left_comes_too_late(run: Run) -> None:
+    async def main() -> int:
+        async with real_time_limit(SOON):
+            # Real, and with the loop standing still: the limit rings, but nobody hears it yet.
+            time.sleep(3 * SOON)  # noqa: ASYNC251
+        await turns()
+        return current().cancelling()
+
+    assert run(main()) == 0
+
+
+def test_a_limit_that_was_left_keeps_no_thread() -> None:
+    async def main() -> None:
+        async with real_time_limit(LATE):
+            pass
+
+    Run("asyncio", ours=True)(main())
+    timers = [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
+    for timer in timers:
+        timer.join(LATE / 10)
+    assert not any(timer.is_alive() for timer in timers)
 
 
 def test_a_cancellation_from_elsewhere_is_not_taken_for_the_limit(run: Run) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
@@ -131,6 +132,24 @@ def test_time_waits_at_the_due_time_of_slow_work_and_runs_freely_up_to_it() -> N
         return [*seen, clock.now()]
 
     assert run_clock(main) == [40 * MS, 50 * MS]
+
+
+def test_the_outside_is_served_while_time_waits_for_work() -> None:
+    """Here the work itself waits for an answer of the loop's."""
+
+    async def main(loop: LockstepLoop, clock: LockstepClock) -> tuple[bool, int]:
+        answered = threading.Event()
+
+        def ask() -> bool:
+            # Real, for by then the loop is to have nothing left to do but to wait.
+            time.sleep(0.02)
+            loop.call_soon_threadsafe(answered.set)
+            return answered.wait(5)
+
+        executor: Any = loop._default_executor  # type: ignore[attr-defined]
+        return await clock.beside(executor.submit(ask)), clock.now()
+
+    assert run_clock(main) == (True, 0)
 
 
 def test_threads_without_latency_freeze_time() -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from runtime import lockstep
 from runtime.lockstep import LockstepLoop
+from runtime.schedule import Tick, Ticker
 
 
 class Wall:
@@ -87,6 +88,34 @@ def test_a_signal_is_noticed_while_time_runs_freely() -> None:
         while not noticed.is_set() and count < 10_000:
             await asyncio.sleep(1)
             count += 1
+        loop.remove_signal_handler(signal.SIGUSR1)
+        return count
+
+    with asyncio.Runner(loop_factory=LockstepLoop) as runner:
+        assert runner.run(main()) <= 2 * lockstep._POLL_EVERY
+
+
+def test_a_signal_is_noticed_while_nothing_but_ticks_happens() -> None:
+    """Ticks run on the spot, without a turn of the loop between them."""
+    count = 0
+
+    def tick(at: Tick) -> None:
+        nonlocal count
+        count = at.index
+        if count == 10:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        ticker.stopped = count > 10_000
+
+    ticker = Ticker("t", 1000, tick, lambda error: pytest.fail(str(error)))
+
+    async def main() -> int:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, LockstepLoop)
+        noticed = loop.create_future()
+        loop.add_signal_handler(signal.SIGUSR1, noticed.set_result, None)
+        loop.schedule.add(0, ticker)
+        await noticed
+        ticker.stopped = True
         loop.remove_signal_handler(signal.SIGUSR1)
         return count
 
