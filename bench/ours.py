@@ -80,11 +80,11 @@ class StreamOne(_One):
     async def run(self) -> None:
         """Measure."""
         now, send, taken, ping = time.perf_counter_ns, self.pings.send, self.taken, self.ping
-        receive = self.pongs.receive
+        pongs = self.pongs
         for number in range(len(taken)):
             begin = now()
             send(ping(number))
-            await receive()
+            await anext(pongs)
             taken[number] = now() - begin
         self.stop("measured")
 

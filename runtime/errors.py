@@ -74,8 +74,8 @@ class ChannelFullError(ChannelError):
     """An input with ``overflow="error"`` was sent more than it holds."""
 
 
-class ChannelClosedError(ChannelError, StopAsyncIteration):
-    """The input was closed, and what it held has been read; ends an ``async for`` over it."""
+class ChannelClosedError(ChannelError):
+    """The input was closed, and what it held has been read."""
 
 
 class ChannelBusyError(ChannelError):

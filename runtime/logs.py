@@ -90,7 +90,10 @@ def logging_to(
 
 
 def terminal_handler() -> logging.Handler:
-    """Return a handler that prints to standard error, in colour where that is a terminal."""
+    """Return a handler that prints to standard error, in colour where that is a terminal.
+
+    It leaves out what the command line says itself when the run is over (records with `told`).
+    """
     from rich.console import Console
     from rich.logging import RichHandler
 
@@ -98,6 +101,7 @@ def terminal_handler() -> logging.Handler:
         console=Console(stderr=True), show_path=False, show_time=False, markup=False
     )
     handler.setFormatter(logging.Formatter("%(seconds)9.3f %(speaker)s: %(message)s"))
+    handler.addFilter(lambda record: not getattr(record, "told", False))
     return handler
 
 

@@ -150,11 +150,16 @@ def on(*events: type[Event], source: str | None = None) -> Callable[[F], F]:
         raise DeclarationError("@on: expected an event type, found nothing")
 
     def declare(method: F) -> F:
-        if inspect.iscoroutinefunction(method):
-            raise DeclarationError(
-                f"@on: {method.__qualname__}: expected a plain function, found a coroutine "
-                "function; to wait for things, read an Input in run()"
-            )
+        for kind, found in (
+            (inspect.iscoroutinefunction, "a coroutine function"),
+            (inspect.isasyncgenfunction, "an asynchronous generator"),
+            (inspect.isgeneratorfunction, "a generator"),
+        ):
+            if kind(method):
+                raise DeclarationError(
+                    f"@on: {method.__qualname__}: expected a plain function, found {found}; "
+                    "to wait for things, read an Input in run()"
+                )
         method.__handles__ = Handles(events, source)  # type: ignore[attr-defined]
         return method
 

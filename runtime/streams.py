@@ -105,15 +105,8 @@ class Stream(Generic[T]):
         return self
 
     @types.coroutine
-    def receive(self) -> Generator[Any, Any, T]:
-        """Wait for the next event and take it.
-
-        Cancelling loses nothing: an event that comes afterwards is kept for the next call.
-
-        Raises:
-            ChannelClosedError: The stream is closed and has been read.
-            ChannelBusyError: Another coroutine waits here already.
-        """
+    def __anext__(self) -> Generator[Any, Any, T]:
+        """Wait for the next event and take it; a closed stream ends once it has been read."""
         buffer = self._buffer
         if buffer:
             self._taken += 1
@@ -121,7 +114,7 @@ class Stream(Generic[T]):
                 yield
         while not buffer:
             if self._closed:
-                raise ChannelClosedError(f"{self.name} is closed")
+                raise StopAsyncIteration
             if self.waiter is not None:
                 raise ChannelBusyError(f"{self.name}: another coroutine waits here already")
             event = yield self  # the reader's driver becomes our `waiter`
@@ -132,7 +125,20 @@ class Stream(Generic[T]):
             self._room.set()
         return event
 
-    __anext__ = receive
+    async def receive(self) -> T:
+        """Wait for the next event and take it.
+
+        ``await anext(stream)`` does the same, a little quicker, and ends as an iterator does.
+        Cancelling loses nothing: an event that comes afterwards is kept for the next call.
+
+        Raises:
+            ChannelClosedError: The stream is closed and has been read.
+            ChannelBusyError: Another coroutine waits here already.
+        """
+        try:
+            return await self.__anext__()
+        except StopAsyncIteration:
+            raise ChannelClosedError(f"{self.name} is closed") from None
 
     def receive_nowait(self) -> T:
         """Take the next event if one waits.

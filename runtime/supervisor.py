@@ -170,11 +170,12 @@ class Supervisor:
         life = self._lives[name]
         if life.recovering:
             return
-        log.error("%s: %s: %s", name, type(error).__name__, error, exc_info=error)
         wrapped = error if isinstance(error, NodeError) else _wrap(name, error)
+        fatal = isinstance(error, FatalError) or life.spec.on_error == "stop" or not self._running
+        _log(wrapped, last=fatal and not self._ended.is_set())
         if self._ended.is_set():
             self.error = self.error or wrapped
-        elif isinstance(error, FatalError) or life.spec.on_error == "stop" or not self._running:
+        elif fatal:
             self.stop(f"{name} failed", wrapped)
         else:
             life.recovering = True
@@ -195,8 +196,7 @@ class Supervisor:
             for life in self._lives.values():
                 self._hear(life)
         except NodeError as error:
-            cause = error.__cause__
-            log.error("%s", error, exc_info=None if isinstance(cause, VisnavError) else cause)
+            _log(error, last=True)
             self.stop("start-up failed", error)
             return
         for announcement in self.announcements:
@@ -384,6 +384,17 @@ class Supervisor:
             for stream in streams(node).values():
                 stream.close()
         self._connect()
+
+
+def _log(error: NodeError, *, last: bool) -> None:
+    """Log a node's error, with the traceback of what is not an error of ours.
+
+    An error of ours says all in its message; if it is the last thing that happens, the command
+    line prints it, and the terminal need not have it twice.
+    """
+    cause = error.__cause__
+    ours = isinstance(error if cause is None else cause, VisnavError)
+    log.error("%s", error, exc_info=None if ours else cause, extra={"told": ours and last})
 
 
 def _wrap(name: str, error: Exception) -> NodeError:

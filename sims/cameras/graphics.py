@@ -10,10 +10,12 @@ import importlib
 import os
 from typing import Any
 
+from runtime.errors import MissingDependencyError
+
 INSTALL = "apt-get install libegl1 libgl1 libgl1-mesa-dri"
 
 
-class GraphicsError(RuntimeError):
+class GraphicsError(MissingDependencyError, RuntimeError):
     """Rendering is impossible here: the machine's GL libraries or drivers are missing or broken."""
 
 

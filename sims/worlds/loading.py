@@ -9,6 +9,7 @@ from typing import Any
 
 import mujoco
 
+from runtime import VisnavError
 from sims.worlds.hall import hall
 from sims.worlds.yard import yard
 
@@ -16,7 +17,7 @@ WORLDS: dict[str, Callable[[int], Any]] = {"hall": hall, "yard": yard}
 """The worlds that are built in: name to the function that makes one from a seed."""
 
 
-class WorldError(ValueError):
+class WorldError(VisnavError, ValueError):
     """The world that was asked for isn't there, or isn't one."""
 
 
