@@ -13,7 +13,8 @@ import numpy.typing as npt
 import uvloop
 
 from bench.messages import Ping, Pong
-from bench.system import Case, Samples, System, large_array
+from bench.peers.parts import payloads
+from bench.system import Case, Samples, System
 from runtime import Input, Node, NodeConfig, Output, on, steps
 from runtime.config import Config, RunConfig
 from runtime.digest import Digest
@@ -35,19 +36,9 @@ class _One(Node[OneConfig]):
 
     def __init__(self) -> None:
         case = self.config.case
-        self.array = None if case.case == "small" else large_array()
+        self.payload = payloads(case)
         self.taken: npt.NDArray[np.int64] = np.empty(case.warm_up + case.samples, np.int64)
         self.target = "one" if case.mode != "routed" else f"one/{case.nodes}"
-
-    def ping(self, number: int) -> Ping:
-        """Make the next ping; a copy of the large array is part of it."""
-        case = self.config.case
-        payload = self.array
-        if case.case == "large" and payload is not None:
-            payload = payload.copy()
-        return Ping(
-            stamp=0, source=self.target, receiver=case.nodes, number=number, payload=payload
-        )
 
 
 class HandlerOne(_One):
@@ -64,10 +55,11 @@ class HandlerOne(_One):
 
     async def run(self) -> None:
         """Measure; nothing here waits, so one sample is one call of `send`."""
-        now, send, taken, ping = time.perf_counter_ns, self.pings.send, self.taken, self.ping
+        now, send, taken, payload = time.perf_counter_ns, self.pings.send, self.taken, self.payload
+        target, to = self.target, self.config.case.nodes
         for number in range(len(taken)):
             begin = now()
-            send(ping(number))
+            send(Ping(stamp=begin, source=target, receiver=to, number=number, payload=payload()))
             taken[number] = self.arrived - begin
         self.stop("measured")
 
@@ -79,11 +71,11 @@ class StreamOne(_One):
 
     async def run(self) -> None:
         """Measure."""
-        now, send, taken, ping = time.perf_counter_ns, self.pings.send, self.taken, self.ping
-        pongs = self.pongs
+        now, send, taken, payload = time.perf_counter_ns, self.pings.send, self.taken, self.payload
+        target, to, pongs = self.target, self.config.case.nodes, self.pongs
         for number in range(len(taken)):
             begin = now()
-            send(ping(number))
+            send(Ping(stamp=begin, source=target, receiver=to, number=number, payload=payload()))
             await anext(pongs)
             taken[number] = now() - begin
         self.stop("measured")

@@ -110,7 +110,8 @@ class Stream(Generic[T]):
         buffer = self._buffer
         if buffer:
             self._taken += 1
-            if self._taken % TURN == 0:  # a reader that never runs dry must not keep the loop
+            if self._taken == TURN:  # a reader that never runs dry must not keep the loop
+                self._taken = 0
                 yield
         while not buffer:
             if self._closed:

@@ -48,7 +48,8 @@ class Worker(Generic[W]):
         latency: Seconds of the run's clock from a call to its result.
         timeout: Real seconds after which a call that has no answer is a `WorkerTimeoutError`.
         env: Environment variables for the processes, added to ours.
-        niceness: How much the processes stand back for others, 0 to 19.
+        niceness: How much the processes stand back for others, 0 to 19. In real time they also
+            keep off one core, so that a tick need not wait for a core to come free.
         printed: Told each line that a process prints.
         died: Told when a process ends on its own or is killed for hanging; from any thread.
     """
@@ -80,7 +81,8 @@ class Worker(Generic[W]):
             _Process(f"{name}[{n}]" if processes > 1 else name, timeout, environment, printed, died)
             for n in range(processes)
         ]
-        self._started = [p.start(factory, args, niceness) for p in self._processes]
+        cores = _spare_cores() if clock.kind == "real" else None
+        self._started = [p.start(factory, args, niceness, cores) for p in self._processes]
 
     async def ready(self) -> None:
         """Wait until the object has been made in every process.
@@ -132,6 +134,18 @@ class Worker(Generic[W]):
             process.join()
 
 
+def _spare_cores() -> set[int] | None:
+    """Return all cores but one, which is left to the loop; `None` where there is no choice.
+
+    On two cores with a camera rendering, this brings the 99th percentile of a 400 Hz tick's
+    lateness from three times that without a camera down to the same.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return None
+    cores = sorted(os.sched_getaffinity(0))
+    return set(cores[1:]) or None
+
+
 class _Process:
     """One process and the calls on their way to and from it."""
 
@@ -172,13 +186,17 @@ class _Process:
         self._reader = threading.Thread(target=self._read_answers, name=name, daemon=True)
 
     def start(
-        self, factory: Callable[..., Any], args: tuple[Any, ...], niceness: int
+        self,
+        factory: Callable[..., Any],
+        args: tuple[Any, ...],
+        niceness: int,
+        cores: set[int] | None,
     ) -> concurrent.futures.Future[Any]:
         """Have the object made; the future tells whether that went well."""
         self._output.start()
         with contextlib.suppress(OSError):  # if it is gone already, the request below says so
             self._pipe.send(sys.path)
-        started = self.request((factory, args, niceness))
+        started = self.request((factory, args, niceness, cores))
         self._reader.start()
         return started
 

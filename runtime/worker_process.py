@@ -35,8 +35,12 @@ def main(socket_fd: int, in_fd: int, out_fd: int) -> None:
             target.close()
 
 
-def _make(factory: Callable[..., Any], args: tuple[Any, ...], niceness: int) -> Any:
+def _make(
+    factory: Callable[..., Any], args: tuple[Any, ...], niceness: int, cores: set[int] | None
+) -> Any:
     os.nice(niceness)
+    if cores is not None:  # before any library starts threads, which inherit it
+        os.sched_setaffinity(0, cores)
     return factory(*args)
 
 

@@ -260,3 +260,18 @@ def alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+async def test_in_real_time_a_core_is_left_to_the_loop() -> None:
+    """On the real clock a worker keeps off one core; in lockstep it may use them all."""
+    cores = os.sched_getaffinity(0)
+    if len(cores) < 2:
+        pytest.skip("needs two cores")
+    async with worker() as plant:
+        assert await plant.call(Plant.cores) == set(sorted(cores)[1:])
+
+    async def in_lockstep() -> set[int]:
+        async with worker() as plant:
+            return await plant.call(Plant.cores)
+
+    assert await asyncio.to_thread(run_in_lockstep, in_lockstep()) == cores
