@@ -48,7 +48,7 @@ peers: $(READY)  ## Install what the benchmarks compare with (PyPI, and Debian's
 	@sh tools/system_packages.sh peers
 
 bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (about 20 minutes).
-	$(BIN)/python -m runtime bench all --out bench/results
+	$(BIN)/python -m runtime bench all --out bench/results --page bench/RESULTS.md
 
 bench-quick: $(READY)  ## Run the quick benchmarks (under two minutes).
 	$(BIN)/python -m runtime bench all --quick --out runs/bench-quick

@@ -129,15 +129,18 @@ def lockstep(
 
 @app.command("all")
 def everything(
-    out: Annotated[Path, typer.Option(help="Folder for results.json, RESULTS.md and plots.")],
+    out: Annotated[Path, typer.Option(help="Folder for results.json and plots.")],
+    page: Annotated[
+        Path | None, typer.Option(help="The page of results; RESULTS.md in the folder.")
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer nodes, rounds, samples.")] = False,
 ) -> None:
     """Run every benchmark, and write the page of results."""
     from bench.suite import run
 
     with _status() as say:
-        run(out, quick=quick, progress=say)
-    print(out / "RESULTS.md")
+        run(out, page or out / "RESULTS.md", quick=quick, progress=say)
+    print(page or out / "RESULTS.md")
 
 
 @app.command()

@@ -37,8 +37,8 @@ Made by `make bench`; do not edit.
 """
 
 
-def page(results: Results, pictures: Sequence[str]) -> str:
-    """Return the whole page as Markdown."""
+def page(results: Results, pictures: Sequence[str], folder: str) -> str:
+    """Return the whole page as Markdown; the pictures are in `folder`, as seen from the page."""
     parts = [CAVEATS, "\n".join(_goals(results)), "\n".join(_stall(results))]
     parts += ["\n".join(_lockstep(results)), "\n".join(_throughput(results))]
     for case, title in (
@@ -46,7 +46,7 @@ def page(results: Results, pictures: Sequence[str]) -> str:
         ("large", "Large message (4.67 MB), copied"),
         ("large-shared", "Large message, by reference or shared memory"),
     ):
-        parts.append("\n".join(_latency(results.rows, case, title, pictures)))
+        parts.append("\n".join(_latency(results.rows, case, title, pictures, folder)))
     parts.append("\n".join(_measured(results)))
     return "\n".join(parts).rstrip() + "\n"
 
@@ -69,8 +69,25 @@ def _goals(results: Results) -> Iterator[str]:
     comparisons = [
         ("small, handlers", "handler", "plain calls", "handler", nodes, "≤ 1.3"),
         ("small, streams", "stream", "asyncio.Queue (uvloop)", "stream", (2, 16, 128), "≤ 0.33"),
-        ("small, handlers", "handler", "thesis client", "handler", (2, 16, 64, 128), "as it is"),
-        ("small, addressed", "routed", "thesis client", "handler", (2, 16, 64, 128), "as it is"),
+        (
+            "small, handlers",
+            "handler",
+            "thesis client (C++)",
+            "handler",
+            (2, 16, 64, 128),
+            "as it is",
+        ),
+        ("small, handlers", "handler", "roscpp, one process", "handler", (2, 128), "as it is"),
+        ("small, handlers", "handler", "ROS 1 nodelets", "handler", (2,), "≤ 0.05"),
+        ("small, handlers", "handler", "ROS 1 nodelets", "handler", (128,), "≤ 0.2"),
+        (
+            "small, addressed",
+            "routed",
+            "thesis client (C++)",
+            "handler",
+            (2, 16, 64, 128),
+            "as it is",
+        ),
     ]
     for what, mode, peer, peer_mode, counts, mark in comparisons:
         for n in counts:
@@ -93,6 +110,8 @@ def _goals(results: Results) -> Iterator[str]:
             name = "our small message" if peer == "small" else "a copy and a plain call"
             yield f"| {case}, handlers | {name} | 2 | {ours / theirs:.2f} | {mark} |"
     by_mode = {row.mode: row for row in results.stall}
+    bursts = next(r for r in results.throughput if "one wake" in r.case)
+    yield f"| burst of 256 events in one wake, each | | | {bursts.per_event_us:.2f} µs | ≤ 0.5 µs |"
     ratio = by_mode["worker"].late_p99_us / by_mode["none"].late_p99_us
     yield f"| p99 lateness of a 400 Hz tick, camera in a worker | no camera | | {ratio:.2f} | ≤ 1.25 |"  # noqa: E501
     yield f"| processor time of a 100 Hz timer | one core | | {results.idle.cpu_percent:.2f} % | ≤ 1 % |"  # noqa: E501
@@ -137,7 +156,9 @@ def _throughput(results: Results) -> Iterator[str]:
     yield ""
 
 
-def _latency(rows: Sequence[Row], case: str, title: str, pictures: Sequence[str]) -> Iterator[str]:
+def _latency(
+    rows: Sequence[Row], case: str, title: str, pictures: Sequence[str], folder: str
+) -> Iterator[str]:
     yield f"## {title}: median round trip, µs\n"
     for place in ("one process", "processes"):
         own = [r for r in rows if r.case == case and r.place == place]
@@ -156,7 +177,7 @@ def _latency(rows: Sequence[Row], case: str, title: str, pictures: Sequence[str]
         yield ""
     for picture in pictures:
         if picture.startswith(f"{case}-") and picture.removeprefix(f"{case}-")[0] in "s1234567890":
-            yield f"![{picture.removesuffix('.png')}]({picture})\n"
+            yield f"![{picture.removesuffix('.png')}]({folder}/{picture})\n"
 
 
 def _measured(results: Results) -> Iterator[str]:

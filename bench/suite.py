@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,11 +35,14 @@ QUICK_SYSTEMS = ("visnav", "plain", "asyncio.queue", "pyee", "thesis")
 """Parts of the names of what a quick run measures: what is quick to start."""
 
 
-def run(out: Path, *, quick: bool, progress: Callable[..., None] = lambda *_: None) -> Results:
-    """Measure everything and write results.json, RESULTS.md and the plots.
+def run(
+    out: Path, page_path: Path, *, quick: bool, progress: Callable[..., None] = lambda *_: None
+) -> Results:
+    """Measure everything and write the figures, the plots and the page that shows them.
 
     Args:
-        out: Folder, made if missing.
+        out: Folder for results.json and the plots, made if missing.
+        page_path: The page, Markdown.
         quick: Measure less: under two minutes.
         progress: Told what is being measured, and the share of its part that is done.
     """
@@ -56,9 +60,9 @@ def run(out: Path, *, quick: bool, progress: Callable[..., None] = lambda *_: No
             nodes=nodes,
             samples=20_000 if case == "small" else 1_000,
             warm_up=2_000 if case == "small" else 100,
-            repeats=2 if quick else 3,
+            repeats=3 if case == "small" and not quick else 2,
             only=QUICK_SYSTEMS if quick else (),
-            budget=0.3 if quick else 1.0,
+            budget=0.3 if quick else 0.5,
             progress=progress,
         )
         outcomes.append(outcome)
@@ -79,16 +83,17 @@ def run(out: Path, *, quick: bool, progress: Callable[..., None] = lambda *_: No
         missing={k: v for outcome in outcomes for k, v in outcome.missing.items()},
         versions={k: v for outcome in outcomes for k, v in outcome.versions.items()},
     )
-    write(results, out)
+    write(results, out, page_path)
     return results
 
 
-def write(results: Results, out: Path) -> None:
+def write(results: Results, out: Path, page_path: Path) -> None:
     """Write the page of results, its plots, and the figures themselves."""
     encoded = msgspec.json.format(msgspec.json.encode(results), indent=1)
     (out / "results.json").write_bytes(encoded + b"\n")
     pictures = list(_plots(results.rows, out))
-    (out / "RESULTS.md").write_text(page(results, pictures), encoding="utf-8")
+    folder = os.path.relpath(out, page_path.parent)
+    page_path.write_text(page(results, pictures, folder), encoding="utf-8")
 
 
 def _plots(rows: Sequence[Row], out: Path) -> Any:
