@@ -15,19 +15,20 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import itertools
 import math
 import re
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
 from runtime.errors import ConfigError, suggest
+from runtime.explain import explain, show
 from runtime.node import Node, NodeConfig
+from runtime.override import override
 from runtime.ports import MAX_HZ
 from runtime.units import Duration
 
@@ -53,7 +54,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         log: Least level that is logged: trace, debug, info, warning, error or fatal.
     """
 
-    name: str = "run"
+    name: Annotated[str, msgspec.Meta(pattern=r"^[\w-][\w.-]*$")] = "run"
     clock: Literal["lockstep", "real"] = "lockstep"
     speed: Annotated[float, msgspec.Meta(gt=0)] | Literal["max"] | None = None
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
@@ -122,8 +123,8 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Config:
     folder = str(path.resolve().parent)
     if folder not in sys.path:
         sys.path.append(folder)
-    for override in overrides:
-        _override(table, override)
+    for change in overrides:
+        override(table, change)
     return parse(table, path.name)
 
 
@@ -142,7 +143,7 @@ def parse(table: Mapping[str, Any], where: str) -> Config:
     run = convert(table.get("run", {}), RunConfig, f"{where}: run")
     if run.clock == "real" and run.speed in {"max", math.inf}:
         raise ConfigError(
-            f'{where}: run.speed: expected a number with clock "real", found {_show(run.speed)}'
+            f'{where}: run.speed: expected a number with clock "real", found {show(run.speed)}'
         )
     nodes = table.get("nodes", [])
     if not isinstance(nodes, list) or not nodes:
@@ -153,7 +154,7 @@ def parse(table: Mapping[str, Any], where: str) -> Config:
         if spec.name in {other.name for other in specs}:
             raise ConfigError(
                 f"{where}: nodes[{index}].name: expected a name that no other node has, "
-                f"found {_show(spec.name)} a second time"
+                f"found {show(spec.name)} a second time"
             )
         specs.append(spec)
     return Config(run=run, nodes=tuple(specs))
@@ -167,14 +168,14 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
     """
     module_name, _, class_name = type_.partition(":")
     if not re.fullmatch(r"\w+(\.\w+)*:\w+", type_):
-        raise ConfigError(f'{where}: expected "module:Class", found {_show(type_)}')
+        raise ConfigError(f'{where}: expected "module:Class", found {show(type_)}')
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not module_name.startswith(error.name):
             raise ConfigError(f"{where}: {module_name} needs a module {error.name!r}") from error
         raise ConfigError(
-            f"{where}: expected a module that can be imported, found {_show(module_name)}"
+            f"{where}: expected a module that can be imported, found {show(module_name)}"
             + suggest(module_name, _known_modules())
         ) from None
     except ImportError as error:
@@ -186,7 +187,7 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
     }
     if class_name not in known:
         raise ConfigError(
-            f"{where}: expected a node of {module_name}, found {_show(class_name)}"
+            f"{where}: expected a node of {module_name}, found {show(class_name)}"
             + suggest(class_name, known)
         )
     return known[class_name]
@@ -201,7 +202,7 @@ def convert(value: Any, type_: type[S], where: str) -> S:
     try:
         return msgspec.convert(value, type_, dec_hook=_decode)
     except msgspec.ValidationError as error:
-        raise ConfigError(_explain(str(error), value, type_, where)) from None
+        raise ConfigError(explain(str(error), value, type_, where)) from None
 
 
 def to_builtins(config: Config) -> dict[str, Any]:
@@ -229,13 +230,13 @@ def _without_none(value: Any) -> Any:
 
 def _node(entry: Any, where: str) -> NodeSpec:
     if not isinstance(entry, dict):
-        raise ConfigError(f"{where}: expected a table, found {_show(entry)}")
+        raise ConfigError(f"{where}: expected a table, found {show(entry)}")
     keys = {f.name for f in msgspec.structs.fields(_NodeHead)}
     head = convert({k: v for k, v in entry.items() if k in keys}, _NodeHead, where)
     if not re.fullmatch(r"[A-Za-z_][\w-]*", head.name):
         raise ConfigError(
             f"{where}.name: expected a letter, then letters, digits, _ and -, "
-            f"found {_show(head.name)}"
+            f"found {show(head.name)}"
         )
     if head.name == "run":
         raise ConfigError(f'{where}.name: expected any name but "run", which is the run itself')
@@ -247,7 +248,7 @@ def _node(entry: Any, where: str) -> NodeSpec:
         if port not in cls.declared.listening:
             raise ConfigError(
                 f"{where}: inputs: expected an input or handler of {head.type}, "
-                f"found {_show(port)}" + suggest(port, cls.declared.listening)
+                f"found {show(port)}" + suggest(port, cls.declared.listening)
             )
     for method, ticks in cls.declared.ticks.items():
         if isinstance(ticks.hz, str):
@@ -255,7 +256,7 @@ def _node(entry: Any, where: str) -> NodeSpec:
             if not isinstance(rate, int | float) or not 0 < rate <= MAX_HZ:
                 raise ConfigError(
                     f"{where}: {ticks.hz}: expected a rate above 0, up to {MAX_HZ} Hz, "
-                    f"for {method}, found {_show(rate)}"
+                    f"for {method}, found {show(rate)}"
                 )
     return NodeSpec(
         name=head.name,
@@ -267,149 +268,10 @@ def _node(entry: Any, where: str) -> NodeSpec:
     )
 
 
-def _override(table: dict[str, Any], override: str) -> None:
-    path, equals, text = override.partition("=")
-    keys = path.strip().split(".")
-    where = f"--set {override}"
-    if not equals or len(keys) < 2 or not all(keys):
-        raise ConfigError(f"{where}: expected node.key=value or run.key=value")
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text.strip()
-    nodes = _by_name(table.get("nodes"))
-    if keys[0] == "run":
-        target = table.setdefault("run", {})
-    elif keys[0] in nodes:
-        target = nodes[keys[0]]
-    else:
-        raise ConfigError(
-            f'{where}: expected "run" or the name of a node, found {_show(keys[0])}'
-            + suggest(keys[0], ["run", *nodes])
-        )
-    for before, key in itertools.pairwise(keys[:-1]):
-        if isinstance(target, list):  # an entry of a list of tables, by its name
-            target = _entry(target, key, f"{where}: {before}")
-        elif isinstance(target, dict):
-            target = target.setdefault(key, {})
-    if isinstance(target, list):
-        _entry(target, keys[-1], f"{where}: {keys[-2]}")
-    if not isinstance(target, dict):
-        raise ConfigError(
-            f"{where}: {keys[-2]}: expected a table, since .{keys[-1]} follows, "
-            f"found {_show(target)}"
-        )
-    target[keys[-1]] = value
-
-
-def _entry(entries: list[Any], name: str, where: str) -> dict[str, Any]:
-    named = _by_name(entries)
-    if name not in named:
-        listed = ", ".join(named) or "a table with a name"
-        raise ConfigError(
-            f"{where}: expected one of {listed}; found {_show(name)}" + suggest(name, named)
-        )
-    return named[name]
-
-
-def _by_name(entries: Any) -> dict[str, dict[str, Any]]:
-    tables = [e for e in entries if isinstance(e, dict)] if isinstance(entries, list) else []
-    return {str(table["name"]): table for table in tables if "name" in table}
-
-
 def _decode(type_: type[Any], value: Any) -> Any:
     if type_ is Duration:
         return Duration.parse(value)
     raise NotImplementedError(f"settings of type {type_}")
-
-
-_NAMES = {
-    "float": "a number",
-    "int": "a whole number",
-    "str": "a text",
-    "bool": "true or false",
-    "array": "a list",
-    "object": "a table",
-}
-
-
-def _explain(message: str, value: Any, type_: type[msgspec.Struct], where: str) -> str:
-    """Rewrite one of msgspec's messages as place, expected, found."""
-    text, _, path = message.partition(" - at `$")
-    path = path.rstrip("`")
-    place = where + path if not where.endswith(")") or not path else f"{where}: {path[1:]}"
-    if match := re.fullmatch(r"Object contains unknown field `(.*)`", text):
-        known = _fields_at(type_, path)
-        listed = ", ".join(known) or "no settings"
-        found = f"found unknown key {match[1]!r}" + suggest(match[1], known)
-        return f"{place}: expected one of {listed}; {found}"
-    if match := re.fullmatch(r"Object missing required field `(.*)`", text):
-        return f"{place}: expected a setting {_show(match[1])}, found none"
-    if "found" in text:  # a check of our own, which has said it all
-        return f"{place}: {text}"
-    if text.startswith("Invalid enum value"):
-        text = "expected " + " or ".join(_choices(_type_at(type_, path)))
-    expected = re.sub(r", got .*", "", text)
-    expected = re.sub(r"`([\w| ]+)`", lambda match: _translate(match[1]), expected)
-    expected = re.sub(r"(\d)\.0\b", r"\1", expected)
-    expected = expected.replace("matching regex '", "that matches '")
-    expected = expected[0].lower() + expected[1:]
-    return f"{place}: {expected}, found {_show(_at(value, path))}"
-
-
-def _translate(types: str) -> str:
-    return " or ".join(_NAMES.get(name, name) for name in types.split(" | ") if name != "null")
-
-
-def _choices(type_: Any) -> list[str]:
-    """Return what a setting of a type may be."""
-    if get_origin(type_) is Literal:
-        return [_show(value) for value in get_args(type_)]
-    if get_args(type_):
-        return [choice for inner in get_args(type_) for choice in _choices(inner)]
-    name = getattr(type_, "__name__", "")
-    return [_NAMES[name]] if name in _NAMES else []
-
-
-def _at(value: Any, path: str) -> Any:
-    """Return what stands at a path such as ``.cameras[0].rate``."""
-    for name, index in re.findall(r"\.([\w-]+)|\[(\d+)\]", path):
-        try:
-            value = value[name] if name else value[int(index)]
-        except (KeyError, IndexError, TypeError):
-            return value
-    return value
-
-
-def _fields_at(type_: Any, path: str) -> list[str]:
-    """Return the names of the settings that are known at a path."""
-    struct = _struct_in(_type_at(type_, path))
-    return [] if struct is None else list(struct.__struct_encode_fields__)
-
-
-def _type_at(type_: Any, path: str) -> Any:
-    """Return the type of the setting at a path; `None` if there is none."""
-    for name in re.findall(r"\.([\w-]+)", path):
-        struct = _struct_in(type_)
-        fields = () if struct is None else msgspec.structs.fields(struct)
-        type_ = next((f.type for f in fields if f.encode_name == name), None)
-    return type_
-
-
-def _struct_in(type_: Any) -> type[msgspec.Struct] | None:
-    """Return the struct that a type is, or is a list of."""
-    while type_ is not None and not hasattr(type_, "__struct_fields__"):
-        type_ = next(iter(get_args(type_)), None)
-    return type_  # type: ignore[no-any-return]
-
-
-def _show(value: Any) -> str:
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, bool):
-        return str(value).lower()
-    text = str(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _known_modules() -> list[str]:

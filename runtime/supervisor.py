@@ -18,7 +18,7 @@ import functools
 import inspect
 import logging
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,9 @@ from typing_extensions import TypeVar
 from events import Announcement, Event, Shutdown, WindowClosed
 from runtime import graph
 from runtime.clock import Clock
-from runtime.config import Config, NodeSpec
-from runtime.errors import FatalError, NodeError, NodeTimeoutError, RefusedError, VisnavError
+from runtime.config import Config
+from runtime.errors import FatalError, NodeError, NodeTimeoutError, RefusedError
+from runtime.life import Life, log_error, wrap
 from runtime.limits import real_time_limit
 from runtime.node import Node, make_node, streams
 from runtime.schedule import Once, Tick, Ticker
@@ -43,21 +44,6 @@ log = logging.getLogger("visnav.runtime")
 FIRST_BACKOFF = 0.5
 LONGEST_BACKOFF = 30.0
 """Seconds of the clock before a restart: doubled from the first at each failure."""
-
-
-class _Life:
-    """What belongs to one node while it runs."""
-
-    def __init__(self, spec: NodeSpec) -> None:
-        self.spec = spec
-        self.node: Node[Any] | None = None
-        self.tasks: set[asyncio.Task[None]] = set()
-        self.tickers: list[Ticker] = []
-        self.workers: list[Worker[Any]] = []
-        self.started = False
-        self.failures = 0
-        self.recovering = False
-        self.ending = asyncio.Lock()
 
 
 class Supervisor:
@@ -91,7 +77,7 @@ class Supervisor:
         self.tickers: dict[str, Ticker] = {}
         self._config = config
         self._taps = tuple(taps)
-        self._lives = {spec.name: _Life(spec) for spec in config.nodes}
+        self._lives = {spec.name: Life(spec) for spec in config.nodes}
         self._running = False
         self._ended = asyncio.Event()
         self._begin: asyncio.Task[None] | None = None
@@ -170,9 +156,9 @@ class Supervisor:
         life = self._lives[name]
         if life.recovering:
             return
-        wrapped = error if isinstance(error, NodeError) else _wrap(name, error)
+        wrapped = error if isinstance(error, NodeError) else wrap(name, error)
         fatal = isinstance(error, FatalError) or life.spec.on_error == "stop" or not self._running
-        _log(wrapped, last=fatal and not self._ended.is_set())
+        log_error(wrapped, last=fatal and not self._ended.is_set())
         if self._ended.is_set():
             self.error = self.error or wrapped
         elif fatal:
@@ -196,7 +182,7 @@ class Supervisor:
             for life in self._lives.values():
                 self._hear(life)
         except NodeError as error:
-            _log(error, last=True)
+            log_error(error, last=True)
             self.stop("start-up failed", error)
             return
         for announcement in self.announcements:
@@ -212,7 +198,7 @@ class Supervisor:
         for life in self._lives.values():
             self._begin_node(life)
 
-    async def _start_up(self, life: _Life) -> None:
+    async def _start_up(self, life: Life) -> None:
         spec = life.spec
         try:
             life.node = node = make_node(spec.node, spec.name, spec.config, self)
@@ -226,18 +212,18 @@ class Supervisor:
             limit = f"expected on_startup to end within {self._config.run.startup_limit:g} s"
             raise NodeTimeoutError(spec.name, f"{limit}, found it still running") from None
         except Exception as error:
-            raise _wrap(spec.name, error) from error
+            raise wrap(spec.name, error) from error
 
-    def _announced(self, life: _Life) -> list[Announcement]:
+    def _announced(self, life: Life) -> list[Announcement]:
         assert life.node is not None
         try:
             return list(life.node.announce())
         except NodeError:
             raise
         except Exception as error:
-            raise _wrap(life.spec.name, error) from error
+            raise wrap(life.spec.name, error) from error
 
-    def _hear(self, life: _Life) -> None:
+    def _hear(self, life: Life) -> None:
         """Let a node hear all announcements, and turn a refusal into an error."""
         assert life.node is not None
         for announcement in self.announcements:
@@ -250,7 +236,7 @@ class Supervisor:
             except NodeError:
                 raise
             except Exception as error:
-                raise _wrap(life.spec.name, error) from error
+                raise wrap(life.spec.name, error) from error
 
     def _connect(self) -> None:
         nodes = [life.node for life in self._lives.values() if life.node and life.started]
@@ -258,7 +244,7 @@ class Supervisor:
         end = Listener("run", self._hear_end, (Shutdown, WindowClosed))
         graph.connect(nodes, sources, self._taps, self._listener_failed, [end])
 
-    def _begin_node(self, life: _Life) -> None:
+    def _begin_node(self, life: Life) -> None:
         node = life.node
         assert node is not None
         for ticker in life.tickers:
@@ -309,7 +295,7 @@ class Supervisor:
         reason = getattr(event, "reason", "") or type(event).__name__
         self.stop(f"{event.source}: {reason}")
 
-    async def _recover(self, life: _Life) -> None:
+    async def _recover(self, life: Life) -> None:
         """Take a failed node out, and bring up a new one in its place if that is wanted."""
         # Shielded: the end of the run ends this task, but must not cut an on_shutdown short.
         await asyncio.shield(self._group.create_task(self._retire(life)))
@@ -350,32 +336,23 @@ class Supervisor:
         for life in reversed(self._lives.values()):
             await self._retire(life)
 
-    async def _retire(self, life: _Life) -> None:
+    async def _retire(self, life: Life) -> None:
         """End one node, unless that is done: it hears nothing afterwards."""
         async with life.ending:
             await self._end_node(life)
 
-    async def _end_node(self, life: _Life) -> None:
+    async def _end_node(self, life: Life) -> None:
         """End a node's ticks, tasks and workers."""
-        node, limit = life.node, self._config.run.shutdown_limit
+        node = life.node
         for ticker in life.tickers:
             ticker.stopped = True
         life.tickers.clear()
         for task in life.tasks:
             task.cancel()
-        try:
-            async with real_time_limit(limit):
-                if life.tasks:
-                    await asyncio.wait(life.tasks)
-                if node is not None and life.started:
-                    await node.on_shutdown()
-        except TimeoutError:
-            late = NodeTimeoutError(life.spec.name, f"expected to end within {limit:g} s")
-            self.error = self.error or late
-            log.error("%s", late)
-        except Exception as error:
-            self.error = self.error or _wrap(life.spec.name, error)
-            log.error("%s: on_shutdown: %s", life.spec.name, error, exc_info=error)
+        if life.tasks:
+            await self._within_limit(life, "its tasks", asyncio.wait(life.tasks))
+        if node is not None and life.started:
+            await self._within_limit(life, "on_shutdown", node.on_shutdown())
         for worker in life.workers:
             await asyncio.to_thread(worker.close)
         life.workers.clear()
@@ -385,20 +362,16 @@ class Supervisor:
                 stream.close()
         self._connect()
 
-
-def _log(error: NodeError, *, last: bool) -> None:
-    """Log a node's error, with the traceback of what is not an error of ours.
-
-    An error of ours says all in its message; if it is the last thing that happens, the command
-    line prints it, and the terminal need not have it twice.
-    """
-    cause = error.__cause__
-    ours = isinstance(error if cause is None else cause, VisnavError)
-    log.error("%s", error, exc_info=None if ours else cause, extra={"told": ours and last})
-
-
-def _wrap(name: str, error: Exception) -> NodeError:
-    ours = isinstance(error, VisnavError)  # says all there is to say; others need their type
-    wrapped = NodeError(name, str(error) if ours else f"{type(error).__name__}: {error}")
-    wrapped.__cause__ = error
-    return wrapped
+    async def _within_limit(self, life: Life, what: str, ending: Awaitable[Any]) -> None:
+        """Await a step of a node's end; whatever goes wrong, the other steps follow."""
+        limit, name = self._config.run.shutdown_limit, life.spec.name
+        try:
+            async with real_time_limit(limit):
+                await ending
+        except TimeoutError:
+            late = NodeTimeoutError(name, f"expected {what} to end within {limit:g} s")
+            self.error = self.error or late
+            log.error("%s", late)
+        except Exception as error:
+            self.error = self.error or wrap(name, error)
+            log.error("%s: %s: %s", name, what, error, exc_info=error)

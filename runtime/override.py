@@ -1,0 +1,69 @@
+"""Changing settings from the command line: ``--set drone.cameras.front.rate=10``."""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from typing import Any
+
+from runtime.errors import ConfigError, suggest
+from runtime.explain import show
+
+
+def override(table: dict[str, Any], change: str) -> None:
+    """Change one setting of a table, as `tomllib` gives it.
+
+    Args:
+        table: Of the whole file; is changed.
+        change: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word.
+
+    Raises:
+        ConfigError: There is no such node, or nothing to set there.
+    """
+    path, equals, text = change.partition("=")
+    keys = path.strip().split(".")
+    where = f"--set {change}"
+    if not equals or len(keys) < 2 or not all(keys):
+        raise ConfigError(f"{where}: expected node.key=value or run.key=value")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()
+    nodes = _by_name(table.get("nodes"))
+    if keys[0] == "run":
+        target = table.setdefault("run", {})
+    elif keys[0] in nodes:
+        target = nodes[keys[0]]
+    else:
+        raise ConfigError(
+            f'{where}: expected "run" or the name of a node, found {show(keys[0])}'
+            + suggest(keys[0], ["run", *nodes])
+        )
+    for before, key in itertools.pairwise(keys[:-1]):
+        if isinstance(target, list):  # an entry of a list of tables, by its name
+            target = _entry(target, key, f"{where}: {before}")
+        elif isinstance(target, dict):
+            target = target.setdefault(key, {})
+    if isinstance(target, list):
+        _entry(target, keys[-1], f"{where}: {keys[-2]}")
+    if not isinstance(target, dict):
+        raise ConfigError(
+            f"{where}: {keys[-2]}: expected a table, since .{keys[-1]} follows, "
+            f"found {show(target)}"
+        )
+    target[keys[-1]] = value
+
+
+def _entry(entries: list[Any], name: str, where: str) -> dict[str, Any]:
+    named = _by_name(entries)
+    if name not in named:
+        listed = ", ".join(named) or "a table with a name"
+        raise ConfigError(
+            f"{where}: expected one of {listed}; found {show(name)}" + suggest(name, named)
+        )
+    return named[name]
+
+
+def _by_name(entries: Any) -> dict[str, dict[str, Any]]:
+    tables = [e for e in entries if isinstance(e, dict)] if isinstance(entries, list) else []
+    return {str(table["name"]): table for table in tables if "name" in table}

@@ -1,0 +1,68 @@
+"""The benchmarks of whole runs, shortened: they measure what they say."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench import idle, lockstep, stall, throughput
+
+
+@pytest.mark.slow
+def test_an_inline_camera_delays_ticks_and_a_worker_fetches_as_much(tmp_path: Path) -> None:
+    """The command writes a row a mode; inline, a tick waits for a whole picture."""
+    out = tmp_path / "stall.json"
+    command = [sys.executable, "-m", "runtime", "bench", "stall", "--seconds", "1.5"]
+    subprocess.run([*command, "--repeats", "1", "--json", str(out)], check=True)
+    rows = {row["mode"]: row for row in json.loads(out.read_text())["rows"]}
+    assert list(rows) == ["none", "inline", "thread", "worker"]
+    assert rows["none"]["frames"] == 0
+    for mode in ("inline", "thread", "worker"):
+        assert 10 <= rows[mode]["frames"] <= 16
+        assert rows[mode]["fetch_ms_median"] > 1
+    # A picture takes several periods of the tick, so inline some ticks must be that late.
+    assert rows["inline"]["late_max_us"] > 2_500
+    assert rows["inline"]["missed"] > 0
+
+
+def test_stall_rows_are_statistics_of_what_was_collected() -> None:
+    """Percentiles, means and medians are those of the samples, in the units of their names."""
+    late = [1_000 * n for n in range(1, 101)]
+    samples = stall._Samples(late=late, update=[2_500_000] * 99, fetch=[8_000_000], missed=3)
+    row = stall._row("worker", samples)
+    assert row.late_p50_us == pytest.approx(50.5)
+    assert row.late_p99_us == pytest.approx(99.01)
+    assert row.late_max_us == 100
+    assert (row.update_mean_ms, row.update_sd_ms) == (2.5, 0)
+    assert (row.frames, row.fetch_ms_median, row.missed) == (1, 8.0, 3)
+
+
+@pytest.mark.slow
+def test_lockstep_is_compared_with_a_bare_loop() -> None:
+    """Both fly; the run takes longer than the bare loop, and cameras longer than none."""
+    bare, run, cameras = lockstep.measure(seconds=5, repeats=1)
+    assert bare.speed > run.speed > cameras.speed > 0
+    assert run.share is not None
+    assert 0 < run.share < 1
+
+
+def test_idling_is_measured_over_the_ticks() -> None:
+    """A second of 100 Hz is a hundred ticks, and takes some of a core but not all of it."""
+    row = idle.measure(1.0)
+    assert 95 <= row.ticks <= 102
+    assert 0 < row.cpu_percent < 100
+
+
+def test_throughput_covers_handlers_streams_and_workers() -> None:
+    """Each way through has a row; only pictures have bytes."""
+    rows = throughput.measure(bursts=3)
+    assert [row.case.split(",")[0] for row in rows] == [
+        *("events", "events", "events", "images by reference"),
+        *("images to a worker and back", "images to a worker and back"),
+    ]
+    assert all(row.per_event_us > 0 for row in rows)
+    assert [row.bytes_per_second > 0 for row in rows] == [False, False, False, True, True, True]

@@ -1,0 +1,96 @@
+"""The page of results: what it says first, and that its figures are those measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bench.driver import Row
+from bench.idle import IdleRow
+from bench.lockstep import LockstepRow
+from bench.stall import StallRow
+from bench.suite import Results, write
+from bench.throughput import ThroughputRow
+
+
+def row(system: str, mode: str, nodes: int, median: float) -> Row:
+    return Row(
+        case="small",
+        system=system,
+        mode=mode,
+        nodes=nodes,
+        place="one process",
+        samples=100,
+        median_us=median,
+        mean_us=median,
+        q1_us=median * 0.9,
+        q3_us=median * 1.1,
+        p99_us=median * 2,
+        max_us=median * 9,
+        rounds_us=(median,),
+    )
+
+
+def stall_row(mode: str, p99: float) -> StallRow:
+    return StallRow(
+        mode=mode,
+        ticks=100,
+        late_p50_us=20,
+        late_p99_us=p99,
+        late_max_us=500,
+        missed=0,
+        update_mean_ms=2.5,
+        update_median_ms=2.5,
+        update_sd_ms=0.1,
+        frames=0 if mode == "none" else 10,
+        fetch_ms_median=8,
+    )
+
+
+def results() -> Results:
+    return Results(
+        environment={"cpu": "a processor", "commit": "abc"},
+        quick=True,
+        rows=[
+            *(row("visnav", "handler", n, 0.5) for n in (2, 128)),
+            *(row("plain calls", "handler", n, 0.4) for n in (2, 128)),
+            *(row("visnav", "stream", n, 1.0) for n in (2, 128)),
+            *(row("asyncio.Queue (uvloop)", "stream", n, 4.0) for n in (2, 128)),
+        ],
+        stall=[stall_row("none", 50), stall_row("worker", 60)],
+        throughput=[
+            ThroughputRow(
+                case="events, stream, all in one wake",
+                batch=256,
+                per_event_us=0.3,
+                events_per_second=3e6,
+                bytes_per_second=0,
+            )
+        ],
+        idle=IdleRow(hz=100, seconds=10, ticks=1000, cpu_percent=0.8),
+        lockstep=[LockstepRow(case="run", speed=100, share=0.2)],
+        missing={"trio channels": "not installed"},
+        versions={"pyee": "pyee 13"},
+    )
+
+
+def test_the_page_says_first_what_its_numbers_do_not_show(tmp_path: Path) -> None:
+    """Caveats, then ratios, then tables; what was not measured is at the end, with the reason."""
+    write(results(), tmp_path, tmp_path / "RESULTS.md")
+    text = (tmp_path / "RESULTS.md").read_text()
+    headings = [line for line in text.splitlines() if line.startswith("## ")]
+    assert headings[:2] == ["## What these numbers do not show", "## In short"]
+    assert "| small, handlers | plain calls | 128 | 1.25 | ≤ 1.3 |" in text
+    assert "| small, streams | asyncio.Queue (uvloop) | 2 | 0.25 | ≤ 0.33 |" in text
+    assert "camera in a worker | no camera | | 1.20 | ≤ 1.25 |" in text
+    assert text.rstrip().endswith("- trio channels: not installed")
+
+
+def test_the_pictures_on_the_page_exist(tmp_path: Path) -> None:
+    """Links lead from the page to plots in another folder."""
+    out = tmp_path / "results"
+    out.mkdir()
+    write(results(), out, tmp_path / "RESULTS.md")
+    lines = (tmp_path / "RESULTS.md").read_text().splitlines()
+    links = [line.split("](")[1].rstrip(")") for line in lines if line.startswith("![")]
+    assert links == ["results/small-scaling.png", "results/small-2.png", "results/small-128.png"]
+    assert all((tmp_path / link).stat().st_size > 5_000 for link in links)
