@@ -165,7 +165,7 @@ def environment() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             versions[library] = "not installed"
     return {
-        "system": platform.platform(),
+        "system": f"{platform.system()} {platform.release().partition('-')[0]}",
         "processor": platform.machine(),
         "cores": str(os.cpu_count()),
         "python": platform.python_version(),
