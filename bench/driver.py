@@ -140,9 +140,8 @@ def measure_all(
                 case=case, mode=mode, nodes=n, samples=count, warm_up=min(warm_up, count // 5 + 1)
             )
             try:
-                taken.setdefault((system.name, mode, n), []).append(
-                    _measure(module, system.name, asked)
-                )
+                samples_of_it = _measure(module, system.name, asked)
+                taken.setdefault((system.name, mode, n), []).append(samples_of_it)
             except (subprocess.SubprocessError, OSError) as error:
                 missing[f"{system.name}, {mode}, {n} nodes"] = _reason(error)
     places = {s.name: s.place for entries in systems().values() for s in entries}

@@ -54,7 +54,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         log: Least level that is logged: trace, debug, info, warning, error or fatal.
     """
 
-    name: Annotated[str, msgspec.Meta(pattern=r"^[\w-][\w.-]*$")] = "run"
+    name: str = "run"
     clock: Literal["lockstep", "real"] = "lockstep"
     speed: Annotated[float, msgspec.Meta(gt=0)] | Literal["max"] | None = None
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
@@ -141,6 +141,11 @@ def parse(table: Mapping[str, Any], where: str) -> Config:
                 + suggest(key, ["run", "nodes"])
             )
     run = convert(table.get("run", {}), RunConfig, f"{where}: run")
+    if not run.name.strip() or "/" in run.name or "\0" in run.name or run.name.startswith("."):
+        raise ConfigError(
+            f"{where}: run.name: expected a name for a folder, without / and not beginning with "
+            f"a dot, found {show(run.name)}"
+        )
     if run.clock == "real" and run.speed in {"max", math.inf}:
         raise ConfigError(
             f'{where}: run.speed: expected a number with clock "real", found {show(run.speed)}'

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.config import Config, load
+from runtime.config import Config, load, parse
 from runtime.errors import ConfigError
 
 DRONE = """
@@ -156,3 +156,12 @@ def test_a_module_that_needs_another_says_which(tmp_path: Path) -> None:
     assert "needy_node needs a module 'surely_not_there'" in text
     text = message(tmp_path, '[[nodes]]\nname = "m"\ntype = "wrong_node:Mine"')
     assert "wrong_node cannot be imported: cannot import name" in text
+
+
+@pytest.mark.parametrize("name", ["", "  ", "a/b", "../x", ".hidden"])
+def test_a_run_is_named_as_a_folder_can_be(name: str) -> None:
+    """The name of the run becomes a folder, and nothing beyond it."""
+    node = {"name": "s", "type": "tests.runtime.samples:Speaker"}
+    table = {"run": {"name": name}, "nodes": [node]}
+    with pytest.raises(ConfigError, match=r"c: run\.name: expected a name for a folder"):
+        parse(table, "c")
