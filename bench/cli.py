@@ -72,7 +72,7 @@ def large(
 def stall(
     json: Json = None,
     seconds: Annotated[float, typer.Option(min=0.5, help="Length of each run.")] = 6.0,
-    repeats: Annotated[int, typer.Option(min=1, help="Runs of each mode, interleaved.")] = 4,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each mode, interleaved.")] = 3,
     rate: Annotated[float, typer.Option(min=0.1, help="Hertz of the camera.")] = 10.0,
     size: Annotated[int, typer.Option(min=16, help="Width and height of its pictures.")] = 512,
 ) -> None:

@@ -1,15 +1,25 @@
 """How late a 400 Hz controller gets while pictures are fetched: the thesis's table 6.3, done right.
 
 A multirotor hovers on the real clock, controlled at 400 Hz, while a 512×512 RGB-D camera at 10 Hz
-is rendered in one of four ways: not at all, inline on the loop (as the thesis did), in a thread,
-and in a worker process (as this project does). Short runs of all ways are interleaved and pooled,
-so that whatever else the machine does falls on all alike.
+is fetched in one of these ways:
+
+    none          not at all
+    inline        rendered on the loop
+    thread        rendered in a thread
+    worker        rendered in a worker process, as this project does
+    fetch inline  from a server on a socket that takes 80 ms, waiting for it on the loop: the thesis
+    fetch         from the same server, awaited
+
+Short runs of all ways are interleaved and pooled, so that whatever else the machine does falls on
+all alike.
 """
 
 from __future__ import annotations
 
+import asyncio
 import concurrent.futures
 import random
+import socket
 import time
 from collections.abc import Callable
 from typing import Any, Literal
@@ -17,6 +27,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from bench.slow_server import slow_server
 from events import Odometry, Takeoff
 from runtime import Input, Node, NodeConfig, Output, Tick, Worker, every
 from runtime.config import parse
@@ -24,8 +35,8 @@ from runtime.execute import execute
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.worlds import load_world
 
-Mode = Literal["none", "inline", "thread", "worker"]
-MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker")
+Mode = Literal["none", "inline", "thread", "worker", "fetch inline", "fetch"]
+MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker", "fetch inline", "fetch")
 
 
 class StallRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -110,6 +121,7 @@ class CameraConfig(NodeConfig):
     rate: float = 10.0
     world: str = "hall"
     warm_up: float = 1.0
+    port: int = 0
 
 
 class Camera(Node[CameraConfig]):
@@ -123,6 +135,9 @@ class Camera(Node[CameraConfig]):
         self._samples = _collected.setdefault(config.mode, _Samples())
         self._fetch: Callable[..., Any] | None = None
         if config.mode == "none":
+            return
+        if config.mode in {"fetch", "fetch inline"}:
+            await self._connect()
             return
         spec = CameraSpec(name="eye", width=config.width, height=config.height)
         arguments = (await self.offload(_model, config.world, spec), (spec,), "free/", 0)
@@ -145,6 +160,30 @@ class Camera(Node[CameraConfig]):
             self._fetch = render
             self._close = renderer.close
 
+    async def _connect(self) -> None:
+        """Connect with the slow server, and fetch from it on the loop or awaiting it."""
+        config = self.config
+        size = pair_size(config.width, config.height)
+        if config.mode == "fetch":
+            reader, self._writer = await asyncio.open_connection(
+                "127.0.0.1", config.port, limit=size
+            )
+
+            async def fetch(*_: Any) -> None:
+                self._writer.write(b"?")
+                await reader.readexactly(size)
+        else:
+            self._socket = socket.create_connection(("127.0.0.1", config.port))
+            pair = bytearray(size)
+
+            async def fetch(*_: Any) -> None:
+                self._socket.sendall(b"?")
+                got = 0
+                while got < size:
+                    got += self._socket.recv_into(memoryview(pair)[got:])
+
+        self._fetch = fetch
+
     @every(hz="rate")
     async def expose(self, tick: Tick) -> None:
         """Fetch a pair."""
@@ -163,6 +202,16 @@ class Camera(Node[CameraConfig]):
             self._pool.shutdown()
         elif self.config.mode == "inline":
             self._close()
+        elif self.config.mode == "fetch":
+            self._writer.close()
+            await self._writer.wait_closed()
+        elif self.config.mode == "fetch inline":
+            self._socket.close()
+
+
+def pair_size(width: int, height: int) -> int:
+    """Return the bytes of a colour image with its depth."""
+    return width * height * (3 + 4)
 
 
 def _model(world: str, camera: CameraSpec) -> bytes:
@@ -192,16 +241,17 @@ def measure(
     """
     _collected.clear()
     shuffle = random.Random(0).shuffle
-    for round_ in range(repeats):
-        order = list(modes)
-        shuffle(order)
-        for mode in order:
-            progress(f"round {round_ + 1} of {repeats}: {mode}")
-            execute(parse(_settings(mode, seconds, rate, size), "bench stall"))
+    with slow_server(pair_size(size, size)) as port:
+        for round_ in range(repeats):
+            order = list(modes)
+            shuffle(order)
+            for mode in order:
+                progress(f"round {round_ + 1} of {repeats}: {mode}")
+                execute(parse(_settings(mode, seconds, rate, size, port), "bench stall"))
     return [_row(mode, _collected[mode]) for mode in modes]
 
 
-def _settings(mode: Mode, seconds: float, rate: float, size: int) -> dict[str, Any]:
+def _settings(mode: Mode, seconds: float, rate: float, size: int, port: int) -> dict[str, Any]:
     here = __name__
     return {
         "run": {"clock": "real", "duration": seconds + 1.0, "log": "error"},
@@ -215,6 +265,7 @@ def _settings(mode: Mode, seconds: float, rate: float, size: int) -> dict[str, A
                 "rate": rate,
                 "width": size,
                 "height": size,
+                "port": port,
             },
         ],
     }

@@ -19,7 +19,7 @@ def test_an_inline_camera_delays_ticks_and_a_worker_fetches_as_much(tmp_path: Pa
     command = [sys.executable, "-m", "runtime", "bench", "stall", "--seconds", "1.5"]
     subprocess.run([*command, "--repeats", "1", "--json", str(out)], check=True)
     rows = {row["mode"]: row for row in json.loads(out.read_text())["rows"]}
-    assert list(rows) == ["none", "inline", "thread", "worker"]
+    assert list(rows) == ["none", "inline", "thread", "worker", "fetch inline", "fetch"]
     assert rows["none"]["frames"] == 0
     for mode in ("inline", "thread", "worker"):
         assert 10 <= rows[mode]["frames"] <= 16
@@ -27,6 +27,11 @@ def test_an_inline_camera_delays_ticks_and_a_worker_fetches_as_much(tmp_path: Pa
     # A picture takes several periods of the tick, so inline some ticks must be that late.
     assert rows["inline"]["late_max_us"] > 2_500
     assert rows["inline"]["missed"] > 0
+    for mode in ("fetch inline", "fetch"):
+        assert rows[mode]["fetch_ms_median"] >= 80
+    # Waiting for 80 ms on the loop costs 32 periods of 2.5 ms; awaiting it costs none of them.
+    assert rows["fetch inline"]["late_max_us"] > 70_000
+    assert rows["fetch"]["missed"] < rows["fetch inline"]["missed"] / 10
 
 
 def test_stall_rows_are_statistics_of_what_was_collected() -> None:
