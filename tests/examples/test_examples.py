@@ -49,6 +49,14 @@ def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
     assert (tmp_path / "pictures.png").stat().st_size > 10_000
 
 
+def test_the_tour_of_the_yard_touches_nothing(tmp_path: Path) -> None:
+    """`yard` flies its whole tour, without a camera here, and lands without a collision."""
+    summary = run("yard", tmp_path, "drone.cameras=[]", "run.stall=1")
+    assert summary["reason"] == "tour: tour flown"
+    # Armed, taken off, landed, disarmed: no collision among what happened.
+    assert summary["outputs"]["drone.happenings"] == 4
+
+
 def test_computer_vision_follows_the_trajectory(tmp_path: Path) -> None:
     """`computer_vision` ends with its trajectory, having given one set of images per update."""
     summary = run("computer_vision", tmp_path, "camera.rate=5")
