@@ -2,7 +2,8 @@
 
 Read in this order: `node` (what an author writes), `ports`, `sender` and `streams` (how an event
 gets from one node to another), `steps` (why that is quick), `schedule`, `clock`, `lockstep` and
-`realtime` (time), `worker` and `shared` (slow work), `graph`, `supervisor` and `execute` (a run).
+`realtime` (time), `worker` and `shared` (slow work), `graph`, `supervisor` and `execute` (a run),
+`config` (the file). `testing` is for tests of nodes.
 """
 
 from runtime.clock import Clock
