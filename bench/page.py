@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from bench.driver import Row
@@ -37,8 +37,8 @@ Made by `make bench`; do not edit.
 """
 
 
-def page(results: Results, pictures: Sequence[str], folder: str) -> str:
-    """Return the whole page as Markdown; the pictures are in `folder`, as seen from the page."""
+def page(results: Results, pictures: Mapping[str, Sequence[str]], folder: str) -> str:
+    """Return the whole page as Markdown; the pictures of each case are in `folder`."""
     parts = [CAVEATS, "\n".join(_goals(results)), "\n".join(_stall(results))]
     parts += ["\n".join(_lockstep(results)), "\n".join(_throughput(results))]
     for case, title in (
@@ -46,7 +46,7 @@ def page(results: Results, pictures: Sequence[str], folder: str) -> str:
         ("large", "Large message (4.67 MB), copied"),
         ("large-shared", "Large message, by reference or shared memory"),
     ):
-        parts.append("\n".join(_latency(results.rows, case, title, pictures, folder)))
+        parts.append("\n".join(_latency(results.rows, case, title, pictures.get(case, ()), folder)))
     parts.append("\n".join(_measured(results)))
     return "\n".join(parts).rstrip() + "\n"
 
@@ -167,8 +167,7 @@ def _latency(
             yield f"| {system} | {mode} | {cells} |"
         yield ""
     for picture in pictures:
-        if picture.startswith(f"{case}-") and picture.removeprefix(f"{case}-")[0] in "s1234567890":
-            yield f"![{picture.removesuffix('.png')}]({folder}/{picture})\n"
+        yield f"![{picture.removesuffix('.png')}]({folder}/{picture})\n"
 
 
 def _measured(results: Results) -> Iterator[str]:

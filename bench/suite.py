@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -91,19 +90,23 @@ def write(results: Results, out: Path, page_path: Path) -> None:
     """Write the page of results, its plots, and the figures themselves."""
     encoded = msgspec.json.format(msgspec.json.encode(results), indent=1)
     (out / "results.json").write_bytes(encoded + b"\n")
-    pictures = list(_plots(results.rows, out))
+    pictures = _plots(results.rows, out)
     folder = os.path.relpath(out, page_path.parent)
     page_path.write_text(page(results, pictures, folder), encoding="utf-8")
 
 
-def _plots(rows: Sequence[Row], out: Path) -> Any:
+def _plots(rows: Sequence[Row], out: Path) -> dict[str, list[str]]:
+    """Draw each case's plots and return their names."""
+    drawn: dict[str, list[str]] = {}
     for case in dict.fromkeys(row.case for row in rows):
         own = [row for row in rows if row.case == case]
+        names = drawn.setdefault(case, [])
         if len({row.nodes for row in own}) > 1:
-            plot_scaling(own, f"{case} message", out / f"{case}-scaling.png")
-            yield f"{case}-scaling.png"
+            names.append(f"{case}-scaling.png")
+            plot_scaling(own, f"{case} message", out / names[-1])
         for n in (2, 128):
             boxed = [row for row in own if row.nodes == n]
             if boxed:
-                plot_boxes(boxed, f"{case} message, {n} nodes", out / f"{case}-{n}.png")
-                yield f"{case}-{n}.png"
+                names.append(f"{case}-{n}.png")
+                plot_boxes(boxed, f"{case} message, {n} nodes", out / names[-1])
+    return drawn

@@ -48,7 +48,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         duration: Seconds of the clock after which the run ends; 0 for no limit.
         digest: Whether to fingerprint all events; if not given, in lockstep only, since no two
             runs in real time are alike.
-        stall: Real seconds without a turn of the loop that the watchdog reports.
+        stall: Real seconds without a turn of the loop that the watchdog reports; 0 for none.
         startup_limit: Real seconds a node's `on_startup` may take.
         shutdown_limit: Real seconds a node's `on_shutdown` may take.
         log: Least level that is logged: trace, debug, info, warning, error or fatal.

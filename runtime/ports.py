@@ -26,7 +26,22 @@ T = TypeVar("T", bound=Event)
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-class Input(Generic[T]):
+class _Port:
+    """What an input and an output have in common: a name, and nothing to show before a run."""
+
+    name = "?"
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def _declaration(self, node: object | None, owner: type) -> Self:
+        """Return the declaration; what stands behind it on an instance is the instance's own."""
+        if node is None:
+            return self
+        raise AttributeError(f"{owner.__name__}.{self.name} exists once a run has made the node")
+
+
+class Input(_Port, Generic[T]):
     """An input that a coroutine reads: ``async for image in self.images``.
 
     On an instance this is a `runtime.streams.Stream`.
@@ -72,10 +87,6 @@ class Input(Generic[T]):
         self.overflow: Overflow = "drop_oldest" if keep == "latest" else overflow
         self.soon = wake == "soon"
         self.source = source
-        self.name = "?"
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
 
     @overload
     def __get__(self, node: None, owner: type) -> Self: ...
@@ -83,16 +94,14 @@ class Input(Generic[T]):
     def __get__(self, node: object, owner: type) -> Stream[T]: ...
     def __get__(self, node: object | None, owner: type) -> Self | Stream[T]:
         """Return the declaration; an instance's stream stands in the instance itself."""
-        if node is None:
-            return self
-        raise AttributeError(f"{owner.__name__}.{self.name} exists once a run has made the node")
+        return self._declaration(node, owner)
 
     def make(self, node: str) -> Stream[T]:
         """Return a new stream for the node of this name."""
         return Stream(f"{node}.{self.name}", self.bound, self.overflow, self.soon)
 
 
-class Output(Generic[T]):
+class Output(_Port, Generic[T]):
     """An output: ``self.estimate.send(event)``. On an instance this is a `Sender`.
 
     Args:
@@ -102,10 +111,6 @@ class Output(Generic[T]):
     def __init__(self, event: type[T]) -> None:
         check_event_type("Output", event)
         self.event = event
-        self.name = "?"
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
 
     @overload
     def __get__(self, node: None, owner: type) -> Self: ...
@@ -113,9 +118,7 @@ class Output(Generic[T]):
     def __get__(self, node: object, owner: type) -> Sender[T]: ...
     def __get__(self, node: object | None, owner: type) -> Self | Sender[T]:
         """Return the declaration; an instance's sender stands in the instance itself."""
-        if node is None:
-            return self
-        raise AttributeError(f"{owner.__name__}.{self.name} exists once a run has made the node")
+        return self._declaration(node, owner)
 
 
 class Handles(msgspec.Struct, frozen=True):
@@ -142,7 +145,7 @@ def on(*events: type[Event], source: str | None = None) -> Callable[[F], F]:
         source: Take only events of this source or below it.
 
     Raises:
-        DeclarationError: No event type, or the method is a coroutine function.
+        DeclarationError: No event type, or the method is a coroutine function or a generator.
     """
     for event in events:
         check_event_type("@on", event)

@@ -22,6 +22,9 @@ import msgspec
 from runtime import lockstep
 from runtime.node import Node
 
+_LONGEST_PAUSE = 0.05
+"""Seconds between two looks at most; a run's end waits for the last of them."""
+
 _WAITING = {selectors.__file__, lockstep.__file__}
 """Modules in which a loop that has nothing to do waits…"""
 
@@ -49,7 +52,7 @@ class Watchdog:
 
     Args:
         loop: The loop.
-        limit: Real seconds without a turn that are a stall.
+        limit: Real seconds without a turn that are a stall; 0 watches nothing.
         report: Told of each stall once it is over; from the watchdog's thread.
     """
 
@@ -68,16 +71,18 @@ class Watchdog:
 
     def start(self) -> None:
         """Begin to watch."""
-        self._thread.start()
+        if self._limit > 0:
+            self._thread.start()
 
     def stop(self) -> None:
         """Watch no more."""
         self._end.set()
         self._signed.set()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join()
 
     def _watch(self) -> None:
-        pause = self._limit / 4
+        pause = min(self._limit / 4, _LONGEST_PAUSE)
         while not self._end.is_set():
             time.sleep(pause)  # an `Event.wait` with a time-out costs five times as much
             frame = sys._current_frames().get(self._thread_id)
@@ -85,6 +90,8 @@ class Watchdog:
                 continue
             del frame
             self._signed.clear()
+            if self._end.is_set():  # `stop` may have signed just before the note was wiped
+                return
             asked = time.monotonic()
             try:
                 self._loop.call_soon_threadsafe(self._signed.set)

@@ -12,6 +12,6 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     from runtime.graph import edges
 
     settings = load(config, overrides or [])
-    warn_unconnected(config, list(overrides or []))
+    warn_unconnected(settings)
     connections = edges([(spec.name, spec.node) for spec in settings.nodes])
     print(f"{config}: {len(settings.nodes)} nodes, {len(connections)} connections: right")

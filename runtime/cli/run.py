@@ -14,6 +14,7 @@ import typer
 from runtime.cli.common import ConfigFile, Overrides
 
 if TYPE_CHECKING:
+    from runtime.config import Config
     from runtime.summary import Summary
 
 
@@ -57,7 +58,7 @@ def run(
     if log is not None and log is not Log.events:
         changes.append(f"run.log={log.value}")
     settings = load(config, changes)
-    warn_unconnected(config, changes)
+    warn_unconnected(settings)
     folder = out or Path("runs") / settings.run.name
     summary = execute(
         settings,
@@ -71,12 +72,11 @@ def run(
     leave_threads_behind(0)
 
 
-def warn_unconnected(config: Path, overrides: list[str]) -> None:
+def warn_unconnected(settings: Config) -> None:
     """Print a line for each input that no node can send to."""
-    from runtime.config import load
     from runtime.graph import unconnected
 
-    nodes = [(spec.name, spec.node) for spec in load(config, overrides).nodes]
+    nodes = [(spec.name, spec.node) for spec in settings.nodes]
     for node, port, event in unconnected(nodes):
         print(f"warning: {node}.{port}: expects {event}, and no node sends it", file=sys.stderr)
 
@@ -101,11 +101,10 @@ def report(summary: Summary, folder: Path) -> None:
 
 def leave_threads_behind(code: int) -> None:
     """End the process if offloaded work of a node never returns; else Python would wait for it."""
-    stuck = [t.name for t in threading.enumerate() if t.name.startswith(("offload", "node"))]
-    alive = [t for t in threading.enumerate() if t.name in stuck and t.is_alive()]
-    for thread in alive:
+    threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node"))]
+    for thread in threads:
         thread.join(1.0)
-    if any(thread.is_alive() for thread in alive):
+    if stuck := [thread.name for thread in threads if thread.is_alive()]:
         print(f"warning: still busy, left behind: {', '.join(stuck)}", file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
+
 from bench.driver import Row
 from bench.idle import IdleRow
 from bench.lockstep import LockstepRow
@@ -94,3 +96,16 @@ def test_the_pictures_on_the_page_exist(tmp_path: Path) -> None:
     links = [line.split("](")[1].rstrip(")") for line in lines if line.startswith("![")]
     assert links == ["results/small-scaling.png", "results/small-2.png", "results/small-128.png"]
     assert all((tmp_path / link).stat().st_size > 5_000 for link in links)
+
+
+def test_each_picture_stands_once_under_its_own_case(tmp_path: Path) -> None:
+    """``large`` and ``large-shared`` begin alike, and yet do not share their pictures."""
+    measured = results()
+    cases = ("small", "large", "large-shared")
+    rows = [msgspec.structs.replace(r, case=case) for r in measured.rows for case in cases]
+    write(msgspec.structs.replace(measured, rows=rows), tmp_path, tmp_path / "RESULTS.md")
+    lines = (tmp_path / "RESULTS.md").read_text().splitlines()
+    links = [line.split("](")[1] for line in lines if line.startswith("![")]
+    assert len(links) == len(set(links)) == 9
+    shared = next(n for n, line in enumerate(lines) if line.startswith("## Large message, by"))
+    assert not any("large-shared" in line for line in lines[:shared] if line.startswith("!["))

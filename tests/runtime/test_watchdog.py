@@ -153,3 +153,27 @@ def test_a_closed_loop_ends_the_watch() -> None:
     dog.start()
     dog._thread.join(1.0)
     assert not dog._thread.is_alive()
+
+
+def test_a_long_limit_does_not_hold_up_the_end() -> None:
+    """A watchdog with a limit of an hour stops within a moment of being told to."""
+    dog = Watchdog(asyncio.new_event_loop(), 3600.0, lambda _: None)
+    try:
+        dog.start()
+        stopping = threading.Thread(target=dog.stop)
+        stopping.start()
+        stopping.join(5.0)
+        assert not stopping.is_alive()
+    finally:
+        dog._loop.close()
+
+
+def test_a_limit_of_none_watches_nothing() -> None:
+    """With a limit of 0 there is no thread, and stopping is no mistake."""
+    loop = asyncio.new_event_loop()
+    dog = Watchdog(loop, 0.0, lambda _: None)
+    before = threading.active_count()
+    dog.start()
+    assert threading.active_count() == before
+    dog.stop()
+    loop.close()
