@@ -7,6 +7,7 @@ No asyncio, no input or output, no imports from the other rooms. A node's own ev
 from events.announcements import (
     Announcement,
     CameraAnnouncement,
+    EstimatorAnnouncement,
     ImuAnnouncement,
     VehicleAnnouncement,
 )
@@ -19,13 +20,20 @@ from events.control import (
     Disarm,
     Hover,
     Land,
+    PlannedPose,
     PoseSetpoint,
     PositionSetpoint,
     Setpoint,
     Takeoff,
     VelocitySetpoint,
 )
-from events.estimates import PoseEstimate, TrackingLost, TrackingRegained
+from events.estimates import (
+    PoseEstimate,
+    TrackedFeatures,
+    TrackingEvent,
+    TrackingLost,
+    TrackingRegained,
+)
 from events.geometry import Odometry, PoseStamped, TransformStamped
 from events.lifecycle import Shutdown
 from events.maps import PointCloud
@@ -59,6 +67,7 @@ __all__ = [
     "DepthImage",
     "Disarm",
     "Disarmed",
+    "EstimatorAnnouncement",
     "Event",
     "FluidPressure",
     "Hover",
@@ -73,6 +82,7 @@ __all__ = [
     "MagneticField",
     "NavSatFix",
     "Odometry",
+    "PlannedPose",
     "PointCloud",
     "PoseEstimate",
     "PoseSetpoint",
@@ -86,6 +96,8 @@ __all__ = [
     "Shutdown",
     "TakenOff",
     "Takeoff",
+    "TrackedFeatures",
+    "TrackingEvent",
     "TrackingLost",
     "TrackingRegained",
     "TransformStamped",

@@ -114,3 +114,19 @@ class BodyRateSetpoint(Setpoint):
 
     angular_velocity: Vector3
     thrust: float
+
+
+class PlannedPose(Event):
+    """Where a pilot means the vehicle to be at `stamp`; for the record, not an order.
+
+    Attributes:
+        frame_id: Parent frame.
+        position: Metres in the parent frame.
+        yaw: Heading in radians, clockwise from north seen from above.
+    """
+
+    category: ClassVar[Category] = Category.CONTROL
+
+    frame_id: str = "map"
+    position: Vector3
+    yaw: float

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
+import numpy.typing as npt
+
 from events.base import Category, Event, Quaternion, Vector3
+from events.sensors import publish
 
 
 class PoseEstimate(Event):
@@ -27,19 +31,46 @@ class PoseEstimate(Event):
     covariance: tuple[float, ...] = ()
 
 
-class TrackingLost(Event):
+class TrackingEvent(Event):
+    """Base of what happens to an estimator's tracking."""
+
+    category: ClassVar[Category] = Category.ESTIMATE
+
+
+class TrackingLost(TrackingEvent):
     """An estimator no longer knows where it is.
 
     Attributes:
         reason: Why, if known.
     """
 
-    category: ClassVar[Category] = Category.ESTIMATE
-
     reason: str = ""
 
 
-class TrackingRegained(Event):
+class TrackingRegained(TrackingEvent):
     """An estimator knows again where it is."""
 
+
+class TrackedFeatures(Event, eq=False):
+    """What an estimator followed in a picture; `stamp` is the picture's.
+
+    Attributes:
+        frame_id: Optical frame of the picture.
+        points: float32 pixels, shape (n, 2): column, row (pixel centres are whole numbers).
+        inliers: bool, shape (n,): those that agree with the estimated pose.
+    """
+
     category: ClassVar[Category] = Category.ESTIMATE
+
+    frame_id: str
+    points: npt.NDArray[np.float32]
+    inliers: npt.NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        publish("TrackedFeatures", "points", self.points, np.float32, {2})
+        publish("TrackedFeatures", "inliers", self.inliers, np.bool_, {1})
+        if self.points.shape != (len(self.inliers), 2):
+            raise TypeError(
+                f"TrackedFeatures.points: expected shape ({len(self.inliers)}, 2), as many as "
+                f"inliers, found {self.points.shape}"
+            )

@@ -1,11 +1,13 @@
 """The runtime: nodes as coroutines on one event loop, talking through awaitable channels.
 
-Read in this order: `node` (what an author writes), `ports`, `sender` and `streams` (how an event
-gets from one node to another), `steps` (why that is quick), `schedule`, `clock`, `lockstep` and
-`realtime` (time), `worker` and `shared` (slow work), `graph`, `supervisor` and `execute` (a run),
-`config` (the file). `testing` is for tests of nodes.
+Read in this order: `node` (what an author writes), `ports` and `bundles` (what it declares),
+`sender`, `streams` and `links` (how an event gets from one node to another), `steps` (why that is
+quick), `schedule`, `clock`, `lockstep` and `realtime` (time), `worker` and `shared` (slow work),
+`graph`, `supervisor`, `execute` and `summary` (a run), `config` (the file). `testing` is for tests
+of nodes.
 """
 
+from runtime.bundles import Bundle
 from runtime.clock import Clock
 from runtime.errors import RefusedError, VisnavError
 from runtime.node import Node, NodeConfig
@@ -16,6 +18,7 @@ from runtime.units import Duration
 from runtime.worker import Worker
 
 __all__ = [
+    "Bundle",
     "Clock",
     "Duration",
     "Input",

@@ -8,6 +8,7 @@ name = "drone"
 type = "sims.multirotor:Multirotor"     # module:Class
 on_error = "stop"                       # optional, like `inputs`
 inputs = { setpoints = "tour" }         # narrow a port to a source
+links = { setpoints = { delay = "80ms" } }  # make the way there worse than perfect
 rate = 30                               # all other keys: the node's own settings
 """
 
@@ -27,6 +28,7 @@ import msgspec
 
 from runtime.errors import ConfigError, suggest
 from runtime.explain import explain, show
+from runtime.links import LinkConfig
 from runtime.node import Node, NodeConfig
 from runtime.override import override
 from runtime.ports import MAX_HZ
@@ -74,6 +76,7 @@ class NodeSpec(msgspec.Struct, frozen=True, kw_only=True):
         type_name: ``module:Class``.
         on_error: What an exception in the node does to the run.
         inputs: Port or handler to the source it is narrowed to.
+        links: Port or handler to what the way there does to events.
         node: The class.
         config: The node's own settings.
     """
@@ -82,6 +85,7 @@ class NodeSpec(msgspec.Struct, frozen=True, kw_only=True):
     type_name: str
     on_error: OnError
     inputs: dict[str, str]
+    links: dict[str, LinkConfig]
     node: type[Node[Any]]
     config: NodeConfig
 
@@ -98,6 +102,7 @@ class _NodeHead(msgspec.Struct, frozen=True, kw_only=True):
     type: str
     on_error: OnError = "stop"
     inputs: dict[str, str] = {}
+    links: dict[str, Any] = {}
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> Config:
@@ -217,6 +222,8 @@ def to_builtins(config: Config) -> dict[str, Any]:
         head = {"name": spec.name, "type": spec.type_name, "on_error": spec.on_error}
         if spec.inputs:
             head["inputs"] = spec.inputs  # type: ignore[assignment]
+        if spec.links:
+            head["links"] = msgspec.to_builtins(spec.links, enc_hook=float)
         nodes.append(head | msgspec.to_builtins(spec.config, enc_hook=float))
     table: dict[str, Any] = _without_none(
         {"run": msgspec.to_builtins(config.run, enc_hook=float), "nodes": nodes}
@@ -249,11 +256,12 @@ def _node(entry: Any, where: str) -> NodeSpec:
     cls = find_node(head.type, f"{where}: type")
     rest = {k: v for k, v in entry.items() if k not in keys}
     config = convert(rest, cls.config_type, where)
-    for port in head.inputs:
-        if port not in cls.declared.listening:
+    ports = [*cls.declared.listening, *cls.declared.bundle_fields()]
+    for key, port in [("inputs", p) for p in head.inputs] + [("links", p) for p in head.links]:
+        if port not in ports:
             raise ConfigError(
-                f"{where}: inputs: expected an input or handler of {head.type}, "
-                f"found {show(port)}" + suggest(port, cls.declared.listening)
+                f"{where}: {key}: expected an input or handler of {head.type}, "
+                f"found {show(port)}" + suggest(port, ports)
             )
     for method, ticks in cls.declared.ticks.items():
         if isinstance(ticks.hz, str):
@@ -268,6 +276,10 @@ def _node(entry: Any, where: str) -> NodeSpec:
         type_name=head.type,
         on_error=head.on_error,
         inputs=head.inputs,
+        links={
+            port: convert(link, LinkConfig, f"{where}: links.{port}")
+            for port, link in head.links.items()
+        },
         node=cls,
         config=config,
     )

@@ -11,7 +11,8 @@
     ├── ChannelError
     │   ├── ChannelFullError   the receiver fell behind further than it allowed
     │   ├── ChannelClosedError you (or the end of the run) closed it
-    │   └── ChannelBusyError   two coroutines wait on one input
+    │   ├── ChannelBusyError   two coroutines wait on one input
+    │   └── AmbiguousSourceError  an input that matches stamps hears two sources
     └── WorkerError
         ├── WorkerDiedError    the process ended: name, exit code and last output
         └── WorkerTimeoutError the process did not answer in time
@@ -80,6 +81,10 @@ class ChannelClosedError(ChannelError):
 
 class ChannelBusyError(ChannelError):
     """A second coroutine wanted to wait on an input that has one waiting."""
+
+
+class AmbiguousSourceError(ChannelError):
+    """Two sources send events for one field of a bundle; the file must name one."""
 
 
 class WorkerError(VisnavError):

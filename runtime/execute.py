@@ -61,10 +61,12 @@ def execute(
         handlers.append(file_handler(out / "log.txt"))
     loop = make_loop(config.run)
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
-        summary, error = runner.run(_run(config, out, handlers, log_events, watch))
+        summary, after, error = runner.run(_run(config, out, handlers, log_events, watch))
     if out is not None:
         encoded = msgspec.json.format(msgspec.json.encode(summary), indent=2)
         (out / "summary.json").write_bytes(encoded + b"\n")
+        for call in after:
+            call(out)
     if error is not None:
         raise error
     return summary
@@ -94,7 +96,7 @@ async def _run(
     handlers: list[logging.Handler],
     log_events: bool,
     watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
-) -> tuple[Summary, Exception | None]:
+) -> tuple[Summary, list[Callable[[Path], Any]], Exception | None]:
     loop = asyncio.get_running_loop()
     steps.install(loop)
     clock = make_clock(config.run, loop)
@@ -127,6 +129,7 @@ async def _run(
             stalls=watchdog.stalls,
             longest_stalls=watchdog.longest,
         ),
+        supervisor.after,
         supervisor.error,
     )
 

@@ -9,33 +9,58 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from runtime.links import Link
 from runtime.node import Node, senders
-from runtime.sender import Listener, Tap
+from runtime.sender import Deliver, Listener, Tap
 from runtime.steps import Fault
 
 Sources = Mapping[str, Mapping[str, str]]
 """Node to port to the source that the port is narrowed to."""
 
+Links = Mapping[str, Mapping[str, Link]]
+"""Node to port to the link that stands before it."""
 
-def listeners(node: Node[Any], sources: Mapping[str, str]) -> list[Listener]:
-    """Return a node's inputs and handlers, in order."""
+
+def listeners(
+    node: Node[Any],
+    sources: Mapping[str, str],
+    links: Mapping[str, Link],
+    fault: Fault | None = None,
+) -> list[Listener]:
+    """Return a node's inputs, fields of bundles and handlers, in order."""
     found = []
+
+    def add(
+        port: str, deliver: Deliver, events: Any, source: str | None, stream: Any = None
+    ) -> None:
+        if port in links:
+            deliver, stream = _linked(links[port], deliver, fault), None
+        found.append(Listener(node.name, deliver, events, source, stream))
+
     for name in node.declared.listening:
-        handles = node.declared.handlers.get(name)
-        if handles is not None:
-            source = sources.get(name, handles.source)
-            found.append(Listener(node.name, getattr(node, name), handles.events, source))
+        if name in node.declared.handlers:
+            handles = node.declared.handlers[name]
+            add(name, getattr(node, name), handles.events, sources.get(name, handles.source))
+        elif name in node.declared.bundles:
+            matcher, declared = getattr(node, name), node.declared.bundles[name]
+            matcher.deliver = matcher.stream.offer
+            if name in links:
+                matcher.deliver = _linked(links[name], matcher.deliver, fault)
+            for field, slot in matcher.slots.items():
+                port = f"{name}.{field}"
+                of_all = None if slot.kind == "all" else sources.get(name, declared.source)
+                add(port, slot.take, (declared.fields[field].event,), sources.get(port, of_all))
         else:
-            declared = node.declared.inputs[name]
-            stream = getattr(node, name)
-            source = sources.get(name, declared.source)
-            found.append(Listener(node.name, stream.offer, (declared.event,), source, stream))
+            input_, stream = node.declared.inputs[name], getattr(node, name)
+            source = sources.get(name, input_.source)
+            add(name, stream.offer, (input_.event,), source, stream)
     return found
 
 
 def connect(
     nodes: Sequence[Node[Any]],
     sources: Sources,
+    links: Links | None = None,
     taps: Iterable[Tap] = (),
     fault: Fault | None = None,
     last: Iterable[Listener] = (),
@@ -45,11 +70,18 @@ def connect(
     Args:
         nodes: In the order in which they hear events.
         sources: Ports narrowed by the file.
+        links: Ports whose events come late or not at all.
         taps: See every event first.
         fault: Told of listeners that raise; without it, `send` raises what they do.
         last: Listeners after all nodes.
     """
-    heard = [listener for n in nodes for listener in listeners(n, sources.get(n.name, {}))]
+    heard = [
+        listener
+        for node in nodes
+        for listener in listeners(
+            node, sources.get(node.name, {}), (links or {}).get(node.name, {}), fault
+        )
+    ]
     heard += last
     for node in nodes:
         others = [listener for listener in heard if listener.node != node.name]
@@ -73,13 +105,17 @@ def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, 
 
 
 def heard_types(cls: type[Node[Any]]) -> dict[str, tuple[Any, ...]]:
-    """Return the event types of a class's inputs and handlers."""
-    return {
-        name: cls.declared.handlers[name].events
-        if name in cls.declared.handlers
-        else (cls.declared.inputs[name].event,)
-        for name in cls.declared.listening
-    }
+    """Return the event types of a class's inputs, fields of bundles and handlers."""
+    found: dict[str, tuple[Any, ...]] = {}
+    for name in cls.declared.listening:
+        if name in cls.declared.handlers:
+            found[name] = cls.declared.handlers[name].events
+        elif name in cls.declared.bundles:
+            fields = cls.declared.bundles[name].fields
+            found |= {f"{name}.{field}": (each.event,) for field, each in fields.items()}
+        else:
+            found[name] = (cls.declared.inputs[name].event,)
+    return found
 
 
 def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str]]:
@@ -92,8 +128,15 @@ def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str,
         (name, port, " or ".join(e.__name__ for e in events))
         for name, cls in nodes
         for port, events in heard_types(cls).items()
-        if port in cls.declared.inputs and (name, port) not in connected
+        if port not in cls.declared.handlers
+        and (name, port) not in connected
+        and port not in cls.declared.optional_fields()
     ]
+
+
+def _linked(link: Link, deliver: Deliver, fault: Fault | None) -> Deliver:
+    """Put a link before a port; what its far end raises later is reported as its near end's is."""
+    return link.to(deliver, None if fault is None else lambda error: fault(deliver, error))
 
 
 def _nothing(_: Any) -> None:

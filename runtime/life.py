@@ -6,8 +6,10 @@ import asyncio
 import logging
 from typing import Any
 
+from runtime.clock import Clock
 from runtime.config import NodeSpec
 from runtime.errors import NodeError, VisnavError
+from runtime.links import Link
 from runtime.node import Node
 from runtime.schedule import Ticker
 from runtime.worker import Worker
@@ -24,10 +26,23 @@ class Life:
         self.tasks: set[asyncio.Task[None]] = set()
         self.tickers: list[Ticker] = []
         self.workers: list[Worker[Any]] = []
+        self.links: dict[str, Link] = {}
         self.started = False
         self.failures = 0
         self.recovering = False
         self.ending = asyncio.Lock()
+
+    def make_links(self, clock: Clock, seed: int) -> None:
+        """Make the links that the file puts before the node's ports."""
+        self.links = {
+            port: Link(f"{self.spec.name}.{port}", config, clock, seed)
+            for port, config in self.spec.links.items()
+        }
+
+    def close_links(self) -> None:
+        """Let nothing that is on its way arrive any more."""
+        for link in self.links.values():
+            link.close()
 
 
 def log_error(error: NodeError, *, last: bool) -> None:

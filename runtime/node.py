@@ -11,7 +11,7 @@ from __future__ import annotations
 import concurrent.futures
 import functools
 import zlib
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Generic, ParamSpec, Protocol, dataclass_transform, get_args
 
@@ -20,6 +20,7 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from events import Announcement
+from runtime.bundles import Bundle, Matcher
 from runtime.clock import Clock
 from runtime.errors import DeclarationError
 from runtime.logs import NodeLogger
@@ -56,11 +57,25 @@ class Declared(msgspec.Struct):
     """What a node's class declares, by attribute name, in the order of the class body."""
 
     inputs: dict[str, Input[Any]]
+    bundles: dict[str, Bundle[Any]]
     outputs: dict[str, Output[Any]]
     handlers: dict[str, Handles]
     ticks: dict[str, Ticks]
     listening: list[str]
-    """Inputs and handlers, in the order in which they hear an event."""
+    """Inputs, bundles and handlers, in the order in which they hear an event."""
+
+    def bundle_fields(self) -> list[str]:
+        """Return ``bundle.field`` for all fields of all bundles."""
+        return [f"{name}.{field}" for name, b in self.bundles.items() for field in b.fields]
+
+    def optional_fields(self) -> list[str]:
+        """Return ``bundle.field`` for the fields that a set can do without."""
+        return [
+            f"{name}.{field}"
+            for name, bundle in self.bundles.items()
+            for field, each in bundle.fields.items()
+            if each.kind == "maybe"
+        ]
 
 
 class Host(Protocol):
@@ -84,6 +99,12 @@ class Host(Protocol):
 
     def stop(self, reason: str) -> None:
         """End the run in order."""
+
+    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool) -> None:
+        """Put a verdict into the summary."""
+
+    def after_run(self, call: Callable[[Path], Any]) -> None:
+        """Call a function once the summary is written."""
 
 
 class Node(Generic[C]):
@@ -111,6 +132,8 @@ class Node(Generic[C]):
         out: Folder for files, or `None` if the run writes none.
     """
 
+    deterministic: ClassVar[bool] = True
+    """Whether equal inputs give equal outputs; if not, no run with it promises its digest."""
     declared: ClassVar[Declared]
     config_type: ClassVar[type[NodeConfig]] = NodeConfig
 
@@ -200,6 +223,25 @@ class Node(Generic[C]):
         """End the run in order, as Ctrl-C would."""
         self._host.stop(reason)
 
+    def conclude(self, subject: str, figures: Mapping[str, Any], *, passed: bool = True) -> None:
+        """Put a verdict about something into the run's summary.
+
+        If any verdict of a run is not passed, the command line ends with exit code 1.
+
+        Args:
+            subject: What was judged: the source of an estimator.
+            figures: Numbers and words about it.
+            passed: Whether it met its thresholds.
+        """
+        self._host.conclude(subject, figures, passed)
+
+    def after_run(self, call: Callable[[Path], Any]) -> None:
+        """Have a function called with the run's folder once its summary is written.
+
+        It is called in the order of asking, and not at all if the run writes no files.
+        """
+        self._host.after_run(call)
+
 
 N = TypeVar("N", bound=Node[Any])
 
@@ -216,6 +258,8 @@ def make_node(cls: type[N], name: str, config: NodeConfig, host: Host) -> N:
     node._host = host
     for port, declared in cls.declared.inputs.items():
         setattr(node, port, declared.make(name))
+    for port, bundle in cls.declared.bundles.items():
+        setattr(node, port, bundle.make(name))
     for port, output in cls.declared.outputs.items():
         setattr(node, port, Sender(f"{name}.{port}", output.event))
     node.__init__()  # type: ignore[misc]  # now that what it may use is there
@@ -224,7 +268,13 @@ def make_node(cls: type[N], name: str, config: NodeConfig, host: Host) -> N:
 
 def streams(node: Node[Any]) -> dict[str, Stream[Any]]:
     """Return a node's streams by port."""
-    return {port: getattr(node, port) for port in node.declared.inputs}
+    found = {port: getattr(node, port) for port in node.declared.inputs}
+    return found | {port: matcher.stream for port, matcher in matchers(node).items()}
+
+
+def matchers(node: Node[Any]) -> dict[str, Matcher[Any]]:
+    """Return a node's matchers by port."""
+    return {port: getattr(node, port) for port in node.declared.bundles}
 
 
 def senders(node: Node[Any]) -> dict[str, Sender[Any]]:
@@ -234,24 +284,26 @@ def senders(node: Node[Any]) -> dict[str, Sender[Any]]:
 
 def _declared(cls: type[Node[Any]]) -> Declared:
     """Read the declarations of a class and its bases."""
-    found = Declared({}, {}, {}, {}, [])
+    found = Declared({}, {}, {}, {}, {}, [])
     names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
     for name in names:
         value = getattr(cls, name, None)
-        if isinstance(value, Input | Output) and name in _RESERVED:
+        if isinstance(value, Input | Bundle | Output) and name in _RESERVED:
             raise DeclarationError(
                 f"{cls.__name__}.{name}: every node has an attribute of this name; "
                 "call the port something else"
             )
         if isinstance(value, Input):
             found.inputs[name] = value
+        elif isinstance(value, Bundle):
+            found.bundles[name] = value
         elif isinstance(value, Output):
             found.outputs[name] = value
         if handles := getattr(value, "__handles__", None):
             found.handlers[name] = handles
         if ticks := getattr(value, "__ticks__", None):
             found.ticks[name] = ticks
-        if name in found.inputs or name in found.handlers:
+        if name in found.inputs or name in found.bundles or name in found.handlers:
             found.listening.append(name)
     return found
 

@@ -15,7 +15,8 @@ def override(table: dict[str, Any], change: str) -> None:
 
     Args:
         table: Of the whole file; is changed.
-        change: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word.
+        change: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word. For
+            ``drone.cameras.front.rate`` there is ``front.rate``, if nothing else has that name.
 
     Raises:
         ConfigError: There is no such node, or nothing to set there.
@@ -35,10 +36,7 @@ def override(table: dict[str, Any], change: str) -> None:
     elif keys[0] in nodes:
         target = nodes[keys[0]]
     else:
-        raise ConfigError(
-            f'{where}: expected "run" or the name of a node, found {show(keys[0])}'
-            + suggest(keys[0], ["run", *nodes])
-        )
+        target = _part(nodes, keys[0], where)
     for before, key in itertools.pairwise(keys[:-1]):
         if isinstance(target, list):  # an entry of a list of tables, by its name
             target = _entry(target, key, f"{where}: {before}")
@@ -52,6 +50,25 @@ def override(table: dict[str, Any], change: str) -> None:
             f"found {show(target)}"
         )
     target[keys[-1]] = value
+
+
+def _part(nodes: dict[str, dict[str, Any]], name: str, where: str) -> dict[str, Any]:
+    """Return the one table of this name in the lists of all nodes, such as a camera's."""
+    parts = {
+        f"{node}.{key}.{part}": entry
+        for node, table in nodes.items()
+        for key, entries in table.items()
+        for part, entry in _by_name(entries).items()
+    }
+    found = [path for path in parts if path.endswith(f".{name}")]
+    if len(found) == 1:
+        return parts[found[0]]
+    if found:
+        raise ConfigError(f"{where}: expected one of {', '.join(found)}; found {show(name)}")
+    known = ["run", *nodes, *(path.rpartition(".")[2] for path in parts)]
+    raise ConfigError(
+        f'{where}: expected "run" or the name of a node, found {show(name)}' + suggest(name, known)
+    )
 
 
 def _entry(entries: list[Any], name: str, where: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from runtime.node import senders, streams
+from runtime.node import matchers, senders, streams
 from runtime.schedule import SECOND
 from runtime.supervisor import Supervisor
 from runtime.watchdog import Stall
@@ -29,11 +29,34 @@ class TickSummary(msgspec.Struct, frozen=True):
 
 
 class StreamSummary(msgspec.Struct, frozen=True):
-    """How full one input got, and what it dropped."""
+    """How full one input got, and what it dropped.
+
+    For a bundle, `missed` says how often a set did not come about, by the field that was missing.
+    """
 
     bound: int
     peak: int
     dropped: int
+    missed: dict[str, int] = {}
+
+
+class LinkSummary(msgspec.Struct, frozen=True):
+    """How many events a link lost, and how many it left out to keep to its rate."""
+
+    lost: int
+    thinned: int
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """How those did whom the run was about.
+
+    Attributes:
+        passed: Whether all met their thresholds.
+        estimators: By source: ``passed``, and figures such as ``ate_rmse_m``.
+    """
+
+    passed: bool
+    estimators: dict[str, dict[str, Any]]
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -49,10 +72,13 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         wall_seconds: Real seconds, from the first update to when the end was asked for.
         digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels
             depend on the graphics driver, so digests compare on one machine.) `None` if off.
+        not_deterministic: Nodes because of which equal runs may have unequal digests.
+        verdict: What nodes concluded; `None` if none did.
         events: Events sent, by type.
         outputs: Events sent, by output.
         drops: Events dropped, by input.
         streams: Inputs' bounds and peaks.
+        links: What links did, by port.
         ticks: Punctuality, by ticker.
         stalls: Times the loop did not turn, by node.
         longest_stalls: The worst of them, by node.
@@ -68,10 +94,13 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     sim_seconds: float
     wall_seconds: float
     digest: str | None
+    not_deterministic: list[str]
+    verdict: Verdict | None
     events: dict[str, int]
     outputs: dict[str, int]
     drops: dict[str, int]
     streams: dict[str, StreamSummary]
+    links: dict[str, LinkSummary]
     ticks: dict[str, TickSummary]
     stalls: dict[str, int]
     longest_stalls: dict[str, Stall]
@@ -95,11 +124,15 @@ def count_drops(supervisor: Supervisor) -> dict[str, StreamSummary]:
     """Return how full each input got and what it dropped."""
     found: dict[str, StreamSummary] = {}
     for node in supervisor.ever:
-        for stream in streams(node).values():
+        missed = {port: matcher.missed for port, matcher in matchers(node).items()}
+        for port, stream in streams(node).items():
             before = found.get(stream.name, StreamSummary(stream.bound, 0, 0))
             now = stream.statistics()
             found[stream.name] = StreamSummary(
-                stream.bound, max(before.peak, now.peak), before.dropped + now.dropped
+                stream.bound,
+                max(before.peak, now.peak),
+                before.dropped + now.dropped,
+                dict(Counter(before.missed) + Counter(missed.get(port, {}))),
             )
     return found
 
@@ -141,10 +174,15 @@ def summarise(
         sim_seconds=sim_ns / SECOND,
         wall_seconds=round(ended - (supervisor.first_update or ended), 6),
         digest=digest,
+        not_deterministic=sorted({n.name for n in supervisor.ever if not n.deterministic}),
+        verdict=_verdict(supervisor),
         events=dict(sorted(by_type.items())),
         outputs=dict(by_output),
         drops={port: s.dropped for port, s in by_input.items()},
         streams=by_input,
+        links={
+            link.name: LinkSummary(link.lost, link.thinned) for link in supervisor.links.values()
+        },
         ticks=tick_summaries(supervisor),
         stalls=dict(stalls),
         longest_stalls=longest_stalls,
@@ -155,9 +193,24 @@ def summarise(
     )
 
 
+def _verdict(supervisor: Supervisor) -> Verdict | None:
+    found = supervisor.verdicts
+    if not found:
+        return None
+    return Verdict(all(each["passed"] for each in found.values()), found)
+
+
 def environment() -> dict[str, str]:
     """Return what a figure depends on: machine, Python and the libraries' versions."""
-    libraries = ["visnav-runtime", "numpy", "mujoco", "opencv-python-headless", "uvloop", "msgspec"]
+    libraries = [
+        "visnav-runtime",
+        "numpy",
+        "mujoco",
+        "opencv-python-headless",
+        "scipy",
+        "uvloop",
+        "msgspec",
+    ]
     versions = {}
     for library in libraries:
         try:

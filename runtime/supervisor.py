@@ -18,7 +18,7 @@ import functools
 import inspect
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from runtime.config import Config
 from runtime.errors import FatalError, NodeError, NodeTimeoutError, RefusedError
 from runtime.life import Life, log_error, wrap
 from runtime.limits import real_time_limit
+from runtime.links import Link
 from runtime.node import Node, make_node, streams
 from runtime.schedule import Once, Tick, Ticker
 from runtime.sender import Deliver, Listener, Tap
@@ -75,6 +76,12 @@ class Supervisor:
         self.ever: list[Node[Any]] = []
         """All nodes there have been, those restarted or dropped included."""
         self.tickers: dict[str, Ticker] = {}
+        self.links: dict[str, Link] = {}
+        """All links of the nodes that there are, by ``node.port``."""
+        self.verdicts: dict[str, dict[str, Any]] = {}
+        """What nodes concluded, by what they judged."""
+        self.after: list[Callable[[Path], Any]] = []
+        """What is to be called with the run's folder at the very end."""
         self._config = config
         self._taps = tuple(taps)
         self._lives = {spec.name: Life(spec) for spec in config.nodes}
@@ -105,6 +112,14 @@ class Supervisor:
         self._ended.set()
         if self._begin is not None and not self._begin.done():
             self._begin.cancel()
+
+    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool) -> None:
+        """Note a verdict for the summary."""
+        self.verdicts[subject] = {"passed": passed, **figures}
+
+    def after_run(self, call: Callable[[Path], Any]) -> None:
+        """Have a function called once the summary is written."""
+        self.after.append(call)
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as part of a node."""
@@ -203,6 +218,8 @@ class Supervisor:
         try:
             life.node = node = make_node(spec.node, spec.name, spec.config, self)
             self.ever.append(node)
+            life.make_links(self.clock, self.seed)
+            self.links |= {link.name: link for link in life.links.values()}
             async with real_time_limit(self._config.run.startup_limit):
                 await node.on_startup()
             life.started = True
@@ -241,8 +258,9 @@ class Supervisor:
     def _connect(self) -> None:
         nodes = [life.node for life in self._lives.values() if life.node and life.started]
         sources = {spec.name: spec.inputs for spec in self._config.nodes}
+        links = {life.spec.name: life.links for life in self._lives.values()}
         end = Listener("run", self._hear_end, (Shutdown, WindowClosed))
-        graph.connect(nodes, sources, self._taps, self._listener_failed, [end])
+        graph.connect(nodes, sources, links, self._taps, self._listener_failed, [end])
 
     def _begin_node(self, life: Life) -> None:
         node = life.node
@@ -357,6 +375,7 @@ class Supervisor:
             await asyncio.to_thread(worker.close)
         life.workers.clear()
         life.started = False
+        life.close_links()
         if node is not None:
             for stream in streams(node).values():
                 stream.close()

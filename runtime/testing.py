@@ -19,6 +19,7 @@ import msgspec
 from events import Announcement, Event
 from runtime import steps
 from runtime.config import Config, NodeSpec, OnError, RunConfig, convert
+from runtime.links import LinkConfig
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.node import Node
 from runtime.ports import Output
@@ -149,6 +150,7 @@ def spec(
     config: Mapping[str, Any] | None = None,
     on_error: OnError = "stop",
     inputs: Mapping[str, str] | None = None,
+    links: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> NodeSpec:
     """Return what the file's table for a node would become."""
     return NodeSpec(
@@ -156,6 +158,10 @@ def spec(
         type_name=f"{node.__module__}:{node.__name__}",
         on_error=on_error,
         inputs=dict(inputs or {}),
+        links={
+            port: convert(dict(link), LinkConfig, f"{name}.links.{port}")
+            for port, link in (links or {}).items()
+        },
         node=node,
         config=convert(dict(config or {}), node.config_type, name),
     )

@@ -14,8 +14,10 @@ import typer
 from runtime.cli.common import ConfigFile, Overrides
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from runtime.config import Config
-    from runtime.summary import Summary
+    from runtime.summary import Summary, Verdict
 
 
 class Log(Enum):
@@ -69,7 +71,9 @@ def run(
     )
     if not quiet:
         report(summary, folder)
-    leave_threads_behind(0)
+    code = 0 if summary.verdict is None or summary.verdict.passed else 1
+    leave_threads_behind(code)
+    raise typer.Exit(code)
 
 
 def warn_unconnected(settings: Config) -> None:
@@ -91,12 +95,25 @@ def report(summary: Summary, folder: Path) -> None:
     for table in run_tables(summary):
         console.print(table)
     speed = summary.sim_seconds / max(summary.wall_seconds, 1e-9)
+    digest = summary.digest or "off"
+    if summary.digest and summary.not_deterministic:
+        digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
+    if summary.verdict is not None:
+        _judge(console, summary.verdict)
     console.print(
         f"{summary.sim_seconds:.1f} s on the {summary.clock} clock in "
         f"{summary.wall_seconds:.1f} s ({speed:.1f} × real time), ended by: {summary.reason}\n"
-        f"digest {summary.digest or 'off'}   results in [bold]{folder}[/bold]",
+        f"digest {digest}   results in [bold]{folder}[/bold]",
         highlight=False,
     )
+
+
+def _judge(console: Console, verdict: Verdict) -> None:
+    """Print who passed, and what those failed that did not."""
+    for name, figures in verdict.estimators.items():
+        passed = "[green]passed[/green]" if figures["passed"] else "[red]failed[/red]"
+        reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
+        console.print(f"{name} {passed}{': ' + reasons if reasons else ''}", highlight=False)
 
 
 def leave_threads_behind(code: int) -> None:

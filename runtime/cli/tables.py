@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from rich.table import Table
 
-from runtime.summary import Summary
+from runtime.summary import Summary, Verdict
 
 
 def run_tables(summary: Summary) -> Iterator[Table]:
@@ -16,9 +17,11 @@ def run_tables(summary: Summary) -> Iterator[Table]:
     for output, count in sorted(summary.outputs.items()):
         sent.add_row(output, f"{count}", f"{count / seconds:.1f}")
     yield _numbers(sent)
-    streams = Table("input", "dropped", "fullest", "holds", title="inputs")
+    streams = Table("input", "dropped", "fullest", "holds", "unmatched", title="inputs")
     for port, stream in sorted(summary.streams.items()):
-        streams.add_row(port, f"{stream.dropped}", f"{stream.peak}", f"{stream.bound}")
+        unmatched = f"{sum(stream.missed.values())}" if stream.missed else ""
+        dropped = f"{stream.dropped}"
+        streams.add_row(port, dropped, f"{stream.peak}", f"{stream.bound}", unmatched)
     if streams.row_count:
         yield _numbers(streams)
     ticks = Table("tick", "Hz", "calls", "late p50 µs", "p99 µs", "max µs", "missed", title="ticks")
@@ -40,6 +43,25 @@ def run_tables(summary: Summary) -> Iterator[Table]:
         stalls.add_row(node, f"{count}", f"{worst.seconds * 1e3:.0f}", worst.line)
     if stalls.row_count:
         yield _numbers(stalls)
+    if summary.verdict is not None:
+        yield from _verdict(summary.verdict)
+
+
+def _verdict(verdict: Verdict) -> Iterator[Table]:
+    """Return the figures of those that were judged: one column each."""
+    table = Table("figure", *verdict.estimators, title="verdict")
+    figures = dict.fromkeys(key for each in verdict.estimators.values() for key in each)
+    for figure in figures:
+        row = [each.get(figure, "") for each in verdict.estimators.values()]
+        if not any(isinstance(value, list | tuple | dict) for value in row):
+            table.add_row(figure, *(_show(value) for value in row))
+    yield _numbers(table)
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _numbers(table: Table) -> Table:

@@ -21,6 +21,7 @@ from tests.runtime.test_config import CAMERAS, DRONE, SPEAKER, message, read
 BAD_OVERRIDES = [
     ("x", "--set x: expected node.key=value or run.key=value"),
     ("drone=1", "--set drone=1: expected node.key=value or run.key=value"),
+    ("frnt.rate=3", 'expected "run" or the name of a node, found "frnt" (did you mean \'front\'?)'),
     ("run..seed=1", "expected node.key=value or run.key=value"),
     ("dron.a=1", 'expected "run" or the name of a node, found "dron" (did you mean \'drone\'?)'),
     ("drone.cameras.frnt.rate=3", 'cameras: expected one of front, down; found "frnt" (did you'),
@@ -41,6 +42,18 @@ def test_overrides_of_a_broken_file_are_no_crash(tmp_path: Path, text: str) -> N
     assert "expected" in message(tmp_path, text, "run.seed=3")
     assert "expected" in message(tmp_path, text, "drone.rate=3")
     assert "expected" in message(tmp_path, "nodes = [3, {name = 'drone'}]", "drone.type=x:Y")
+
+
+def test_a_table_with_a_name_of_its_own_needs_no_path(tmp_path: Path) -> None:
+    config = read(tmp_path, DRONE + CAMERAS, "front.rate=7")
+    assert isinstance(config.nodes[0].config, MultirotorConfig)
+    assert [camera.rate for camera in config.nodes[0].config.cameras] == [7, 30]
+
+
+def test_a_table_whose_name_is_not_its_own_needs_a_path(tmp_path: Path) -> None:
+    twice = DRONE + CAMERAS + (DRONE + CAMERAS).replace('name = "drone"', 'name = "other"')
+    expected = "expected one of drone.cameras.front, other.cameras.front"
+    assert expected in message(tmp_path, twice, "front.rate=7")
 
 
 def test_overrides_change_plain_and_nested_settings(tmp_path: Path) -> None:

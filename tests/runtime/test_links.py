@@ -1,0 +1,134 @@
+"""Links: delay, jitter, loss and rate on the way to a port."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import pytest
+
+from events import Event
+from runtime import Bundle, Input, Node, Output, on
+from runtime.errors import ConfigError, NodeError
+from runtime.testing import run_nodes, spec
+
+MS = 1_000_000
+
+
+class Said(Event):
+    """Something to hear."""
+
+
+class Heard(Event):
+    """What came, and when."""
+
+    of: int
+
+
+class Ear(Node):
+    """Tells what came when, by a stream."""
+
+    said = Input(Said)
+    heard = Output(Heard)
+
+    def tell(self, event: Said) -> None:
+        self.heard.send(Heard(stamp=self.clock.now(), source=self.name, of=event.stamp))
+
+    async def run(self) -> None:
+        async for event in self.said:
+            self.tell(event)
+
+
+class Handler(Ear):
+    """The same by a handler, which ends the delivery."""
+
+    @on(Said)
+    def hear(self, event: Said) -> bool:
+        self.tell(event)
+        return True
+
+
+class Single(NamedTuple):
+    said: Said
+
+
+class Bundled(Ear):
+    """The same by a bundle."""
+
+    sets = Bundle(Single)
+
+    async def run(self) -> None:
+        async for each in self.sets:
+            self.tell(each.said)
+
+
+EVENTS = [Said(stamp=ms * MS, source="x") for ms in range(0, 1000, 5)]
+
+
+def listen(node: type[Ear], port: str, seed: int = 0, **link: Any) -> list[tuple[int, int]]:
+    result = run_nodes(
+        [spec(node, "ear", links={port: link})], inputs=EVENTS, duration=2.0, seed=seed
+    )
+    return [(event.of, event.stamp) for event in result.of(Heard)]
+
+
+PORTS = [(Ear, "said"), (Bundled, "sets"), (Bundled, "sets.said")]
+
+
+@pytest.mark.parametrize(("node", "port"), PORTS)
+def test_a_delay_is_exact_and_nothing_is_lost(node: type[Ear], port: str) -> None:
+    heard = listen(node, port, delay="80ms")
+    assert heard == [(event.stamp, event.stamp + 80 * MS) for event in EVENTS]
+
+
+@pytest.mark.parametrize(("node", "port"), PORTS)
+def test_loss_is_at_random_and_the_same_for_a_seed(node: type[Ear], port: str) -> None:
+    heard = listen(node, port, loss=0.3)
+    assert 100 < len(heard) < 180
+    assert heard == listen(node, port, loss=0.3)
+    assert heard != listen(node, port, loss=0.3, seed=1)
+
+
+@pytest.mark.parametrize(("node", "port"), PORTS)
+def test_jitter_keeps_order_and_bounds(node: type[Ear], port: str) -> None:
+    heard = listen(node, port, delay="10ms", jitter="20ms")
+    assert [of for of, _ in heard] == [event.stamp for event in EVENTS]
+    late = [now - of for of, now in heard]
+    assert min(late) >= 10 * MS
+    assert max(late) <= 30 * MS
+    assert len(set(late)) > 50
+
+
+@pytest.mark.parametrize(("node", "port"), PORTS)
+def test_a_rate_thins_evenly(node: type[Ear], port: str) -> None:
+    heard = listen(node, port, rate=10)
+    assert [of // MS for of, _ in heard] == list(range(0, 1000, 100))
+
+
+def test_a_handler_behind_a_delay_is_called_later() -> None:
+    heard = listen(Handler, "hear", delay="3ms")
+    handled = [event for event in heard if event[1] - event[0] == 3 * MS]
+    assert len(handled) == len(EVENTS)
+
+
+def test_an_error_behind_a_delay_is_the_nodes() -> None:
+    class Bad(Node):
+        @on(Said)
+        def hear(self, event: Said) -> None:
+            raise RuntimeError("no")
+
+    with pytest.raises(NodeError, match="bad: RuntimeError: no"):
+        run_nodes([spec(Bad, "bad", links={"hear": {"delay": 0.1}})], inputs=EVENTS[:1])
+
+
+def test_mistakes_in_the_file() -> None:
+    from runtime.config import parse
+
+    def read(links: Any) -> None:
+        parse({"nodes": [{"name": "n", "type": f"{__name__}:Ear", "links": links}]}, "c.toml")
+
+    with pytest.raises(ConfigError, match=r'links: expected an input or handler.*"sad"'):
+        read({"sad": {"delay": 1}})
+    with pytest.raises(ConfigError, match=r"links\.said\.loss: expected a number <= 1, found 2"):
+        read({"said": {"loss": 2}})
+    with pytest.raises(ConfigError, match=r"unknown key 'dealy' \(did you mean 'delay'"):
+        read({"said": {"dealy": 2}})
