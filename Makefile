@@ -57,4 +57,4 @@ pictures: demo  ## Make the README's pictures anew.
 	$(BIN)/python tools/readme_pictures.py
 
 clean:  ## Remove the environment, results and caches.
-	rm -rf $(VENV) runs .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) runs sweeps .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

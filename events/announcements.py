@@ -84,14 +84,8 @@ class EstimatorAnnouncement(Announcement):
 
     Attributes:
         method: What it is, in a word or two: ``features``, ``ORB-SLAM3 rgbd``.
-        frame_id: Parent frame of its estimates.
-        child_frame_id: The body whose pose it estimates.
         scale_free: True if its unit of length is its own (monocular).
-        cameras: Sources of the images that it reads.
     """
 
     method: str
-    frame_id: str
-    child_frame_id: str = "base_link"
     scale_free: bool = False
-    cameras: tuple[str, ...] = ()

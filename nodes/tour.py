@@ -1,13 +1,19 @@
-"""A scripted flight: take off, follow waypoints, land, end the run."""
+"""A scripted flight: take off, follow waypoints, land, end the run.
+
+`Pilot` is what all such flights have in common; `Tour` follows its path by the vehicle's own
+position, `nodes.visual_pilot` by an estimator's.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import math
+from abc import ABC, abstractmethod
 from typing import Annotated
 
 import msgspec
 import numpy as np
+from typing_extensions import TypeVar
 
 from events import (
     Command,
@@ -15,6 +21,7 @@ from events import (
     Land,
     Landed,
     Odometry,
+    PoseEstimate,
     PositionSetpoint,
     Shutdown,
     TakenOff,
@@ -52,25 +59,32 @@ class TourConfig(NodeConfig):
     end_run: bool = True
 
 
-class Tour(Node[TourConfig]):
-    """Flies a vehicle along waypoints, looking where it goes."""
+C = TypeVar("C", bound=TourConfig, default=TourConfig)
+
+
+class Pilot(Node[C], ABC):
+    """Base of those who take off, follow a path, land and end the run.
+
+    A subclass calls `see` with what it takes the vehicle's pose to be, and follows the path.
+    """
 
     orders = Output(Command)
-    setpoints = Output(PositionSetpoint)
     end = Output(Shutdown)
 
     def __init__(self) -> None:
-        self._here: Odometry | None = None
+        self.here: Odometry | PoseEstimate | None = None
         self._placed = asyncio.Event()
         self._taken_off = asyncio.Event()
         self._landed = asyncio.Event()
 
-    @on(Odometry)
-    def moved(self, event: Odometry) -> None:
+    def see(self, here: Odometry | PoseEstimate) -> None:
         """Note where the vehicle is."""
-        if self._here is None:
-            self._placed.set()
-        self._here = event
+        self.here = here
+        self._placed.set()
+
+    @abstractmethod
+    async def follow(self, path: Path) -> None:
+        """Fly along a path that begins now."""
 
     @on(TakenOff)
     def taken_off(self, _: TakenOff) -> None:
@@ -87,14 +101,14 @@ class Tour(Node[TourConfig]):
         clock, name = self.clock, self.name
         await self._placed.wait()
         await clock.sleep(self.config.wait)
-        assert self._here is not None
-        height = self._here.position[2] - self.config.waypoints[0][2]
+        assert self.here is not None
+        height = self.here.position[2] - self.config.waypoints[0][2]
         self.orders.send(Takeoff(stamp=clock.now(), source=name, altitude=max(height, 0.5)))
         await self._taken_off.wait()
-        path = await self.offload(self._plan, self._here)
+        path = await self.offload(self._plan, self.here)
         if path is not None:
             self.log.info("a path of %.1f m in %.1f s", path.length, path.seconds)
-            await self._follow(path)
+            await self.follow(path)
         self.orders.send(Hover(stamp=clock.now(), source=name))
         self.orders.send(Land(stamp=clock.now(), source=name))
         await self._landed.wait()
@@ -103,7 +117,7 @@ class Tour(Node[TourConfig]):
         if self.config.end_run:
             self.end.send(Shutdown(stamp=clock.now(), source=name, reason="tour flown"))
 
-    def _plan(self, start: Odometry) -> Path | None:
+    def _plan(self, start: Odometry | PoseEstimate) -> Path | None:
         """Return the path from here; `None` if the only waypoint is where the vehicle is."""
         config = self.config
         w, x, y, z = start.orientation
@@ -123,7 +137,19 @@ class Tour(Node[TourConfig]):
             step=1 / config.rate,
         )
 
-    async def _follow(self, path: Path) -> None:
+
+class Tour(Pilot[TourConfig]):
+    """Flies a vehicle along waypoints, looking where it goes."""
+
+    setpoints = Output(PositionSetpoint)
+
+    @on(Odometry)
+    def moved(self, event: Odometry) -> None:
+        """Note where the vehicle is."""
+        self.see(event)
+
+    async def follow(self, path: Path) -> None:
+        """Send a place for every moment of the path."""
         begin = self.clock.now()
         rows = zip(
             path.position.tolist(),

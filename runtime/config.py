@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import math
 import re
 import sys
@@ -193,7 +194,7 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
     known = {
         name: value
         for name, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, Node) and value is not Node
+        if isinstance(value, type) and issubclass(value, Node) and not is_base(value)
     }
     if class_name not in known:
         raise ConfigError(
@@ -201,6 +202,11 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
             + suggest(class_name, known)
         )
     return known[class_name]
+
+
+def is_base(cls: type[Node[Any]]) -> bool:
+    """Tell whether a class is there to be subclassed, and no node for a file."""
+    return cls is Node or inspect.isabstract(cls)
 
 
 def convert(value: Any, type_: type[S], where: str) -> S:

@@ -130,6 +130,7 @@ class Node(Generic[C]):
         log: The node's logger (trace, debug, info, warning, error, fatal).
         rng: Random numbers that depend on the run's seed and the node's name only.
         out: Folder for files, or `None` if the run writes none.
+        sources: Ports narrowed to a source, by the file or by `narrow`.
     """
 
     deterministic: ClassVar[bool] = True
@@ -143,12 +144,14 @@ class Node(Generic[C]):
     log: NodeLogger
     rng: np.random.Generator
     out: Path | None
+    sources: dict[str, str]
     _host: Host
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         for base in vars(cls).get("__orig_bases__", ()):
             for argument in get_args(base):
+                argument = getattr(argument, "__bound__", argument)  # of a base for several nodes
                 if isinstance(argument, type) and issubclass(argument, NodeConfig):
                     cls.config_type = argument
         cls.declared = _declared(cls)
@@ -168,6 +171,14 @@ class Node(Generic[C]):
         Raises:
             ValueError: This node cannot work with it; the message says why, and the run ends.
         """
+
+    def narrow(self, port: str, source: str) -> None:
+        """Hear only one source on a port (or on a bundle, or on ``bundle.field``).
+
+        For nodes that choose among what is announced: call it in `on_announcement`. What the file
+        says of the port holds nevertheless.
+        """
+        self.sources.setdefault(port, source)
 
     async def run(self) -> None:
         """Do what the node does; returning is allowed. Cancelled when the run ends."""
@@ -246,7 +257,13 @@ class Node(Generic[C]):
 N = TypeVar("N", bound=Node[Any])
 
 
-def make_node(cls: type[N], name: str, config: NodeConfig, host: Host) -> N:
+def make_node(
+    cls: type[N],
+    name: str,
+    config: NodeConfig,
+    host: Host,
+    sources: Mapping[str, str] | None = None,
+) -> N:
     """Make a node with its ports in place."""
     node = cls.__new__(cls)
     node.name = name
@@ -255,6 +272,7 @@ def make_node(cls: type[N], name: str, config: NodeConfig, host: Host) -> N:
     node.log = NodeLogger(name)
     node.rng = np.random.default_rng([host.seed, zlib.crc32(name.encode())])
     node.out = host.out
+    node.sources = dict(sources or {})
     node._host = host
     for port, declared in cls.declared.inputs.items():
         setattr(node, port, declared.make(name))

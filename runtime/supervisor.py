@@ -216,7 +216,7 @@ class Supervisor:
     async def _start_up(self, life: Life) -> None:
         spec = life.spec
         try:
-            life.node = node = make_node(spec.node, spec.name, spec.config, self)
+            life.node = node = make_node(spec.node, spec.name, spec.config, self, spec.inputs)
             self.ever.append(node)
             life.make_links(self.clock, self.seed)
             self.links |= {link.name: link for link in life.links.values()}
@@ -257,7 +257,7 @@ class Supervisor:
 
     def _connect(self) -> None:
         nodes = [life.node for life in self._lives.values() if life.node and life.started]
-        sources = {spec.name: spec.inputs for spec in self._config.nodes}
+        sources = {node.name: node.sources for node in nodes}
         links = {life.spec.name: life.links for life in self._lives.values()}
         end = Listener("run", self._hear_end, (Shutdown, WindowClosed))
         graph.connect(nodes, sources, links, self._taps, self._listener_failed, [end])

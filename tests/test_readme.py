@@ -17,10 +17,14 @@ COMMANDS = re.findall(r"^    python -m runtime (.*?)(?: +#.*)?$", README, re.MUL
 TARGETS = sorted(set(re.findall(r"(?:^    |`)make ([a-z -]+?)(?:`|  +#|$)", README, re.MULTILINE)))
 
 SHORTER = {
-    "run": ["--set", "run.duration=1s", "--set", "drone.cameras=[]", "--quiet"],
+    "run": ["--set", "run.duration=1s", "--quiet"],
+    "sweep": ["--set", "run.duration=1s", "--set", "camera.width=96", "--set", "camera.height=96"],
     "bench": ["--help"],
 }
 """What is added to a command so that it takes a second."""
+
+MISSED = 1
+"""The exit code of a run that missed a threshold, as one must that has not left the ground."""
 
 
 def test_there_are_commands_to_check() -> None:
@@ -35,12 +39,12 @@ def test_each_command_runs(command: str, tmp_path: Path) -> None:
     words = shlex.split(command)
     words = [str(tmp_path / word) if word.endswith(".png") else word for word in words]
     words += SHORTER.get(words[0], [])
-    if words[0] == "run":
+    if words[0] in {"run", "sweep", "report", "export"}:
         words += ["--out", str(tmp_path)]
     done = subprocess.run(
         [sys.executable, "-m", "runtime", *words], cwd=ROOT, capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode in {0, MISSED}, done.stderr
 
 
 @pytest.mark.parametrize("targets", TARGETS)

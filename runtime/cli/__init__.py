@@ -12,9 +12,12 @@ import typer
 
 from runtime.cli.bench import bench
 from runtime.cli.check import check
+from runtime.cli.export import export
 from runtime.cli.graph import graph
 from runtime.cli.nodes import nodes
+from runtime.cli.report import report
 from runtime.cli.run import leave_threads_behind, run
+from runtime.cli.sweep import sweep
 from runtime.errors import VisnavError
 
 app = typer.Typer(
@@ -27,6 +30,9 @@ app.command()(run)
 app.command()(check)
 app.command()(graph)
 app.command()(nodes)
+app.command()(sweep)
+app.command()(report)
+app.command()(export)
 app.command(  # the arguments, --help among them, are the benchmarks' own
     context_settings={
         "ignore_unknown_options": True,

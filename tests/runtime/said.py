@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -63,6 +63,12 @@ class NoHost:
         raise NotImplementedError
 
     def stop(self, reason: str) -> None:
+        raise NotImplementedError
+
+    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool) -> None:
+        raise NotImplementedError
+
+    def after_run(self, call: Callable[[Path], Any]) -> None:
         raise NotImplementedError
 
 

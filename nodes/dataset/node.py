@@ -1,0 +1,175 @@
+"""Records a run's sensors and ground truth as a data set, beside the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+
+from events import Announcement, DepthImage, Image, Imu, Odometry, PoseStamped
+from nodes.dataset.euroc import Euroc
+from nodes.dataset.pictures import PictureFile
+from nodes.dataset.recording import Recording
+from nodes.dataset.rig import choose
+from nodes.dataset.tum_rgbd import TumRgbd
+from runtime import Input, Node, NodeConfig, on
+from runtime.errors import ConfigError
+
+_AT_ONCE = 4
+"""Pictures that are being written."""
+
+_WAITING = 64
+"""Pictures of a kind that wait for that. In lockstep, time waits for the files, and none ever has
+to be dropped; in real time the oldest is, and the run's summary counts it."""
+
+
+class DatasetConfig(NodeConfig):
+    """Settings of a recorded data set.
+
+    Attributes:
+        format: ``euroc``: grey pictures of all cameras of the first camera's vehicle (and depth),
+            IMU, the vehicle's poses. ``tum_rgbd``: colour and depth pictures of the first camera
+            and its poses.
+        folder: Its name in the run's folder. A data set that was there is removed.
+        depth_factor: Steps of a depth picture per metre; 65535 of them are the limit, so 5000
+            reach 13.1 m, and depth beyond that is written as none.
+    """
+
+    format: Literal["euroc", "tum_rgbd"] = "euroc"
+    folder: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")] = "dataset"
+    depth_factor: Annotated[float, msgspec.Meta(gt=0)] = 5000.0
+
+
+class DatasetWriter(Node[DatasetConfig]):
+    """Writes what cameras, an IMU and the ground truth say, as EuRoC or TUM RGB-D have it.
+
+    Which camera (or vehicle) can be said with ``inputs = { images = "drone/front" }``. The world
+    of the files is z up: north, west, up.
+    """
+
+    images = Input(Image, bound=_WAITING, overflow="drop_oldest")
+    depths = Input(DepthImage, bound=_WAITING, overflow="drop_oldest")
+
+    async def on_startup(self) -> None:
+        """Make room."""
+        self._announcements: list[Announcement] = []
+        self._recording: Recording | None = None
+        self._unwritten: set[PictureFile] = set()
+        self._queue: asyncio.Queue[PictureFile] = asyncio.Queue(maxsize=1)
+        if self.out is not None:
+            await self.offload(_make_empty, self.out / self.config.folder)
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Note what sensors there are."""
+        self._announcements.append(announcement)
+
+    async def run(self) -> None:
+        """Have pictures written as they come."""
+        self._open()
+        for _ in range(_AT_ONCE):
+            self.start(self._write())
+        self.start(self._take_depths())
+        async for image in self.images:
+            if (file := self._picture(image)) is not None:
+                await self._queue.put(file)
+
+    async def _take_depths(self) -> None:
+        async for depth in self.depths:
+            if (file := self._depth(depth)) is not None:
+                await self._queue.put(file)
+
+    async def _write(self) -> None:
+        """Write one picture after the other, beside the loop."""
+        while True:
+            file = await self._queue.get()
+            await self.offload(file)
+            self._unwritten.discard(file)
+
+    @on(PoseStamped)
+    def posed(self, event: PoseStamped) -> None:
+        """Note where a camera is."""
+        if (recording := self._open()) is not None:
+            recording.pose(event)
+
+    @on(Odometry)
+    def moved(self, event: Odometry) -> None:
+        """Note where the vehicle is."""
+        if (recording := self._open()) is not None:
+            recording.odometry(event)
+
+    @on(Imu)
+    def measured(self, event: Imu) -> None:
+        """Note a measurement."""
+        if (recording := self._open()) is not None:
+            recording.imu(event)
+
+    async def on_shutdown(self) -> None:
+        """Write what has come and is not written yet, and say what is missing."""
+        if self._recording is None:
+            return
+        for _ in range(self.images.statistics().buffered):
+            self._picture(self.images.receive_nowait())
+        for _ in range(self.depths.statistics().buffered):
+            self._depth(self.depths.receive_nowait())
+        await self.offload(_finish, self._recording, list(self._unwritten))
+        dropped = self.images.statistics().dropped + self.depths.statistics().dropped
+        if dropped:
+            self.log.warning("%d pictures are missing: writing was too slow for them", dropped)
+        if left_out := self._recording.left_out():
+            self.log.warning("%d events came out of order and are left out", left_out)
+        if empty := self._recording.empty():
+            self.log.warning("nothing came for %s", ", ".join(empty))
+
+    def _open(self) -> Recording | None:
+        """Return the recording, begun at the first event: all announcements have come by then."""
+        if self._recording is None and self.out is not None:
+            layout = Euroc if self.config.format == "euroc" else TumRgbd
+            try:
+                rig = choose(self._announcements, self.sources.get("images"))
+                folder = self.out / self.config.folder
+                self._recording = layout(folder, rig, self.config.depth_factor)
+            except ValueError as error:
+                self.log.fatal("%s", error)
+        return self._recording
+
+    def _picture(self, event: Image) -> PictureFile | None:
+        recording = self._open()
+        return self._keep(recording.picture(event) if recording is not None else None)
+
+    def _depth(self, event: DepthImage) -> PictureFile | None:
+        recording = self._open()
+        return self._keep(recording.depth(event) if recording is not None else None)
+
+    def _keep(self, file: PictureFile | None) -> PictureFile | None:
+        """Remember a picture until it is written, should the run end before."""
+        if file is not None:
+            self._unwritten.add(file)
+        return file
+
+
+def _make_empty(folder: Path) -> None:
+    """Make a folder that holds nothing of an earlier run.
+
+    Raises:
+        ConfigError: It holds something else.
+    """
+    if folder.is_dir() and any(folder.iterdir()):
+        if not any((folder / sign).exists() for sign in ("mav0", "rgb.txt")):
+            raise ConfigError(
+                f"folder: expected the name of a new folder, or of an earlier data set, "
+                f"found {folder} with other files"
+            )
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _finish(recording: Recording, files: list[PictureFile]) -> None:
+    """Write the rest; pictures that another thread is writing are waited for."""
+    try:
+        for file in files:
+            file()
+    finally:
+        recording.close()

@@ -1,0 +1,84 @@
+"""What recordings of all layouts have in common: events in, rows and pictures out.
+
+Rows are written at once; a picture is returned as a `PictureFile`, for whoever has time to write
+it. Nothing here waits or knows a clock.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from events import DepthImage, Image, Imu, Odometry, PoseStamped
+from nodes.dataset.pictures import PictureFile
+from nodes.dataset.rig import Rig
+from nodes.dataset.rows import RowFile
+
+
+class Recording(ABC):
+    """A data set that is being written.
+
+    Args:
+        folder: Where; it exists and is empty.
+        rig: The sensors. Events of others are passed over.
+        depth_factor: Steps of a depth picture per metre.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, depth_factor: float) -> None:
+        self.folder = folder
+        self.rig = rig
+        self.depth_factor = depth_factor
+        self.files: list[RowFile] = []
+
+    @abstractmethod
+    def picture(self, event: Image) -> PictureFile | None:
+        """Note a picture, and return what is left to write."""
+
+    @abstractmethod
+    def depth(self, event: DepthImage) -> PictureFile | None:
+        """Note a depth picture, and return what is left to write."""
+
+    @abstractmethod
+    def pose(self, event: PoseStamped) -> None:
+        """Note where a camera is."""
+
+    @abstractmethod
+    def odometry(self, event: Odometry) -> None:
+        """Note where the body is."""
+
+    @abstractmethod
+    def imu(self, event: Imu) -> None:
+        """Note what the IMU measures."""
+
+    def close(self) -> None:
+        """Write out what is left."""
+        for file in self.files:
+            file.close()
+
+    def rows(self, name: str, header: str) -> RowFile:
+        """Open a file of rows in the folder; its folder is made if need be."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = RowFile(path, header)
+        self.files.append(file)
+        return file
+
+    def write(self, name: str, text: str) -> None:
+        """Write a whole text file."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+    def empty(self) -> list[str]:
+        """Return the files that have no rows yet."""
+        return [str(f.path.relative_to(self.folder)) for f in self.files if not f.count]
+
+    def left_out(self) -> int:
+        """Return how many events came out of order and are in no file."""
+        return sum(file.left_out for file in self.files)
+
+
+def real(value: float) -> str:
+    """Return a number as YAML 1.1 has it: ``2e-05`` would be a text, ``2.0e-05`` is none."""
+    digits, e, exponent = repr(value).partition("e")
+    return f"{digits if '.' in digits else digits + '.0'}{e}{exponent}"

@@ -1,0 +1,73 @@
+"""Which sensors a data set is made of, chosen among those that are announced."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from events import Announcement, CameraAnnouncement, ImuAnnouncement
+
+
+class Rig(msgspec.Struct, frozen=True):
+    """The sensors of one body.
+
+    Attributes:
+        body: Source of its odometry.
+        cameras: One or more, in the order in which they were announced.
+        imu: Its IMU, if it has one.
+    """
+
+    body: str
+    cameras: tuple[CameraAnnouncement, ...]
+    imu: ImuAnnouncement | None
+
+
+def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
+    """Choose the cameras of one body, and its IMU.
+
+    Args:
+        announcements: All there are.
+        named: A source to keep to: a camera, or a body; None for the first camera's body.
+
+    Raises:
+        ValueError: No such camera gives pictures.
+    """
+    announced = [a for a in announcements if isinstance(a, CameraAnnouncement)]
+    able = [a for a in announced if {"rgb", "grey"} & {*a.images}]
+    cameras = [a for a in able if named is None or _belongs(a, named)]
+    if not cameras:
+        found = ", ".join(f"{a.source} ({', '.join(a.images)})" for a in announced) or "none"
+        called = f" called {named}" if named is not None else ""
+        raise ValueError(f"expected a camera with rgb or grey images{called}, found {found}")
+    body = body_of(cameras[0].source)
+    imus = (
+        a for a in announcements if isinstance(a, ImuAnnouncement) and body_of(a.source) == body
+    )
+    return Rig(
+        body=body,
+        cameras=tuple(a for a in cameras if body_of(a.source) == body),
+        imu=next(imus, None),
+    )
+
+
+def body_of(source: str) -> str:
+    """Return the source of the body that carries a sensor: ``drone`` for ``drone/front``."""
+    return source.rpartition("/")[0] or source
+
+
+def mounting(camera: CameraAnnouncement) -> npt.NDArray[np.float64]:
+    """Return the transform from the camera's optical frame to its body, shape (4, 4)."""
+    matrix = np.eye(4)
+    rotation = Rotation.from_quat(camera.orientation, scalar_first=True)
+    matrix[:3, :3] = rotation.as_matrix()
+    matrix[:3, 3] = camera.position
+    return matrix
+
+
+def _belongs(camera: CameraAnnouncement, named: str) -> bool:
+    """Tell whether a camera is the named source, below it, or (its grey pictures) above it."""
+    return f"{camera.source}/".startswith(f"{named}/") or named == f"{camera.source}/grey"

@@ -1,0 +1,126 @@
+"""The layout of TUM's RGB-D benchmark, for one camera.
+
+J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and
+cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. Stamps have nine decimals in place of six.
+"""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+from events import DepthImage, Image, Imu, Odometry, PoseStamped
+from nodes.dataset.pictures import PictureFile, in_16_bits, in_colour
+from nodes.dataset.recording import Recording, real
+from nodes.dataset.rig import Rig
+from nodes.dataset.rows import RowFile
+from nodes.dataset.world import WORLD, rotation_to_nwu, vector_to_nwu
+from nodes.trajectory.formats import tum_row
+from nodes.trajectory.table import seconds_text
+
+
+class TumRgbd(Recording):
+    """Pictures of the rig's first camera and its poses, `depth_factor` 5000 in the original.
+
+    ::
+
+        rgb/<s>.png, depth/<s>.png        depth: 16 bits, 0 for none
+        rgb.txt, depth.txt                stamp and file
+        associations.txt                  pairs of both with one stamp
+        groundtruth.txt                   the camera's optical frame in the world
+        accelerometer.txt                 in the body's frame
+        camera.yaml                       intrinsics
+    """
+
+    def __init__(self, folder: Path, rig: Rig, depth_factor: float) -> None:
+        super().__init__(folder, rig, depth_factor)
+        self._camera = camera = rig.cameras[0]
+        colour = "rgb" in camera.images
+        self._files = {
+            "rgb": self._index("rgb", "color images" if colour else "grey images"),
+            "groundtruth": self._rows(
+                "groundtruth", "ground truth trajectory", f"{WORLD}; camera: {_OPTICAL}",
+                "timestamp tx ty tz qx qy qz qw",
+            ),
+        }  # fmt: skip
+        if "depth" in camera.images:
+            scale = f"{depth_factor:g} steps per metre along the optical axis, 0 for none"
+            self._files["depth"] = self._index("depth", f"depth maps, {scale}")
+            self._pairs = self.rows("associations.txt", "")
+        if rig.imu is not None:
+            self._files["accelerometer"] = self._rows(
+                "accelerometer", "accelerometer data", "body: x forward, y right, z down; m/s^2",
+                "timestamp ax ay az",
+            )  # fmt: skip
+        self._unpaired: dict[int, str] = {}  # by stamp: rgb or depth, whichever came
+        self.write("camera.yaml", self._calibration())
+
+    def picture(self, event: Image) -> PictureFile | None:
+        """Note a picture of the camera: in colour if it has any."""
+        if event.source != self._camera.source or not self._add("rgb", event.stamp):
+            return None
+        return PictureFile(self._path("rgb", event.stamp), event.data, in_colour)
+
+    def depth(self, event: DepthImage) -> PictureFile | None:
+        """Note a depth picture of the camera."""
+        if event.source != self._camera.source or not self._add("depth", event.stamp):
+            return None
+        convert = functools.partial(in_16_bits, factor=self.depth_factor)
+        return PictureFile(self._path("depth", event.stamp), event.data, convert)
+
+    def pose(self, event: PoseStamped) -> None:
+        """Note where the camera is."""
+        if event.source == self._camera.source:
+            pose = vector_to_nwu(event.position), rotation_to_nwu(event.orientation)
+            self._files["groundtruth"].add(event.stamp, tum_row(event.stamp, *pose))
+
+    def odometry(self, event: Odometry) -> None:
+        """Do nothing: the layout has no place for the body."""
+
+    def imu(self, event: Imu) -> None:
+        """Note the accelerations."""
+        if self.rig.imu is not None and event.source == self.rig.imu.source:
+            x, y, z = event.linear_acceleration
+            row = f"{seconds_text(event.stamp)} {x:.9f} {y:.9f} {z:.9f}\n"
+            self._files["accelerometer"].add(event.stamp, row)
+
+    def _add(self, kind: str, stamp: int) -> bool:
+        """Note a picture, and its partner if that has come; tell whether it is in order."""
+        name = f"{seconds_text(stamp)} {kind}/{seconds_text(stamp)}.png"
+        if kind not in self._files or not self._files[kind].add(stamp, f"{name}\n"):
+            return False
+        if "depth" in self._files:
+            partner = self._unpaired.pop(stamp, None)
+            if partner is None:
+                self._unpaired[stamp] = name
+            else:
+                first, second = sorted((name, partner), key=lambda n: "depth/" in n)
+                self._pairs.add(stamp, f"{first} {second}\n")
+                self._unpaired = {s: n for s, n in self._unpaired.items() if s > stamp}
+        return True
+
+    def _path(self, kind: str, stamp: int) -> Path:
+        return self.folder / kind / f"{seconds_text(stamp)}.png"
+
+    def _index(self, kind: str, title: str) -> RowFile:
+        (self.folder / kind).mkdir()
+        return self._rows(kind, title, f"camera: {self._camera.source}", "timestamp filename")
+
+    def _rows(self, name: str, *header: str) -> RowFile:
+        """Open a file with a head of three lines: there are readers that skip just that many."""
+        return self.rows(f"{name}.txt", "".join(f"# {line}\n" for line in header))
+
+    def _calibration(self) -> str:
+        info = self._camera.info
+        lens = ", ".join(map(real, info.distortion))
+        return (
+            f"# {self._camera.source}: pinhole; pixel centres have whole coordinates\n"
+            f"width: {info.width}\nheight: {info.height}\n"
+            f"fx: {real(info.fx)}\nfy: {real(info.fy)}\ncx: {real(info.cx)}\ncy: {real(info.cy)}\n"
+            f"distortion: [{lens}]  # k1, k2, p1, p2, k3\n"
+            f"rate_hz: {real(self._camera.rate)}\n"
+            f"depth_factor: {real(self.depth_factor)}\n"
+        )
+
+
+_OPTICAL = "x right, y down, z forward"

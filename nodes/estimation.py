@@ -1,0 +1,252 @@
+"""What estimators have in common: which camera they read, where it sits, what they say.
+
+Not here: how a pose is computed (`nodes.visual_odometry` and its neighbours), and how good it is
+(`nodes.evaluation`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+from typing_extensions import TypeVar
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Image,
+    PoseEstimate,
+    Quaternion,
+    TrackedFeatures,
+    TrackingEvent,
+    TrackingLost,
+    TrackingRegained,
+    Vector3,
+    VehicleAnnouncement,
+)
+from runtime import Duration, Node, NodeConfig, Output
+
+Floats = npt.NDArray[np.float64]
+
+WORKER_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+"""One core for each estimator: the sums of linear algebra then have one order, and one result."""
+
+
+class RgbdFrame(NamedTuple):
+    """A colour (or grey) picture and the depth of the same exposure."""
+
+    image: Image
+    depth: DepthImage
+
+
+class Tracked(Protocol):
+    """What a tracker says of one picture.
+
+    Attributes:
+        pose: The optical camera now, in the optical camera at the first picture; metres (or the
+            tracker's own unit), shape (4, 4).
+        lost: Whether the pose is not known; `pose` is then the last one that was.
+        reason: Why.
+        points: float32 pixels, shape (n, 2): what was followed.
+        inliers: bool, shape (n,): what agrees with the pose.
+    """
+
+    @property
+    def pose(self) -> Floats: ...  # noqa: D102  # above
+    @property
+    def lost(self) -> bool: ...  # noqa: D102
+    @property
+    def reason(self) -> str: ...  # noqa: D102
+    @property
+    def points(self) -> npt.NDArray[np.float32]: ...  # noqa: D102
+    @property
+    def inliers(self) -> npt.NDArray[np.bool_]: ...  # noqa: D102
+
+
+class EstimatorConfig(NodeConfig):
+    """Settings that all estimators have.
+
+    Attributes:
+        origin: ``announced``: the estimates are in ``map``, and begin at the pose at which the
+            vehicle said it stands (if none did, as ``start``). ``start``: they are in ``odom``,
+            which is where the body is at the first picture.
+        latency: Seconds on the run's clock that one estimate takes.
+    """
+
+    origin: Literal["announced", "start"] = "announced"
+    latency: Duration = Duration(0.015)  # immutable
+
+
+C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
+
+
+class Estimator(Node[C], ABC):
+    """Base of the nodes that turn pictures into poses.
+
+    A subclass declares its input as ``frames`` (of one camera), names in `needs` what that camera
+    must give, and in `run` calls `publish` with what its tracker says.
+    """
+
+    needs: ClassVar[frozenset[str]]
+    """Kinds of image: all must be there; ``grey`` is satisfied by ``rgb`` too."""
+    method: ClassVar[str]
+    scale_free: ClassVar[bool] = False
+
+    estimates = Output(PoseEstimate)
+    tracking = Output(TrackingEvent)
+    features = Output(TrackedFeatures)
+
+    camera: CameraAnnouncement | None = None
+    _vehicles: tuple[VehicleAnnouncement, ...] = ()
+    _mount: Mount | None = None
+    _lost = False
+
+    def announce(self) -> Iterable[Announcement]:
+        """Say that there will be estimates."""
+        yield EstimatorAnnouncement(
+            stamp=0, source=self.name, method=self.method, scale_free=self.scale_free
+        )
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Take the first camera that gives what is needed, or the one that the file names."""
+        if isinstance(announcement, VehicleAnnouncement):
+            self._vehicles += (announcement,)
+        if not isinstance(announcement, CameraAnnouncement) or self.camera is not None:
+            return
+        named = self.sources.get("frames")
+        if named is not None and named != announcement.source:
+            return
+        gives = {*announcement.images} | ({"grey"} if "rgb" in announcement.images else set())
+        if lacking := self.needs - gives:
+            if named is None:
+                return
+            raise ValueError(
+                f"expected a camera with {', '.join(sorted(self.needs))} images, "
+                f"found none with {', '.join(sorted(lacking))}"
+            )
+        self.camera = announcement
+        self.narrow("frames", announcement.source)
+
+    @abstractmethod
+    async def run(self) -> None:
+        """Track the pictures."""
+
+    def the_camera(self) -> CameraAnnouncement:
+        """Return the camera to read.
+
+        Raises:
+            FatalError: No camera gives what is needed.
+        """
+        if self.camera is None:
+            named = self.sources.get("frames")
+            self.log.fatal(
+                "expected a camera with %s images%s, found none announced",
+                ", ".join(sorted(self.needs)),
+                f" called {named}" if named else "",
+            )
+        assert self.camera is not None
+        return self.camera
+
+    def publish(self, image: Image, tracked: Tracked) -> None:
+        """Say what a tracker found in a picture."""
+        self.features.send(
+            TrackedFeatures(
+                stamp=image.stamp,
+                source=self.name,
+                frame_id=image.frame_id,
+                points=tracked.points,
+                inliers=tracked.inliers,
+            )
+        )
+        if tracked.lost and not self._lost:
+            self.log.warning("lost: %s", tracked.reason or "no reason given")
+            self.tracking.send(
+                TrackingLost(stamp=image.stamp, source=self.name, reason=tracked.reason)
+            )
+        elif self._lost and not tracked.lost:
+            self.log.info("regained %s", tracked.reason)
+            self.tracking.send(TrackingRegained(stamp=image.stamp, source=self.name))
+        self._lost = tracked.lost
+        if not tracked.lost:
+            self._mount = self._mount or self._mounting()
+            self.estimates.send(self._mount.estimate(image.stamp, self.name, tracked.pose))
+
+    def _mounting(self) -> Mount:
+        camera = self.the_camera()
+        carriers = (v for v in self._vehicles if camera.source.startswith(f"{v.source}/"))
+        vehicle = next(carriers, None) if self.config.origin == "announced" else None
+        return Mount.of(camera, vehicle)
+
+
+class Mount(msgspec.Struct, frozen=True, eq=False):
+    """Where a camera sits on a body, and where the body was at the first picture.
+
+    Attributes:
+        frame_id: Parent frame of the estimates.
+        child_frame_id: The body.
+        start: The body at the first picture in the parent frame, shape (4, 4).
+        camera: The optical frame in the body's, shape (4, 4).
+    """
+
+    frame_id: str
+    child_frame_id: str
+    start: Floats
+    camera: Floats
+
+    @classmethod
+    def of(cls, camera: CameraAnnouncement, vehicle: VehicleAnnouncement | None) -> Mount:
+        """Make the mount of an announced camera; without a vehicle, the start is unknown."""
+        return cls(
+            frame_id="odom" if vehicle is None else "map",
+            child_frame_id=camera.parent_frame_id,
+            start=np.eye(4)
+            if vehicle is None
+            else pose_matrix(vehicle.position, vehicle.orientation),
+            camera=pose_matrix(camera.position, camera.orientation),
+        )
+
+    def estimate(self, stamp: int, source: str, pose: Floats) -> PoseEstimate:
+        """Return the body's pose.
+
+        Args:
+            stamp: Of the picture (ns).
+            source: Who says it.
+            pose: The optical camera in its own first frame, shape (4, 4).
+        """
+        body = self.start @ self.camera @ pose @ np.linalg.inv(self.camera)
+        position, orientation = pose_tuples(body)
+        return PoseEstimate(
+            stamp=stamp,
+            source=source,
+            frame_id=self.frame_id,
+            child_frame_id=self.child_frame_id,
+            position=position,
+            orientation=orientation,
+        )
+
+
+def pose_matrix(position: Vector3, orientation: Quaternion) -> Floats:
+    """Return a pose (metres; w, x, y, z) as the transform from child to parent, shape (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(orientation, scalar_first=True).as_matrix()
+    matrix[:3, 3] = position
+    return matrix
+
+
+def pose_tuples(matrix: npt.NDArray[Any]) -> tuple[Vector3, Quaternion]:
+    """Return a transform, shape (4, 4), as position (metres) and orientation (w, x, y, z)."""
+    x, y, z = matrix[:3, 3].tolist()
+    quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True, scalar_first=True)
+    qw, qx, qy, qz = quaternion.tolist()
+    return (x, y, z), (qw, qx, qy, qz)

@@ -1,0 +1,78 @@
+"""Sample pictures with what estimators followed in them, spread evenly over a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from events import Image, TrackedFeatures
+from nodes.evaluation.results import file_name
+
+SECOND = 1_000_000_000
+
+_WAITING = 30
+"""Pictures whose features may still come."""
+_RECENT_GREEN, _OUTLIER_RED = (90, 255, 60), (60, 70, 255)  # blue, green, red
+
+
+class Album:
+    """Keeps about `size` pictures of each estimator, whatever the length of the run.
+
+    Args:
+        size: How many pictures, at most.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._images: dict[tuple[str, int], Image] = {}  # by optical frame and stamp
+        self._kept: dict[str, list[tuple[Image, TrackedFeatures]]] = {}
+        self._interval: dict[str, int] = {}
+        self._next: dict[str, int] = {}
+
+    def see(self, image: Image) -> None:
+        """Hold a picture until its features have come."""
+        if not self._size:
+            return
+        self._images[image.frame_id, image.stamp] = image
+        if len(self._images) > _WAITING:
+            del self._images[next(iter(self._images))]
+
+    def follow(self, features: TrackedFeatures) -> None:
+        """Keep the picture that these were followed in, if it is time for another."""
+        name = features.source
+        if features.stamp < self._next.get(name, 0):
+            return
+        image = self._images.get((features.frame_id, features.stamp))
+        if image is None:
+            return
+        kept = self._kept.setdefault(name, [])
+        interval = self._interval.setdefault(name, SECOND)
+        kept.append((image, features))
+        if len(kept) > self._size:
+            self._kept[name] = kept[::2]
+            self._interval[name] = interval = 2 * interval
+        self._next[name] = features.stamp + interval
+
+    def write(self, folder: Path) -> None:
+        """Draw all that was kept into JPEG files: ``<estimator>_<stamp>.jpg``."""
+        if not self._kept:
+            return
+        folder.mkdir(exist_ok=True)
+        for name, kept in self._kept.items():
+            for image, features in kept:
+                drawn = draw_features(image, features)
+                path = folder / f"{file_name(name)}_{image.stamp:015d}.jpg"
+                cv2.imwrite(str(path), drawn, [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def draw_features(image: Image, features: TrackedFeatures) -> np.ndarray:
+    """Return the picture (blue, green, red) with a ring on each feature: green, or red if odd."""
+    code = cv2.COLOR_GRAY2BGR if image.data.ndim == 2 else cv2.COLOR_RGB2BGR
+    canvas = cv2.cvtColor(image.data, code)
+    radius = max(round(image.data.shape[1] / 170), 2)
+    for (x, y), agrees in zip(features.points.tolist(), features.inliers.tolist(), strict=True):
+        color = _RECENT_GREEN if agrees else _OUTLIER_RED
+        cv2.circle(canvas, (round(x), round(y)), radius, color, 1, cv2.LINE_AA)
+    return np.asarray(canvas)

@@ -1,0 +1,228 @@
+"""From what an estimator said and the truth to figures, and from figures to a verdict.
+
+Pure functions; `nodes.evaluation.node` collects, and `nodes.evaluation.results` writes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.evaluation.alignment import How, align, associate, transform
+from nodes.evaluation.metrics import (
+    absolute_error,
+    drift_percent,
+    position_errors,
+    relative_error,
+    rotation_errors,
+)
+from nodes.evaluation.record import EstimatorRecord, Interval, seconds
+from nodes.trajectory import Trajectory
+
+Floats = npt.NDArray[np.float64]
+
+SECOND = 1_000_000_000
+MILLISECOND = 1_000_000
+
+
+class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What an estimator's figures may be at most; what is not given is not asked for.
+
+    Attributes:
+        ate_rmse_m: Absolute trajectory error, metres.
+        ate_percent: The same in percent of the true path.
+        rpe_trans_percent: Relative pose error of the position.
+        rpe_rot_deg_per_m: Relative pose error of the orientation.
+        drift_percent: Error of the last pose seen from the first, in percent of the path.
+        lost_seconds: Time without a pose.
+        latency_p99_ms: From exposure to estimate.
+        available_rmse_m: Error of the newest pose there was at each control tick.
+    """
+
+    ate_rmse_m: float | None = None
+    ate_percent: float | None = None
+    rpe_trans_percent: float | None = None
+    rpe_rot_deg_per_m: float | None = None
+    drift_percent: float | None = None
+    lost_seconds: float | None = None
+    latency_p99_ms: float | None = None
+    available_rmse_m: float | None = None
+
+    def missed(self, figures: dict[str, Any]) -> list[str]:
+        """Return a sentence for each threshold that is not met."""
+        found = []
+        for name in self.__struct_fields__:
+            limit, value = getattr(self, name), figures.get(name)
+            if limit is None:
+                continue
+            if value is None:
+                found.append(f"{name}: expected at most {limit:g}, found none")
+            elif not value <= limit:
+                found.append(f"{name}: expected at most {limit:g}, found {value:.4g}")
+        return found
+
+
+class Errors(msgspec.Struct, frozen=True, eq=False):
+    """Errors over time, one row a pose; all arrays of shape (n,).
+
+    Attributes:
+        stamps: Nanoseconds: of the picture, or of the control tick.
+        since: Nanoseconds: when the estimate came; for ticks, the stamp of the pose there was.
+        position: Metres, after alignment.
+        rotation: Radians, after alignment.
+    """
+
+    stamps: npt.NDArray[np.int64]
+    since: npt.NDArray[np.int64]
+    position: Floats
+    rotation: Floats
+
+
+class Judgement(msgspec.Struct, frozen=True, eq=False):
+    """All that is known of one estimator at the end.
+
+    Attributes:
+        figures: Its figures, by name (a unit is the name's end).
+        estimate: What it said, as it said it.
+        aligned: The same in the truth's frame, where there is a truth; `None` if it said nothing.
+        of_images: Errors of each pose at the time of its image.
+        of_ticks: Errors of the newest pose there was at each control tick.
+        lost: When it had no pose.
+    """
+
+    figures: dict[str, Any]
+    estimate: Trajectory | None
+    aligned: Trajectory | None = None
+    of_images: Errors | None = None
+    of_ticks: Errors | None = None
+    lost: list[Interval] = []
+
+
+def judge(
+    record: EstimatorRecord,
+    truth: Trajectory,
+    *,
+    alignment: How | Literal["auto"] = "auto",
+    rate: float = 400.0,
+    delta: float = 1.0,
+    gap: float = 0.5,
+) -> Judgement:
+    """Judge an estimator against the truth.
+
+    Args:
+        record: What it said.
+        truth: The true poses of the same body.
+        alignment: How the two frames are brought together; see `choose_alignment`.
+        rate: Control ticks a second.
+        delta: Metres of path over which relative errors are taken.
+        gap: Seconds of silence that count as lost.
+    """
+    if not len(record):
+        return Judgement(figures={"method": record.method, "estimates": 0}, estimate=None)
+    estimate = record.rows.trajectory()
+    how = choose_alignment(record) if alignment == "auto" else alignment
+    end = int(truth.stamps[-1])
+    # The last estimates of an orderly run are those whose latency had passed when it ended.
+    latencies = (record.arrivals(estimate) - estimate.stamps) / MILLISECOND
+    lost = record.lost(end, round(gap * SECOND) + round(float(latencies.max()) * MILLISECOND))
+    figures: dict[str, Any] = {
+        "method": record.method,
+        "alignment": how,
+        "estimates": len(estimate),
+        "rate_hz": (len(estimate) - 1) / estimate.seconds if estimate.seconds else 0.0,
+        "latency_p50_ms": float(np.percentile(latencies, 50)),
+        "latency_p99_ms": float(np.percentile(latencies, 99)),
+        "first_s": int(estimate.stamps[0]) / SECOND,
+        "lost_seconds": seconds(lost),
+        "lost_count": len(lost),
+        "path_m": truth.length(),
+    }
+    try:
+        there, kept = associate(truth, estimate)
+        aligned = align(kept, there, how)
+    except ValueError as error:  # too little to align, or no time in common
+        return Judgement(figures={**figures, "why": str(error)}, estimate=estimate, lost=lost)
+    moved = aligned.trajectory
+    absolute = absolute_error(there, moved)
+    path = truth.length()
+    figures |= {
+        "scale": aligned.scale,
+        "ate_rmse_m": absolute.rmse_m,
+        "ate_percent": 100.0 * absolute.rmse_m / path if path > 0 else None,
+        "ate_max_m": absolute.max_m,
+        "mse_m2": absolute.mse_m2,
+        "rot_rmse_deg": absolute.rotation_rmse_deg,
+    }
+    try:
+        relative = relative_error(there, moved, delta)
+        figures |= {
+            "rpe_trans_percent": relative.translation_percent,
+            "rpe_rot_deg_per_m": relative.rotation_deg_per_m,
+            "drift_percent": drift_percent(there, moved),
+        }
+    except ValueError as error:  # it did not get that far
+        figures["why"] = str(error)
+    of_images = Errors(
+        stamps=there.stamps,
+        since=record.arrivals(moved),
+        position=position_errors(there.positions, moved.positions),
+        rotation=rotation_errors(there.orientations, moved.orientations),
+    )
+    whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
+    of_ticks = errors_at_ticks(truth, whole, record.arrivals(estimate), rate)
+    if of_ticks is not None:
+        figures |= {
+            "available_rmse_m": _rms(of_ticks.position),
+            "available_rot_rmse_deg": float(np.degrees(_rms(of_ticks.rotation))),
+            "available_age_ms": float(np.mean(of_ticks.stamps - of_ticks.since)) / MILLISECOND,
+        }
+    return Judgement(figures, estimate, moved, of_images, of_ticks, lost)
+
+
+def choose_alignment(record: EstimatorRecord) -> How:
+    """Return what an estimate's frame allows.
+
+    ``sim3`` if its unit is its own, ``none`` if it claims to be in ``map``, else ``origin``: its
+    first pose is laid on the true one.
+    """
+    if record.scale_free:
+        return "sim3"
+    return "none" if record.frame_id == "map" else "origin"
+
+
+def errors_at_ticks(
+    truth: Trajectory, estimate: Trajectory, arrivals: npt.NDArray[np.int64], rate: float
+) -> Errors | None:
+    """Return the errors of the newest pose that a controller would have had at each of its ticks.
+
+    Args:
+        truth: True poses.
+        estimate: Aligned poses.
+        arrivals: When each came (ns), shape (n,).
+        rate: Ticks a second, from the first estimate's arrival to the end of the truth.
+
+    Returns:
+        The errors; `None` if there was no tick.
+    """
+    first, last = max(int(arrivals.min()), int(truth.stamps[0])), int(truth.stamps[-1])
+    ticks = np.arange(first, last + 1, SECOND / rate).astype(np.int64)
+    if not len(ticks):
+        return None
+    order = np.argsort(arrivals, kind="stable")
+    came = np.searchsorted(arrivals[order], ticks, side="right")
+    # Should poses overtake each other, the newest by stamp is the one to go by.
+    newest = np.maximum.accumulate(order)[came - 1]
+    there = truth.at(ticks)
+    return Errors(
+        stamps=ticks,
+        since=estimate.stamps[newest],
+        position=position_errors(there.positions, estimate.positions[newest]),
+        rotation=rotation_errors(there.orientations, estimate.orientations[newest]),
+    )
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))

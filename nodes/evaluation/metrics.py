@@ -1,0 +1,249 @@
+"""Errors of an estimated trajectory: absolute, relative, drift; and of one pose, on plain floats.
+
+Definitions are those of J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems"
+(IROS 2012), as the tool evo computes them, so that its figures and ours agree. Both trajectories
+have the same stamps and are in one frame: see `nodes.evaluation.alignment` for how they get there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from events import Quaternion, Vector3
+from nodes.trajectory import Trajectory
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class AbsoluteError(msgspec.Struct, frozen=True):
+    """Absolute trajectory error (ATE): how far each pose is from the truth.
+
+    Attributes:
+        rmse_m: Root mean square of the position errors.
+        mean_m: Their mean.
+        median_m: Their median.
+        max_m: The greatest.
+        mse_m2: Their mean square.
+        rotation_rmse_deg: Root mean square of the angles between the orientations.
+        rotation_max_deg: The greatest angle.
+    """
+
+    rmse_m: float
+    mean_m: float
+    median_m: float
+    max_m: float
+    mse_m2: float
+    rotation_rmse_deg: float
+    rotation_max_deg: float
+
+
+class RelativeError(msgspec.Struct, frozen=True):
+    """Relative pose error (RPE): how far the estimate drifts on a stretch of the path.
+
+    Attributes:
+        delta_m: Length of the stretches.
+        pairs: How many there were.
+        translation_percent: Root mean square of their position errors, per length.
+        translation_mean_percent: Mean of the same.
+        rotation_deg_per_m: Root mean square of their errors of orientation, per length.
+        rotation_mean_deg_per_m: Mean of the same.
+    """
+
+    delta_m: float
+    pairs: int
+    translation_percent: float
+    translation_mean_percent: float
+    rotation_deg_per_m: float
+    rotation_mean_deg_per_m: float
+
+
+def absolute_error(truth: Trajectory, estimate: Trajectory) -> AbsoluteError:
+    """Return the absolute errors, pose by pose, of an aligned estimate.
+
+    Raises:
+        ValueError: The stamps of the two differ.
+    """
+    same_stamps(truth, estimate)
+    errors = position_errors(truth.positions, estimate.positions)
+    angles = np.degrees(rotation_errors(truth.orientations, estimate.orientations))
+    mse = float(np.mean(errors**2))
+    return AbsoluteError(
+        rmse_m=math.sqrt(mse),
+        mean_m=float(errors.mean()),
+        median_m=float(np.median(errors)),
+        max_m=float(errors.max()),
+        mse_m2=mse,
+        rotation_rmse_deg=_rms(angles),
+        rotation_max_deg=float(angles.max()),
+    )
+
+
+def relative_error(
+    truth: Trajectory,
+    estimate: Trajectory,
+    delta: float = 1.0,
+    *,
+    pairs_from: Literal["truth", "estimate"] = "truth",
+) -> RelativeError:
+    """Return the relative errors over all pairs of poses a given path length apart.
+
+    No alignment but that of the scale changes it. The same as evo's with ``--delta 1
+    --delta_unit m --all_pairs --pairs_from_reference`` (without the last, evo measures the
+    stretches along the estimate, which noise makes longer).
+
+    Args:
+        truth: The true poses.
+        estimate: The estimated ones, at the same stamps.
+        delta: Path length in metres; a pair may miss it by a tenth.
+        pairs_from: Whose path is measured.
+
+    Raises:
+        ValueError: The stamps of the two differ, or no poses are that far apart.
+    """
+    same_stamps(truth, estimate)
+    distances = (truth if pairs_from == "truth" else estimate).distances()
+    first, last = path_pairs(distances, delta)
+    if not len(first):
+        raise ValueError(
+            f"relative error: expected poses {delta:g} m apart along the path, found none "
+            f"in {len(truth)} poses and {distances[-1]:.3f} m"
+        )
+    shifts, angles = _relative(truth, estimate, first, last)
+    degrees = np.degrees(angles)
+    return RelativeError(
+        delta_m=delta,
+        pairs=len(first),
+        translation_percent=100.0 * _rms(shifts) / delta,
+        translation_mean_percent=100.0 * float(shifts.mean()) / delta,
+        rotation_deg_per_m=_rms(degrees) / delta,
+        rotation_mean_deg_per_m=float(degrees.mean()) / delta,
+    )
+
+
+def drift_percent(truth: Trajectory, estimate: Trajectory) -> float:
+    """Return how far off the last pose is, seen from the first, in percent of the true path.
+
+    As if the estimate had been aligned at its first pose: no alignment but that of the scale
+    changes it.
+
+    Raises:
+        ValueError: The stamps of the two differ, or the true path has no length.
+    """
+    same_stamps(truth, estimate)
+    length = truth.length()
+    if not length > 0.0:
+        raise ValueError(f"drift: expected a path longer than 0 m, found {len(truth)} poses on it")
+    ends = np.array([0]), np.array([len(truth) - 1])
+    shifts, _ = _relative(truth, estimate, *ends)
+    return 100.0 * float(shifts[0]) / length
+
+
+def path_pairs(distances: Floats, delta: float, tolerance: float = 0.1) -> tuple[Indices, Indices]:
+    """Return all pairs of poses a given path length apart, as evo's `filter_pairs_by_path` does.
+
+    For each pose that is the later one whose distance is nearest; the first of equals.
+
+    Args:
+        distances: Path length from the start to each pose, metres, not falling, shape (n,).
+        delta: Metres between the two.
+        tolerance: By what share of it a pair may miss it.
+
+    Returns:
+        Row numbers of the first and of the second poses, each of shape (m,).
+
+    Raises:
+        ValueError: `delta` is not a positive length.
+    """
+    if not 0.0 < delta < math.inf:
+        raise ValueError(f"path_pairs: delta: expected a length above 0 m, found {delta}")
+    n = len(distances)
+    first = np.arange(n - 1)
+    above = np.clip(np.searchsorted(distances, distances[:-1] + delta), first + 1, n - 1)
+    # The nearest from below, and of those that stand on one spot the one that came first.
+    below = np.searchsorted(distances, distances[above - 1])
+    below = np.where(below > first, below, np.minimum(first + 1, above))
+    miss_above = np.abs(distances[above] - distances[first] - delta)
+    miss_below = np.abs(distances[below] - distances[first] - delta)
+    second = np.where(miss_below <= miss_above, below, above)
+    kept = np.minimum(miss_below, miss_above) <= delta * tolerance
+    return first[kept], second[kept]
+
+
+def position_errors(truth: Floats, estimate: Floats) -> Floats:
+    """Return the distances between positions, metres: shapes (n, 3) and (n, 3) to (n,)."""
+    return np.asarray(np.linalg.norm(estimate - truth, axis=1))
+
+
+def rotation_errors(truth: Floats, estimate: Floats) -> Floats:
+    """Return the angles between orientations, radians in [0, π].
+
+    Args:
+        truth: Unit quaternions w, x, y, z, shape (n, 4).
+        estimate: The same.
+
+    Returns:
+        Shape (n,).
+    """
+    a = Rotation.from_quat(truth, scalar_first=True)
+    b = Rotation.from_quat(estimate, scalar_first=True)
+    return np.asarray((a.inv() * b).magnitude())
+
+
+def position_error(truth: Vector3, estimate: Vector3) -> float:
+    """Return the distance between two positions, metres; for one pose in a running node."""
+    return math.dist(truth, estimate)
+
+
+def rotation_error(truth: Quaternion, estimate: Quaternion) -> float:
+    """Return the angle between two orientations, radians in [0, π]; for one pose likewise.
+
+    From both parts of the quaternion between them, as an arc cosine would lose small angles.
+    """
+    aw, ax, ay, az = truth
+    bw, bx, by, bz = estimate
+    w = aw * bw + ax * bx + ay * by + az * bz
+    x = aw * bx - ax * bw - ay * bz + az * by
+    y = aw * by - ay * bw - az * bx + ax * bz
+    z = aw * bz - az * bw - ax * by + ay * bx
+    return 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
+
+
+def same_stamps(truth: Trajectory, estimate: Trajectory) -> None:
+    """Raise `ValueError` unless two trajectories have the same stamps."""
+    if len(truth) != len(estimate):
+        raise ValueError(
+            f"expected poses at the same stamps, found {len(truth)} of the truth "
+            f"and {len(estimate)} of the estimate; see associate()"
+        )
+    if differ := np.flatnonzero(truth.stamps != estimate.stamps).tolist():
+        row = differ[0]
+        raise ValueError(
+            f"expected poses at the same stamps, found {truth.stamps[row]} ns of the truth beside "
+            f"{estimate.stamps[row]} ns of the estimate in row {row}; see associate()"
+        )
+
+
+def _relative(
+    truth: Trajectory, estimate: Trajectory, first: Indices, last: Indices
+) -> tuple[Floats, Floats]:
+    """Return the errors of the motions between pairs of poses: metres and radians, shape (m,)."""
+    (r1, p1), (r2, p2) = (
+        (t.rotations(), t.positions[last] - t.positions[first]) for t in (truth, estimate)
+    )
+    true_motion = r1[first].inv().apply(p1)
+    said_motion = r2[first].inv().apply(p2)
+    true_turn = r1[first].inv() * r1[last]
+    said_turn = r2[first].inv() * r2[last]
+    shifts = np.linalg.norm(said_motion - true_motion, axis=1)
+    return np.asarray(shifts), np.asarray((true_turn.inv() * said_turn).magnitude())
+
+
+def _rms(values: Floats) -> float:
+    return math.sqrt(float(np.mean(values**2)))

@@ -1,0 +1,215 @@
+"""Holds estimates against the truth, live and at the end."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import IO, Annotated, Any, Literal
+
+import msgspec
+
+from events import (
+    Announcement,
+    EstimatorAnnouncement,
+    Image,
+    Odometry,
+    PlannedPose,
+    PoseEstimate,
+    PositionSetpoint,
+    Quaternion,
+    Score,
+    TrackedFeatures,
+    TrackingEvent,
+    VehicleAnnouncement,
+)
+from nodes.evaluation.album import Album
+from nodes.evaluation.judging import Judgement, Thresholds, judge
+from nodes.evaluation.live import LiveErrors, RecentTruth
+from nodes.evaluation.record import EstimatorRecord
+from nodes.evaluation.results import file_name, write_results
+from nodes.trajectory import PoseRows
+from nodes.trajectory.formats import tum_row
+from runtime import Duration, Node, NodeConfig, Output, on
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class EvaluationConfig(NodeConfig):
+    """Settings of an evaluation.
+
+    Attributes:
+        alignment: How an estimate is laid on the truth: ``none``, ``origin`` (first pose on first
+            pose), ``se3``, ``sim3``; ``auto`` is ``sim3`` for scale-free estimators, ``none`` for
+            estimates in ``map``, and ``origin`` for all others.
+        control_rate: Hertz of the controller for which the newest pose is judged.
+        delta: Metres of path over which relative errors are taken.
+        gap: Silence of an estimator that counts as lost.
+        thresholds: What the figures may be at most; if one is above, the run's exit code is 1.
+        pictures: Sample pictures with features, for each estimator; 0 for none.
+        report: Whether to write ``report.html`` and its pictures at the end.
+    """
+
+    alignment: Literal["auto", "none", "origin", "se3", "sim3"] = "auto"
+    control_rate: Positive = 400
+    delta: Positive = 1.0
+    gap: Duration = Duration(0.5)  # immutable
+    thresholds: Thresholds = Thresholds()
+    pictures: Annotated[int, msgspec.Meta(ge=0, le=100)] = 12
+    report: bool = True
+
+
+class Evaluation(Node[EvaluationConfig]):
+    """Judges every estimator that it hears against the odometry of one vehicle.
+
+    Errors are sent as `Score` as the estimates come; the rest is written at the end, and the
+    verdict put into the run's summary.
+    """
+
+    scores = Output(Score)
+
+    async def on_startup(self) -> None:
+        """Open the files of trajectories: they grow as the run goes on."""
+        self._truth = PoseRows()
+        self._recent = RecentTruth()
+        self._plan = PoseRows()
+        self._setpoints = PoseRows()
+        self._records: dict[str, EstimatorRecord] = {}
+        self._live: dict[str, LiveErrors] = {}
+        self._album = Album(self.config.pictures)
+        self._files: dict[str, IO[str]] = {}
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Take the first vehicle's truth, unless the file names another; expect estimators."""
+        if isinstance(announcement, VehicleAnnouncement):
+            self.narrow("moved", announcement.source)
+        if isinstance(announcement, EstimatorAnnouncement):
+            record = EstimatorRecord(announcement.scale_free, announcement.method)
+            self._records[announcement.source] = record
+
+    @on(Odometry)
+    def moved(self, event: Odometry) -> None:
+        """Note the truth."""
+        self._truth.add(event.stamp, event.position, event.orientation)
+        self._recent.add(event.stamp, event.position, event.orientation)
+        self._append("truth", event)
+
+    @on(PlannedPose, PositionSetpoint)
+    def planned(self, event: PlannedPose | PositionSetpoint) -> None:
+        """Note where the pilot means to be."""
+        rows = self._plan if isinstance(event, PlannedPose) else self._setpoints
+        heading: Quaternion = (math.cos(event.yaw / 2), 0.0, 0.0, math.sin(event.yaw / 2))
+        rows.add(event.stamp, event.position, heading)
+
+    @on(PoseEstimate)
+    def estimated(self, event: PoseEstimate) -> None:
+        """Note an estimate, and say how good it is."""
+        name, now = event.source, self.clock.now()
+        record = self._records.setdefault(name, EstimatorRecord())
+        record.add(event, now)
+        self._append(name, event)
+        self._say(event, "latency", (now - event.stamp) / 1e9, "s")
+        truth = self._recent.at(event.stamp)
+        if truth is None or record.scale_free:
+            return
+        live = self._live.setdefault(name, LiveErrors())
+        distance, angle = live.of(event, truth)
+        self._say(event, "position_error", distance, "m")
+        self._say(event, "rotation_error", angle, "rad")
+        self._say(event, "mean_square_error", live.mean_square, "m^2")
+
+    @on(TrackingEvent)
+    def tracking(self, event: TrackingEvent) -> None:
+        """Note that an estimator lost or regained its way."""
+        self._records.setdefault(event.source, EstimatorRecord()).note(event)
+
+    @on(Image)
+    def saw(self, event: Image) -> None:
+        """Hold the picture for a while: its features may follow."""
+        self._album.see(event)
+
+    @on(TrackedFeatures)
+    def followed(self, event: TrackedFeatures) -> None:
+        """Keep a picture and its features now and then."""
+        self._album.follow(event)
+
+    async def on_shutdown(self) -> None:
+        """Judge, and write what came of it."""
+        for file in self._files.values():
+            file.close()
+        if not self._records:
+            self.log.warning("no estimator has announced itself or said anything")
+        judgements, verdict = await self.offload(self._finish)
+        for name, judgement in judgements.items():
+            figures = verdict["estimators"][name]
+            passed = bool(figures["passed"])
+            self.conclude(name, {k: v for k, v in figures.items() if k != "passed"}, passed=passed)
+            if judgement.figures.get("why"):
+                self.log.warning("%s: %s", name, judgement.figures["why"])
+        if self.out is not None and self.config.report:
+            self.after_run(_write_report)
+
+    def _finish(self) -> tuple[dict[str, Judgement], dict[str, Any]]:
+        config = self.config
+        truth = self._truth.trajectory() if len(self._truth) else None
+        judgements = {}
+        for name, record in self._records.items():
+            if truth is None:
+                why = "expected a truth to hold it against, found no odometry"
+                judgements[name] = Judgement(figures={"why": why}, estimate=None)
+            else:
+                judgements[name] = judge(
+                    record,
+                    truth,
+                    alignment=config.alignment,
+                    rate=config.control_rate,
+                    delta=config.delta,
+                    gap=config.gap,
+                )
+        estimators = {}
+        for name, judgement in judgements.items():
+            failed = config.thresholds.missed(judgement.figures)
+            if judgement.figures.get("ate_rmse_m") is None:
+                failed.append(judgement.figures.get("why", "expected estimates, found none"))
+            figures = {"passed": not failed, **judgement.figures, "failed": failed}
+            estimators[name] = figures
+        verdict = {
+            "passed": all(figures["passed"] for figures in estimators.values()),
+            "estimators": estimators,
+            "thresholds": msgspec.to_builtins(config.thresholds),
+        }
+        if self.out is not None:
+            rows = self._plan if len(self._plan) else self._setpoints
+            plan = rows.trajectory() if len(rows) else None
+            write_results(self.out, truth, plan, judgements, verdict)
+            self._album.write(self.out / "frames")
+        return judgements, verdict
+
+    def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
+        """Add a pose to a file: should the run be killed, what was said until then is there."""
+        if self.out is None:
+            return
+        file = self._files.get(name)
+        if file is None:
+            folder = self.out / "trajectories"
+            folder.mkdir(exist_ok=True)
+            path = folder / f"{file_name(name)}.tum"
+            file = self._files[name] = path.open("w", encoding="ascii")
+        file.write(tum_row(event.stamp, event.position, event.orientation))
+
+    def _say(self, event: PoseEstimate, metric: str, value: float, unit: str) -> None:
+        self.scores.send(
+            Score(
+                stamp=event.stamp,
+                source=self.name,
+                subject=event.source,
+                metric=metric,
+                value=value,
+                unit=unit,
+            )
+        )
+
+
+def _write_report(out: Path) -> None:
+    from nodes.report import write_report  # draws with matplotlib, which takes a second to import
+
+    write_report(out)

@@ -1,0 +1,311 @@
+"""Clouds from one viewpoint on one scale, side by side: what is smeared shows beside what is not.
+
+Points are painted straight into an array, the nearer over the farther; matplotlib only adds axes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.report.folder import Run
+from nodes.report.ply import Cloud, read_ply
+from nodes.report.poses import Floats
+from nodes.report.style import DPI, WIDTH, Picture, label, save, sheet
+
+MOST = 1_000_000
+"""Points of a cloud that are drawn: their numbers take 20 bits."""
+ABREAST = 3
+"""Clouds side by side in one picture."""
+
+Indices = npt.NDArray[np.int64]
+Painting = tuple[npt.NDArray[np.uint8], int]
+
+_ENOUGH = 100_000
+"""Points that say where a cloud lies."""
+_DEPTHS = 0xFFFFF
+_BACKGROUND = np.array([250, 250, 248], np.uint8)
+_CLEARANCE = 0.4
+"""Metres above the highest pose from where a cloud is cut off: it is what lies under a ceiling
+that a reader wants to see."""
+_AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(42.0)
+"""Of the oblique view: from the south-west, and from above."""
+_TALLEST, _TITLE = 6.0, 0.55
+"""Inches of a view at most, and of what stands above and below it."""
+_DETAIL = 3.6
+"""Metres across of the detail."""
+
+
+class Shown(msgspec.Struct, frozen=True, eq=False):
+    """A cloud as it is drawn.
+
+    Attributes:
+        name: Of its file.
+        points: East, north, up, metres, float32, shape (n, 3).
+        colors: Red, green, blue, uint8, shape (n, 3).
+        total: Points in the file.
+    """
+
+    name: str
+    points: npt.NDArray[np.float32]
+    colors: npt.NDArray[np.uint8]
+    total: int
+
+
+class View(msgspec.Struct, frozen=True, eq=False):
+    """An orthographic view.
+
+    Attributes:
+        title: What is seen.
+        axes: East, north, up to right, up on the picture, towards the viewer; shape (3, 3).
+        low: Corner of the picture, metres right and up, shape (2,).
+        high: The opposite corner.
+        labels: Of the axes, right and up; none, and a picture has a scale bar instead.
+    """
+
+    title: str
+    axes: Floats
+    low: Floats
+    high: Floats
+    labels: tuple[str, str] | None = None
+
+
+def draw_clouds(run: Run, folder: Path) -> list[Picture]:
+    """Draw all clouds that can be read; `Run.missing` says which cannot.
+
+    If there are many, each picture has the first again to hold the others against.
+    """
+    height = _ceiling(run)
+    clouds = []
+    for path in run.clouds:
+        try:
+            cloud = read_ply(path, MOST)
+        except (OSError, ValueError) as error:
+            run.missing.append(f"clouds/{path.name} cannot be read: {error}")
+            continue
+        if len(cloud.points):
+            clouds.append(_shown(path.stem, cloud, height))
+        else:
+            run.missing.append(f"clouds/{path.name} cannot be drawn: it has no points")
+    if not clouds:
+        return []
+    clouds.sort(key=lambda each: "tru" not in each.name)  # a true one, if there is one, is first
+    first, *others = clouds
+    views = _views(first)
+    if not others:
+        return [_draw_one(first, views, folder / "clouds_1.png", height)]
+    step = ABREAST - 1
+    groups = [[first, *others[k : k + step]] for k in range(0, len(others), step)]
+    return [
+        _draw(group, views, folder / f"clouds_{k}.png", height)
+        for k, group in enumerate(groups, start=1)
+    ]
+
+
+def _ceiling(run: Run) -> float | None:
+    """Return the height (m) above which clouds are cut off: somewhat above where anyone flew."""
+    if run.truth is None:
+        return None
+    return float(-run.truth.positions[:, 2].min()) + _CLEARANCE
+
+
+def _shown(name: str, cloud: Cloud, height: float | None) -> Shown:
+    """Return a cloud's points up to some height, with colours: by height if it has none."""
+    points = cloud.points[:, [1, 0, 2]] * np.array([1, 1, -1], np.float32)
+    colors = cloud.colors
+    if colors is None:
+        low, high = np.percentile(points[:, 2], (1, 99))
+        share = np.clip((points[:, 2] - low) / max(high - low, 1e-9), 0, 1)[:, None]
+        ends = np.array([[30, 60, 110], [230, 190, 80]])
+        colors = (ends[0] + share * (ends[1] - ends[0])).astype(np.uint8)
+    under = points[:, 2] <= (np.inf if height is None else height)
+    if under.any():
+        points, colors = points[under], colors[under]
+    return Shown(name, points, colors, cloud.total)
+
+
+def _views(cloud: Shown) -> list[View]:
+    """Choose what to look at, by the one cloud that the others are held against."""
+    some = slice(None, None, -(-len(cloud.points) // _ENOUGH))
+    points = cloud.points[some].astype(np.float64)
+    low, high = np.percentile(points, (0.3, 99.7), axis=0)
+    margin = 0.03 * float((high - low).max()) + 0.05
+    low, high = low - margin, high + margin
+    within = ((points >= low) & (points <= high)).all(axis=1)
+    inside = points[within]
+    east, north, up = np.eye(3)
+    top = View("from above", np.eye(3), low[:2], high[:2], ("east (m)", "north (m)"))
+    right = np.cos(_AZIMUTH) * east - np.sin(_AZIMUTH) * north
+    away = np.sin(_AZIMUTH) * east + np.cos(_AZIMUTH) * north
+    upward = np.sin(_ELEVATION) * away + np.cos(_ELEVATION) * up
+    oblique = np.stack([right, upward, np.cross(right, upward)])
+    seen = inside @ oblique.T
+    whole = View("obliquely", oblique, seen[:, :2].min(axis=0), seen[:, :2].max(axis=0))
+    place = _busiest(inside, cloud.colors[some][within])
+    middle = oblique[:2] @ place
+    half = np.array([_DETAIL / 2, _DETAIL / 2 * 0.8])
+    detail = View("a detail", oblique, middle - half, middle + half)
+    return [top, whole, detail]
+
+
+def _busiest(points: Floats, colors: npt.NDArray[np.uint8]) -> Floats:
+    """Return the middle of a place of 2 m where there is much to see: many heights, and colours."""
+    cells = np.floor(points[:, :2] / 2.0).astype(np.int64)
+    cells -= cells.min(axis=0)
+    index = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    slots = np.unique(index * 64 + (points[:, 2] * 10).astype(np.int64) % 64)
+    heights = np.bincount(slots // 64)
+    counts = np.maximum(np.bincount(index), 1)
+    grey = colors.mean(axis=1)
+    mean, square = np.bincount(index, grey) / counts, np.bincount(index, grey**2) / counts
+    contrast = np.sqrt(np.maximum(square - mean**2, 0.0)) + 1.0
+    best = int(np.argmax(heights * contrast * np.sqrt(counts)))
+    return np.asarray(np.median(points[index == best], axis=0))
+
+
+def visible(cloud: Shown, view: View, pixels: float) -> tuple[Indices, Indices, Indices]:
+    """Return the nearest point of each pixel that has one.
+
+    Args:
+        cloud: East, north, up; at most `MOST` points.
+        view: From where.
+        pixels: To a metre.
+
+    Returns:
+        Their rows and columns in the picture, and their numbers in the cloud; each of shape (m,),
+        the farthest first.
+    """
+    width = _size(view, pixels)[1]
+    seen = cloud.points @ view.axes.T.astype(np.float32)
+    inside = np.flatnonzero(((seen[:, :2] > view.low) & (seen[:, :2] < view.high)).all(axis=1))
+    seen = seen[inside]
+    column = ((seen[:, 0] - view.low[0]) * pixels).astype(np.uint64)
+    row = ((view.high[1] - seen[:, 1]) * pixels).astype(np.uint64)
+    near = seen[:, 2]
+    span = float(np.ptp(near)) + 1e-6 if len(near) else 1.0
+    depth = ((near - near.min(initial=np.inf)) * (_DEPTHS / span)).astype(np.uint64)
+    # One sort of whole numbers (pixel, depth, number of the point) is all the hiding there is.
+    keys = np.sort((row * np.uint64(width) + column) << 40 | depth << 20 | inside.astype(np.uint64))
+    pixel = keys >> 40
+    nearest = np.append(pixel[1:] != pixel[:-1], np.ones(min(len(pixel), 1), bool))
+    keys, where = keys[nearest], pixel[nearest].astype(np.int64)
+    order = np.argsort(keys >> 20 & 0xFFFFF, kind="stable")
+    number = (keys & 0xFFFFF).astype(np.int64)
+    return where[order] // width, where[order] % width, number[order]
+
+
+def paint(cloud: Shown, view: View, pixels: float, dot: int | None = None) -> Painting:
+    """Return what a view shows of a cloud as a picture, shape (h, w, 3), and its width of dots.
+
+    Args:
+        cloud: East, north, up; with colours.
+        view: From where.
+        pixels: To a metre.
+        dot: Width of a point in pixels; as wide as fills gaps between them, if not given.
+    """
+    height, width = _size(view, pixels)
+    row, column, number = visible(cloud, view, pixels)
+    if dot is None:
+        dot = int(np.clip(np.ceil(np.sqrt(2.0 * height * width / max(len(row), 1))), 2, 5))
+    spread = np.arange(dot) - (dot - 1) // 2
+    rows = np.clip(row[:, None, None] + spread[:, None], 0, height - 1)
+    columns = np.clip(column[:, None, None] + spread, 0, width - 1)
+    picture = np.full((height * width, 3), _BACKGROUND)
+    # Where several dots lie on one pixel, numpy keeps the last: the nearest.
+    painted = np.repeat(cloud.colors[number], dot * dot, axis=0)
+    picture[(rows * width + columns).reshape(-1)] = painted
+    return picture.reshape(height, width, 3), dot
+
+
+def _size(view: View, pixels: float) -> tuple[int, int]:
+    """Return a picture's height and width in pixels."""
+    across, up = np.maximum(np.ceil((view.high - view.low) * pixels), 1).astype(int).tolist()
+    return up, across
+
+
+def _draw(clouds: list[Shown], views: list[View], path: Path, height: float | None) -> Picture:
+    """Draw clouds side by side: one column a cloud, and one row a view."""
+    across = (WIDTH - 0.6) / len(clouds)
+    heights = [min(across * _aspect(view), _TALLEST) + _TITLE for view in views]
+    figure = sheet(sum(heights))
+    grid: Any = figure.subplots(len(views), len(clouds), squeeze=False, height_ratios=heights)
+    for axes, view in zip(grid, views, strict=True):
+        pixels = min(across, _TALLEST / _aspect(view)) / (view.high - view.low)[0] * DPI
+        dot = None
+        for axis, cloud in zip(axes, clouds, strict=True):
+            dot = _show(axis, cloud, view, pixels, dot)
+    save(figure, path)
+    return Picture(path, "Clouds", _caption(clouds, height))
+
+
+def _draw_one(cloud: Shown, views: list[View], path: Path, height: float | None) -> Picture:
+    """Draw a cloud that has none to be held against: the view from above beside the others."""
+    above, *others = views
+    # Widths of the columns such that both are equally tall.
+    left = 1.0 / _aspect(above)
+    right = 1.0 / sum(_aspect(view) for view in others)
+    tall = min((WIDTH - 0.8 - _TITLE / 2) / (left + right), _TALLEST)
+    figure = sheet(tall + 2 * _TITLE)
+    axes = figure.subplot_mosaic(
+        [["0", "1"], ["0", "2"]],
+        width_ratios=[left, right],
+        height_ratios=[_aspect(view) for view in others],
+    )
+    for k, view in enumerate(views):
+        wide = tall * (right if k else left)
+        _show(axes[str(k)], cloud, view, wide / (view.high - view.low)[0] * DPI, None)
+    save(figure, path)
+    return Picture(path, "Cloud", _caption([cloud], height))
+
+
+def _aspect(view: View) -> float:
+    across, up = (view.high - view.low).tolist()
+    return float(up / across)
+
+
+def _show(axis: Any, cloud: Shown, view: View, pixels: float, dot: int | None) -> int:
+    """Paint a cloud into some axes; return the width of its dots."""
+    picture, dot = paint(cloud, view, pixels, dot)
+    extent = (view.low[0], view.high[0], view.low[1], view.high[1])
+    axis.imshow(picture, extent=extent, interpolation="nearest")
+    axis.grid(visible=False)
+    axis.set_title(f"{label(cloud.name)}: {view.title}")
+    if view.labels is not None:
+        axis.set(xlabel=view.labels[0], ylabel=view.labels[1])
+    else:
+        _bar(axis, view)
+    return dot
+
+
+def _caption(clouds: list[Shown], height: float | None) -> str:
+    counts = ", ".join(f"{c.name} " + f"{c.total:,}".replace(",", " ") for c in clouds)
+    text = ""
+    if len(clouds) > 1:
+        text = (
+            "One viewpoint and one scale for all: errors of the poses show as walls that are "
+            "doubled or smeared. "
+        )
+    text += f"Points: {counts}."
+    if height is not None:
+        text += f" What is higher than {height:.1f} m, such as a ceiling, is left out."
+    return text
+
+
+def _bar(axis: Any, view: View) -> None:
+    """Replace the axes by a bar of a round length."""
+    axis.set(xticks=[], yticks=[])
+    for spine in axis.spines.values():
+        spine.set_visible(False)
+    size = view.high - view.low
+    length = next((n for n in (10, 5, 2, 1, 0.5, 0.2) if n < 0.3 * size[0]), 0.1)
+    x, y = view.low + 0.03 * size[0]
+    for color, thickness in (("white", 5.0), ("#222222", 2.5)):
+        axis.plot([x, x + length], [y, y], color=color, lw=thickness, solid_capstyle="butt")
+    behind = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.5}
+    place = (x + length / 2, y + 0.02 * size[0])
+    axis.text(*place, f"{length:g} m", ha="center", va="bottom", bbox=behind)
+    axis.set(xlim=(view.low[0], view.high[0]), ylim=(view.low[1], view.high[1]))

@@ -1,0 +1,260 @@
+"""Errors over time, how they are spread, latencies, and what is lost over a length of path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
+
+from nodes.report.folder import Estimator, Run
+from nodes.report.poses import Floats, broken, relative_errors
+from nodes.report.style import (
+    Picture,
+    label,
+    legend_above,
+    number,
+    save,
+    sheet,
+    thin,
+    wide_range,
+)
+
+SECOND = 1e9
+MILLISECOND = 1e6
+LENGTHS = (1.0, 2.0, 5.0, 10.0, 20.0)
+"""Metres of path over which relative errors are shown."""
+
+_STYLES: dict[str, Any] = {"at image time": "-", "newest at control ticks": (0, (4, 2))}
+"""Of the lines of distributions."""
+_LOST = "lost, in the estimator's colour"
+_SHOWN = 95
+"""Percent of the errors that the distributions show at least."""
+_FEWEST = 5
+"""Pairs of poses that make a box."""
+
+
+def draw_errors(run: Run, folder: Path) -> Picture | None:
+    """Draw position and rotation error of each estimate over time, lost intervals shaded."""
+    known = [(e, e.of_images) for e in run.estimators if e.of_images is not None]
+    if not known:
+        return None
+    figure = sheet(4.6, names=[*(each.name for each, _ in known), _LOST])
+    axes: Any = figure.subplots(2, 1, sharex=True)
+    for each, errors in known:
+        for axis, values in zip(axes, (errors.position, np.degrees(errors.rotation)), strict=True):
+            some = thin(len(values))
+            stamps = errors.stamps[some]
+            line = broken(values[some], stamps, each.lost)
+            seconds = (stamps - run.start) / SECOND
+            axis.plot(seconds, line, color=each.color, lw=1.2, label=label(each.name))
+    lost = any(each.lost for each in run.estimators)
+    for axis in axes if lost else ():
+        _shade(run, axis)
+    _scale(axes[0], [e.position for _, e in known], "y")
+    _scale(axes[1], [np.degrees(e.rotation) for _, e in known], "y")
+    axes[0].set_ylabel("position error (m)")
+    axes[1].set(ylabel="rotation error (°)", xlabel="time (s)")
+    axes[0].margins(x=0.01)
+    patch = Patch(facecolor="#bbbbbb", alpha=0.5, label=_LOST)
+    legend_above(figure, axes[0], *([patch] if lost else []))
+    path = folder / "errors.png"
+    save(figure, path)
+    when = "; ".join(
+        f"{each.name} "
+        + ", ".join(
+            f"{(a - run.start) / SECOND:.1f}–{(b - run.start) / SECOND:.1f} s" for a, b in each.lost
+        )
+        for each in run.estimators
+        if each.lost
+    )
+    caption = "Each estimate against the truth at the time of its image."
+    caption += f" Lost (shaded): {when}." if lost else " Nobody was lost."
+    return Picture(path, "Errors over time", caption)
+
+
+def _shade(run: Run, axis: Any) -> None:
+    for each in run.estimators:
+        for start, end in each.lost:
+            a, b = (start - run.start) / SECOND, (end - run.start) / SECOND
+            axis.axvspan(a, b, facecolor=each.color, alpha=0.18, lw=0, zorder=0.5)
+
+
+def draw_distributions(run: Run, folder: Path) -> Picture | None:
+    """Draw what share of errors is below a value: at image time and at the control ticks."""
+    known = [e for e in run.estimators if e.of_images is not None or e.of_ticks is not None]
+    if not known:
+        return None
+    figure = sheet(3.4, names=[*(each.name for each in known), *_STYLES])
+    axes: Any = figure.subplots(1, 2, sharey=True)
+    shares = np.linspace(0.0, 1.0, 401)
+    series: tuple[list[Floats], list[Floats]] = ([], [])
+    for each in known:
+        name: str | None = label(each.name)
+        for errors, style in zip((each.of_images, each.of_ticks), _STYLES.values(), strict=True):
+            if errors is None:
+                continue
+            for k, values in enumerate((errors.position, np.degrees(errors.rotation))):
+                series[k].append(values)
+                axes[k].plot(
+                    np.quantile(values, shares),
+                    100.0 * shares,
+                    color=each.color,
+                    ls=style,
+                    label=None if k else name,
+                )
+            name = None
+    for axis, both in zip(axes, series, strict=True):
+        _scale(axis, both, "x", _SHOWN)
+        axis.set_ylim(0, 101)
+    axes[0].set(xlabel="position error (m)", ylabel="share of poses below (%)")
+    axes[1].set(xlabel="rotation error (°)")
+    lines = [Line2D([], [], color="#666666", ls=ls, label=what) for what, ls in _STYLES.items()]
+    legend_above(figure, axes[0], *lines)
+    path = folder / "distributions.png"
+    save(figure, path)
+    return Picture(
+        path,
+        "Distribution of the errors",
+        "Solid: each estimate against the truth at the time of its image. Dashed: the newest pose "
+        "a controller had at each of its ticks against the truth at that tick; the distance "
+        "between the two is what latency and frame rate cost. "
+        f"The axes end where {_SHOWN} % of the widest curve are below.",
+    )
+
+
+def draw_latency(run: Run, folder: Path) -> Picture | None:
+    """Draw how long estimates took, and how old the newest was at the control ticks."""
+    took = [
+        (e, (e.of_images.since - e.of_images.stamps) / MILLISECOND)
+        for e in run.estimators
+        if e.of_images is not None and len(e.of_images.since)
+    ]
+    age = [
+        (e, (e.of_ticks.stamps - e.of_ticks.since) / MILLISECOND)
+        for e in run.estimators
+        if e.of_ticks is not None
+    ]
+    if not took and not age:
+        return None
+    figure = sheet(3.0, names=[each.name for each in run.estimators])
+    axes: Any = figure.subplots(1, 2)
+    _histogram(axes[0], took, "from exposure to estimate (ms)", "share of estimates (%)")
+    _histogram(axes[1], age, "age of the newest pose (ms)", "share of control ticks (%)")
+    axes[0].set_title("latency")
+    axes[1].set_title("what a controller has to go by")
+    legend_above(figure, axes[0] if took else axes[1])
+    path = folder / "latency.png"
+    save(figure, path)
+    return Picture(
+        path,
+        "Latency",
+        "Left: from the exposure of an image to the arrival of its pose. Right: how long ago that "
+        "exposure was, at each tick of the controller. What lies beyond the axis (the last pose of "
+        "an estimator that is lost gets old) is gathered in the last bar.",
+    )
+
+
+def _histogram(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, ylabel: str) -> None:
+    """Draw outlined histograms on common bins."""
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    if not series:
+        axis.text(0.5, 0.5, "not known", ha="center", transform=axis.transAxes, color="#777777")
+        return
+    low = min(float(values.min()) for _, values in series)
+    # An estimator that was lost has a few poses of any age: the rest is to be seen as well.
+    high = max(min(float(np.percentile(v, 99.5)), 5.0 * float(np.median(v))) for _, v in series)
+    margin = max(0.05 * (high - low), 5.0)
+    bins = np.linspace(max(low - margin, 0.0), high + margin, 61)
+    for each, values in series:
+        counts, _ = np.histogram(np.minimum(values, bins[-1]), bins)
+        share = 100.0 * counts / len(values)
+        axis.stairs(share, bins, color=each.color, lw=1.3, label=label(each.name))
+        axis.stairs(share, bins, color=each.color, alpha=0.15, fill=True)
+    axis.set_xlim(bins[0], bins[-1])
+
+
+def draw_relative(run: Run, folder: Path) -> Picture | None:
+    """Draw boxes of the relative errors over several lengths of path."""
+    if run.truth is None:
+        return None
+    known = [(e, e.aligned) for e in run.estimators if e.aligned is not None]
+    boxes = []
+    for place, length in enumerate(LENGTHS):
+        for k, (each, aligned) in enumerate(known):
+            inside = aligned.take(run.truth.covers(aligned.stamps))
+            shifts, angles = relative_errors(run.truth.at(inside.stamps), inside, length)
+            if len(shifts) >= _FEWEST:
+                share = 0.7 / len(known)
+                where = place + (k - (len(known) - 1) / 2) * share
+                values = 100.0 * shifts / length, np.degrees(angles) / length
+                boxes.append((each, where, 0.8 * share, length, values))
+    if not boxes:
+        return None
+    figure = sheet(3.4, names=[each.name for each, _ in known])
+    axes: Any = figure.subplots(1, 2)
+    for row, axis in enumerate(axes):
+        for each in dict.fromkeys(each for each, *_ in boxes):
+            own = [box for box in boxes if box[0] is each]
+            _boxes(axis, each, [(where, width, v[row]) for _, where, width, _, v in own])
+        _scale(axis, [values[row] for *_, values in boxes], "y", 95)
+        axis.set_xticks(range(len(LENGTHS)), [f"{length:g}" for length in LENGTHS])
+        axis.set(xlabel="length of path (m)", xlim=(-0.6, len(LENGTHS) - 0.4))
+        axis.grid(visible=False, axis="x")
+    axes[0].set(ylabel="position: error (% of the length)")
+    axes[1].set(ylabel="rotation: error (°/m)")
+    legend_above(figure, axes[0])
+    path = folder / "relative.png"
+    save(figure, path)
+    reached = max(length for *_, length, _ in boxes)
+    short = "" if reached == LENGTHS[-1] else f" The path gives none beyond {reached:g} m."
+    return Picture(
+        path,
+        "Relative error over path length",
+        "How far motions over a length of path are off. Boxes: quartiles and median; whiskers: "
+        f"5th and 95th percentile; all pairs of poses that far apart along the true path.{short}",
+    )
+
+
+def _boxes(axis: Any, each: Estimator, boxes: list[tuple[float, float, Floats]]) -> None:
+    names = ("whislo", "q1", "med", "q3", "whishi")
+    statistics = [
+        dict(zip(names, np.percentile(v, (5, 25, 50, 75, 95)).tolist(), strict=True))
+        for _, _, v in boxes
+    ]
+    drawn = axis.bxp(
+        statistics,
+        positions=[where for where, _, _ in boxes],
+        widths=[width for _, width, _ in boxes],
+        showfliers=False,
+        patch_artist=True,
+        manage_ticks=False,
+        boxprops={"facecolor": f"{each.color}40", "edgecolor": each.color},
+        medianprops={"color": each.color, "lw": 1.8},
+        whiskerprops={"color": each.color},
+        capprops={"color": each.color},
+    )
+    drawn["boxes"][0].set_label(label(each.name))
+
+
+def _scale(axis: Any, series: list[Floats], which: str, share: float = 100.0) -> None:
+    """Start an axis at 0, or make it logarithmic where that would flatten all but one.
+
+    Args:
+        axis: The axes.
+        series: What is drawn.
+        which: ``x`` or ``y``.
+        share: Percent of each series that is shown.
+    """
+    top = 1.05 * max((float(np.nanpercentile(v, share)) for v in series if len(v)), default=1.0)
+    if not wide_range(series):
+        axis.set(**{f"{which}lim": (0, top or 1.0)})
+        return
+    low = min(float(np.nanpercentile(v[v > 0], 5)) for v in series if (v > 0).any())
+    axis.set(**{f"{which}scale": "log", f"{which}lim": (max(low / 2, top * 1e-6), top * 1.4)})
+    ruler = getattr(axis, f"{which}axis")
+    ruler.set_major_formatter(lambda value, _: number(value, 1))
+    ruler.set_minor_formatter(NullFormatter())

@@ -1,0 +1,291 @@
+"""What a run left in its folder, read for the report.
+
+Everything is optional, as a run may have been killed at any time: what is not there, or cannot be
+read, is said in `Run.missing`, and the rest of the report goes on without it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from nodes.evaluation.judging import Errors
+from nodes.evaluation.record import Interval, seconds
+from nodes.evaluation.results import file_name, read_errors
+from nodes.report.poses import gaps, lay_on, read_poses
+from nodes.report.style import COLORS
+from nodes.trajectory import Trajectory
+from runtime.summary import LinkSummary, StreamSummary, TickSummary
+
+T = TypeVar("T")
+
+SIGNS = ("summary.json", "config.toml", "log.txt", "trajectories", "evaluation")
+"""A folder with one of these is a run's."""
+
+_PICTURES = ("flight.png", "pictures.png")
+_LOG_LINES = 200
+_NO_ESTIMATES = {"truth", "plan"}
+_ABOUT = 0.25
+"""Seconds by which two counts of lost time may differ."""
+_LOUD = {"WARNING", "ERROR", "CRITICAL"}
+
+
+class Facts(msgspec.Struct, frozen=True, kw_only=True):
+    """What the report wants of ``summary.json``; see `runtime.summary.Summary`."""
+
+    name: str | None = None
+    clock: str | None = None
+    seed: int | None = None
+    reason: str | None = None
+    error: str | None = None
+    sim_seconds: float | None = None
+    wall_seconds: float | None = None
+    digest: str | None = None
+    not_deterministic: list[str] = []
+    verdict: Verdict | None = None
+    outputs: dict[str, int] = {}
+    streams: dict[str, StreamSummary] = {}
+    links: dict[str, LinkSummary] = {}
+    ticks: dict[str, TickSummary] = {}
+    stalls: dict[str, int] = {}
+    announcements: list[dict[str, Any]] = []
+    environment: dict[str, str] = {}
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """What ``evaluation/verdict.json`` holds, and without thresholds the summary."""
+
+    passed: bool
+    estimators: dict[str, dict[str, Any]]
+    thresholds: dict[str, float | None] = {}
+
+
+class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+    """One of those that were judged, or that would have been.
+
+    Attributes:
+        name: Its source.
+        color: In every picture.
+        figures: From the verdict; empty if there is none.
+        aligned: Its poses in the truth's frame.
+        of_images: Errors of each pose at the time of its image.
+        of_ticks: Errors of the newest pose there was at each control tick.
+        lost: When it had no pose.
+    """
+
+    name: str
+    color: str
+    figures: dict[str, Any] = {}
+    aligned: Trajectory | None = None
+    of_images: Errors | None = None
+    of_ticks: Errors | None = None
+    lost: list[Interval] = []
+
+
+class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+    """One run's folder.
+
+    Attributes:
+        folder: Where it is.
+        facts: From the summary.
+        verdict: What the evaluation concluded.
+        truth: True poses.
+        plan: Where the pilot meant to be.
+        estimators: By order of the verdict.
+        frames: Sample pictures with features, by estimator's file name.
+        clouds: Files of clouds.
+        pictures: Pictures that other nodes left.
+        config: Text of ``config.toml``.
+        log: Its warnings and errors.
+        missing: Sentences that say what is not there or cannot be read.
+    """
+
+    folder: Path
+    facts: Facts
+    verdict: Verdict | None
+    truth: Trajectory | None
+    plan: Trajectory | None
+    estimators: list[Estimator]
+    frames: dict[str, list[Path]]
+    clouds: list[Path]
+    pictures: list[Path]
+    config: str | None
+    log: list[str]
+    missing: list[str]
+
+    @property
+    def name(self) -> str:
+        """Name of the run."""
+        return self.facts.name or self.folder.resolve().name
+
+    @property
+    def start(self) -> int:
+        """What times in the pictures count from: 0, or for stamps of a calendar the first one."""
+        first = int(self.truth.stamps[0]) if self.truth is not None else 0
+        return first if first > 1e15 else 0
+
+
+def read_run(folder: Path) -> Run:
+    """Read what there is.
+
+    Raises:
+        ValueError: The folder is not there, or is no run's.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: expected the folder of a run, found none")
+    if not any((folder / sign).exists() for sign in SIGNS):
+        inside = ", ".join(sorted(p.name for p in folder.iterdir())[:5]) or "nothing"
+        raise ValueError(
+            f"{folder}: expected the folder of a run, with {', '.join(SIGNS[:-1])} "
+            f"or {SIGNS[-1]} in it, found {inside}"
+        )
+    return _Reader(folder).run()
+
+
+class _Reader:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.missing: list[str] = []
+
+    def run(self) -> Run:
+        facts = self._try("summary.json", _facts, "the run did not end in an orderly way")
+        verdict = self._try("evaluation/verdict.json", _verdict, "nothing was evaluated to the end")
+        if verdict is None and facts is not None:
+            verdict = facts.verdict
+        config = self._try("config.toml", _text, "the settings are not known")
+        log = self._try("log.txt", _text, "what was logged is not known")
+        truth = self._truth()
+        plan = self._try("trajectories/plan.tum", read_poses)
+        return Run(
+            folder=self.folder,
+            facts=facts or Facts(),
+            verdict=verdict,
+            truth=truth,
+            plan=plan,
+            estimators=self._estimators(verdict, truth),
+            frames=_frames(self.folder / "frames"),
+            clouds=sorted((self.folder / "clouds").glob("*.ply")),
+            pictures=[p for name in _PICTURES if (p := self.folder / name).is_file()],
+            config=config,
+            log=_loud(log or ""),
+            missing=self.missing,
+        )
+
+    def _truth(self) -> Trajectory | None:
+        """Read the truth as the evaluation left it, else as the flight log did."""
+        evaluated = (self.folder / "trajectories" / "truth.tum").is_file()
+        if not evaluated and (self.folder / "trajectory.tum").is_file():
+            return self._try("trajectory.tum", read_poses)
+        return self._try("trajectories/truth.tum", read_poses, "there is nothing to compare with")
+
+    def _estimators(self, verdict: Verdict | None, truth: Trajectory | None) -> list[Estimator]:
+        figures = {} if verdict is None else verdict.estimators
+        files = {file_name(name): name for name in figures}
+        said = {p.stem for p in (self.folder / "trajectories").glob("*.tum")} - _NO_ESTIMATES
+        files |= {file: file for file in sorted(said - set(files))}
+        if not files:
+            self.missing.append("no estimator has said anything, and none was judged")
+        return [
+            self._estimator(file, name, COLORS[k % len(COLORS)], figures.get(name, {}), truth)
+            for k, (file, name) in enumerate(files.items())
+        ]
+
+    def _estimator(
+        self, file: str, name: str, color: str, figures: dict[str, Any], truth: Trajectory | None
+    ) -> Estimator:
+        found = Estimator(name=name, color=color, figures=figures)
+        aligned = self._try(f"evaluation/{file}.aligned.tum", read_poses)
+        errors = self._try(f"evaluation/{file}.csv", _errors)
+        ticks = self._try(f"evaluation/{file}.ticks.csv", _errors)
+        if aligned is None:
+            said = self._try(f"trajectories/{file}.tum", read_poses)
+            if said is None:
+                why = figures.get("why") or "it left no poses"
+                self.missing.append(f"{name}: no curves: {why}")
+                return found
+            if truth is not None:
+                try:
+                    aligned, errors = lay_on(truth, said)
+                except ValueError as error:
+                    self.missing.append(f"{name}: no curves: {error}")
+                    return found
+                self.missing.append(
+                    f"{name}: the run left no evaluation of it; its first pose was laid on the "
+                    "true one for this report, its scale left as it is"
+                )
+        lost = self._try(f"evaluation/{file}.lost.csv", _intervals)
+        if lost is None:
+            lost = gaps(aligned, errors, truth)
+            known, counted = seconds(lost), figures.get("lost_seconds")
+            if isinstance(counted, int | float) and abs(counted - known) > _ABOUT:
+                self.missing.append(
+                    f"{name}: lost for {counted:.1f} s by the figures; gaps between its poses "
+                    f"tell of {known:.1f} s, which are what the pictures show"
+                )
+        return msgspec.structs.replace(
+            found, aligned=aligned, of_images=errors, of_ticks=ticks, lost=lost
+        )
+
+    def _try(self, name: str, read: Callable[[Path], T], without: str = "") -> T | None:
+        """Read a file; say so if it is not there (and is expected) or is not what it should be."""
+        path = self.folder / name
+        if not path.is_file():
+            if without:
+                self.missing.append(f"{name} is not there: {without}")
+            return None
+        try:
+            return read(path)
+        except (OSError, ValueError, msgspec.MsgspecError) as error:
+            self.missing.append(f"{name} cannot be read: {error}")
+            return None
+
+
+def _facts(path: Path) -> Facts:
+    return msgspec.json.decode(path.read_bytes(), type=Facts)
+
+
+def _verdict(path: Path) -> Verdict:
+    return msgspec.json.decode(path.read_bytes(), type=Verdict)
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _errors(path: Path) -> Errors:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy's, of a file without rows
+        errors = read_errors(path)
+    if not len(errors.stamps):
+        raise ValueError("expected rows of errors, found none")
+    return errors
+
+
+def _intervals(path: Path) -> list[Interval]:
+    """Read a file of rows ``start_ns,end_ns`` under a header."""
+    rows = [line.split(",") for line in path.read_text(encoding="ascii").splitlines()[1:]]
+    return [Interval(int(start), int(end)) for start, end in rows]
+
+
+def _frames(folder: Path) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for path in sorted(folder.glob("*.jpg")):
+        found.setdefault(path.stem.rpartition("_")[0], []).append(path)
+    return found
+
+
+def _loud(log: str) -> list[str]:
+    """Return warnings and errors, with the lines that go on about them; the last ones."""
+    found: list[str] = []
+    loud = False
+    for line in log.splitlines():
+        words = line.split(None, 2)
+        if len(words) > 1 and words[0].replace(".", "", 1).isdigit():
+            loud = words[1] in _LOUD
+        if loud:
+            found.append(line)
+    return found[-_LOG_LINES:]

@@ -1,0 +1,72 @@
+"""Sheets of the sample pictures in which an evaluation drew what an estimator followed."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from nodes.report.folder import Run
+from nodes.report.style import DPI, WIDTH, Picture, label, save, sheet
+
+_COLUMNS = 4
+_MOST = 12
+_GAP = 6
+"""Pixels between pictures."""
+_CAPTION = 26
+"""Pixels above each."""
+
+
+def draw_frames(run: Run, folder: Path) -> list[Picture]:
+    """Draw one sheet for each estimator that left pictures."""
+    names = {e.name.replace("/", "_"): e.name for e in run.estimators}
+    pictures = []
+    for file, paths in run.frames.items():
+        step = -(-len(paths) // _MOST)
+        path = folder / f"frames_{file}.png"
+        if _sheet(run, paths[::step], path):
+            name = names.get(file, file)
+            caption = "Rings: tracked features; green agree with the estimated motion, red don't."
+            pictures.append(Picture(path, f"What {name} saw and followed", caption, photo=True))
+    return pictures
+
+
+def _sheet(run: Run, paths: list[Path], out: Path) -> bool:
+    """Draw a sheet; `False` if there was nothing to draw."""
+    columns = min(_COLUMNS, len(paths))
+    width = (round(WIDTH * DPI) - _GAP * (_COLUMNS - 1)) // _COLUMNS
+    shown = []
+    for path in paths:
+        picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB)
+        if picture is None:
+            run.missing.append(f"frames/{path.name} cannot be read: expected a JPEG")
+            continue
+        height = max(round(picture.shape[0] * width / picture.shape[1]), 1)
+        small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        shown.append((_caption(run, path), small))
+    if not shown:
+        return False
+    tallest = max(picture.shape[0] for _, picture in shown) + _CAPTION + _GAP
+    rows = math.ceil(len(shown) / columns)
+    canvas = np.full((rows * tallest, columns * (width + _GAP) - _GAP, 3), 255, np.uint8)
+    figure = sheet(canvas.shape[0] / DPI, constrained=False, width=canvas.shape[1] / DPI)
+    axis: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axis.set_axis_off()
+    for k, (text, picture) in enumerate(shown):
+        top, left = k // columns * tallest, k % columns * (width + _GAP)
+        canvas[top + _CAPTION : top + _CAPTION + picture.shape[0], left : left + width] = picture
+        axis.text(left + 2, top + _CAPTION - 6, text, fontsize=9, color="#222222")
+    axis.imshow(canvas, interpolation="nearest", aspect="auto")
+    save(figure, out)
+    return True
+
+
+def _caption(run: Run, path: Path) -> str:
+    """Return the time of a picture, from the stamp at the end of its name."""
+    stamp = path.stem.rpartition("_")[2]
+    if not stamp.isdigit():
+        return label(path.stem)
+    return f"{(int(stamp) - run.start) / 1e9:.2f} s"

@@ -1,0 +1,195 @@
+"""The trajectories, from above and from the side, on one scale; and the height over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.evaluation.record import Interval
+from nodes.report.folder import Run
+from nodes.report.poses import Floats, broken
+from nodes.report.style import PLAN, TRUTH, WIDTH, Picture, label, legend_columns, save, sheet, thin
+from nodes.trajectory import Trajectory
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 0.7, 0.2, 0.5, 0.5
+_ASIDE, _BETWEEN = 0.75, 0.8
+"""Inches around the axes, and between them."""
+_ROW = 0.2
+"""Inches of a row of the legend."""
+_TALLEST = 6.0
+"""Inches of the view from above, at most."""
+_TIME = 1.3
+"""Inches of the height over time, at least."""
+
+Rectangle = tuple[float, float, float, float]
+"""Left, bottom, width, height; inches."""
+
+
+class _Line(msgspec.Struct, frozen=True, eq=False):
+    """What is drawn: stamps (ns), points east, north, up (m)."""
+
+    name: str
+    stamps: npt.NDArray[np.int64]
+    points: Floats
+    style: dict[str, Any]
+
+
+def draw_paths(run: Run, folder: Path) -> Picture | None:
+    """Draw truth, plan and aligned estimates; `None` if there is none of them.
+
+    Both views are of one scale, metre for metre, and share the east axis.
+    """
+    lines = _lines(run)
+    if not lines:
+        return None
+    low, high = _bounds(lines)
+    columns = legend_columns([*(line.name for line in lines), "start", "end"])
+    top = _TOP + _ROW * -(-(len(lines) + 2) // columns)
+    east, north, up = (high - low).tolist()
+    height, *places = _layout(east, north, up, top)
+    figure = sheet(height, constrained=False)
+    above, beside, later = (
+        figure.add_axes((x / WIDTH, y / height, w / WIDTH, h / height)) for x, y, w, h in places
+    )
+    for line in lines:
+        x, y, z = line.points.T
+        above.plot(x, y, label=line.name, **line.style)
+        beside.plot(x, z, **line.style)
+        later.plot((line.stamps - run.start) / 1e9, z, **line.style)
+    for k, line in enumerate(lines):
+        if line.style["color"] != PLAN:
+            _ends(above, beside, line, main=k == 0)
+    above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    above.set(xlabel="east (m)", ylabel="north (m)", title="from above")
+    beside.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]))
+    beside.set(xlabel="east (m)", ylabel="height (m)", title="from the side (looking north)")
+    later.set(xlabel="time (s)", ylabel="height (m)", title="height over time")
+    later.set_ylim(low[2], high[2])
+    later.margins(x=0.01)
+    handles, names = above.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        names,
+        loc="upper left",
+        bbox_to_anchor=((_LEFT - 0.1) / WIDTH, 1.0 - 0.05 / height),
+        ncols=columns,
+    )
+    path = folder / "trajectories.png"
+    save(figure, path)
+    astray = any(((p < low) | (p > high)).any() for p in (line.points for line in lines))
+    return Picture(path, "Trajectories", _caption(run, astray=astray))
+
+
+def _caption(run: Run, *, astray: bool) -> str:
+    how = {str(e.figures["alignment"]) for e in run.estimators if "alignment" in e.figures}
+    laid = f" (alignment: {', '.join(sorted(how))})" if how else ""
+    text = "Both views have one scale."
+    if any(e.aligned is not None for e in run.estimators):
+        text += (
+            f" Estimates as laid on the truth for the evaluation{laid}; "
+            "their lines are broken where they were lost."
+        )
+    if astray:
+        text += " What goes farther astray than this is cut off."
+    return text
+
+
+def _lines(run: Run) -> list[_Line]:
+    found = []
+    if run.truth is not None:
+        style = {"color": TRUTH, "lw": 3.2, "alpha": 0.45, "solid_capstyle": "round"}
+        found.append(_line("truth", run.truth, style))
+    if run.plan is not None:
+        found.append(_line("plan", run.plan, {"color": PLAN, "lw": 0.9, "ls": (0, (5, 3))}))
+    for each in run.estimators:
+        if each.aligned is not None:
+            style = {"color": each.color, "lw": 1.3}
+            found.append(_line(label(each.name), each.aligned, style, each.lost))
+    return found
+
+
+def _line(
+    name: str, poses: Trajectory, style: dict[str, Any], lost: Sequence[Interval] = ()
+) -> _Line:
+    some = thin(len(poses))
+    stamps = poses.stamps[some]
+    return _Line(name, stamps, _shown(broken(poses.positions[some], stamps, lost)), style)
+
+
+def _shown(positions: Floats) -> Floats:
+    """Return NED positions as east, north, up, shape (n, 3)."""
+    return positions[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
+def _bounds(lines: list[_Line]) -> tuple[Floats, Floats]:
+    """Return the corners of what is drawn, with a margin; no side is all too thin.
+
+    An estimate that goes astray is followed only so far: as far again as the truth is wide.
+    """
+    points = np.concatenate([line.points for line in lines])
+    if lines[0].name == "truth":
+        first = lines[0].points
+        low, high = first.min(axis=0), first.max(axis=0)
+        beyond = max(float((high - low).max()), 0.5)
+        points = np.clip(points, low - beyond, high + beyond)
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    middle, extent = (low + high) / 2, high - low
+    widest = max(float(extent.max()), 0.5)
+    # A vehicle that hovers, or one that goes straight ahead, still has a picture of some shape.
+    half = np.maximum(extent / 2, widest * np.array([0.2, 0.2, 0.06])) + 0.05 * widest
+    return middle - half, middle + half
+
+
+def _layout(
+    east: float, north: float, up: float, top: float
+) -> tuple[float, Rectangle, Rectangle, Rectangle]:
+    """Return the figure's height, and the places of: above, from the side, over time; inches.
+
+    What is broad has its views one below the other; what is tall has them side by side.
+
+    Args:
+        east: Metres to show.
+        north: Likewise.
+        up: Likewise.
+        top: Inches above all axes.
+    """
+    across = WIDTH - _LEFT - _RIGHT
+    if north < 0.7 * east:
+        scale = min(across / east, _TALLEST / north)
+        width, view, side = east * scale, north * scale, up * scale
+        left = _LEFT + (across - width) / 2
+        second = _BOTTOM + _TIME + _BETWEEN
+        first = second + side + _BETWEEN
+        return (
+            first + view + top,
+            (left, first, width, view),
+            (left, second, width, side),
+            (left, _BOTTOM, width, _TIME),
+        )
+    scale = min((across - _ASIDE) / (2 * east), _TALLEST / north)
+    width, view, side = east * scale, north * scale, up * scale
+    right = _LEFT + width + _ASIDE
+    rest = max(view - side - _BETWEEN, _TIME)
+    tall = max(view, side + _BETWEEN + rest)
+    return (
+        _BOTTOM + tall + top,
+        (_LEFT, _BOTTOM + tall - view, width, view),
+        (right, _BOTTOM + tall - side, width, side),
+        (right, _BOTTOM, WIDTH - _RIGHT - right, rest),
+    )
+
+
+def _ends(above: Any, beside: Any, line: _Line, *, main: bool) -> None:
+    """Mark where a line ends, and where the main one starts."""
+    known = line.points[~np.isnan(line.points[:, 0])]
+    marks = [(0, "o", "start"), (-1, "s", "end")] if main else [(-1, "s", None)]
+    for row, marker, name in marks if len(known) else []:
+        east, north, up = known[row]
+        style = {"color": line.style["color"], "ms": 8 if main else 5, "mec": "white", "ls": ""}
+        above.plot(east, north, marker, label=name, zorder=4, **style)
+        beside.plot(east, up, marker, zorder=4, **style)

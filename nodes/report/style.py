@@ -1,0 +1,170 @@
+"""How a report looks: one colour for each estimator in every picture, plain axes, few digits."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+
+Floats = npt.NDArray[np.float64]
+
+COLORS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#6a3d7c",
+    "#6b5b00",
+)
+"""For estimators. The first six are told apart by the colour-blind as well (M. Okabe and K. Ito,
+"Color universal design", 2008)."""
+TRUTH = "#3a3a3a"
+PLAN = "#111111"
+
+WIDTH = 10.0
+"""Inches of a picture across the page."""
+DPI = 110
+
+_MOST = 2500
+"""Points of a line; more than that no picture shows."""
+
+_LETTERS, _HANDLE = 115, 8
+"""Letters of a legend across the page; letters that a line and its margin take."""
+
+_STYLE: dict[Any, Any] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#777777",
+    "axes.grid": True,
+    "axes.labelcolor": "#222222",
+    "axes.linewidth": 0.8,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.unicode_minus": True,
+    "figure.facecolor": "white",
+    "font.family": "DejaVu Sans",  # comes with matplotlib
+    "font.size": 9,
+    "grid.alpha": 0.6,
+    "grid.color": "#d8d8d8",
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "path.simplify": True,
+    "text.parse_math": False,  # names may have dollar signs
+    "xtick.color": "#444444",
+    "ytick.color": "#444444",
+}
+
+
+class Picture(msgspec.Struct, frozen=True):
+    """A picture of the report.
+
+    Attributes:
+        path: The PNG.
+        title: What is seen.
+        caption: How to read it.
+        photo: Whether it is of photographs, which the page holds as JPEG: a fifth of the size.
+    """
+
+    path: Path
+    title: str
+    caption: str = ""
+    photo: bool = False
+
+
+@contextlib.contextmanager
+def drawing() -> Iterator[None]:
+    """Draw in the report's style while the block runs."""
+    with mpl.rc_context(_STYLE), warnings.catch_warnings():
+        # A name may have letters that the font lacks; they are drawn as boxes.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        yield
+
+
+def sheet(
+    height: float,
+    *,
+    names: Sequence[str] = (),
+    constrained: bool = True,
+    width: float = WIDTH,
+) -> Figure:
+    """Return an empty figure.
+
+    Args:
+        height: Inches, and as much more as the legend is higher than one row.
+        names: What the legend above all will say.
+        constrained: Whether axes find their places themselves.
+        width: Inches.
+    """
+    rows = -(-len(names) // legend_columns(names))
+    size = (width, height + 0.2 * max(rows - 1, 0))
+    return Figure(figsize=size, layout="constrained" if constrained else None)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG; equal figures give equal bytes."""
+    figure.savefig(path, dpi=DPI, metadata={"Software": None})
+
+
+def label(name: str) -> str:
+    """Return a name that fits a legend, and that matplotlib doesn't leave out of it."""
+    shown = name if len(name) <= 40 else f"{name[:39]}…"
+    return f"\u200a{shown}" if shown.startswith("_") else shown
+
+
+def thin(count: int) -> slice:
+    """Return which of so many points are enough for a line."""
+    return slice(None, None, max(-(-count // _MOST), 1))
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with some significant digits, and no exponent if it can be read without."""
+    if not math.isfinite(value):
+        return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
+    if value == 0:
+        return "0"
+    rounded = f"{value:.{digits - 1}e}"
+    exponent = int(rounded.partition("e")[2])
+    if -5 < exponent < 7:
+        rounded = f"{value:.{max(digits - 1 - exponent, 0)}f}"
+    return rounded.replace("-", "−")
+
+
+def wide_range(values: list[Floats], share: float = 95.0) -> bool:
+    """Tell whether several series are so unlike that only a logarithmic axis shows all.
+
+    Args:
+        values: The series.
+        share: Percent of each that count, as a few values may be of any size.
+    """
+    tops = [top for v in values if len(v) and (top := float(np.nanpercentile(v, share))) > 0.0]
+    return len(tops) > 1 and max(tops) > 20.0 * min(tops)
+
+
+def legend_columns(names: Sequence[str]) -> int:
+    """Return how many columns of a legend fit across the page."""
+    longest = max((len(name) for name in names), default=0)
+    return max(min(_LETTERS // (longest + _HANDLE), len(names)), 1)
+
+
+def legend_above(figure: Figure, axes: Any, *extra: Artist) -> None:
+    """Put the legend of some axes, and what else it should name, above all of a figure."""
+    handles, names = axes.get_legend_handles_labels()
+    handles, names = [*handles, *extra], [*names, *(str(each.get_label()) for each in extra)]
+    if handles:
+        columns = legend_columns(names)
+        figure.legend(handles, names, loc="outside upper left", ncols=columns)

@@ -1,0 +1,177 @@
+"""The report's tables: figures beside their thresholds, facts of the run, punctuality."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from nodes.report.folder import Facts, Run
+from nodes.report.style import number
+
+MAIN = {
+    "ate_rmse_m": ("absolute trajectory error (ATE), RMS", "m"),
+    "ate_percent": ("ATE in percent of the path", "%"),
+    "ate_max_m": ("greatest position error", "m"),
+    "rot_rmse_deg": ("rotation error, RMS", "°"),
+    "rpe_trans_percent": ("relative pose error (RPE), position", "%"),
+    "rpe_rot_deg_per_m": ("relative pose error (RPE), rotation", "°/m"),
+    "drift_percent": ("drift at the end, in percent of the path", "%"),
+    "available_rmse_m": ("error of the newest pose at control ticks, RMS", "m"),
+    "available_rot_rmse_deg": ("rotation error of the same, RMS", "°"),
+    "latency_p50_ms": ("latency, median", "ms"),
+    "latency_p99_ms": ("latency, 99th percentile", "ms"),
+    "lost_seconds": ("time without a pose", "s"),
+    "lost_count": ("times lost", ""),
+    "rate_hz": ("estimates a second", "Hz"),
+}
+"""Figures that the top of the report shows: what they are, and their units."""
+
+_UNITS = {
+    "_percent": "%",
+    "_deg_per_m": "°/m",
+    "_deg": "°",
+    "_ms": "ms",
+    "_hz": "Hz",
+    "_m2": "m²",
+    "_m": "m",
+    "_s": "s",
+    "_seconds": "s",
+}
+"""Units of other figures, by the end of their names."""
+
+_NO_FIGURES = {"passed", "failed", "why"}
+
+
+class Row(msgspec.Struct, frozen=True):
+    """A row of a table of figures.
+
+    Attributes:
+        name: In the files.
+        meaning: In words.
+        unit: Of its values.
+        limit: Threshold; empty if there is none.
+        cells: One an estimator: its value, and whether it is missed.
+    """
+
+    name: str
+    meaning: str
+    unit: str
+    limit: str
+    cells: list[tuple[str, bool]]
+
+
+def figures(run: Run, *, main: bool) -> list[Row]:
+    """Return the main figures, or all others, with the thresholds there are."""
+    thresholds = run.verdict.thresholds if run.verdict is not None else {}
+    asked = {name: limit for name, limit in thresholds.items() if limit is not None}
+    names = dict.fromkeys(MAIN) | dict.fromkeys(asked)
+    if not main:
+        others = dict.fromkeys(k for e in run.estimators for k in e.figures)
+        names = {k: None for k in others if k not in names and k not in _NO_FIGURES}
+    rows = []
+    for name in names:
+        values = [e.figures.get(name) for e in run.estimators]
+        limit = asked.get(name)
+        if limit is None and all(value is None for value in values):
+            continue
+        meaning, unit = MAIN.get(name) or (name.replace("_", " "), _unit(name))
+        cells = [(show(value), _missed(value, limit)) for value in values]
+        rows.append(Row(name, meaning, unit, "" if limit is None else f"≤ {limit:g}", cells))
+    return rows
+
+
+def show(value: Any) -> str:
+    """Return a figure as it is read."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return number(value)
+    if isinstance(value, list | dict):
+        return msgspec.json.encode(value).decode()
+    return str(value)
+
+
+def facts(run: Run) -> list[tuple[str, str]]:
+    """Return what is known of the run as a whole."""
+    f = run.facts
+    rows: list[tuple[str, str]] = []
+    if run.truth is not None:
+        rows.append(("true path", f"{number(run.truth.length())} m"))
+    if f.clock is not None:
+        rows.append(("clock", f.clock))
+    if f.seed is not None:
+        rows.append(("seed", str(f.seed)))
+    if f.sim_seconds is not None:
+        rows.append(("time on the run's clock", f"{f.sim_seconds:.2f} s"))
+    if f.wall_seconds is not None:
+        speed = (f.sim_seconds or 0.0) / max(f.wall_seconds, 1e-9)
+        rows.append(("real time", f"{f.wall_seconds:.2f} s ({number(speed)} × real time)"))
+    if f.reason is not None:
+        rows.append(("ended by", f.reason))
+    if f.error is not None:
+        rows.append(("error", f.error))
+    if f.name is not None:
+        rows.append(("digest", _digest(f)))
+    rows += [(f"dropped at {port}", str(s.dropped)) for port, s in f.streams.items() if s.dropped]
+    rows += [
+        (f"unmatched sets at {port}", _counts(s.missed))
+        for port, s in f.streams.items()
+        if s.missed
+    ]
+    rows += [
+        (f"link {port}", f"{link.lost} lost, {link.thinned} left out")
+        for port, link in f.links.items()
+    ]
+    rows += [(f"loop stood still in {node}", f"{count} times") for node, count in f.stalls.items()]
+    if f.name is not None and not any(s.dropped or s.missed for s in f.streams.values()):
+        rows.append(("dropped or unmatched", "nothing"))
+    return rows
+
+
+def _digest(f: Facts) -> str:
+    if f.digest is None:
+        return "off"
+    if f.clock != "lockstep":
+        return f"{f.digest} (not promised: the clock is real)"
+    if f.not_deterministic:
+        return f"{f.digest} (not promised, because of {', '.join(f.not_deterministic)})"
+    return f"{f.digest} (an equal run gives the same)"
+
+
+def ticks(run: Run) -> list[list[str]]:
+    """Return how punctual each ticker was."""
+    return [
+        [
+            name,
+            f"{t.hz:g}",
+            str(t.calls),
+            f"{t.late_p50_us:.0f}",
+            f"{t.late_p99_us:.0f}",
+            f"{t.late_max_us:.0f}",
+            str(t.missed),
+        ]
+        for name, t in sorted(run.facts.ticks.items())
+    ]
+
+
+def outputs(run: Run) -> list[list[str]]:
+    """Return what was sent."""
+    seconds = max(run.facts.sim_seconds or 0.0, 1e-9)
+    return [[k, str(n), f"{n / seconds:.1f}"] for k, n in sorted(run.facts.outputs.items())]
+
+
+def _unit(name: str) -> str:
+    return next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
+
+
+def _missed(value: Any, limit: float | None) -> bool:
+    if limit is None:
+        return False
+    return not (isinstance(value, int | float) and value <= limit)
+
+
+def _counts(missed: dict[str, int]) -> str:
+    return ", ".join(f"{count} without {field}" for field, count in sorted(missed.items()))

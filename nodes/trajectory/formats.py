@@ -1,0 +1,181 @@
+"""Trajectory files of other tools, read and written: TUM, EuRoC, KITTI.
+
+- TUM (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): ``timestamp tx ty tz qx qy qz qw``
+  in seconds and metres, the scalar last.
+- EuRoC's ground truth (M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016):
+  nanoseconds, position, quaternion with the scalar first, velocity, biases; with commas.
+- KITTI (cvlibs.net/datasets/kitti/eval_odometry.php): the first three rows of the transform from
+  child to parent, row by row; no stamps, so two such files go together line by line.
+
+All are written with nanoseconds, nanometres and 12 decimals of a quaternion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from events import Quaternion, Vector3
+from nodes.trajectory.table import Row, read_rows, seconds_text
+from nodes.trajectory.trajectory import Trajectory, not_rotations
+
+Floats = npt.NDArray[np.float64]
+
+EUROC_HEADER = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
+    "q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], "
+    "b_w_RS_S_y [rad s^-1], b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], "
+    "b_a_RS_S_z [m s^-2]"
+)
+"""First line of EuRoC's files."""
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM file; stamps keep every nanosecond that is written.
+
+    Raises:
+        ValueError: It cannot be read or holds something else; the message names the line.
+    """
+    rows = read_rows(path, None, (8,), "timestamp tx ty tz qx qy qz qw")
+    poses = [(row, row.seconds(), row.numbers(1, 8)) for row in rows]
+    return _trajectory([(row, stamp, [*v[:3], v[6], *v[3:6]]) for row, stamp, v in poses])
+
+
+def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
+    """Write a TUM file.
+
+    Args:
+        path: The file.
+        trajectory: What to write.
+        comment: Lines for its head, such as the names of the frames.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    header = "timestamp[s] tx ty tz[m] qx qy qz qw"
+    rows = (tum_row(*pose) for pose in _poses(trajectory))
+    _write(path, [*_comment(comment), f"# {header}\n", *rows])
+
+
+def tum_row(stamp: int, position: Vector3, orientation: Quaternion) -> str:
+    """Return a pose (ns, metres, w x y z) as a line of a TUM file."""
+    (x, y, z), (qw, qx, qy, qz) = position, orientation
+    return (
+        f"{seconds_text(stamp)} {x:.9f} {y:.9f} {z:.9f} {qx:.12f} {qy:.12f} {qz:.12f} {qw:.12f}\n"
+    )
+
+
+def read_euroc(path: Path) -> Trajectory:
+    """Read a EuRoC ground truth of 17 columns, or the 8 first of them (as TUM VI has it).
+
+    Raises:
+        ValueError: It cannot be read or holds something else; the message names the line.
+    """
+    rows = read_rows(path, ",", (17, 8), "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3")
+    return _trajectory([(row, row.nanoseconds(), row.numbers(1, 17)[:7]) for row in rows])
+
+
+def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
+    """Write a EuRoC ground truth; velocities from neighbouring positions, biases zero.
+
+    Args:
+        path: The file.
+        trajectory: What to write.
+        comment: Lines to go before the header.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    velocities: list[Vector3] = [(0.0, 0.0, 0.0)] * len(trajectory)
+    if len(trajectory) > 1:
+        seconds = (trajectory.stamps - trajectory.stamps[0]) / 1e9
+        slopes: Floats = np.asarray(np.gradient(trajectory.positions, seconds, axis=0))
+        velocities = [(x, y, z) for x, y, z in slopes.tolist()]
+    rows = (
+        euroc_row(*pose, velocity)
+        for pose, velocity in zip(_poses(trajectory), velocities, strict=True)
+    )
+    _write(path, [*_comment(comment), f"{EUROC_HEADER}\n", *rows])
+
+
+def euroc_row(
+    stamp: int, position: Vector3, orientation: Quaternion, velocity: Vector3 = (0.0, 0.0, 0.0)
+) -> str:
+    """Return a pose as a line of a EuRoC ground truth, with zero biases.
+
+    Args:
+        stamp: Nanoseconds.
+        position: Metres.
+        orientation: w, x, y, z.
+        velocity: Metres per second in the parent frame.
+    """
+    x, y, z = position
+    w, i, j, k = orientation
+    u, v, s = velocity
+    return (
+        f"{stamp},{x:.9f},{y:.9f},{z:.9f},{w:.12f},{i:.12f},{j:.12f},{k:.12f},"
+        f"{u:.9f},{v:.9f},{s:.9f},0,0,0,0,0,0\n"
+    )
+
+
+def read_kitti(path: Path) -> Floats:
+    """Read a KITTI file.
+
+    Returns:
+        Transforms child to parent, shape (n, 4, 4); see `Trajectory.from_matrices`.
+
+    Raises:
+        ValueError: It cannot be read or holds something else; the message names the line.
+    """
+    rows = list(read_rows(path, None, (12,), "r11 r12 r13 tx r21 … tz"))
+    matrices = np.zeros((len(rows), 4, 4))
+    matrices[:, 3, 3] = 1.0
+    matrices[:, :3, :] = np.reshape([row.numbers(0, 12) for row in rows], (-1, 3, 4))
+    if wrong := not_rotations(matrices[:, :3, :3]):
+        rows[wrong[0]].wrong("a rotation matrix", str(matrices[wrong[0], :3, :3].tolist()))
+    return matrices
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """Write a KITTI file: poses only, no stamps, no comments.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    rows = trajectory.matrices()[:, :3, :].reshape(-1, 12).tolist()
+    _write(path, [" ".join(f"{value:.12f}" for value in row) + "\n" for row in rows])
+
+
+def _poses(trajectory: Trajectory) -> Iterable[tuple[int, Vector3, Quaternion]]:
+    return zip(
+        trajectory.stamps.tolist(),
+        trajectory.positions.tolist(),
+        trajectory.orientations.tolist(),
+        strict=True,
+    )
+
+
+def _trajectory(rows: list[tuple[Row, int, list[float]]]) -> Trajectory:
+    """Make a trajectory of lines, stamps, and rows of x y z qw qx qy qz, checked line by line."""
+    last: int | None = None
+    for row, stamp, pose in rows:
+        if last is not None and stamp <= last:
+            row.wrong(f"a stamp above {last} ns", f"{stamp} ns")
+        last = stamp
+        if not abs(np.linalg.norm(pose[3:]) - 1.0) < 0.01:
+            row.wrong("a quaternion of length 1", f"w x y z = {pose[3:]}")
+    values = np.array([pose for _, _, pose in rows])
+    stamps = np.array([stamp for _, stamp, _ in rows], dtype=np.int64)
+    return Trajectory(stamps, values[:, :3], values[:, 3:])
+
+
+def _comment(text: str) -> list[str]:
+    return [f"# {line}\n" for line in text.splitlines()]
+
+
+def _write(path: Path, lines: Iterable[str]) -> None:
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(lines)

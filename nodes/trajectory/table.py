@@ -1,0 +1,121 @@
+"""Text files of numbers in rows: what all trajectory files have in common."""
+
+from __future__ import annotations
+
+import decimal
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
+
+SECOND = 1_000_000_000
+"""Nanoseconds."""
+
+_TOO_LATE = 1 << 63
+"""The first number of nanoseconds that 64 bits do not hold."""
+
+_SHOWN = 60
+"""Characters of a wrong line that a message shows."""
+
+
+class Row:
+    """A line of a file, split into fields; ``#`` starts a comment.
+
+    Attributes:
+        where: Path and number of the line, for messages.
+        fields: Its texts.
+    """
+
+    __slots__ = ("fields", "where")
+
+    def __init__(self, where: str, fields: list[str]) -> None:
+        self.where = where
+        self.fields = fields
+
+    def numbers(self, start: int, end: int) -> list[float]:
+        """Return fields as finite numbers.
+
+        Raises:
+            ValueError: One of them is none.
+        """
+        try:
+            values = [float(field) for field in self.fields[start:end]]
+        except ValueError:
+            values = [math.nan]
+        if not all(map(math.isfinite, values)):
+            self.wrong("finite numbers", " ".join(self.fields[start:end]))
+        return values
+
+    def seconds(self) -> int:
+        """Return the first field, a number of seconds, as whole nanoseconds: no float between.
+
+        Raises:
+            ValueError: It is none.
+        """
+        try:
+            stamp = int((decimal.Decimal(self.fields[0]) * SECOND).to_integral_value())
+        except (decimal.InvalidOperation, ValueError, OverflowError):
+            stamp = _TOO_LATE
+        if abs(stamp) >= _TOO_LATE:
+            self.wrong("a stamp in seconds", self.fields[0])
+        return stamp
+
+    def nanoseconds(self) -> int:
+        """Return the first field, a whole number.
+
+        Raises:
+            ValueError: It is none.
+        """
+        try:
+            stamp = int(self.fields[0])
+        except ValueError:
+            stamp = _TOO_LATE
+        if abs(stamp) >= _TOO_LATE:
+            self.wrong("a stamp in whole nanoseconds", self.fields[0])
+        return stamp
+
+    def wrong(self, expected: str, found: str) -> NoReturn:
+        """Raise a `ValueError` that names the file and the line."""
+        shown = found if len(found) <= _SHOWN else f"{found[:_SHOWN]}…"
+        raise ValueError(f"{self.where}: expected {expected}, found {shown!r}")
+
+
+def read_rows(
+    path: Path, separator: str | None, columns: tuple[int, ...], meaning: str
+) -> Iterator[Row]:
+    """Yield the rows of a file.
+
+    Args:
+        path: The file.
+        separator: Between fields; None for blanks.
+        columns: How many fields a row may have.
+        meaning: What they are, for messages.
+
+    Raises:
+        ValueError: The file cannot be read, has no rows, or a row of another length.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{path}: expected a text file of rows {meaning}, found: {error}"
+        ) from None
+    empty = True
+    for number, line in enumerate(text.splitlines(), start=1):
+        content = line.partition("#")[0].strip()
+        if not content:
+            continue
+        row = Row(f"{path}:{number}", [field.strip() for field in content.split(separator)])
+        if len(row.fields) not in columns:
+            counts = " or ".join(map(str, columns))
+            row.wrong(f"{counts} fields ({meaning})", f"{len(row.fields)}: {content}")
+        empty = False
+        yield row
+    if empty:
+        raise ValueError(f"{path}: expected rows of {meaning}, found none")
+
+
+def seconds_text(stamp: int) -> str:
+    """Return nanoseconds as seconds with nine decimals, exactly."""
+    whole, rest = divmod(abs(stamp), SECOND)
+    return f"{'-' if stamp < 0 else ''}{whole}.{rest:09d}"

@@ -1,0 +1,257 @@
+"""Poses in time: checked arrays, interpolation, matrices; and rows for nodes that collect them.
+
+Pure numpy and scipy. Files are in `nodes.trajectory.formats`; errors between two trajectories in
+`nodes.evaluation.metrics`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+from events import Quaternion, Vector3
+
+Floats = npt.NDArray[np.float64]
+Stamps = npt.NDArray[np.int64]
+
+_UNIT = 0.01
+"""How far from 1 the length of a quaternion may be: files of few decimals are let in, and what
+is no quaternion is not."""
+
+
+class Trajectory(msgspec.Struct, frozen=True, eq=False):
+    """Poses of one body in one frame, in order of time. Its arrays are read-only copies.
+
+    Attributes:
+        stamps: Nanoseconds, int64, shape (n,), n ≥ 1, strictly rising.
+        positions: Metres in the parent frame, float64, shape (n, 3).
+        orientations: Unit quaternions w, x, y, z, child to parent, float64, shape (n, 4).
+
+    Raises:
+        ValueError: The arrays differ from that; the message names the first row that does.
+    """
+
+    stamps: Stamps
+    positions: Floats
+    orientations: Floats
+
+    def __post_init__(self) -> None:
+        stamps = np.array(self.stamps)
+        if stamps.dtype.kind not in "iu":
+            raise ValueError(
+                f"trajectory: stamps: expected whole nanoseconds, found {stamps.dtype} "
+                f"of shape {stamps.shape}"
+            )
+        if stamps.ndim != 1 or not len(stamps):
+            raise ValueError(
+                f"trajectory: stamps: expected one or more in a row, found shape {stamps.shape}"
+            )
+        n = len(stamps)
+        positions = _floats("positions", self.positions, (n, 3))
+        orientations = _floats("orientations", self.orientations, (n, 4))
+        if back := np.flatnonzero(np.diff(stamps) <= 0).tolist():
+            row = back[0] + 1
+            raise ValueError(
+                f"trajectory: row {row}: expected a stamp above {stamps[row - 1]} ns, "
+                f"found {stamps[row]} ns"
+            )
+        norms = np.linalg.norm(orientations, axis=1)
+        if odd := np.flatnonzero(abs(norms - 1.0) > _UNIT).tolist():
+            row = odd[0]
+            raise ValueError(
+                f"trajectory: row {row}: expected a quaternion of length 1, "
+                f"found {orientations[row].tolist()} of length {norms[row]:.6g}"
+            )
+        if abs(norms - 1.0).max() > 1e-12:
+            orientations /= norms[:, None]
+        for name, array in (
+            ("stamps", stamps.astype(np.int64)),
+            ("positions", positions),
+            ("orientations", orientations),
+        ):
+            array.setflags(write=False)
+            msgspec.structs.force_setattr(self, name, array)
+
+    @classmethod
+    def from_matrices(cls, stamps: Stamps, matrices: Floats) -> Trajectory:
+        """Make a trajectory of transforms.
+
+        Args:
+            stamps: Nanoseconds, shape (n,).
+            matrices: Child to parent, shape (n, 4, 4): rotation and metres.
+
+        Raises:
+            ValueError: They are no rigid transforms.
+        """
+        matrices = np.asarray(matrices, dtype=np.float64)
+        if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
+            raise ValueError(
+                f"trajectory: matrices: expected shape (n, 4, 4), found {matrices.shape}"
+            )
+        return cls(stamps, matrices[:, :3, 3], quaternions(matrices[:, :3, :3]))
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first pose to the last."""
+        return int(self.stamps[-1] - self.stamps[0]) / 1e9
+
+    def length(self) -> float:
+        """Return the length of the path in metres, pose to pose."""
+        return float(self.distances()[-1])
+
+    def distances(self) -> Floats:
+        """Return the path's length from the start to each pose, metres, shape (n,)."""
+        steps = np.linalg.norm(np.diff(self.positions, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def rotations(self) -> Any:
+        """Return the orientations as a `scipy.spatial.transform.Rotation` of n rotations."""
+        return Rotation.from_quat(self.orientations, scalar_first=True)
+
+    def matrices(self) -> Floats:
+        """Return the poses as transforms from child to parent, shape (n, 4, 4)."""
+        matrices = np.zeros((len(self), 4, 4))
+        matrices[:, :3, :3] = self.rotations().as_matrix()
+        matrices[:, :3, 3] = self.positions
+        matrices[:, 3, 3] = 1.0
+        return matrices
+
+    def take(self, rows: npt.NDArray[Any] | slice) -> Trajectory:
+        """Return some of the rows: a mask of shape (n,), rising row numbers, or a slice.
+
+        Raises:
+            ValueError: Nothing is left, or the order of time is.
+        """
+        return Trajectory(self.stamps[rows], self.positions[rows], self.orientations[rows])
+
+    def slice(self, start: int, end: int) -> Trajectory:
+        """Return the poses of ``start <= stamp <= end`` (ns).
+
+        Raises:
+            ValueError: There is none.
+        """
+        inside = (self.stamps >= start) & (self.stamps <= end)
+        if not inside.any():
+            raise ValueError(
+                f"trajectory: expected poses between {start} and {end} ns, found them "
+                f"between {self.stamps[0]} and {self.stamps[-1]} ns"
+            )
+        return self.take(inside)
+
+    def covers(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
+        """Tell which stamps (ns) lie between the first pose and the last, shape as given."""
+        stamps = np.asarray(stamps)
+        return np.asarray((stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]))
+
+    def at(self, stamps: Stamps) -> Trajectory:
+        """Return the poses at other times: positions linear, orientations by slerp.
+
+        A stamp that the trajectory has gives that very row. (K. Shoemake, "Animating rotation
+        with quaternion curves", 1985.)
+
+        Args:
+            stamps: Nanoseconds, strictly rising, all of them covered; see `covers`.
+
+        Raises:
+            ValueError: A stamp lies before the first pose or after the last.
+        """
+        stamps = np.asarray(stamps)
+        outside = np.flatnonzero(~self.covers(stamps)).tolist()
+        if outside:
+            raise ValueError(
+                f"trajectory: expected stamps between {self.stamps[0]} and {self.stamps[-1]} ns, "
+                f"found {stamps[outside[0]]} ns ({len(outside)} such)"
+            )
+        if len(self) == 1:
+            return self
+        after = np.clip(np.searchsorted(self.stamps, stamps), 1, len(self) - 1)
+        before = after - 1
+        share = (stamps - self.stamps[before]) / (self.stamps[after] - self.stamps[before])
+        a, b = self.positions[before], self.positions[after]
+        # Since the start, so that a float holds every nanosecond.
+        slerp = Slerp((self.stamps - self.stamps[0]).astype(np.float64), self.rotations())
+        turned = slerp((stamps - self.stamps[0]).astype(np.float64))
+        positions = a + share[:, None] * (b - a)
+        orientations = turned.as_quat(scalar_first=True)
+        same = self.stamps[after] == stamps
+        positions[same], orientations[same] = b[same], self.orientations[after[same]]
+        if stamps[0] == self.stamps[0]:
+            orientations[0] = self.orientations[0]
+        return Trajectory(stamps, positions, orientations)
+
+
+class PoseRows:
+    """Poses as events bring them, in any order, until a trajectory is made of them."""
+
+    def __init__(self) -> None:
+        self._rows: dict[int, tuple[Vector3, Quaternion]] = {}
+        self.replaced = 0
+        """How many poses came for a stamp that had one; the later one holds."""
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, stamp: int, position: Vector3, orientation: Quaternion) -> None:
+        """Note a pose: nanoseconds, metres, quaternion w, x, y, z."""
+        self.replaced += stamp in self._rows
+        self._rows[stamp] = (position, orientation)
+
+    def trajectory(self) -> Trajectory:
+        """Return what has come so far, in order of time.
+
+        Raises:
+            ValueError: Nothing has, or a pose is none.
+        """
+        stamps = sorted(self._rows)
+        rows = [self._rows[stamp] for stamp in stamps]
+        return Trajectory(
+            np.array(stamps, dtype=np.int64),
+            np.array([position for position, _ in rows], dtype=np.float64),
+            np.array([orientation for _, orientation in rows], dtype=np.float64),
+        )
+
+
+def quaternions(rotations: Floats) -> Floats:
+    """Return rotation matrices, shape (n, 3, 3), as quaternions w, x, y, z, shape (n, 4).
+
+    Raises:
+        ValueError: One of them is no rotation.
+    """
+    if wrong := not_rotations(rotations):
+        raise ValueError(
+            f"trajectory: row {wrong[0]}: expected a rotation matrix, "
+            f"found {rotations[wrong[0]].tolist()}"
+        )
+    return np.asarray(Rotation.from_matrix(rotations).as_quat(scalar_first=True))
+
+
+def not_rotations(matrices: Floats) -> list[int]:
+    """Return the rows of shape (n, 3, 3) that are no rotations, to 1e-4 (files of few decimals)."""
+    finite = np.isfinite(matrices).all(axis=(1, 2), keepdims=True)
+    matrices = np.where(finite, matrices, 0.0)
+    odd = abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    wrong: list[int] = np.flatnonzero((odd > 1e-4) | (np.linalg.det(matrices) < 0.0)).tolist()
+    return wrong
+
+
+def _floats(name: str, array: Any, shape: tuple[int, int]) -> Floats:
+    """Return a copy as float64, or say how it differs from what the field holds."""
+    copy = np.array(array, dtype=np.float64)
+    if copy.shape != shape:
+        raise ValueError(
+            f"trajectory: {name}: expected shape {shape}, as many rows as stamps, "
+            f"found {copy.shape}"
+        )
+    if wrong := np.flatnonzero(~np.isfinite(copy).all(axis=1)).tolist():
+        raise ValueError(
+            f"trajectory: row {wrong[0]}: {name}: expected finite numbers, "
+            f"found {copy[wrong[0]].tolist()}"
+        )
+    return copy

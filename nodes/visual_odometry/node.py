@@ -1,0 +1,66 @@
+"""RGB-D visual odometry as a node: which camera it reads, and which method it runs beside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import ClassVar, Literal
+
+import cv2
+
+from events import Announcement, CameraInfo, EstimatorAnnouncement
+from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig, RgbdFrame
+from nodes.visual_odometry.dense import DenseOdometry, DenseSettings
+from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
+from nodes.visual_odometry.tracker import Tracker
+from runtime import Bundle
+
+
+class VisualOdometryConfig(EstimatorConfig):
+    """Settings of visual odometry.
+
+    Attributes:
+        method: ``features``: corners, followed by optical flow, and their depth; ``dense``: every
+            pixel, by OpenCV's ``cv2.Odometry``.
+        features: Of the first method.
+        dense: Of the second.
+    """
+
+    method: Literal["features", "dense"] = "features"
+    features: FeatureSettings = FeatureSettings()
+    dense: DenseSettings = DenseSettings()
+
+
+class VisualOdometry(Estimator[VisualOdometryConfig]):
+    """Where a camera with depth has gone, from its pictures alone."""
+
+    needs: ClassVar[frozenset[str]] = frozenset({"grey", "depth"})
+
+    frames = Bundle(RgbdFrame, keep="latest")
+
+    def announce(self) -> Iterable[Announcement]:
+        """Say that there will be estimates."""
+        yield EstimatorAnnouncement(
+            stamp=0, source=self.name, method=f"RGB-D odometry ({self.config.method})"
+        )
+
+    async def run(self) -> None:
+        """Track each picture in a process of its own; skip those that come meanwhile."""
+        tracker = await self.worker(
+            make_tracker,
+            self.config,
+            self.the_camera().info,
+            latency=self.config.latency,
+            env=WORKER_ENVIRONMENT,
+        )
+        async for image, depth in self.frames:
+            self.publish(
+                image, await tracker.call(Tracker.track, image.stamp, image.data, depth.data)
+            )
+
+
+def make_tracker(config: VisualOdometryConfig, info: CameraInfo) -> Tracker:
+    """Make the tracker that the settings ask for, in the process that will run it."""
+    cv2.setNumThreads(1)
+    if config.method == "dense":
+        return DenseOdometry(info, config.dense)
+    return FeatureOdometry(info, config.features)

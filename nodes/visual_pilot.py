@@ -1,0 +1,117 @@
+"""A scripted flight on an estimator's poses: the closed loop."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import Annotated
+
+import msgspec
+
+from events import Hover, PlannedPose, PoseEstimate, Quaternion, Vector3, VelocitySetpoint
+from nodes.path import Path
+from nodes.tour import Pilot, TourConfig
+from runtime import Duration, Output, on
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class VisualPilotConfig(TourConfig):
+    """Settings of a visual pilot, besides a tour's.
+
+    Attributes:
+        gain: Metres per second for each metre beside the path.
+        yaw_gain: Radians per second for each radian off the heading.
+        catch_up: Metres per second that the correction never exceeds.
+        patience: How old the newest estimate may be; then the vehicle stops and waits.
+    """
+
+    gain: Positive = 1.0
+    yaw_gain: Positive = 1.0
+    catch_up: Positive = 0.5
+    patience: Duration = Duration(0.5)  # immutable
+
+
+class VisualPilot(Pilot[VisualPilotConfig]):
+    """Flies a vehicle along waypoints, knowing of its pose only what an estimator says.
+
+    It asks for velocities along the vehicle's own heading, so whatever is wrong with the estimate,
+    heading included, shows in the flight. (Attitude and velocity are held by the vehicle itself.)
+    """
+
+    setpoints = Output(VelocitySetpoint)
+    plans = Output(PlannedPose)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._fresh = asyncio.Event()
+
+    @on(PoseEstimate)
+    def estimated(self, event: PoseEstimate) -> None:
+        """Note where the vehicle seems to be."""
+        self.see(event)
+        self._fresh.set()
+
+    async def follow(self, path: Path) -> None:
+        """Ask for the path's velocity, and for more where the estimate is beside the path."""
+        clock, config = self.clock, self.config
+        step, last = round(path.step * 1e9), len(path.position) - 1
+        begin = clock.now()
+        for index in range(last + 1):
+            await clock.sleep_until(begin + index * step)
+            begin += await self._wait_for_sight()
+            now = clock.now()
+            x, y, z = path.position[index].tolist()
+            yaw = float(path.yaw[index])
+            self.plans.send(PlannedPose(stamp=now, source=self.name, position=(x, y, z), yaw=yaw))
+            assert self.here is not None
+            # Against the path at the time of the picture: its age then does not matter.
+            seen = min(max(round((self.here.stamp - begin) / step), 0), last)
+            to_go = path.position[seen] - self.here.position
+            correction = config.gain * to_go
+            size = math.sqrt(float(correction @ correction))
+            if size > config.catch_up:
+                correction *= config.catch_up / size
+            north, east, down = (path.velocity[index] + correction).tolist()
+            yaw_error = _wrap(float(path.yaw[seen]) - heading(self.here.orientation))
+            # What the vehicle's nose seems to point at now: the path's heading, less what is off.
+            velocity = _turned((north, east, down), yaw_error - yaw)
+            self.setpoints.send(
+                VelocitySetpoint(
+                    stamp=now,
+                    source=self.name,
+                    frame_id="heading",
+                    velocity=velocity,
+                    yaw_rate=float(path.yaw_rate[index]) + config.yaw_gain * yaw_error,
+                )
+            )
+
+    async def _wait_for_sight(self) -> int:
+        """Stop while the newest estimate is too old; return how long that took (ns)."""
+        start = self.clock.now()
+        assert self.here is not None
+        if start - self.here.stamp <= self.config.patience * 1e9:
+            return 0
+        self.log.warning("no estimate for %g s: waiting for one", self.config.patience)
+        self.orders.send(Hover(stamp=start, source=self.name))
+        while self.clock.now() - self.here.stamp > self.config.patience * 1e9:
+            self._fresh.clear()
+            await self._fresh.wait()
+        return self.clock.now() - start
+
+
+def heading(orientation: Quaternion) -> float:
+    """Return where the x axis points, radians clockwise from north seen from above."""
+    w, x, y, z = orientation
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _turned(vector: Vector3, angle: float) -> Vector3:
+    """Return a vector turned about the vertical by an angle, clockwise seen from above."""
+    x, y, z = vector
+    c, s = math.cos(angle), math.sin(angle)
+    return (c * x - s * y, s * x + c * y, z)
+
+
+def _wrap(angle: float) -> float:
+    return math.remainder(angle, math.tau)

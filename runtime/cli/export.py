@@ -1,0 +1,44 @@
+"""``export``: a run's trajectories, as files for other tools."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Format(Enum):
+    """What ``--format`` takes."""
+
+    tum = "tum"
+    euroc = "euroc"
+    kitti = "kitti"
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name>.")],
+    form: Annotated[Format, typer.Option("--format", "-f", help="Format of the files.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the files; RUN/export if not given.")
+    ] = None,
+) -> None:
+    """Write the true and the estimated trajectories of a run as evo and other tools read them.
+
+    tum and euroc give one file each for the truth and every estimator; euroc adds the estimates
+    in TUM's format, which is what evo_ape euroc compares with. kitti has no stamps, so it gives
+    a pair of files for every estimator, pose by pose.
+    """
+    import importlib
+
+    from runtime.errors import ConfigError
+
+    # By name, as nodes are: the runtime imports no other room.
+    nodes = importlib.import_module("nodes.trajectory.export")
+    try:
+        written = nodes.export(run, form.value, out)
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from None
+    for path in written:
+        print(path)

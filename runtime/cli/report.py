@@ -1,0 +1,27 @@
+"""``report``: a run's folder as one page to read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name>.")],
+) -> None:
+    """Write a run's report.html and the pictures in it (plots/*.png) anew.
+
+    A run that was killed, or that nobody evaluated, gives a page that says what is missing.
+    """
+    import importlib
+
+    from runtime.errors import ConfigError
+
+    # By name, as nodes are: the runtime imports no other room.
+    nodes = importlib.import_module("nodes.report")
+    try:
+        print(nodes.write_report(run))
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from None

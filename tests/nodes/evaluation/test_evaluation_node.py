@@ -1,0 +1,190 @@
+"""The evaluation node: scores while it runs, figures, thresholds and files at the end."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from events import Event, Image, PositionSetpoint, Score, TrackedFeatures
+from nodes.evaluation import Evaluation
+from nodes.evaluation.results import read_errors
+from nodes.trajectory.formats import read_tum
+from runtime.testing import run_node
+from tests.nodes.evaluation.flights import (
+    MS,
+    SECOND,
+    announced,
+    estimate,
+    lost,
+    place,
+    regained,
+    truth,
+)
+
+
+def judged(out: Path, *groups: list[Event], late: int = 0, **config: Any) -> dict[str, Any]:
+    """Run the node on events that come `late` nanoseconds after their stamps; give its verdict."""
+    run(out, *groups, late=late, **config)
+    verdict: dict[str, Any] = json.loads((out / "evaluation" / "verdict.json").read_text())
+    return verdict
+
+
+def run(out: Path, *groups: list[Event], late: int = 0, **config: Any) -> list[Score]:
+    from runtime.testing import run_nodes, spec
+
+    links = {"estimated": {"delay": late / 1e9}, "tracking": {"delay": late / 1e9}}
+    script = sorted((e for group in groups for e in group), key=lambda e: e.stamp)
+    node = spec(Evaluation, "evaluation", {"report": False, **config}, links=links if late else {})
+    return run_nodes([node], inputs=script, duration=11.0, out=out).of(Score)
+
+
+FRAMES = range(0, 10 * SECOND + 1, 100 * MS)
+
+
+def test_a_constant_error_is_found_everywhere(tmp_path: Path) -> None:
+    estimates: list[Event] = [estimate(s, error=(0.3, 0.0, 0.4)) for s in FRAMES]
+    figures = judged(tmp_path, announced(), truth(10), estimates)["estimators"]["est"]
+    assert figures["alignment"] == "none"
+    assert figures["ate_rmse_m"] == pytest.approx(0.5)
+    assert figures["ate_max_m"] == pytest.approx(0.5)
+    assert figures["mse_m2"] == pytest.approx(0.25)
+    assert figures["path_m"] == pytest.approx(4 * math.pi, rel=1e-3)
+    assert figures["ate_percent"] == pytest.approx(50 / (4 * math.pi), rel=1e-3)
+    assert figures["rpe_trans_percent"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["lost_seconds"] == 0.0
+    assert figures["estimates"] == 101
+    assert figures["rate_hz"] == pytest.approx(10.0)
+
+
+def test_an_estimate_in_odom_is_laid_on_the_first_pose(tmp_path: Path) -> None:
+    estimates: list[Event] = [estimate(s, error=(7.0, 0.0, 0.0), frame_id="odom") for s in FRAMES]
+    scores = run(tmp_path, announced(), truth(10), estimates)
+    assert max(s.value for s in scores if s.metric == "position_error") < 1e-9
+    verdict = json.loads((tmp_path / "evaluation" / "verdict.json").read_text())
+    assert verdict["estimators"]["est"]["alignment"] == "origin"
+    assert verdict["estimators"]["est"]["ate_rmse_m"] < 1e-9
+
+
+def test_a_scale_free_estimate_is_scaled_and_its_scale_told(tmp_path: Path) -> None:
+    estimates: list[Event] = [estimate(s, scale=0.25) for s in FRAMES]
+    figures = judged(tmp_path, announced(scale_free=True), truth(10), estimates)
+    assert figures["estimators"]["est"]["scale"] == pytest.approx(4.0)
+    assert figures["estimators"]["est"]["ate_rmse_m"] < 1e-6
+
+
+def test_scores_come_with_each_estimate(tmp_path: Path) -> None:
+    estimates: list[Event] = [
+        estimate(s, error=(0.1 * (i + 1), 0.0, 0.0)) for i, s in enumerate(FRAMES[:3])
+    ]
+    scores = run(tmp_path, announced(), truth(1), estimates)
+    errors = [s.value for s in scores if s.metric == "position_error"]
+    squares = [s.value for s in scores if s.metric == "mean_square_error"]
+    assert errors == pytest.approx([0.1, 0.2, 0.3])
+    assert squares == pytest.approx([0.01, 0.05 / 2, 0.14 / 3])
+    assert {s.subject for s in scores} == {"est"}
+
+
+def test_the_pose_there_was_is_worse_by_its_age(tmp_path: Path) -> None:
+    estimates: list[Event] = [estimate(s) for s in FRAMES]
+    figures = judged(tmp_path, announced(), truth(10), estimates, late=80 * MS)
+    found = figures["estimators"]["est"]
+    assert found["ate_rmse_m"] < 1e-9
+    assert found["latency_p50_ms"] == pytest.approx(80.0)
+    # The pose is 80 to 180 ms old, at 4π m in 10 s: the root mean square of a uniform age.
+    age = math.sqrt((0.18**3 - 0.08**3) / (3 * 0.1))
+    assert found["available_rmse_m"] == pytest.approx(4 * math.pi / 10 * age, rel=0.02)
+    assert found["available_age_ms"] == pytest.approx(130.0, rel=0.03)
+
+
+def test_lost_time_is_by_word_and_by_silence(tmp_path: Path) -> None:
+    kept = [
+        s for s in FRAMES if not 2 * SECOND < s < 3 * SECOND and not 5 * SECOND < s < 7 * SECOND
+    ]
+    said: list[Event] = [lost(2100 * MS), regained(3 * SECOND)]
+    estimates: list[Event] = [estimate(s) for s in kept]
+    found = judged(tmp_path, announced(), truth(10), estimates, said)["estimators"]["est"]
+    assert found["lost_count"] == 2
+    assert found["lost_seconds"] == pytest.approx(1.0 + 2.0)
+
+
+def test_an_estimator_that_falls_silent_is_lost_until_the_end(tmp_path: Path) -> None:
+    estimates: list[Event] = [estimate(s) for s in FRAMES if s <= 4 * SECOND]
+    found = judged(tmp_path, announced(), truth(10), estimates)["estimators"]["est"]
+    assert found["lost_seconds"] == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize(("limit", "passed"), [(0.6, True), (0.4, False)])
+def test_thresholds_decide(tmp_path: Path, limit: float, passed: bool) -> None:
+    estimates: list[Event] = [estimate(s, error=(0.5, 0.0, 0.0)) for s in FRAMES]
+    verdict = judged(tmp_path, announced(), truth(10), estimates, thresholds={"ate_rmse_m": limit})
+    assert verdict["passed"] is passed
+    assert verdict["estimators"]["est"]["passed"] is passed
+    failed = verdict["estimators"]["est"]["failed"]
+    assert failed == ([] if passed else ["ate_rmse_m: expected at most 0.4, found 0.5"])
+
+
+def test_an_estimator_that_says_nothing_has_failed(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, announced(), truth(2))
+    assert verdict["passed"] is False
+    assert verdict["estimators"]["est"]["estimates"] == 0
+
+
+def test_without_a_truth_there_is_no_verdict_but_a_reason(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, announced(), [estimate(0)])
+    assert "no odometry" in verdict["estimators"]["est"]["failed"][0]
+
+
+def test_files_hold_what_was_said(tmp_path: Path) -> None:
+    estimates: list[Event] = [estimate(s, error=(0.3, 0.0, 0.0)) for s in FRAMES]
+    plan: list[Event] = [
+        PositionSetpoint(stamp=s, source="tour", position=place(s)) for s in FRAMES
+    ]
+    judged(tmp_path, announced(), truth(10), estimates, plan)
+    said = read_tum(tmp_path / "trajectories" / "est.tum")
+    assert said.stamps.tolist() == list(FRAMES)
+    np.testing.assert_allclose(said.positions[7], np.add(place(FRAMES[7]), (0.3, 0, 0)), atol=1e-9)
+    assert len(read_tum(tmp_path / "trajectories" / "truth.tum")) == 2001
+    assert len(read_tum(tmp_path / "trajectories" / "plan.tum")) == len(FRAMES)
+    errors = read_errors(tmp_path / "evaluation" / "est.csv")
+    np.testing.assert_allclose(errors.position, 0.3, atol=1e-8)
+    ticks = read_errors(tmp_path / "evaluation" / "est.ticks.csv")
+    assert len(ticks.stamps) == 4001
+
+
+def test_of_many_pictures_a_few_are_kept_with_their_features(tmp_path: Path) -> None:
+    events: list[Event] = []
+    for stamp in FRAMES:
+        data = np.full((60, 80), 128, np.uint8)
+        events.append(
+            Image(stamp=stamp, source="c", frame_id="c_optical", encoding="mono8", data=data)
+        )
+        events.append(
+            TrackedFeatures(
+                stamp=stamp,
+                source="est",
+                frame_id="c_optical",
+                points=np.array([[20, 30], [60, 30]], np.float32),
+                inliers=np.array([True, False]),
+            )
+        )
+    run(tmp_path, announced(), truth(1), events, pictures=4)
+    files = sorted((tmp_path / "frames").iterdir())
+    assert 2 <= len(files) <= 4
+    drawn = cv2.imread(str(files[0]))
+    assert drawn is not None
+    left, right = drawn[:, :40].astype(int), drawn[:, 40:].astype(int)
+    assert (left[..., 1] - left[..., 2]).max() > 60  # a green ring
+    assert (right[..., 2] - right[..., 1]).max() > 60  # a red one
+
+
+def test_an_unknown_threshold_is_refused() -> None:
+    from runtime.errors import ConfigError
+
+    with pytest.raises(ConfigError, match=r"thresholds.*unknown key 'ate'"):
+        run_node(Evaluation, config={"thresholds": {"ate": 1}})

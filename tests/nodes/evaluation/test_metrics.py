@@ -1,0 +1,206 @@
+"""Our errors are evo's, and what we define ourselves is what we say."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from evo.core import metrics as evo
+from evo.core.filters import filter_pairs_by_path
+from evo.core.units import Unit
+from hypothesis import given, settings
+from scipy.spatial.transform import Rotation
+
+from nodes.evaluation.alignment import align, associate
+from nodes.evaluation.metrics import (
+    absolute_error,
+    drift_percent,
+    path_pairs,
+    position_error,
+    relative_error,
+    rotation_error,
+    rotation_errors,
+)
+from nodes.trajectory import Trajectory
+from nodes.trajectory.formats import read_tum
+from tests.nodes.trajectory.samples import as_evo, moved, noisy, walk
+
+ROOT = Path(__file__).parents[3]
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def ape(truth: Trajectory, estimate: Trajectory, relation: Any) -> dict[str, float]:
+    metric = evo.APE(relation)
+    metric.process_data((as_evo(truth), as_evo(estimate)))
+    return dict(metric.get_all_statistics())
+
+
+def rpe(truth: Trajectory, estimate: Trajectory, relation: Any, *options: Any) -> Any:
+    metric = evo.RPE(relation, *options)
+    metric.process_data((as_evo(truth), as_evo(estimate)))
+    return metric
+
+
+@given(seed=SEEDS, n=st.integers(1, 80))
+@settings(max_examples=20, deadline=None)
+def test_absolute_errors_are_evos(seed: int, n: int) -> None:
+    truth = walk(n, seed)
+    estimate = noisy(truth, seed=seed + 1)
+    ours = absolute_error(truth, estimate)
+    shifts = ape(truth, estimate, evo.PoseRelation.translation_part)
+    for name in ("rmse", "mean", "median", "max"):
+        assert getattr(ours, f"{name}_m") == pytest.approx(shifts[name], abs=1e-9)
+    assert ours.mse_m2 == pytest.approx(shifts["sse"] / n, abs=1e-9)
+    turns = ape(truth, estimate, evo.PoseRelation.rotation_angle_deg)
+    assert ours.rotation_rmse_deg == pytest.approx(turns["rmse"], abs=1e-9)
+    assert ours.rotation_max_deg == pytest.approx(turns["max"], abs=1e-9)
+
+
+@pytest.mark.parametrize("pairs_from", ["truth", "estimate"])
+@given(seed=SEEDS, n=st.integers(30, 120), delta=st.sampled_from([0.2, 1.0]))
+@settings(max_examples=10, deadline=None)
+def test_relative_errors_are_evos(
+    pairs_from: Literal["truth", "estimate"], seed: int, n: int, delta: float
+) -> None:
+    truth = walk(n, seed)
+    estimate = noisy(truth, metres=0.005, seed=seed + 1)
+    ours = relative_error(truth, estimate, delta, pairs_from=pairs_from)
+    options = (delta, Unit.meters, 0.1, True, pairs_from == "truth")
+    shifts = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
+    turns = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
+    assert ours.pairs == len(shifts.error)
+    for metric, rmse, mean in (
+        (shifts, ours.translation_percent / 100, ours.translation_mean_percent / 100),
+        (turns, ours.rotation_deg_per_m, ours.rotation_mean_deg_per_m),
+    ):
+        found = metric.get_all_statistics()
+        assert rmse * delta == pytest.approx(found["rmse"], abs=1e-9)
+        assert mean * delta == pytest.approx(found["mean"], abs=1e-9)
+
+
+def test_a_real_flights_errors_are_evos() -> None:
+    """As from 200 Hz truth, with the vehicle at rest at both ends, and an estimate at 30 Hz."""
+    orbit = read_tum(ROOT / "examples" / "orbit.tum")
+    rest = 5_000_000 * np.arange(1, 201)
+    waiting = [np.tile(orbit.positions[i], (200, 1)) for i in (0, -1)]
+    turned = [np.tile(orbit.orientations[i], (200, 1)) for i in (0, -1)]
+    flight = orbit.at(np.arange(orbit.stamps[0], orbit.stamps[-1], 5_000_000))
+    truth = Trajectory(
+        np.concatenate([flight.stamps[0] - rest[::-1], flight.stamps, flight.stamps[-1] + rest]),
+        np.concatenate([waiting[0], flight.positions, waiting[1]]),
+        np.concatenate([turned[0], flight.orientations, turned[1]]),
+    )
+    stamps = np.arange(truth.stamps[0], truth.stamps[-1], 33_333_333)
+    truth, estimate = associate(truth, noisy(truth.at(stamps), metres=0.003))
+    estimate = align(estimate, truth, "se3").trajectory
+    shifts = ape(truth, estimate, evo.PoseRelation.translation_part)
+    assert absolute_error(truth, estimate).rmse_m == pytest.approx(shifts["rmse"], abs=1e-9)
+    options = (1.0, Unit.meters, 0.1, True, True)
+    found = relative_error(truth, estimate)
+    relative = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
+    assert found.pairs == len(relative.error) > 300
+    rmse = relative.get_all_statistics()["rmse"]
+    assert found.translation_percent / 100 == pytest.approx(rmse, abs=1e-9)
+    relative = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
+    rmse = relative.get_all_statistics()["rmse"]
+    assert found.rotation_deg_per_m == pytest.approx(rmse, abs=1e-9)
+
+
+steps = st.lists(st.sampled_from([0.0, 0.0, 0.1, 0.25, 0.5, 2.0]), min_size=1, max_size=40)
+
+
+@given(steps=steps, delta=st.sampled_from([0.1, 0.5, 1.0, 1.3]))
+@settings(deadline=None)
+def test_pairs_are_evos_also_for_a_vehicle_that_stands_still_or_jumps(
+    steps: list[float], delta: float
+) -> None:
+    poses = np.tile(np.eye(4), (len(steps) + 1, 1, 1))
+    poses[1:, 0, 3] = np.cumsum(steps)
+    distances = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(poses[:, 0, 3])))])
+    first, second = path_pairs(distances, delta)
+    theirs = filter_pairs_by_path(list(poses), delta, 0.1 * delta, all_pairs=True)
+    # One a little short and one a little far may be equally near but for rounding; of those
+    # that stand on one spot it is the first.
+    ours = list(zip(first.tolist(), second.tolist(), strict=True))
+    assert [i for i, _ in ours] == [i for i, _ in theirs]
+    for (i, j), (_, k) in zip(ours, theirs, strict=True):
+        misses = [abs(distances[end] - distances[i] - delta) for end in (j, k)]
+        tie = distances[j] != distances[k] and misses[0] == pytest.approx(misses[1], abs=1e-12)
+        assert j == k or tie
+
+
+def test_no_pair_so_far_apart_is_an_error_that_says_how_long_the_path_is() -> None:
+    truth = walk(10)
+    with pytest.raises(ValueError, match=r"expected poses 1 m apart .* in 10 poses and 0\.450 m"):
+        relative_error(truth, truth)
+
+
+@pytest.mark.parametrize("delta", [0.0, -1.0, math.nan, math.inf])
+def test_a_distance_that_is_none_is_an_error(delta: float) -> None:
+    with pytest.raises(ValueError, match="expected a length above 0 m"):
+        relative_error(walk(), walk(), delta)
+
+
+def test_relative_errors_and_drift_do_not_depend_on_the_frame() -> None:
+    truth = walk()
+    estimate = noisy(truth)
+    elsewhere = moved(estimate)
+    assert drift_percent(truth, elsewhere) == pytest.approx(drift_percent(truth, estimate))
+    ours, other = relative_error(truth, estimate), relative_error(truth, elsewhere)
+    assert other.translation_percent == pytest.approx(ours.translation_percent)
+    assert other.rotation_deg_per_m == pytest.approx(ours.rotation_deg_per_m)
+
+
+def test_drift_is_the_error_at_the_end_over_the_true_path() -> None:
+    truth = walk(101, step=0.1)  # 10 m
+    positions = truth.positions.copy()
+    positions[-1] += [0.0, 0.3, 0.4]
+    estimate = Trajectory(truth.stamps, positions, truth.orientations)
+    assert drift_percent(truth, estimate) == pytest.approx(5.0)
+    with pytest.raises(ValueError, match="expected a path longer than 0 m"):
+        drift_percent(truth.take(slice(0, 1)), estimate.take(slice(0, 1)))
+
+
+def test_a_perfect_estimate_has_no_errors() -> None:
+    truth = walk()
+    found = absolute_error(truth, truth)
+    assert found.max_m == 0.0
+    assert found.rotation_max_deg < 1e-12
+    assert relative_error(truth, truth).translation_percent < 1e-12
+    assert drift_percent(truth, truth) < 1e-12
+
+
+@given(seed=SEEDS, radians=st.floats(0.0, math.pi))
+def test_the_angle_of_one_pose_is_that_of_many(seed: int, radians: float) -> None:
+    rng = np.random.default_rng(seed)
+    a = Rotation.random(rng=rng)
+    axis = rng.normal(size=3)
+    b = a * Rotation.from_rotvec(radians * axis / np.linalg.norm(axis))
+    p, q = a.as_quat(scalar_first=True), b.as_quat(scalar_first=True)
+    assert rotation_error(tuple(p), tuple(q)) == pytest.approx(radians, abs=1e-9)
+    assert rotation_error(tuple(p), tuple(-q)) == pytest.approx(radians, abs=1e-9)
+    assert rotation_errors(p[None], q[None])[0] == pytest.approx(radians, abs=1e-9)
+
+
+def test_a_tiny_angle_is_not_lost() -> None:
+    tiny = 1e-9
+    turned = (math.cos(tiny / 2), math.sin(tiny / 2), 0.0, 0.0)
+    assert rotation_error((1.0, 0.0, 0.0, 0.0), turned) == pytest.approx(tiny, rel=1e-6)
+
+
+def test_the_distance_of_one_pose() -> None:
+    assert position_error((1.0, 2.0, 3.0), (1.0, 5.0, 7.0)) == 5.0
+
+
+@pytest.mark.parametrize("function", [absolute_error, relative_error, drift_percent])
+def test_other_stamps_are_an_error_that_names_the_row(function: Any) -> None:
+    truth = walk(5)
+    late = Trajectory(truth.stamps + np.array([0, 0, 1, 1, 1]), truth.positions, truth.orientations)
+    with pytest.raises(ValueError, match=r"found 100000000 ns .* 100000001 ns .* in row 2"):
+        function(truth, late)
+    with pytest.raises(ValueError, match=r"found 5 of the truth and 4 of the estimate"):
+        function(truth, late.take(slice(0, 4)))

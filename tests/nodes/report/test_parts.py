@@ -1,0 +1,155 @@
+"""The report's parts, each on its own: lenient reading, gaps, relative errors, hiding, numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nodes.evaluation.alignment import align, associate
+from nodes.evaluation.metrics import relative_error
+from nodes.evaluation.record import Interval
+from nodes.report.clouds import Shown, View, paint
+from nodes.report.ply import read_ply
+from nodes.report.poses import broken, gaps, read_poses, relative_errors
+from nodes.report.style import number
+from nodes.trajectory.formats import read_tum, write_tum
+from tests.nodes.report.folders import SECOND, ply, recorded, walk
+
+
+def test_poses_are_read_as_the_strict_reader_reads_them(tmp_path: Path) -> None:
+    write_tum(tmp_path / "a.tum", walk(1))
+    ours, theirs = read_poses(tmp_path / "a.tum"), read_tum(tmp_path / "a.tum")
+    assert (ours.stamps == theirs.stamps).all()
+    assert (ours.positions == theirs.positions).all()
+    assert (ours.orientations == theirs.orientations).all()
+
+
+def test_a_last_line_that_is_cut_off_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    write_tum(path, walk(1))
+    path.write_bytes(path.read_bytes()[:-60])
+    assert len(read_poses(path)) == len(walk(1)) - 1
+
+
+def test_calendar_stamps_keep_their_nanoseconds(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text("1403636579.763555527 0 0 0 0 0 0 1\n1403636579.8 0 0 0 0 0 0 1\n")
+    assert read_poses(path).stamps.tolist() == [1403636579763555527, 1403636579800000000]
+
+
+@pytest.mark.parametrize("text", ["", "# only\n", "1 2 3\n", "a b c d e f g h\n"])
+def test_what_holds_no_poses_is_an_error(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.tum").write_text(text)
+    with pytest.raises(ValueError, match=r"."):
+        read_poses(tmp_path / "a.tum")
+
+
+def test_single_relative_errors_have_the_mean_square_that_the_metrics_tell() -> None:
+    truth = walk(20)
+    there, said = associate(truth, recorded(truth).rows.trajectory())
+    said = align(said, there, "origin").trajectory
+    shifts, angles = relative_errors(there, said, 2.0)
+    whole = relative_error(there, said, 2.0)
+    assert len(shifts) == whole.pairs
+    assert 100 * np.sqrt(np.mean(shifts**2)) / 2 == pytest.approx(whole.translation_percent)
+    degrees = np.degrees(angles)
+    assert np.sqrt(np.mean(degrees**2)) / 2 == pytest.approx(whole.rotation_deg_per_m)
+    assert not len(relative_errors(there, said, 1e4)[0])
+
+
+def test_gaps_are_where_no_pose_is_and_lines_break_there() -> None:
+    truth = walk(10)
+    said = recorded(truth, silent=(4.0, 6.0)).rows.trajectory()
+    (lost,) = gaps(said, None, truth)
+    assert (lost.start / SECOND, lost.end / SECOND) == pytest.approx((4.0, 6.0), abs=0.04)
+    line = broken(said.positions, said.stamps, [lost])
+    assert np.isnan(line[:, 0]).sum() == 1
+    inside = broken(said.positions, said.stamps, [Interval(SECOND, 2 * SECOND)])
+    within = (said.stamps > SECOND) & (said.stamps < 2 * SECOND)
+    assert (np.isnan(inside[:, 0]) == within).all()
+
+
+def test_an_end_in_silence_is_a_gap() -> None:
+    truth = walk(10)
+    said = recorded(truth).rows.trajectory()
+    (lost,) = gaps(said.slice(0, 7 * SECOND), None, truth)
+    assert lost.end == truth.stamps[-1]
+
+
+def test_of_points_on_one_pixel_the_nearest_is_seen() -> None:
+    view = View("", np.eye(3), np.zeros(2), np.ones(2))
+    points = np.array([[0.5, 0.5, z] for z in (0.1, 0.9, 0.5)], np.float32)
+    colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
+    picture, _ = paint(Shown("", points, colors, 3), view, 11.0, 1)
+    assert picture.shape == (11, 11, 3)
+    assert picture[5, 5].tolist() == [0, 255, 0]
+    assert (picture.reshape(-1, 3) != picture[0, 0]).any(axis=1).sum() == 1
+
+
+def test_up_on_the_picture_is_north_and_right_is_east() -> None:
+    view = View("", np.eye(3), np.zeros(2), np.ones(2))
+    points = np.array([[0.95, 0.95, 0.0]], np.float32)
+    picture, _ = paint(Shown("", points, np.zeros((1, 3), np.uint8), 1), view, 10.0, 1)
+    assert picture[0, 9].tolist() == [0, 0, 0]
+
+
+def test_clouds_are_read_whole_and_sampled(tmp_path: Path) -> None:
+    points = np.arange(300, dtype=float).reshape(100, 3)
+    points[7] = np.nan
+    colors = np.arange(300).reshape(100, 3) % 256
+    ply(tmp_path / "a.ply", points, colors)
+    cloud = read_ply(tmp_path / "a.ply", 1000)
+    assert cloud.total == 100
+    assert cloud.colors is not None
+    assert cloud.points.tolist() == np.delete(points, 7, 0).tolist()
+    assert cloud.colors.tolist() == np.delete(colors, 7, 0).tolist()
+    assert len(read_ply(tmp_path / "a.ply", 10).points) in (9, 10)
+    ply(tmp_path / "b.ply", points)
+    assert read_ply(tmp_path / "b.ply", 10).colors is None
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"", "expected a PLY file"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "format ascii"),
+        (b"ply\nformat binary_little_endian 1.0\nelement face 2\nend_header\n", "element face"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nend_header\n", "x, y and z"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
+            b"property float y\nproperty float z\nend_header\n1234",
+            "2 points in",
+        ),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
+            b"property list uchar int x\nend_header\n",
+            "property list",
+        ),
+    ],
+)
+def test_what_is_no_such_cloud_is_said(tmp_path: Path, content: bytes, found: str) -> None:
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(ValueError, match=found):
+        read_ply(tmp_path / "a.ply", 10)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (0.012345, "0.0123"),
+        (0.9996, "1.00"),
+        (123.456, "123"),
+        (54321.0, "54321"),
+        (-1.5, "−1.50"),
+        (1.234e-7, "1.23e−07"),
+        (3e9, "3.00e+09"),
+        (float("inf"), "∞"),
+        (float("-inf"), "−∞"),
+        (float("nan"), "–"),
+    ],
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert number(value) == text

@@ -1,0 +1,107 @@
+"""Flying on estimates: on the path if they are right, beside it if not, waiting for them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from events import Event, Hover, Odometry, PlannedPose, PoseEstimate, Vector3
+from nodes.visual_pilot import VisualPilot
+from runtime import Node, NodeConfig, Output, on
+from runtime.testing import NodeResult, run_nodes, spec
+from sims.multirotor.node import Multirotor
+
+SECOND = 1_000_000_000
+WAYPOINTS = [[0.0, 0.0, -1.5], [3.0, 0.0, -1.5], [3.0, 2.5, -1.5]]
+
+
+class OracleConfig(NodeConfig):
+    """How wrong it is.
+
+    Attributes:
+        shift: Metres that it is off, once the flight is under way.
+        blind: Seconds from, and to, which it says nothing.
+    """
+
+    shift: Vector3 = (0.0, 0.0, 0.0)
+    blind: tuple[float, float] = (0.0, 0.0)
+
+
+class Oracle(Node[OracleConfig]):
+    """Says the truth at 40 Hz as if it were an estimate, but for what its settings ask."""
+
+    estimates = Output(PoseEstimate)
+
+    @on(Odometry)
+    def moved(self, event: Odometry) -> None:
+        seconds = event.stamp / SECOND
+        start, end = self.config.blind
+        if event.stamp % (SECOND // 40) or start < seconds < end:
+            return
+        x, y, z = event.position
+        dx, dy, dz = self.config.shift if seconds > 4 else (0.0, 0.0, 0.0)
+        self.estimates.send(
+            PoseEstimate(
+                stamp=event.stamp,
+                source=self.name,
+                frame_id="map",
+                position=(x + dx, y + dy, z + dz),
+                orientation=event.orientation,
+            )
+        )
+
+
+def fly(duration: float = 30.0, delay: str = "60ms", **oracle: Any) -> NodeResult:
+    return run_nodes(
+        [
+            spec(Multirotor, "drone", {"world": "hall"}),
+            spec(Oracle, "oracle", oracle),
+            spec(
+                VisualPilot,
+                "pilot",
+                {"waypoints": WAYPOINTS, "speed": 1.0},
+                links={"estimated": {"delay": delay}},
+            ),
+        ],
+        duration=duration,
+    )
+
+
+def beside_the_plan(result: NodeResult) -> np.ndarray:
+    """Return how far, per axis, the vehicle was from where it was meant to be, shape (n, 3)."""
+    truth = {event.stamp: event.position for event in result.of(Odometry)}
+    plans = [event for event in result.of(PlannedPose) if event.stamp in truth]
+    assert len(plans) > 100
+    return np.array([np.subtract(truth[p.stamp], p.position) for p in plans])
+
+
+def test_right_estimates_though_late_keep_the_vehicle_on_its_path() -> None:
+    result = fly()
+    assert result.reason == "pilot: tour flown"
+    assert np.linalg.norm(beside_the_plan(result), axis=1).max() < 0.3
+
+
+def test_an_estimate_that_is_off_takes_the_vehicle_off() -> None:
+    error = beside_the_plan(fly(shift=(0.0, 0.0, -0.4)))
+    assert error[-100:, 2].mean() == pytest.approx(0.4, abs=0.03)
+
+
+def test_without_estimates_it_stops_and_waits() -> None:
+    result = fly(blind=(5.0, 8.0))
+    waits = [event for event in result.of(Hover) if 5.0 < event.stamp / SECOND < 8.0]
+    assert len(waits) == 1
+    while_blind: list[Event] = [
+        event for event in result.of(PlannedPose) if 5.7 < event.stamp / SECOND < 8.0
+    ]
+    assert not while_blind
+    assert result.reason == "pilot: tour flown"
+
+
+@pytest.mark.parametrize("gain", [-1.0, 0.0])
+def test_gains_must_be_positive(gain: float) -> None:
+    from runtime.errors import ConfigError
+
+    with pytest.raises(ConfigError, match="gain"):
+        spec(VisualPilot, "pilot", {"waypoints": WAYPOINTS, "gain": gain})

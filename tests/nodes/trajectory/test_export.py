@@ -1,0 +1,156 @@
+"""What a run's trajectories become, and that evo reads the files as they are."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nodes.evaluation.alignment import align
+from nodes.evaluation.metrics import absolute_error, relative_error
+from nodes.trajectory import Trajectory
+from nodes.trajectory.export import export, load, together
+from nodes.trajectory.formats import read_euroc, read_kitti, read_tum, write_tum
+from tests.nodes.trajectory.samples import moved, noisy, walk
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """Return a run of two estimators: one in `map`, and one in a frame and at times of its own."""
+    folder = tmp_path / "run" / "trajectories"
+    folder.mkdir(parents=True)
+    truth = walk(400)
+    estimate = noisy(truth, metres=0.005)
+    stamps = np.arange(210_000_000, 19_900_000_000, 33_333_333)
+    write_tum(folder / "truth.tum", truth)
+    write_tum(folder / "plan.tum", truth)
+    write_tum(folder / "vo.tum", estimate.take(slice(20, 380)))
+    write_tum(folder / "slam.tum", moved(estimate.at(stamps)))
+    return tmp_path / "run"
+
+
+def evo(folder: Path, *arguments: str) -> dict[str, float]:
+    """Run one of evo's commands as a user would, and return the statistics it prints."""
+    tool, *rest = arguments
+    code = f"import sys; from evo.cli.entry_points import {tool}; sys.exit({tool}())"
+    command = [sys.executable, "-c", code, *rest]
+    done = subprocess.run(
+        command, cwd=folder, env={"HOME": str(folder)}, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+    return {name: float(value) for name, value in re.findall(r"(\w+)\t(\d\S*)", done.stdout)}
+
+
+def test_every_format_has_its_files(run: Path, tmp_path: Path) -> None:
+    written = {form: export(run, form, tmp_path / form) for form in ("tum", "euroc", "kitti")}
+    assert {form: [p.name for p in paths] for form, paths in written.items()} == {
+        "tum": ["truth.tum", "slam.tum", "vo.tum"],
+        "euroc": ["truth.csv", "slam.csv", "slam.tum", "vo.csv", "vo.tum"],
+        "kitti": [
+            "slam.truth.kitti.txt",
+            "slam.kitti.txt",
+            "vo.truth.kitti.txt",
+            "vo.kitti.txt",
+        ],
+    }
+    assert all(path.is_file() for paths in written.values() for path in paths)
+    assert all(p.parent == run / "export" for p in export(run, "tum"))
+
+
+def test_poses_stay_where_and_when_they_were(run: Path) -> None:
+    truth, estimates = load(run)
+    assert list(estimates) == ["slam", "vo"]
+    export(run, "tum")
+    export(run, "euroc")
+    out = run / "export"
+    for name, expected in ({"truth": truth} | estimates).items():
+        for found in (read_tum(out / f"{name}.tum"), read_euroc(out / f"{name}.csv")):
+            assert (found.stamps == expected.stamps).all()
+            assert abs(found.positions - expected.positions).max() < 1e-9
+
+
+def test_kittis_files_go_together_line_by_line(run: Path) -> None:
+    truth, estimates = load(run)
+    export(run, "kitti")
+    true = read_kitti(run / "export" / "slam.truth.kitti.txt")
+    said = read_kitti(run / "export" / "slam.kitti.txt")
+    assert said[:, :3, 3] == pytest.approx(estimates["slam"].positions)
+    assert true[:, :3, 3] == pytest.approx(truth.at(estimates["slam"].stamps).positions)
+
+
+def test_poses_without_a_truth_are_left_out_of_kittis_pairs() -> None:
+    truth = walk(10)
+    early = Trajectory(truth.stamps - 75_000_000, truth.positions, truth.orientations)
+    true, said = together(truth, early)
+    assert true.stamps.tolist() == said.stamps.tolist() == early.stamps[2:].tolist()
+
+
+def test_a_run_without_trajectories_is_an_error_that_says_what_leaves_them(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"missing: expected the folder of a run, found none"):
+        export(tmp_path / "missing", "tum")
+    with pytest.raises(ValueError, match=r"truth\.tum: expected .* found no trajectories: .*Eval"):
+        export(tmp_path, "tum")
+    (tmp_path / "trajectories").mkdir()
+    write_tum(tmp_path / "trajectories" / "vo.tum", walk(3))
+    with pytest.raises(ValueError, match=r"truth\.tum: expected .* found vo\.tum"):
+        export(tmp_path, "tum")
+
+
+def test_a_kitti_export_needs_an_estimate_of_the_truths_time(tmp_path: Path) -> None:
+    folder = tmp_path / "trajectories"
+    folder.mkdir()
+    write_tum(folder / "truth.tum", walk(3))
+    with pytest.raises(ValueError, match=r"expected an estimate .*, found truth\.tum only"):
+        export(tmp_path, "kitti")
+    write_tum(folder / "vo.tum", walk(3, start=10**12))
+    with pytest.raises(ValueError, match=r"vo\.tum: expected estimates between 0 and 100000000"):
+        export(tmp_path, "kitti")
+    assert not (tmp_path / "export").exists()
+
+
+def test_a_broken_trajectory_is_named(run: Path) -> None:
+    (run / "trajectories" / "vo.tum").write_text("1 2 3\n")
+    with pytest.raises(ValueError, match=r"vo\.tum:1: expected 8 fields"):
+        export(run, "tum")
+    with pytest.raises(ValueError, match="expected one of tum, euroc, kitti, found 'bag'"):
+        export(run, "bag")
+
+
+@pytest.mark.slow
+def test_evos_commands_take_the_files_as_they_are_and_find_our_figures(run: Path) -> None:
+    """`evo_ape` and `evo_rpe` of each format, in processes of their own."""
+    for form in ("tum", "euroc", "kitti"):
+        export(run, form)
+    truth, estimates = load(run)
+    # Only those at stamps of the truth: where evo would pair poses of different times.
+    true, said = together(truth, estimates["vo"])
+    aligned = align(said, true, "se3").trajectory
+    ape, rpe = absolute_error(true, aligned), relative_error(true, said)
+    files = {
+        "tum": ["truth.tum", "vo.tum"],
+        "euroc": ["truth.csv", "vo.tum"],
+        "kitti": ["vo.truth.kitti.txt", "vo.kitti.txt"],
+    }
+    pairs = ["--delta", "1", "--delta_unit", "m", "--all_pairs", "--pairs_from_reference"]
+    for form, names in files.items():
+        found = evo(run / "export", "ape", form, *names, "--align")
+        assert found["rmse"] == pytest.approx(ape.rmse_m, abs=2e-6)  # it prints six decimals
+        assert found["max"] == pytest.approx(ape.max_m, abs=2e-6)
+        found = evo(run / "export", "rpe", form, *names, *pairs)
+        assert found["rmse"] * 100 == pytest.approx(rpe.translation_percent, abs=2e-4)
+
+
+@pytest.mark.slow
+def test_evo_reads_an_estimate_in_a_frame_of_its_own(run: Path) -> None:
+    export(run, "kitti")
+    truth, estimates = load(run)
+    true, said = together(truth, estimates["slam"])
+    found = evo(run / "export", "ape", "kitti", "slam.truth.kitti.txt", "slam.kitti.txt", "--align")
+    ours = absolute_error(true, align(said, true, "se3").trajectory)
+    assert found["rmse"] == pytest.approx(ours.rmse_m, abs=2e-6)

@@ -1,0 +1,154 @@
+"""The standard tour's flight as a user would start it: what it leaves, and that it is the same
+each time. (Nobody judges an estimator here: see `test_verdict`.)"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+import tomli_w
+
+from runtime.config import load
+from runtime.execute import execute
+from runtime.testing import spec
+from tests.runs.witness import Witness
+from tests.runtime.samples_cli import ROOT, command, start, summary
+
+pytestmark = pytest.mark.timeout(120)
+CONFIG = ROOT / "config.toml"
+SMALL = ["camera.width=96", "camera.height=96"]
+SHORT = [*SMALL, "run.duration=6s"]
+BUSY = "while True: pass"
+
+
+def flight(folder: Path) -> Path:
+    """Write the standard tour without what estimates and judges into a folder."""
+    table = tomllib.loads(CONFIG.read_text())
+    judges = {"odometry", "evaluation"}
+    table["nodes"] = [node for node in table["nodes"] if node["name"] not in judges]
+    path = folder / "flight.toml"
+    path.write_text(tomli_w.dumps(table))
+    return path
+
+
+def changes(*settings: str) -> list[str]:
+    return [word for setting in settings for word in ("--set", setting)]
+
+
+def fly(folder: Path, out: str, *settings: str) -> str:
+    """Run the tour and return its digest."""
+    done = command(
+        "run", flight(folder), "-q", "--out", out, *changes(*settings), folder=folder, limit=90
+    )
+    assert done.returncode == 0, done.stderr
+    return str(summary(folder / out)["digest"])
+
+
+def test_a_short_flight_leaves_everything(tmp_path: Path) -> None:
+    fly(tmp_path, "out", *SHORT)
+    out = tmp_path / "out"
+    assert {p.name for p in out.iterdir()} == {
+        *("summary.json", "config.toml", "log.txt"),
+        *("trajectory.tum", "flight.png", "pictures.png"),
+    }
+    found = summary(out)
+    assert (found["sim_seconds"], found["reason"], found["error"]) == (6.0, "duration", None)
+    assert found["events"]["Imu"] == 1200
+    assert set(found["drops"].values()) <= {0}
+    rows = (out / "trajectory.tum").read_text().splitlines()
+    assert len(rows) == 1 + found["events"]["Odometry"]
+    cameras = [a for a in found["announcements"] if a["type"] == "CameraAnnouncement"]
+    assert [(c["source"], c["rate"]) for c in cameras] == [("drone/camera", 30.0)]
+
+
+def test_pictures_depth_pose_and_imu_share_their_stamps() -> None:
+    config = load(CONFIG, [*SMALL, "run.duration=2s", "camera.rate=25"])
+    nodes = (*config.nodes[:1], spec(Witness, "witness"))
+    execute(type(config)(run=config.run, nodes=nodes))
+    seen = {name: dict(pairs) for name, pairs in Witness.seen.items()}
+    assert len(seen["Image"]) == 50
+    for name in ("Image", "DepthImage", "PoseStamped"):
+        assert list(seen[name]) == [k * 40_000_000 for k in range(50)]
+        assert {at - stamp for stamp, at in seen[name].items()} == {40_000_000}
+    for name in ("Imu", "Odometry"):
+        assert set(seen["Image"]) <= set(seen[name])
+        assert {at - stamp for stamp, at in seen[name].items()} == {0}
+
+
+@pytest.mark.slow
+def test_the_same_file_and_seed_give_the_same_events_on_a_busy_machine(tmp_path: Path) -> None:
+    """Another process on each core changes when renderers answer, and nothing else."""
+    settings = [*SMALL, "run.duration=4s"]
+    quiet = fly(tmp_path, "quiet", *settings)
+    busy = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(2)]
+    try:
+        loaded = fly(tmp_path, "busy", *settings)
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert loaded == quiet
+
+
+@pytest.mark.slow
+def test_another_seed_or_number_of_renderers(tmp_path: Path) -> None:
+    """A seed is another flight; how many processes render it is not."""
+    settings = [*SMALL, "run.duration=3s"]
+    one = fly(tmp_path, "one", *settings)
+    assert fly(tmp_path, "two", *settings, "drone.camera_processes=1") == one
+    assert fly(tmp_path, "other", *settings, "run.seed=2") != one
+    assert fly(tmp_path, "slow", *settings, "camera.latency=80ms") != one
+
+
+def test_the_tour_flies_round_the_hall_and_lands(tmp_path: Path) -> None:
+    """Without cameras a minute's flight takes seconds."""
+    fly(tmp_path, "out", "drone.cameras=[]")
+    found = summary(tmp_path / "out")
+    assert found["reason"] == "tour: tour flown"
+    assert (found["events"]["TakenOff"], found["events"]["Landed"]) == (1, 1)
+    assert found["events"].get("Collision", 0) == 0
+    assert 40 < found["sim_seconds"] < 75
+    last = (tmp_path / "out" / "trajectory.tum").read_text().splitlines()[-1].split()
+    x, y, z = map(float, last[1:4])
+    assert abs(x) < 0.2
+    assert abs(y) < 0.2
+    assert -0.2 < z < 0
+
+
+@pytest.mark.slow
+def test_the_whole_tour_with_pictures(tmp_path: Path) -> None:
+    fly(tmp_path, "out", *SMALL)
+    found = summary(tmp_path / "out")
+    assert found["reason"] == "tour: tour flown"
+    assert found["events"].get("Collision", 0) == 0
+    assert abs(found["events"]["Image"] - 30 * found["sim_seconds"]) < 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
+def test_ctrl_c_in_mid_flight_leaves_whole_files(clock: str, tmp_path: Path) -> None:
+    settings = changes(*SMALL, f"run.clock={clock}", "run.speed=1.0")
+    trajectory = tmp_path / "out" / "trajectory.tum"
+    with start(["run", flight(tmp_path), "-q", "--out", "out", *settings], tmp_path) as process:
+        deadline = time.monotonic() + 30
+        # The file grows by blocks as the vehicle flies; only its growth shows from outside.
+        while not trajectory.exists() or trajectory.stat().st_size < 10_000:
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=20)
+    assert process.returncode == 0, err
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (found["reason"], found["error"]) == ("Ctrl-C", None)
+    text = trajectory.read_text()
+    assert text.endswith("\n")
+    assert len(text.splitlines()) == 1 + found["events"]["Odometry"]
+    assert all(len(line.split()) == 8 for line in text.splitlines()[1:])
+    assert (tmp_path / "out" / "flight.png").exists()

@@ -1,0 +1,62 @@
+"""The standard tour with its estimator: judged, reported, and the same however slow the machine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.runtime.samples_cli import ROOT, command
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+CONFIG = ROOT / "config.toml"
+
+
+def fly(folder: Path, config: Path, *settings: str, code: int = 0) -> dict[str, Any]:
+    """Run a file and return its summary."""
+    changes = [word for setting in settings for word in ("--set", setting)]
+    done = command("run", config, "-q", "--out", "out", *changes, folder=folder, limit=280)
+    assert done.returncode == code, done.stderr
+    found: dict[str, Any] = json.loads((folder / "out" / "summary.json").read_text())
+    return found
+
+
+@pytest.mark.parametrize("world", ["config.toml", "examples/yard.toml"])
+def test_odometry_keeps_within_a_third_of_a_percent(world: str, tmp_path: Path) -> None:
+    verdict = fly(tmp_path, ROOT / world, "evaluation.report=false")["verdict"]
+    figures = verdict["estimators"]["odometry"]
+    assert verdict["passed"]
+    assert figures["alignment"] == "none"
+    assert figures["ate_percent"] < 0.3
+    assert figures["lost_seconds"] == 0.0
+    assert figures["path_m"] > 45
+
+
+def test_a_scene_too_heavy_for_the_machine_gives_the_same_estimates(tmp_path: Path) -> None:
+    """Two real seconds a picture, or as fast as it goes: the same events, to the byte."""
+    short = ["run.duration=5s", "camera.rate=5", "camera.width=256", "camera.height=256"]
+    short.append("evaluation.report=false")
+    found = []
+    for render_time in ("0s", "2s"):
+        folder = tmp_path / render_time
+        folder.mkdir()
+        summary = fly(folder, CONFIG, *short, f"camera.render_time={render_time}", code=1)
+        found.append((summary["digest"], summary["verdict"]))
+        assert summary["verdict"]["estimators"]["odometry"]["estimates"] == 25
+    assert found[0] == found[1]
+
+
+def test_a_threshold_that_is_missed_is_the_exit_code(tmp_path: Path) -> None:
+    summary = fly(
+        tmp_path,
+        CONFIG,
+        *("run.duration=6s", "evaluation.thresholds.ate_percent=0.0001", "camera.rate=10"),
+        code=1,
+    )
+    [reason] = summary["verdict"]["estimators"]["odometry"]["failed"]
+    assert reason.startswith("ate_percent: expected at most 0.0001, found ")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "ate_percent" in page
+    assert 'src="http' not in page
