@@ -1,8 +1,9 @@
 """RGB-D odometry on corners: followed from key frames by optical flow, placed by their depth.
 
-Each picture is aligned with the last key frame, not with the picture before, so that error grows
-with key frames and not with pictures; landmarks live on from key frame to key frame, their places
-the mean of all depths read. See `pose`, `depth` and `keyframes` for the parts.
+A few corners, followed from the picture before, tell about where the camera is; then each picture
+is aligned with the last key frame, so that error grows with key frames and not with pictures.
+Landmarks live on from key frame to key frame, their places the mean of all depths read. See
+`pose`, `depth` and `keyframes` for the parts.
 """
 
 from __future__ import annotations
@@ -33,8 +34,10 @@ SECOND = 1_000_000_000
 _FLOW_ENDS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 _ROUND_TRIP = 0.5
 """Pixels by which a corner followed there and back may miss itself."""
-_AGREES = 8.0
+_AGREES = 6.0
 """Standard deviations up to which a landmark agrees with a pose."""
+_FEW = 120
+"""Corners that suffice to tell about where the camera is."""
 _REMEMBERED = 20
 """Key frames in which a lost camera looks for itself."""
 
@@ -45,7 +48,7 @@ class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     Attributes:
         corners: Landmarks of a key frame.
         window: Pixels along the side of the neighbourhood that optical flow compares; odd.
-        levels: Times that flow halves the picture for large motions.
+        levels: Times that flow halves the picture for large motions between two pictures.
         pixel_noise: Standard deviation of a followed corner, pixels.
         depth_noise: Standard deviation of inverse depth, 1/m: k of a sensor with sigma = k z².
         keep: Share of a key frame's landmarks below which the next is made.
@@ -58,7 +61,7 @@ class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     corners: Annotated[int, msgspec.Meta(ge=40, le=2000)] = 400
     window: Annotated[int, msgspec.Meta(ge=5, le=51)] = 15
-    levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 3
+    levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 4
     pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.25
     depth_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.002
     keep: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.6
@@ -97,7 +100,7 @@ class FeatureOdometry:
         self._settings = settings or FeatureSettings()
         self._camera = (info.fx, info.fy, info.cx, info.cy)
         self._pose = np.eye(4)  # world (the first camera) to camera
-        self._motion = np.eye(4)  # from the picture before to this one
+        self._before: tuple[Grey, Floats, Floats] | None = None
         self._keyframe: Keyframe | None = None
         self._known: deque[Keyframe] = deque(maxlen=_REMEMBERED)
         self._lost_since: int | None = None
@@ -107,19 +110,18 @@ class FeatureOdometry:
         grey, depth = grey_and_depth(self._info, image, depth)
         if self._keyframe is None:
             return self._begin(grey, depth, "")
-        matches = self._follow(grey, depth, self._keyframe)
-        solution = self._solve(matches)
+        expected = self._expect(grey)
+        matches = self._follow(grey, depth, self._keyframe, expected)
+        solution = self._solve(matches, expected)
         if solution is None:
             return self._lose(stamp, grey, depth, matches)
         reason = ""
         if self._lost_since is not None:
             reason = "against a key frame"
             self._lost_since = None
-            self._motion = np.eye(4)
-        else:
-            self._motion = solution.pose @ inverse(self._pose)
         self._pose = solution.pose
         agree = solution.errors < _AGREES
+        self._before = grey, matches.seen.landmarks[agree], matches.seen.pixels[agree]
         self._renew(grey, depth, matches, agree)
         return Tracked(
             pose=inverse(self._pose),
@@ -139,15 +141,46 @@ class FeatureOdometry:
             return Tracked(pose, True, few, pixels, np.zeros(len(frame), np.bool_))
         self._keyframe = frame
         self._known.append(frame)
-        self._motion = np.eye(4)
+        self._before = grey, frame.landmarks, frame.pixels
         self._lost_since = None
         return Tracked(pose, False, reason, pixels, np.ones(len(frame), np.bool_), len(frame))
 
-    def _follow(self, grey: Grey, depth: Depth, frame: Keyframe) -> Matches:
-        """Find the key frame's landmarks, beginning where the last motion would put them."""
+    def _expect(self, grey: Grey) -> Floats:
+        """Return about where the camera is, by following a few corners from the picture before.
+
+        Coarse to fine, and without a guess: where texture repeats, a guess that is off by half a
+        brick would find the next brick.
+        """
+        if self._before is None:
+            return self._pose
+        image, landmarks, pixels = self._before
+        no_guess: Any = None
+        few = slice(None, None, max(len(pixels) // _FEW, 1))
+        landmarks, pixels = landmarks[few], pixels[few]
+        there, arrived, _ = cv2.calcOpticalFlowPyrLK(
+            image,
+            grey,
+            pixels.astype(np.float32).reshape(-1, 1, 2),
+            no_guess,
+            winSize=(self._settings.window, self._settings.window),
+            maxLevel=self._settings.levels,
+            criteria=_FLOW_ENDS,
+        )
+        good = arrived.ravel() == 1
+        if good.sum() < self._settings.least:
+            return self._pose
+        seen = Observations(
+            landmarks[good],
+            there.reshape(-1, 2)[good].astype(np.float64),
+            np.zeros(int(good.sum())),
+            np.zeros(int(good.sum()), np.bool_),
+        )
+        return self._refine(seen, self._pose).pose
+
+    def _follow(self, grey: Grey, depth: Depth, frame: Keyframe, expected: Floats) -> Matches:
+        """Find the key frame's landmarks, beginning where an expected pose puts them."""
         fx, fy, cx, cy = self._camera
         height, width = grey.shape
-        expected = self._motion @ self._pose
         points = frame.landmarks @ expected[:3, :3].T + expected[:3, 3]
         z = np.maximum(points[:, 2], 0.05)
         guess = np.stack([fx * points[:, 0] / z + cx, fy * points[:, 1] / z + cy], axis=1)
@@ -167,7 +200,7 @@ class FeatureOdometry:
             grey,
             start,
             guess[rows].astype(np.float32).reshape(-1, 1, 2),
-            maxLevel=self._settings.levels,
+            maxLevel=1,
             **options,
         )
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
@@ -181,12 +214,12 @@ class FeatureOdometry:
         far, measured = inverse_depth_at(depth, pixels)
         return Matches(rows, Observations(frame.landmarks[rows], pixels, far, measured))
 
-    def _solve(self, matches: Matches) -> Solution | None:
+    def _solve(self, matches: Matches, expected: Floats) -> Solution | None:
         """Return the pose, if enough landmarks agree with it."""
         least = self._settings.least
         if len(matches.rows) < least:
             return None
-        solution = self._refine(matches.seen, self._motion @ self._pose)
+        solution = self._refine(matches.seen, expected)
         if (solution.errors < _AGREES).mean() < 0.6:  # the start was wrong, or much is
             cv2.setRNGSeed(1)
             found, turn, shift, _ = cv2.solvePnPRansac(
@@ -242,7 +275,7 @@ class FeatureOdometry:
         """Look for a place that is known; after a while, begin anew."""
         if self._lost_since is None:
             self._lost_since = stamp
-        self._motion = np.eye(4)
+        self._before = None
         for frame in reversed(self._known):
             found = find_again(grey, frame, self._info.matrix())
             if found is not None:
