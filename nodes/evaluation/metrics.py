@@ -115,7 +115,7 @@ def relative_error(
             f"relative error: expected poses {delta:g} m apart along the path, found none "
             f"in {len(truth)} poses and {distances[-1]:.3f} m"
         )
-    shifts, angles = _relative(truth, estimate, first, last)
+    shifts, angles = relative_errors(truth, estimate, first, last)
     degrees = np.degrees(angles)
     return RelativeError(
         delta_m=delta,
@@ -141,7 +141,7 @@ def drift_percent(truth: Trajectory, estimate: Trajectory) -> float:
     if not length > 0.0:
         raise ValueError(f"drift: expected a path longer than 0 m, found {len(truth)} poses on it")
     ends = np.array([0]), np.array([len(truth) - 1])
-    shifts, _ = _relative(truth, estimate, *ends)
+    shifts, _ = relative_errors(truth, estimate, *ends)
     return 100.0 * float(shifts[0]) / length
 
 
@@ -230,10 +230,17 @@ def same_stamps(truth: Trajectory, estimate: Trajectory) -> None:
         )
 
 
-def _relative(
+def relative_errors(
     truth: Trajectory, estimate: Trajectory, first: Indices, last: Indices
 ) -> tuple[Floats, Floats]:
-    """Return the errors of the motions between pairs of poses: metres and radians, shape (m,)."""
+    """Return the errors of the motions between pairs of poses: metres and radians, shape (m,).
+
+    Args:
+        truth: The true poses.
+        estimate: The estimated ones, at the same stamps.
+        first: Row numbers of the first pose of each pair; see `path_pairs`.
+        last: Row numbers of the second.
+    """
     (r1, p1), (r2, p2) = (
         (t.rotations(), t.positions[last] - t.positions[first]) for t in (truth, estimate)
     )

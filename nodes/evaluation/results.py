@@ -4,6 +4,7 @@ trajectories/truth.tum              the true poses
 trajectories/<estimator>.tum        the estimates as they were said
 trajectories/plan.tum               where the pilot meant to be
 evaluation/<estimator>.csv          errors of each estimate at the time of its image
+evaluation/<estimator>.lost.csv     when it had no pose
 evaluation/<estimator>.ticks.csv    errors of the newest pose there was at each control tick
 evaluation/<estimator>.aligned.tum  the estimates in the truth's frame
 evaluation/verdict.json             all figures
@@ -47,6 +48,9 @@ def write_results(
         if judgement.aligned is not None:
             comment = FRAMES.format("map (NED), aligned")
             write_tum(evaluation / f"{name}.aligned.tum", judgement.aligned, comment)
+        rows = [f"{start},{end}\n" for start, end in judgement.lost]
+        lost = "".join(["start_ns,end_ns\n", *rows])
+        (evaluation / f"{name}.lost.csv").write_text(lost, encoding="ascii")
         if judgement.of_images is not None:
             _write_errors(evaluation / f"{name}.csv", "arrival_ns", judgement.of_images)
         if judgement.of_ticks is not None:

@@ -10,8 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
-from nodes.report.folder import Estimator, Run
-from nodes.report.poses import Floats, broken, relative_errors
+from nodes.evaluation.metrics import path_pairs, relative_errors
+from nodes.report.contents import Estimator, Run
+from nodes.report.poses import Floats, broken
 from nodes.report.style import (
     Picture,
     label,
@@ -186,7 +187,8 @@ def draw_relative(run: Run, folder: Path) -> Picture | None:
     for place, length in enumerate(LENGTHS):
         for k, (each, aligned) in enumerate(known):
             inside = aligned.take(run.truth.covers(aligned.stamps))
-            shifts, angles = relative_errors(run.truth.at(inside.stamps), inside, length)
+            truth = run.truth.at(inside.stamps)
+            shifts, angles = relative_errors(truth, inside, *path_pairs(truth.distances(), length))
             if len(shifts) >= _FEWEST:
                 share = 0.7 / len(known)
                 where = place + (k - (len(known) - 1) / 2) * share

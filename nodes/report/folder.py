@@ -16,10 +16,10 @@ import msgspec
 from nodes.evaluation.judging import Errors
 from nodes.evaluation.record import Interval, seconds
 from nodes.evaluation.results import file_name, read_errors
+from nodes.report.contents import Estimator, Facts, Run, Verdict
 from nodes.report.poses import gaps, lay_on, read_poses
 from nodes.report.style import COLORS
 from nodes.trajectory import Trajectory
-from runtime.summary import LinkSummary, StreamSummary, TickSummary
 
 T = TypeVar("T")
 
@@ -32,101 +32,6 @@ _NO_ESTIMATES = {"truth", "plan"}
 _ABOUT = 0.25
 """Seconds by which two counts of lost time may differ."""
 _LOUD = {"WARNING", "ERROR", "CRITICAL"}
-
-
-class Facts(msgspec.Struct, frozen=True, kw_only=True):
-    """What the report wants of ``summary.json``; see `runtime.summary.Summary`."""
-
-    name: str | None = None
-    clock: str | None = None
-    seed: int | None = None
-    reason: str | None = None
-    error: str | None = None
-    sim_seconds: float | None = None
-    wall_seconds: float | None = None
-    digest: str | None = None
-    not_deterministic: list[str] = []
-    verdict: Verdict | None = None
-    outputs: dict[str, int] = {}
-    streams: dict[str, StreamSummary] = {}
-    links: dict[str, LinkSummary] = {}
-    ticks: dict[str, TickSummary] = {}
-    stalls: dict[str, int] = {}
-    announcements: list[dict[str, Any]] = []
-    environment: dict[str, str] = {}
-
-
-class Verdict(msgspec.Struct, frozen=True):
-    """What ``evaluation/verdict.json`` holds, and without thresholds the summary."""
-
-    passed: bool
-    estimators: dict[str, dict[str, Any]]
-    thresholds: dict[str, float | None] = {}
-
-
-class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """One of those that were judged, or that would have been.
-
-    Attributes:
-        name: Its source.
-        color: In every picture.
-        figures: From the verdict; empty if there is none.
-        aligned: Its poses in the truth's frame.
-        of_images: Errors of each pose at the time of its image.
-        of_ticks: Errors of the newest pose there was at each control tick.
-        lost: When it had no pose.
-    """
-
-    name: str
-    color: str
-    figures: dict[str, Any] = {}
-    aligned: Trajectory | None = None
-    of_images: Errors | None = None
-    of_ticks: Errors | None = None
-    lost: list[Interval] = []
-
-
-class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """One run's folder.
-
-    Attributes:
-        folder: Where it is.
-        facts: From the summary.
-        verdict: What the evaluation concluded.
-        truth: True poses.
-        plan: Where the pilot meant to be.
-        estimators: By order of the verdict.
-        frames: Sample pictures with features, by estimator's file name.
-        clouds: Files of clouds.
-        pictures: Pictures that other nodes left.
-        config: Text of ``config.toml``.
-        log: Its warnings and errors.
-        missing: Sentences that say what is not there or cannot be read.
-    """
-
-    folder: Path
-    facts: Facts
-    verdict: Verdict | None
-    truth: Trajectory | None
-    plan: Trajectory | None
-    estimators: list[Estimator]
-    frames: dict[str, list[Path]]
-    clouds: list[Path]
-    pictures: list[Path]
-    config: str | None
-    log: list[str]
-    missing: list[str]
-
-    @property
-    def name(self) -> str:
-        """Name of the run."""
-        return self.facts.name or self.folder.resolve().name
-
-    @property
-    def start(self) -> int:
-        """What times in the pictures count from: 0, or for stamps of a calendar the first one."""
-        first = int(self.truth.stamps[0]) if self.truth is not None else 0
-        return first if first > 1e15 else 0
 
 
 def read_run(folder: Path) -> Run:

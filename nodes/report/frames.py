@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from nodes.report.folder import Run
+from nodes.report.contents import Run
 from nodes.report.style import DPI, WIDTH, Picture, label, save, sheet
 
 _COLUMNS = 4

@@ -12,8 +12,9 @@ import numpy as np
 
 from nodes.report import tables
 from nodes.report.clouds import draw_clouds
+from nodes.report.contents import Run
 from nodes.report.curves import draw_distributions, draw_errors, draw_latency, draw_relative
-from nodes.report.folder import Run, read_run
+from nodes.report.folder import read_run
 from nodes.report.frames import draw_frames
 from nodes.report.paths import draw_paths
 from nodes.report.style import Picture, drawing

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.record import Interval
-from nodes.report.folder import Run
+from nodes.report.contents import Run
 from nodes.report.poses import Floats, broken
 from nodes.report.style import PLAN, TRUTH, WIDTH, Picture, label, legend_columns, save, sheet, thin
 from nodes.trajectory import Trajectory

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.alignment import align, associate
 from nodes.evaluation.judging import Errors
-from nodes.evaluation.metrics import path_pairs, position_errors, rotation_errors
+from nodes.evaluation.metrics import position_errors, rotation_errors
 from nodes.evaluation.record import Interval, union
 from nodes.trajectory import Trajectory
 
@@ -78,28 +77,6 @@ def gaps(
     return union([Interval(int(stamps[k]), int(ends[k])) for k in silent])
 
 
-def relative_errors(
-    truth: Trajectory, estimate: Trajectory, length: float
-) -> tuple[Floats, Floats]:
-    """Return the errors of all motions along a length of path: metres and radians, shape (m,).
-
-    The single errors of which `nodes.evaluation.metrics.relative_error` gives the mean square.
-
-    Args:
-        truth: True poses.
-        estimate: Aligned ones at the same stamps.
-        length: Metres along the true path.
-    """
-    first, last = path_pairs(truth.distances(), length)
-    if not len(first):
-        return np.zeros(0), np.zeros(0)
-    (true_shift, true_turn), (said_shift, said_turn) = (
-        _motions(each, first, last) for each in (truth, estimate)
-    )
-    shifts = np.linalg.norm(said_shift - true_shift, axis=1)
-    return np.asarray(shifts), np.asarray((true_turn.inv() * said_turn).magnitude())
-
-
 def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interval]) -> Floats:
     """Return a copy in which a line does not go on across a lost interval: NaN at its end.
 
@@ -116,10 +93,3 @@ def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interva
         if after < len(values) and not inside.any():
             values[after] = np.nan
     return values
-
-
-def _motions(each: Trajectory, first: Indices, last: Indices) -> tuple[Floats, Any]:
-    """Return the motions between pairs of poses, seen from the first: shifts and rotations."""
-    turns = each.rotations()
-    back = turns[first].inv()
-    return back.apply(each.positions[last] - each.positions[first]), back * turns[last]

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from nodes.report.folder import Facts, Run
+from nodes.report.contents import Facts, Run
 from nodes.report.style import number
 
 MAIN = {

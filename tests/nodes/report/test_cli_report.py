@@ -33,10 +33,7 @@ def test_what_cannot_be_written_is_one_of_our_errors(tmp_path: Path) -> None:
 def test_a_folder_that_is_no_run_gives_one_line_and_exit_code_2(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    alone = typer.Typer()
-    alone.command()(report)
-    monkeypatch.setattr(runtime.cli, "app", alone)
-    monkeypatch.setattr("sys.argv", ["runtime", str(tmp_path)])
+    monkeypatch.setattr("sys.argv", ["runtime", "report", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
         runtime.cli.main()
     assert ended.value.code == 2

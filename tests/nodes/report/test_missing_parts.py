@@ -110,6 +110,7 @@ def test_lost_time_that_the_gaps_do_not_tell_of_is_said(tmp_path: Path) -> None:
     record.note(TrackingLost(stamp=2 * SECOND, source="vo", reason="dark"))
     record.note(TrackingRegained(stamp=5 * SECOND, source="vo"))
     evaluated(tmp_path, truth, {"vo": record}, Thresholds())
+    (tmp_path / "evaluation" / "vo.lost.csv").unlink()
     missing = read_run(tmp_path).missing
     assert any("vo: lost for 3.0 s by the figures" in text for text in missing)
 

@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.evaluation.alignment import align, associate
-from nodes.evaluation.metrics import relative_error
 from nodes.evaluation.record import Interval
-from nodes.report.clouds import Shown, View, paint
 from nodes.report.ply import read_ply
-from nodes.report.poses import broken, gaps, read_poses, relative_errors
-from nodes.report.style import number
+from nodes.report.poses import broken, gaps, read_poses
+from nodes.report.splat import Shown, View, paint
+from nodes.report.style import label, number
 from nodes.trajectory.formats import read_tum, write_tum
 from tests.nodes.report.folders import SECOND, ply, recorded, walk
 
@@ -46,19 +44,6 @@ def test_what_holds_no_poses_is_an_error(tmp_path: Path, text: str) -> None:
         read_poses(tmp_path / "a.tum")
 
 
-def test_single_relative_errors_have_the_mean_square_that_the_metrics_tell() -> None:
-    truth = walk(20)
-    there, said = associate(truth, recorded(truth).rows.trajectory())
-    said = align(said, there, "origin").trajectory
-    shifts, angles = relative_errors(there, said, 2.0)
-    whole = relative_error(there, said, 2.0)
-    assert len(shifts) == whole.pairs
-    assert 100 * np.sqrt(np.mean(shifts**2)) / 2 == pytest.approx(whole.translation_percent)
-    degrees = np.degrees(angles)
-    assert np.sqrt(np.mean(degrees**2)) / 2 == pytest.approx(whole.rotation_deg_per_m)
-    assert not len(relative_errors(there, said, 1e4)[0])
-
-
 def test_gaps_are_where_no_pose_is_and_lines_break_there() -> None:
     truth = walk(10)
     said = recorded(truth, silent=(4.0, 6.0)).rows.trajectory()
@@ -86,6 +71,21 @@ def test_of_points_on_one_pixel_the_nearest_is_seen() -> None:
     assert picture.shape == (11, 11, 3)
     assert picture[5, 5].tolist() == [0, 255, 0]
     assert (picture.reshape(-1, 3) != picture[0, 0]).any(axis=1).sum() == 1
+
+
+def test_where_dots_overlap_the_nearer_is_seen() -> None:
+    view = View("", np.eye(3), np.zeros(2), np.ones(2))
+    points = np.array([[0.5, 0.5, 0.9], [0.6, 0.5, 0.1]], np.float32)
+    colors = np.array([[255, 0, 0], [0, 255, 0]], np.uint8)
+    picture, _ = paint(Shown("", points, colors, 2), view, 11.0, 3)
+    assert (picture == [255, 0, 0]).all(axis=2).sum() == 9
+    assert (picture == [0, 255, 0]).all(axis=2).sum() == 3
+
+
+def test_a_name_that_matplotlib_would_hide_is_shown() -> None:
+    assert label("_a").strip() == "_a"
+    assert not label("_a").startswith("_")
+    assert len(label("long" * 20)) == 40
 
 
 def test_up_on_the_picture_is_north_and_right_is_east() -> None:

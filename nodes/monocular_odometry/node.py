@@ -1,0 +1,59 @@
+"""Monocular odometry as a node: which camera it reads, and when it speaks."""
+
+from __future__ import annotations
+
+from typing import ClassVar, NamedTuple
+
+import cv2
+
+from events import CameraInfo, Image
+from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig
+from nodes.monocular_odometry.odometry import MonocularOdometry as Odometry
+from nodes.monocular_odometry.settings import MonocularSettings
+from runtime import Bundle
+
+
+class Frame(NamedTuple):
+    """One picture."""
+
+    image: Image
+
+
+class MonocularOdometryConfig(EstimatorConfig):
+    """Settings of monocular odometry.
+
+    Attributes:
+        settings: Of the method.
+    """
+
+    settings: MonocularSettings = MonocularSettings()
+
+
+class MonocularOdometry(Estimator[MonocularOdometryConfig]):
+    """Where a single camera has gone, in a unit of length of its own."""
+
+    needs: ClassVar[frozenset[str]] = frozenset({"grey"})
+    method: ClassVar[str] = "monocular odometry"
+    scale_free: ClassVar[bool] = True
+
+    frames = Bundle(Frame, keep="latest")
+
+    async def run(self) -> None:
+        """Track each picture in a process of its own; say nothing until there is a map."""
+        odometry = await self.worker(
+            make_odometry,
+            self.the_camera().info,
+            self.config.settings,
+            latency=self.config.latency,
+            env=WORKER_ENVIRONMENT,
+        )
+        async for (image,) in self.frames:
+            tracked = await odometry.call(Odometry.track, image.stamp, image.data)
+            if tracked.initialised or tracked.lost:
+                self.publish(image, tracked)
+
+
+def make_odometry(info: CameraInfo, settings: MonocularSettings) -> Odometry:
+    """Make the odometry in the process that will run it."""
+    cv2.setNumThreads(1)
+    return Odometry(info, settings)

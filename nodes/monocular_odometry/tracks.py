@@ -1,0 +1,57 @@
+"""Corners on their way through key frames: where each was seen, and where it is in the world."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from nodes.visual_odometry.tracker import Floats
+
+Mask = npt.NDArray[np.bool_]
+View = tuple[float, float]
+
+
+class Tracks:
+    """Corners that are followed.
+
+    Attributes:
+        pixels: Where the newest key frame has them: column, row, shape (n, 2).
+        points: In the world, shape (n, 3); not a number while that is not known.
+        views: For each, its pixels by key frame.
+    """
+
+    def __init__(self, pixels: Floats, keyframe: int) -> None:
+        self.pixels = pixels
+        self.points = np.full((len(pixels), 3), np.nan)
+        self.views: list[dict[int, View]] = [{keyframe: (x, y)} for x, y in pixels.tolist()]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def known(self) -> Mask:
+        """Which have a place in the world, shape (n,)."""
+        return np.asarray(np.isfinite(self.points[:, 0]))
+
+    def keep(self, rows: npt.NDArray[np.int64] | Mask) -> list[tuple[Floats, dict[int, View]]]:
+        """Keep some; return points and views of the others that have a place."""
+        kept = np.zeros(len(self), np.bool_)
+        kept[rows] = True
+        gone = np.flatnonzero(~kept & self.known)
+        retired = [(self.points[row], self.views[row]) for row in gone.tolist()]
+        self.views = [self.views[row] for row in np.flatnonzero(kept).tolist()]
+        self.pixels, self.points = self.pixels[kept], self.points[kept]
+        return retired
+
+    def see(self, keyframe: int, pixels: Floats) -> None:
+        """Note where a new key frame has them, shape (n, 2)."""
+        self.pixels = pixels
+        for views, (x, y) in zip(self.views, pixels.tolist(), strict=True):
+            views[keyframe] = (x, y)
+
+    def add(self, pixels: Floats, keyframe: int) -> None:
+        """Begin to follow new corners of a key frame, shape (m, 2)."""
+        more = Tracks(pixels, keyframe)
+        self.pixels = np.concatenate([self.pixels, more.pixels])
+        self.points = np.concatenate([self.points, more.points])
+        self.views += more.views
