@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -98,10 +98,10 @@ class Estimator(Node[C], ABC):
     must give, and in `run` calls `publish` with what its tracker says.
     """
 
-    needs: ClassVar[frozenset[str]]
+    needs: frozenset[str] = frozenset()
     """Kinds of image: all must be there; ``grey`` is satisfied by ``rgb`` too."""
-    method: ClassVar[str]
-    scale_free: ClassVar[bool] = False
+    method: str = ""
+    scale_free: bool = False
 
     estimates = Output(PoseEstimate)
     tracking = Output(TrackingEvent)

@@ -25,17 +25,21 @@ from events import (
     PositionSetpoint,
     Quaternion,
     SegmentationImage,
+    TransformStamped,
     Vector3,
     VelocitySetpoint,
 )
 from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
-from sims.cameras import CameraSpec, add_free_camera, pose_to_qpos
+from sims.cameras import CameraSpec, add_free_camera, pose_to_qpos, qvel_between
 from sims.cameras.rig import CameraOutputs, CameraRig
 from sims.frames import from_euler, multiply, normalize, rotate, yaw_of
 from sims.worlds import load_world
 
 Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Count = Annotated[int, msgspec.Meta(ge=1, le=16)]
+
+MOMENT = 1e-3
+"""Seconds over which the camera's velocity is taken."""
 
 
 class FreeCameraConfig(NodeConfig):
@@ -72,6 +76,7 @@ class FreeCamera(Node[FreeCameraConfig]):
     depth = Output(DepthImage)
     segmentation = Output(SegmentationImage)
     camera_poses = Output(PoseStamped)
+    transforms = Output(TransformStamped)
     odometry = Output(Odometry)
 
     async def on_startup(self) -> None:
@@ -99,6 +104,11 @@ class FreeCamera(Node[FreeCameraConfig]):
     def announce(self) -> Iterable[Announcement]:
         """Say what cameras these are."""
         return self._rig.announcements(self.name)
+
+    async def run(self) -> None:
+        """Say once where the cameras sit."""
+        for mounting in self._rig.transforms(self.name):
+            self.transforms.send(mounting)
 
     @on(PoseSetpoint)
     def pose(self, event: PoseSetpoint) -> None:
@@ -136,23 +146,39 @@ class FreeCamera(Node[FreeCameraConfig]):
                 angular_velocity=(0.0, 0.0, 0.0),
             )
         )
+        qpos = pose_to_qpos(self._position, self._orientation)
+        soon = pose_to_qpos(*self._pose_in(MOMENT, tick.stamp))
+        qvel = qvel_between(qpos, soon, MOMENT)
         for camera in self._cameras:
-            self._rig.expose(camera, tick.stamp, pose_to_qpos(self._position, self._orientation))
+            self._rig.expose(camera, tick.stamp, qpos, qvel)
+
+    async def on_shutdown(self) -> None:
+        """Say which pictures are missing."""
+        self._rig.say_what_is_missing()
 
     def _drift(self, stamp: int) -> None:
         """Move with the last velocity since the last update."""
+        self._position, self._orientation = self._drifted((stamp - self._stamp) / 1e9, stamp)
+
+    def _pose_in(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
+        """Return the pose a moment after `stamp`; whoever goes where it is told at once rests."""
+        if self._rows is not None:
+            return pose_at(self._rows, self._rows[0, 0] + stamp / 1e9 + seconds)
+        return self._drifted(seconds, stamp)
+
+    def _drifted(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
+        """Return where the velocity that holds at `stamp`, if one does, takes the camera."""
         order = self._velocity
         if order is None or stamp - order.stamp > self.config.setpoint_timeout * 1e9:
-            return
-        seconds = (stamp - self._stamp) / 1e9
+            return self._position, self._orientation
         velocity = order.velocity
         if order.frame_id == "heading":
             velocity = rotate(from_euler(yaw_of(self._orientation), 0.0, 0.0), velocity)
         x, y, z = self._position
         vx, vy, vz = velocity
-        self._position = (x + vx * seconds, y + vy * seconds, z + vz * seconds)
         turn = from_euler(order.yaw_rate * seconds, 0.0, 0.0)
-        self._orientation = normalize(multiply(turn, self._orientation))
+        place = (x + vx * seconds, y + vy * seconds, z + vz * seconds)
+        return place, normalize(multiply(turn, self._orientation))
 
     def _follow(self, stamp: int) -> bool:
         """Take the pose of this time from the trajectory; False when it is over."""

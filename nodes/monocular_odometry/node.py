@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import cv2
 
@@ -32,9 +32,9 @@ class MonocularOdometryConfig(EstimatorConfig):
 class MonocularOdometry(Estimator[MonocularOdometryConfig]):
     """Where a single camera has gone, in a unit of length of its own."""
 
-    needs: ClassVar[frozenset[str]] = frozenset({"grey"})
-    method: ClassVar[str] = "monocular odometry"
-    scale_free: ClassVar[bool] = True
+    needs = frozenset({"grey"})
+    method = "monocular odometry"
+    scale_free = True
 
     frames = Bundle(Frame, keep="latest")
 

@@ -38,7 +38,7 @@ _AGREES = 6.0
 """Standard deviations up to which a landmark agrees with a pose."""
 _FEW = 120
 """Corners that suffice to tell about where the camera is."""
-_REMEMBERED = 20
+_REMEMBERED = 6
 """Key frames in which a lost camera looks for itself."""
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import ClassVar, Literal
+from typing import Literal
 
 import cv2
 
-from events import Announcement, CameraInfo, EstimatorAnnouncement
+from events import CameraInfo
 from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig, RgbdFrame
 from nodes.visual_odometry.dense import DenseOdometry, DenseSettings
 from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
@@ -33,15 +32,12 @@ class VisualOdometryConfig(EstimatorConfig):
 class VisualOdometry(Estimator[VisualOdometryConfig]):
     """Where a camera with depth has gone, from its pictures alone."""
 
-    needs: ClassVar[frozenset[str]] = frozenset({"grey", "depth"})
+    needs = frozenset({"grey", "depth"})
 
     frames = Bundle(RgbdFrame, keep="latest")
 
-    def announce(self) -> Iterable[Announcement]:
-        """Say that there will be estimates."""
-        yield EstimatorAnnouncement(
-            stamp=0, source=self.name, method=f"RGB-D odometry ({self.config.method})"
-        )
+    def __init__(self) -> None:
+        self.method = f"RGB-D odometry ({self.config.method})"
 
     async def run(self) -> None:
         """Track each picture in a process of its own; skip those that come meanwhile."""

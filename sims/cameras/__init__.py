@@ -1,7 +1,7 @@
 """Cameras: what they are, where they sit, what they see. Pure functions and one renderer."""
 
 from sims.cameras.frame import Frame
-from sims.cameras.free import add_free_camera, pose_to_qpos
+from sims.cameras.free import add_free_camera, pose_to_qpos, qvel_between
 from sims.cameras.graphics import GraphicsError
 from sims.cameras.renderer import CameraRenderer, model_from_bytes, model_to_bytes
 from sims.cameras.spec import (
@@ -27,4 +27,5 @@ __all__ = [
     "optical_frame",
     "optical_in_body",
     "pose_to_qpos",
+    "qvel_between",
 ]

@@ -51,3 +51,18 @@ def pose_to_qpos(position: Vector3, orientation: Quaternion) -> npt.NDArray[np.f
     """
     turn = half_turn_quaternion(normalize(orientation))
     return np.array([*half_turn_vector(position), *turn])
+
+
+def qvel_between(
+    before: npt.NDArray[np.float64], after: npt.NDArray[np.float64], seconds: float
+) -> npt.NDArray[np.float64]:
+    """Return a free camera's velocity, shape (6,), from its qpos at two times.
+
+    Args:
+        before: Shape (7,).
+        after: The same, later.
+        seconds: How much later.
+    """
+    turn = np.empty(3)
+    mujoco.mju_subQuat(turn, after[3:], before[3:])
+    return np.concatenate([after[:3] - before[:3], turn]) / seconds

@@ -8,18 +8,26 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import CameraAnnouncement, DepthImage, Image, PoseStamped, SegmentationImage
+from events import (
+    CameraAnnouncement,
+    DepthImage,
+    Image,
+    PoseStamped,
+    SegmentationImage,
+    TransformStamped,
+)
 from runtime import Node, Worker
 from runtime.sender import Sender
+from sims.cameras.delivery import delay_of
 from sims.cameras.frame import Frame
 from sims.cameras.renderer import CameraRenderer, model_to_bytes
-from sims.cameras.spec import CameraSpec, announcement, optical_frame
+from sims.cameras.spec import CameraSpec, announcement, optical_frame, optical_in_body
 
 
 class CameraOutputs(msgspec.Struct, frozen=True):
@@ -31,12 +39,22 @@ class CameraOutputs(msgspec.Struct, frozen=True):
     poses: Sender[PoseStamped]
 
 
+class _Exposure(NamedTuple):
+    spec: CameraSpec
+    stamp: int
+    due: int
+    """When it is delivered (ns)."""
+    qpos: npt.NDArray[np.float64]
+    qvel: npt.NDArray[np.float64] | None
+
+
 class CameraRig:
     """All cameras of one body.
 
-    Every image is sent `latency` seconds after its exposure with the stamp of the exposure, and
-    before it, with the same stamp, the pose of the camera (source and frame as the image's).
-    A camera with both ``rgb`` and ``grey`` sends the grey ones as ``<source>/grey``.
+    Every image is sent `latency` seconds, and up to `jitter` more, after its exposure with the
+    stamp of the exposure, and before it, with the same stamp, the pose of the camera (source and
+    frame as the image's). A camera with both ``rgb`` and ``grey`` sends the grey ones as
+    ``<source>/grey``.
 
     Args:
         node: The node whose rig it is; a camera's source is ``<node>/<camera>``.
@@ -60,8 +78,12 @@ class CameraRig:
         self._processes = processes
         self._threads = threads
         self._renderer: Worker[CameraRenderer] | None = None
+        self._seed = 0
         self._last: dict[str, asyncio.Future[None]] = {}
+        self._last_due = dict.fromkeys(self._specs, 0)
         self._in_flight = dict.fromkeys(self._specs, 0)
+        self.lost = dict.fromkeys(self._specs, 0)
+        """Exposures not delivered because a camera's settings ask for that."""
         self.skipped = dict.fromkeys(self._specs, 0)
         """Exposures left out because the renderer was behind; never in lockstep."""
 
@@ -73,12 +95,13 @@ class CameraRig:
         """
         if not self._specs:
             return
+        self._seed = int(self._node.rng.integers(1 << 31))
         self._renderer = await self._node.worker(
             CameraRenderer,
             await self._node.offload(model_to_bytes, model),
             tuple(self._specs.values()),
             f"{self._node.name}/",
-            int(self._node.rng.integers(1 << 31)),
+            self._seed,
             self._threads,
             processes=self._processes,
         )
@@ -95,39 +118,78 @@ class CameraRig:
                 stamp=self._node.clock.now(),
             )
 
-    def expose(self, camera: str, stamp: int, qpos: npt.NDArray[np.float64]) -> None:
+    def transforms(self, parent_frame_id: str) -> Iterable[TransformStamped]:
+        """Say where the cameras sit: each one's optical frame in the body's, for the whole run."""
+        name = self._node.name
+        for spec in self._specs.values():
+            position, orientation = optical_in_body(spec)
+            yield TransformStamped(
+                stamp=self._node.clock.now(),
+                source=f"{name}/{spec.name}",
+                frame_id=parent_frame_id,
+                child_frame_id=optical_frame(spec, f"{name}/"),
+                translation=position,
+                rotation=orientation,
+                static=True,
+            )
+
+    def expose(
+        self,
+        camera: str,
+        stamp: int,
+        qpos: npt.NDArray[np.float64],
+        qvel: npt.NDArray[np.float64] | None = None,
+    ) -> None:
         """Have a camera take a picture of a state; the events follow when it is due.
 
         Args:
             camera: Its name.
             stamp: Time of the state (ns).
             qpos: The state, shape (nq,); not copied.
+            qvel: Its velocity, shape (nv,), for motion blur; not copied. None: at rest.
         """
         spec = self._specs[camera]
-        on_their_way = math.ceil(spec.latency * spec.rate) + self._processes
+        delay = delay_of(spec, self._seed, stamp)
+        if delay is None:
+            self.lost[camera] += 1
+            return
+        longest = spec.latency + spec.jitter
+        on_their_way = math.ceil(longest * spec.rate) + self._processes
         if self._in_flight[camera] > on_their_way:  # in real time the renderer may fall behind
             self.skipped[camera] += 1
             return
         self._in_flight[camera] += 1
+        due = max(stamp + round(delay * 1e9), self._last_due[camera])
+        self._last_due[camera] = due
         done = asyncio.get_running_loop().create_future()
         before = self._last.get(camera)
         self._last[camera] = done
-        self._node.start(self._deliver(spec, stamp, qpos, before, done))
+        exposure = _Exposure(spec, stamp, due, qpos, qvel)
+        self._node.start(self._deliver(exposure, before, done))
+
+    def say_what_is_missing(self) -> None:
+        """Log how many exposures were not delivered, and why."""
+        for camera, lost in self.lost.items():
+            if lost:
+                self._node.log.info("%s: %d exposures lost, as its settings ask", camera, lost)
+        for camera, skipped in self.skipped.items():
+            if skipped:
+                self._node.log.warning(
+                    "%s: %d exposures skipped, rendering is too slow", camera, skipped
+                )
 
     async def _deliver(
         self,
-        spec: CameraSpec,
-        stamp: int,
-        qpos: npt.NDArray[np.float64],
+        exposure: _Exposure,
         before: asyncio.Future[None] | None,
         done: asyncio.Future[None],
     ) -> None:
         assert self._renderer is not None
-        due = stamp + round(spec.latency * 1e9)
+        spec, stamp, due, qpos, qvel = exposure
         wait = max(due - self._node.clock.now(), 0) / 1e9
         try:
             frames = await self._renderer.call_for(
-                wait, CameraRenderer.render, stamp, qpos, (spec.name,)
+                wait, CameraRenderer.render, stamp, qpos, (spec.name,), qvel
             )
             if before is not None and not before.done():  # two processes: keep the order
                 await asyncio.wait([before])

@@ -25,7 +25,7 @@ OPTICAL_TO_CAMERA: Quaternion = (0.5, 0.5, 0.5, 0.5)
 
 
 class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An ideal pinhole camera, as it stands in a TOML file.
+    """A pinhole camera, as it stands in a TOML file: ideal, unless its settings spoil it.
 
     Attributes:
         name: Its name, unique on its body.
@@ -37,9 +37,18 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         position: Where it sits on the body, metres in FRD.
         orientation: Roll, pitch, yaw of the camera's body frame in the body's, degrees, applied
             yaw first (Z-Y-X). Positive pitch is nose up: -90 looks straight down.
+        light: Factor on all lights of the scene. The sky, and what shines by itself, stay as they
+            are.
+        exposure: Seconds that the shutter is open, half of them before the stamp: motion blurs
+            the picture. Depth, segmentation and pose are those of the stamp.
+        blur: Standard deviation, in pixels, of the Gaussian that a point becomes out of focus.
         noise: Standard deviation of additive Gaussian noise, grey levels (0 to 255).
         depth_noise: k in sigma = k z²: standard deviation (metres) of the noise at depth z.
         latency: Seconds from exposure to delivery.
+        jitter: The delivery comes up to this much later still, at random; the order is kept.
+        loss: Share of exposures of which nothing is delivered, at random.
+        render_time: Real seconds that drawing a frame takes at least: how does a run stand a
+            scene that is too heavy for the machine?
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1, pattern="^[A-Za-z0-9_]+$")]
@@ -50,9 +59,15 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     rate: Annotated[float, msgspec.Meta(gt=0.0)] = 30.0
     position: Vector3 = (0.15, 0.0, 0.0)
     orientation: Vector3 = (0.0, 0.0, 0.0)
+    light: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
+    exposure: Duration = Duration(0)  # immutable
+    blur: NonNegative = 0.0
     noise: NonNegative = 0.0
     depth_noise: NonNegative = 0.0
-    latency: Duration = Duration(0.04)  # immutable
+    latency: Duration = Duration(0.04)
+    jitter: Duration = Duration(0)
+    loss: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
+    render_time: Duration = Duration(0)
 
     def __post_init__(self) -> None:
         if not self.images or len(set(self.images)) != len(self.images):

@@ -23,6 +23,7 @@ from events import (
     PoseStamped,
     SegmentationImage,
     Setpoint,
+    TransformStamped,
     VehicleAnnouncement,
     VehicleEvent,
 )
@@ -92,6 +93,7 @@ class Multirotor(Node[MultirotorConfig]):
     depth = Output(DepthImage)
     segmentation = Output(SegmentationImage)
     camera_poses = Output(PoseStamped)
+    transforms = Output(TransformStamped)
     imu = Output(Imu)
     odometry = Output(Odometry)
     happenings = Output(VehicleEvent)
@@ -153,6 +155,11 @@ class Multirotor(Node[MultirotorConfig]):
         )
         yield from self._rig.announcements(FRAME)
 
+    async def run(self) -> None:
+        """Say once where the cameras sit."""
+        for mounting in self._rig.transforms(FRAME):
+            self.transforms.send(mounting)
+
     @on(Command)
     def command(self, event: Command) -> None:
         """Obey, or say why not."""
@@ -208,14 +215,12 @@ class Multirotor(Node[MultirotorConfig]):
             )
         )
         for camera in self._to_expose:
-            self._rig.expose(camera, stamp, physics.qpos())
+            self._rig.expose(camera, stamp, physics.qpos(), physics.data.qvel.copy())
         self._to_expose.clear()
 
     async def on_shutdown(self) -> None:
-        """Say what real time did not allow."""
-        for camera, skipped in self._rig.skipped.items():
-            if skipped:
-                self.log.warning("%s: %d exposures skipped, rendering is too slow", camera, skipped)
+        """Say which pictures are missing."""
+        self._rig.say_what_is_missing()
 
     def _trigger(self, camera: str) -> Any:
         def trigger(_: Tick) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -43,8 +43,8 @@ class Said(msgspec.Struct):
 class Scripted(Estimator):
     """Moves a metre along its optical axis with each picture; a dark picture is not enough."""
 
-    needs: ClassVar[frozenset[str]] = frozenset({"grey", "depth"})
-    method: ClassVar[str] = "scripted"
+    needs = frozenset({"grey", "depth"})
+    method = "scripted"
     frames = Bundle(RgbdFrame)
 
     async def run(self) -> None:

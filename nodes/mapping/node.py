@@ -1,0 +1,188 @@
+"""Mapping as a node: which camera it maps, where it takes that camera to be, what it leaves."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    Image,
+    Odometry,
+    PointCloud,
+    PoseStamped,
+)
+from nodes.estimation import WORKER_ENVIRONMENT, pose_matrix
+from nodes.mapping.mapper import Mapper
+from runtime import Bundle, Duration, Node, NodeConfig, Output, on
+
+
+class ColourDepthPose(NamedTuple):
+    """What a camera with depth saw, and where it was: all of one exposure."""
+
+    image: Image
+    depth: DepthImage
+    pose: PoseStamped
+
+
+class MappingConfig(NodeConfig):
+    """Settings of a cloud.
+
+    Attributes:
+        pose: ``matched``: the camera's pose of the depth image's own stamp. ``latest``: the
+            vehicle's newest odometry when the frame is taken up, and the camera's mounting on
+            it: by then the vehicle has moved on, and the cloud smears.
+        voxel: Edge of a voxel, metres: no two points of the cloud share one.
+        stride: Take every n-th pixel of every n-th row.
+        max_depth: Metres; what is farther from the camera is left out.
+        every: Take one frame in this time at most.
+        latency: Seconds on the run's clock that a frame takes; those that come meanwhile are
+            skipped.
+        rate: Clouds to send a second, at most; 0: only the one at the end.
+        file: In the run's folder; empty for ``clouds/<name>.ply``.
+    """
+
+    pose: Literal["matched", "latest"] = "matched"
+    voxel: Annotated[float, msgspec.Meta(ge=0.001)] = 0.05
+    stride: Annotated[int, msgspec.Meta(ge=1)] = 2
+    max_depth: Annotated[float, msgspec.Meta(gt=0)] = 10.0
+    every: Duration = Duration(0.1)  # immutable
+    latency: Duration = Duration(0.03)
+    rate: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    file: str = ""
+
+
+class Mapping(Node[MappingConfig]):
+    """A coloured cloud of the world, from depth images and the true poses."""
+
+    frames = Bundle(ColourDepthPose, keep="latest")
+    clouds = Output(PointCloud)
+
+    def __init__(self) -> None:
+        self._camera: CameraAnnouncement | None = None
+        self._here: Odometry | None = None
+        self._frame_id = "map"
+        self._stamp = 0
+        self._used = 0
+
+    async def on_startup(self) -> None:
+        """Start the process that holds the cloud.
+
+        It has one of its own because a thread would make the loop wait for Python's lock at
+        every step between numpy's functions.
+        """
+        config = self.config
+        self._mapper = await self.worker(
+            Mapper,
+            config.stride,
+            config.voxel,
+            config.max_depth,
+            latency=config.latency,
+            env=WORKER_ENVIRONMENT,
+        )
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Take the first camera that gives depth and colours, or the one that the file names."""
+        if not isinstance(announcement, CameraAnnouncement) or self._camera is not None:
+            return
+        named, gives = self.sources.get("frames"), {*announcement.images}
+        if named not in (None, announcement.source):
+            return
+        if not ("depth" in gives and gives & {"rgb", "grey"}):
+            if named is None:
+                return
+            raise ValueError(
+                f"expected a camera with depth and rgb (or grey) images, found one with "
+                f"{', '.join(announcement.images)}"
+            )
+        self._camera = announcement
+        self.narrow("frames", announcement.source)
+
+    @on(Odometry)
+    def moved(self, event: Odometry) -> None:
+        """Note where the vehicle that carries the camera is."""
+        camera = self._camera
+        if camera is not None and camera.source.startswith(f"{event.source}/"):
+            self._here = event
+
+    async def run(self) -> None:
+        """Add frames to the cloud."""
+        config, camera, mapper = self.config, self._the_camera(), self._mapper
+        every, between = round(config.every * 1e9), 1e9 / config.rate if config.rate else math.inf
+        due, cloud_due = 0, 0.0 if config.rate else math.inf
+        pixels = slice(None, None, config.stride)
+        async for image, depth, pose in self.frames:
+            placed = self._placed(camera, pose)
+            if image.stamp < due or placed is None:
+                continue
+            due = image.stamp + every
+            await mapper.call(
+                Mapper.add,
+                camera.info,
+                np.ascontiguousarray(depth.data[pixels, pixels]),
+                np.ascontiguousarray(image.data[pixels, pixels]),
+                placed,
+            )
+            self._stamp = image.stamp
+            self._used += 1
+            if image.stamp >= cloud_due:
+                cloud_due = image.stamp + between
+                await self._send()
+
+    def _the_camera(self) -> CameraAnnouncement:
+        """Return the camera to map with.
+
+        Raises:
+            FatalError: None gives what is needed.
+        """
+        if self._camera is None:
+            named = self.sources.get("frames")
+            self.log.fatal(
+                "expected a camera with depth and rgb (or grey) images%s, found none announced",
+                f" called {named}" if named else "",
+            )
+        assert self._camera is not None
+        return self._camera
+
+    def _placed(
+        self, camera: CameraAnnouncement, pose: PoseStamped
+    ) -> npt.NDArray[np.float64] | None:
+        """Return where the settings take the camera to be, shape (4, 4); `None` if not known."""
+        if self.config.pose == "matched":
+            self._frame_id = pose.frame_id
+            return pose_matrix(pose.position, pose.orientation)
+        if (here := self._here) is None:
+            return None
+        self._frame_id = here.frame_id
+        vehicle = pose_matrix(here.position, here.orientation)
+        return vehicle @ pose_matrix(camera.position, camera.orientation)
+
+    async def _send(self) -> int:
+        """Send the cloud, and return how many points it has."""
+        points, colours = await self._mapper.call_for(0.0, Mapper.cloud)
+        self.clouds.send(
+            PointCloud(
+                stamp=self._stamp,
+                source=self.name,
+                frame_id=self._frame_id,
+                points=points,
+                colors=colours,
+            )
+        )
+        return len(points)
+
+    async def on_shutdown(self) -> None:
+        """Write the cloud, and send it."""
+        if not self._used:
+            self.log.warning("no frame came: there is no cloud")
+            return
+        if self.out is not None:
+            path = self.out / (self.config.file or f"clouds/{self.name}.ply")
+            await self._mapper.call_for(0.0, Mapper.write, path, self._frame_id)
+        self.log.info("%d points from %d frames", await self._send(), self._used)

@@ -1,0 +1,235 @@
+"""Where frames were in each other, at any time: transforms gathered into a tree, and looked up.
+
+Pure: a node feeds it from its handlers. The frames themselves are defined in `events.geometry`.
+
+    tree.add_odometry(odometry)          # map → base_link
+    tree.add(mounting)                   # base_link → drone/camera_optical, for all times
+    tree.lookup("map", "drone/camera_optical", image.stamp) @ point
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from events import Odometry, PoseStamped, Quaternion, TransformStamped, Vector3
+from nodes.estimation import pose_matrix
+
+Floats = npt.NDArray[np.float64]
+
+_Pose = tuple[Vector3, Quaternion]
+
+HISTORY = 10.0
+"""Seconds."""
+
+
+class TransformError(LookupError):
+    """A transform is not known. The message says what is.
+
+    TransformError
+    ├── UnknownFrameError        nothing was ever said of a frame
+    ├── UnconnectedFramesError   no chain of transforms leads from one frame to the other
+    └── UnknownTimeError         one link of the chain was not told of that time, or no more is
+    """
+
+
+class UnknownFrameError(TransformError):
+    """Nothing was ever said of a frame."""
+
+
+class UnconnectedFramesError(TransformError):
+    """No chain of transforms leads from one frame to the other."""
+
+
+class UnknownTimeError(TransformError):
+    """A transform is known for other times only."""
+
+
+class TransformTree:
+    """Frames, each but the roots in one parent.
+
+    Args:
+        history: Seconds for which a moving transform is remembered, back from the newest.
+
+    Raises:
+        ValueError: `history` is negative.
+    """
+
+    def __init__(self, history: float = HISTORY) -> None:
+        if not history >= 0.0:
+            raise ValueError(f"history: expected 0 s or more, found {history}")
+        self._history = round(history * 1e9) if math.isfinite(history) else None
+        self._edges: dict[str, _Edge] = {}
+        """By child."""
+        self._frames: dict[str, None] = {}
+
+    def add(self, transform: TransformStamped) -> None:
+        """Take in a transform. Those of one edge may come in any order.
+
+        Raises:
+            ValueError: It is no transform, or no tree would be left: the child has another
+                parent, or is an ancestor of its parent, or is fixed to it.
+        """
+        self._add(
+            transform.frame_id,
+            transform.child_frame_id,
+            transform.stamp,
+            (transform.translation, transform.rotation),
+            transform.static,
+        )
+
+    def add_odometry(self, event: Odometry) -> None:
+        """Take in a body's pose, as the transform from the body to its parent.
+
+        Raises:
+            ValueError: As for `add`.
+        """
+        pose = event.position, event.orientation
+        self._add(event.frame_id, event.child_frame_id, event.stamp, pose)
+
+    def add_pose(self, event: PoseStamped, child_frame_id: str) -> None:
+        """Take in a pose, as the transform from a frame to the pose's parent.
+
+        Args:
+            event: The pose.
+            child_frame_id: Whose pose it is, which the event does not say.
+
+        Raises:
+            ValueError: As for `add`.
+        """
+        pose = event.position, event.orientation
+        self._add(event.frame_id, child_frame_id, event.stamp, pose)
+
+    def lookup(self, target: str, source: str, stamp: int) -> Floats:
+        """Return the transform that takes coordinates in `source` to coordinates in `target`.
+
+        That is the pose of `source` in `target`. Between two stamps of a moving transform the
+        position is interpolated linearly and the orientation by slerp (K. Shoemake, "Animating
+        rotation with quaternion curves", 1985); beyond them nothing is guessed.
+
+        Args:
+            target: Frame.
+            source: Frame.
+            stamp: Nanoseconds.
+
+        Returns:
+            float64, shape (4, 4).
+
+        Raises:
+            UnknownFrameError: Nothing was ever said of one of the frames.
+            UnconnectedFramesError: They are in different trees.
+            UnknownTimeError: `stamp` lies outside what is remembered of a transform between them.
+        """
+        up, down = self._line(source), self._line(target)
+        shared = next((frame for frame in up if frame in down), None)
+        if shared is None:
+            raise UnconnectedFramesError(
+                f"{target} from {source}: expected a chain of transforms between them, found "
+                f"{source} under {up[-1]} and {target} under {down[-1]}"
+            )
+        there, here = (self._chain(line, shared, stamp) for line in (down, up))
+        return np.asarray(np.linalg.inv(there) @ here)
+
+    def span(self, child: str) -> tuple[int, int] | None:
+        """Return the first and last stamp (ns) known of a frame in its parent; None: all times.
+
+        Raises:
+            UnknownFrameError: Nothing was said of the frame, or it has no parent.
+        """
+        if child not in self._edges:
+            raise UnknownFrameError(f"expected a frame with a parent, found {child!r}")
+        edge = self._edges[child]
+        return None if edge.static else (edge.stamps[0], edge.stamps[-1])
+
+    def _line(self, frame: str) -> list[str]:
+        """Return a frame and its ancestors."""
+        if frame not in self._frames:
+            known = ", ".join(self._frames) or "none"
+            raise UnknownFrameError(f"expected one of the known frames ({known}), found {frame!r}")
+        line = [frame]
+        while (edge := self._edges.get(line[-1])) is not None:
+            line.append(edge.parent)
+        return line
+
+    def _chain(self, line: list[str], end: str, stamp: int) -> Floats:
+        """Return the first frame of a line in one of its ancestors."""
+        matrix = np.eye(4)
+        for child in line[: line.index(end)]:
+            matrix = self._edges[child].at(stamp) @ matrix
+        return matrix
+
+    def _add(self, parent: str, child: str, stamp: int, pose: _Pose, static: bool = False) -> None:
+        where = f"{parent} → {child}"
+        norm = math.hypot(*pose[1])
+        if not (math.isfinite(sum(pose[0])) and 0.0 < norm < math.inf):
+            raise ValueError(f"{where}: expected finite numbers and a rotation, found {pose}")
+        edge = self._edges.get(child)
+        if edge is None:
+            ancestors = self._line(parent) if parent in self._frames else [parent]
+            if child in ancestors:
+                raise ValueError(f"{where}: expected a tree, but {child} is above {parent}")
+            edge = self._edges[child] = _Edge(parent, child, static)
+            self._frames |= {parent: None, child: None}
+        elif edge.parent != parent:
+            raise ValueError(
+                f"{where}: expected one parent for each frame, but {child} is in {edge.parent}"
+            )
+        elif edge.static != static:
+            kinds = ("moving", "static")
+            raise ValueError(f"{where}: expected a {kinds[edge.static]} transform as before")
+        edge.add(stamp, pose, self._history)
+
+
+class _Edge:
+    """What is known of one frame in its parent."""
+
+    __slots__ = ("child", "parent", "poses", "stamps", "static")
+
+    def __init__(self, parent: str, child: str, static: bool) -> None:
+        self.parent = parent
+        self.child = child
+        self.static = static
+        self.stamps: list[int] = []
+        self.poses: list[_Pose] = []
+
+    def add(self, stamp: int, pose: _Pose, history: int | None) -> None:
+        """Put a pose in its place; one of the same stamp gives way."""
+        stamps, poses = self.stamps, self.poses
+        if self.static:
+            stamps[:], poses[:] = [stamp], [pose]
+            return
+        place = bisect.bisect_left(stamps, stamp)
+        if place < len(stamps) and stamps[place] == stamp:
+            poses[place] = pose
+        else:
+            stamps.insert(place, stamp)
+            poses.insert(place, pose)
+        if history is not None:
+            old = bisect.bisect_left(stamps, stamps[-1] - history)
+            del stamps[:old], poses[:old]
+
+    def at(self, stamp: int) -> Floats:
+        """Return the child's pose in the parent, shape (4, 4)."""
+        stamps = self.stamps
+        if self.static:
+            return pose_matrix(*self.poses[0])
+        after = bisect.bisect_left(stamps, stamp)
+        if after < len(stamps) and stamps[after] == stamp:
+            return pose_matrix(*self.poses[after])
+        if after in (0, len(stamps)):
+            raise UnknownTimeError(
+                f"{self.parent} → {self.child}: expected a stamp from {stamps[0] / 1e9:.9f} s to "
+                f"{stamps[-1] / 1e9:.9f} s, found {stamp / 1e9:.9f} s"
+            )
+        (p, q), (r, s) = self.poses[after - 1 : after + 1]
+        share = (stamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+        first, last = Rotation.from_quat([q, s], scalar_first=True)
+        turn = Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
+        matrix = np.eye(4)
+        matrix[:3, :3] = (first * turn).as_matrix()
+        matrix[:3, 3] = (1.0 - share) * np.array(p) + share * np.array(r)
+        return matrix

@@ -1,0 +1,212 @@
+"""A model in a GL context, as one of its cameras sees it: colour, depth, numbers, pose.
+
+Here everything is ideal. What lens, shutter and sensor do to a picture is put together in
+`sims.cameras.renderer`; contexts are in `sims.cameras.graphics`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from events.base import Quaternion, Vector3
+from sims.cameras.graphics import open_context
+from sims.frames import half_turn_quaternion, half_turn_vector
+
+Floats = npt.NDArray[np.float64]
+Colours = npt.NDArray[np.uint8]
+Depths = npt.NDArray[np.float32]
+Size = tuple[int, int]
+"""Height and width, pixels."""
+
+NEAR = 0.02
+FAR = 20_000.0
+"""Clipping planes, metres. The depth buffer is float32 and reversed (1 at NEAR, 0 at FAR), so
+planes this far apart cost no precision: a step is 10⁻⁷ of the depth, wherever it is."""
+
+RANGE = 500.0
+"""Depth beyond this (metres) is ``inf``. MuJoCo's sky is a cube of half width 0.53 · FAR and writes
+depth; at the rim of the widest view (170°) that is a planar depth of some 600 m."""
+
+LOOK = ".look"
+"""A geom `<name>.look` is the picture of the geom `<name>`, and is numbered as that one is."""
+
+
+class Stage:
+    """Draws the geoms of groups 0 to 2 (MuJoCo's default) of one model.
+
+    Not thread-safe: stay in the thread that made it.
+
+    Args:
+        model: Is changed, to be drawn quickly.
+        width: Of the largest picture, pixels.
+        height: Of the largest picture, pixels.
+        threads: Of the software renderer, if this is the process's first GL context.
+
+    Raises:
+        GraphicsError: No GL here; the message says what to install.
+    """
+
+    def __init__(self, model: Any, width: int, height: int, threads: int) -> None:
+        self._context: Any = None
+        self._gl: Any = None
+        self.model = model
+        self._data = mujoco.MjData(model)
+        _set_quality(model, width, height)
+        self._numbers = _object_numbers(model)
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
+        self._scene.flags[:] = 0
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = 1
+        self._option = _surfaces_only()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._gl = open_context(width, height, threads)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+
+    @property
+    def closed(self) -> bool:
+        """Whether the GL context has been given back."""
+        return self._context is None
+
+    def enter(self) -> None:
+        """Make this stage's context the thread's."""
+        self._gl.make_current()
+
+    def look(self, camera_id: int, qpos: Floats, light: float = 1.0) -> None:
+        """Set the scene up as a camera sees it.
+
+        Args:
+            camera_id: Its number in the model.
+            qpos: The model's generalised positions, shape (nq,).
+            light: Factor on all lights.
+        """
+        model, data = self.model, self._data
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)  # lights that track something ask for it
+        mujoco.mj_camlight(model, data)
+        self._camera.fixedcamid = camera_id
+        category = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, category, self._scene)
+        if light != 1.0:
+            for source in self._scene.lights[: self._scene.nlight]:
+                for part in (source.ambient, source.diffuse, source.specular):
+                    part *= light
+
+    def colour_and_depth(
+        self, size: Size, colour: bool, depth: bool
+    ) -> tuple[Colours | None, Depths | None]:
+        """Draw once and read both, or what of them is wanted; None stands for the other."""
+        rgb = np.empty((*size, 3), np.uint8) if colour else None
+        buffer = np.empty(size, np.float32) if depth else None
+        if rgb is None and buffer is None:
+            return None, None
+        self._draw(size, rgb, buffer)
+        # GL counts rows from the bottom.
+        return (
+            None if rgb is None else np.ascontiguousarray(rgb[::-1]),
+            None if buffer is None else metric_depth(buffer[::-1]),
+        )
+
+    def segmentation(self, size: Size) -> npt.NDArray[np.int32]:
+        """Draw object numbers."""
+        code = np.empty((*size, 3), np.uint8)
+        flags = self._scene.flags
+        saved = flags.copy()
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
+        flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
+        try:
+            self._draw(size, code, None)
+        finally:
+            flags[:] = saved
+        wide = code[::-1].astype(np.int32)
+        index = wide[..., 0] | wide[..., 1] << 8 | wide[..., 2] << 16
+        return np.asarray(self._numbers_in_scene()[index], dtype=np.int32)
+
+    def pose(self, camera_id: int) -> tuple[Vector3, Quaternion]:
+        """Return a camera's optical pose in ``map``, at the state last looked at."""
+        quat = np.empty(4)
+        mujoco.mju_mat2Quat(quat, self._data.cam_xmat[camera_id])
+        if quat[0] < 0.0:
+            quat = -quat  # the same rotation; one sign for it, so that logs read smoothly
+        w, x, y, z = quat.tolist()
+        # The half turn about x on both sides also turns MuJoCo's camera (-z ahead) into optical.
+        position = half_turn_vector(tuple(self._data.cam_xpos[camera_id].tolist()))
+        return position, half_turn_quaternion((w, x, y, z))
+
+    def close(self) -> None:
+        """Give the GL context back. Further calls do nothing."""
+        if self._context is not None:
+            self._gl.make_current()
+            self._context.free()
+            self._context = None
+        if self._gl is not None:
+            self._gl.free()
+            self._gl = None
+
+    def _draw(self, size: Size, rgb: Colours | None, depth: Depths | None) -> None:
+        viewport = mujoco.MjrRect(0, 0, size[1], size[0])
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        mujoco.mjr_readPixels(rgb, depth, viewport, self._context)
+
+    def _numbers_in_scene(self) -> npt.NDArray[np.int32]:
+        """Return the object number of each drawn colour: colour 0 is nothing, n is segid n-1."""
+        table = np.full(self._scene.ngeom + 1, -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                table[geom.segid + 1] = self._numbers[geom.objid]
+        return table
+
+
+def metric_depth(buffer: Depths) -> Depths:
+    """Return planar depth in metres from a reversed depth buffer, shape (h, w).
+
+    With reversed z the projection writes ``d = near (far - z) / (z (far - near))``, which is 1 at
+    the near plane and 0 at the far one; solved for z. Exact to float32.
+    """
+    depth = np.float32(NEAR * FAR) / (buffer * np.float32(FAR - NEAR) + np.float32(NEAR))
+    depth[depth > RANGE] = np.inf
+    return np.asarray(depth, dtype=np.float32)
+
+
+def _set_quality(model: Any, width: int, height: int) -> None:
+    """Leave out what costs much in software, and set the clipping planes."""
+    visual = model.vis
+    visual.quality.offsamples = 0  # multisampling would also blur depth and numbers
+    visual.quality.shadowsize = 0
+    visual.global_.offwidth = max(visual.global_.offwidth, width)
+    visual.global_.offheight = max(visual.global_.offheight, height)
+    visual.map.znear = NEAR / model.stat.extent
+    visual.map.zfar = FAR / model.stat.extent
+
+
+def _surfaces_only() -> Any:
+    """Return the options that show geoms with their textures, and no sites, tendons or arrows."""
+    option = mujoco.MjvOption()
+    option.flags[:] = 0
+    option.flags[mujoco.mjtVisFlag.mjVIS_TEXTURE] = 1
+    option.flags[mujoco.mjtVisFlag.mjVIS_STATIC] = 1
+    option.flags[mujoco.mjtVisFlag.mjVIS_SKIN] = 1
+    option.sitegroup[:] = 0
+    option.tendongroup[:] = 0
+    option.jointgroup[:] = 0
+    option.actuatorgroup[:] = 0
+    return option
+
+
+def _object_numbers(model: Any) -> npt.NDArray[np.int32]:
+    """Return each geom's object number: its own id, or its namesake's if it is a look."""
+    numbers = np.arange(model.ngeom, dtype=np.int32)
+    for geom in range(model.ngeom):
+        name = model.geom(geom).name
+        if name.endswith(LOOK):
+            solid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name.removesuffix(LOOK))
+            if solid >= 0:
+                numbers[geom] = solid
+    return numbers
