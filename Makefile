@@ -6,10 +6,10 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check fix peers bench bench-quick pictures clean
+.PHONY: help setup demo test test-all check fix peers bench bench-quick orbslam3 pictures clean
 
 help:  ## List the targets.
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 setup: $(READY)  ## Make a virtual environment with all that is needed (the others do it too).
 
@@ -23,7 +23,7 @@ $(READY): pyproject.toml
 	@sh tools/system_packages.sh gl $(BIN)/python
 	@touch $@
 
-demo: $(READY)  ## Fly the standard tour and leave its results in runs/tour.
+demo: $(READY)  ## Fly the standard tour, judge visual odometry on it, and report in runs/tour.
 	$(BIN)/python -m runtime run config.toml
 
 test: $(READY)  ## Run the quick tests.
@@ -42,6 +42,11 @@ check: $(READY)  ## Check style and types.
 fix: $(READY)  ## Mend what style checks can mend.
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+orbslam3: $(READY)  ## Install ORB-SLAM3 (GPL) and train its vocabulary from rendered pictures.
+	$(BIN)/python -m pip install --quiet -e '.[orbslam3]'
+	@sh tools/system_packages.sh orbslam3 $(BIN)/python
+	$(BIN)/python -m runtime vocabulary config.toml
 
 peers: $(READY)  ## Install what the benchmarks compare with (PyPI, and Debian's ROS 1 and C++).
 	$(BIN)/python -m pip install --quiet -e '.[peers]'

@@ -7,17 +7,16 @@ from pathlib import Path
 
 import cv2
 
-RUN, DOCS = Path("runs/tour"), Path("docs")
+PLOTS, DOCS = Path("runs/tour/plots"), Path("docs")
 
 
 def main() -> None:
-    """Shrink what the run left."""
-    sheet = cv2.imread(str(RUN / "pictures.png"))
-    if sheet is None:
-        raise SystemExit(f"expected {RUN / 'pictures.png'}, found none: run `make demo` first")
-    small = cv2.resize(sheet, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
-    cv2.imwrite(str(DOCS / "pictures.jpg"), small, [cv2.IMWRITE_JPEG_QUALITY, 88])
-    shutil.copy(RUN / "flight.png", DOCS / "flight.png")
+    """Take over what the report drew."""
+    features = cv2.imread(str(PLOTS / "frames_odometry.png"))
+    if features is None:
+        raise SystemExit(f"expected {PLOTS / 'frames_odometry.png'}: run `make demo` first")
+    cv2.imwrite(str(DOCS / "features.jpg"), features, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    shutil.copy(PLOTS / "trajectories.png", DOCS / "trajectories.png")
 
 
 if __name__ == "__main__":

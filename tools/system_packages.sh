@@ -2,12 +2,14 @@
 # Install system packages that are missing, if we may; otherwise say which.
 # Usage: system_packages.sh gl PYTHON     what MuJoCo renders with, without a screen
 #        system_packages.sh display       what the tests of windows need
+#        system_packages.sh orbslam3 PYTHON  what ORB-SLAM3 is linked with
 #        system_packages.sh peers         what the benchmarks compare with
 set -u
 
 has_what_it_takes() {
     case "$1" in
     gl) "$2" -c 'from sims.cameras.graphics import open_context; open_context(8, 8, 1).free()' ;;
+    orbslam3) "$2" -c "import pyorbslam3" ;;
     display) command -v Xvfb && command -v xdotool ;;
     peers) command -v g++ && dpkg -s libroscpp-dev libnodeletlib-dev python3-rosmaster python3-rospy ;;
     esac >/dev/null 2>&1
@@ -16,6 +18,10 @@ has_what_it_takes() {
 case "$1" in
 gl) packages="libegl1 libgl1 libgl1-mesa-dri" without="MuJoCo cannot render" ;;
 display) packages="xvfb xdotool" without="tests of windows are skipped" ;;
+orbslam3)
+    packages="libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6"
+    without="ORB-SLAM3 cannot be loaded"
+    ;;
 peers)
     packages="g++ libroscpp-dev libnodeletlib-dev python3-rosmaster python3-rospy python3-numpy"
     without="the C++ and ROS 1 peers are not measured"

@@ -18,6 +18,7 @@ from runtime.cli.nodes import nodes
 from runtime.cli.report import report
 from runtime.cli.run import leave_threads_behind, run
 from runtime.cli.sweep import sweep
+from runtime.cli.vocabulary import vocabulary
 from runtime.errors import VisnavError
 
 app = typer.Typer(
@@ -33,6 +34,7 @@ app.command()(nodes)
 app.command()(sweep)
 app.command()(report)
 app.command()(export)
+app.command()(vocabulary)
 app.command(  # the arguments, --help among them, are the benchmarks' own
     context_settings={
         "ignore_unknown_options": True,

@@ -1,0 +1,88 @@
+"""One frame for all of ORB-SLAM3's maps, whose own it turns, scales, leaves and merges.
+
+ORB-SLAM3's world is that of its present map: when it has been lost for long it begins another one
+at identity, when it knows a place again it merges the two, and when the IMU's scale and gravity
+become known it turns the world upright. What stays is the map's first key frame, whose present
+pose is asked of it whenever the world may have changed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+Floats = npt.NDArray[np.float64]
+
+
+class KeyFrame(NamedTuple):
+    """A key frame of the present map.
+
+    Attributes:
+        stamp: Seconds, to a microsecond; tells key frames apart.
+        pose: The camera in ORB-SLAM3's world now, shape (4, 4).
+    """
+
+    stamp: float
+    pose: Floats
+
+
+class Anchor:
+    """Takes poses from ORB-SLAM3's worlds to the frame of the very first key frame.
+
+    A map that begins after tracking was lost is put where the camera was last known to be, since
+    nothing better is known: so the way in between is missing, until the maps are merged.
+    """
+
+    def __init__(self) -> None:
+        self._first: dict[float, Floats] = {}  # first key frames of all maps, in our frame
+        self._from_world = np.eye(4)
+        self._last = np.eye(4)
+
+    @property
+    def maps(self) -> int:
+        """How many maps there have been."""
+        return len(self._first)
+
+    def world_may_have_changed(self, first: KeyFrame, pose: Floats) -> None:
+        """Take note of the first key frame of the map in which the camera is now.
+
+        Args:
+            first: That key frame.
+            pose: The camera now in the same world, shape (4, 4).
+        """
+        if first.stamp not in self._first:
+            begin = np.linalg.inv(pose) @ first.pose  # first key frame in the camera now
+            self._first[first.stamp] = self._last @ begin if self._first else np.eye(4)
+        self._from_world = self._first[first.stamp] @ np.linalg.inv(first.pose)
+
+    def place(self, pose: Floats) -> Floats:
+        """Return a pose in the frame of the very first key frame; remembered as the last one."""
+        self._last = self._from_world @ pose
+        return self._last
+
+    def place_points(self, points: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Return points (n, 3) of the present world in the frame of the very first key frame."""
+        turned = points @ self._from_world[:3, :3].T + self._from_world[:3, 3]
+        return turned.astype(np.float32)
+
+    @property
+    def last(self) -> Floats:
+        """The last pose that was known; identity before the first."""
+        return self._last
+
+
+def first_key_frame(trajectory: Path) -> KeyFrame | None:
+    """Read the first pose of a trajectory in TUM's format; None if it is empty."""
+    with trajectory.open(encoding="ascii") as lines:
+        words = lines.readline().split()
+    if len(words) != 8:
+        return None
+    stamp, *position, qx, qy, qz, qw = map(float, words)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat((qx, qy, qz, qw)).as_matrix()
+    pose[:3, 3] = position
+    return KeyFrame(stamp, pose)

@@ -1,0 +1,274 @@
+"""ORB-SLAM3 itself, by `pyorbslam3`. For a worker's process: it is GPL, and it may end or crash it.
+
+    slam = await self.worker(OrbSlam3Process, settings, vocabulary, latency=…)
+    tracked = await slam.call(OrbSlam3Process.track, stamp, image, depth)
+
+The library is imported when an object is made, so that others may import this module for its
+names. It prints much, to standard output, which a worker gathers.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import KDTree
+
+from nodes.orb_slam3.anchor import Anchor, first_key_frame
+from nodes.orb_slam3.settings import Settings
+from nodes.orb_slam3.vocabulary_file import check_vocabulary
+from runtime.errors import MissingDependencyError
+
+Floats = npt.NDArray[np.float64]
+Points = npt.NDArray[np.float32]
+
+INSTALL = (
+    "pip install 'visnav-runtime[orbslam3]', and on Debian and Ubuntu "
+    "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6"
+)
+
+_NO_POINTS = np.empty((0, 2), np.float32)
+
+_CELL = 0.05
+"""Metres."""
+
+_REACH = 6.0
+"""Pixels between a map point, projected, and the corner that it was found at; a corner high in
+the pyramid is known to a few pixels only."""
+
+
+class Tracked(msgspec.Struct, frozen=True, eq=False):
+    """What ORB-SLAM3 says of one image.
+
+    Attributes:
+        pose: The optical camera now, in the optical camera at the first key frame, shape (4, 4);
+            metres, or, without depth and IMU, its own unit.
+        lost: Whether the pose is not known; `pose` is then the last one that was.
+        reason: Why it is lost, or what happened to the map.
+        state: ORB-SLAM3's own word: OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …
+        points: float32 pixels (column, row) of all corners, without distortion, shape (n, 2).
+        inliers: bool, shape (n,): those that agree with the map.
+        matches: How many map points were found in the image.
+        map_points: How many points `OrbSlam3Process.map_points` has by now.
+        began: Stamp of the first key frame (ns); -1 before there is one.
+        maps: How many maps it has begun. What lies between two is guessed: see `Anchor`.
+    """
+
+    pose: Floats
+    lost: bool
+    reason: str = ""
+    state: str = ""
+    points: Points = _NO_POINTS
+    inliers: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
+    matches: int = 0
+    map_points: int = 0
+    began: int = -1
+    maps: int = 0
+
+
+class OrbSlam3Process:
+    """ORB-SLAM3 with its threads: one of them tracks in `track`, the others map meanwhile.
+
+    Args:
+        settings: Mode, settings file, size of images.
+        vocabulary: In DBoW2's text format, its name ending with ``.txt``.
+        patience: Real seconds that `track` leaves the other threads, at most, to be done with the
+            image before. Without, images that come faster than a camera takes them make the map
+            poorer.
+
+    Raises:
+        MissingDependencyError: `pyorbslam3` cannot be imported.
+        ValueError: The vocabulary is none.
+    """
+
+    def __init__(self, settings: Settings, vocabulary: Path, *, patience: float = 0.0) -> None:
+        try:
+            import pyorbslam3
+        except ImportError as error:  # also where one of the system's libraries is missing
+            raise MissingDependencyError(
+                f"ORB-SLAM3 needs pyorbslam3 ({error}): {INSTALL}"
+            ) from error
+        check_vocabulary(vocabulary)
+        self._settings = settings
+        self._patience = patience
+        self._left_alone = time.monotonic()
+        self._anchor = Anchor()
+        self._was_ok = False
+        self._stamps: list[int] = []
+        self._began = -1
+        self._cloud: dict[tuple[int, ...], tuple[float, ...]] = {}
+        self._folder = tempfile.TemporaryDirectory(prefix="orb_slam3_")
+        file = Path(self._folder.name) / "settings.yaml"
+        file.write_text(settings.text, encoding="ascii")
+        self._slam: Any = pyorbslam3.Slam(
+            vocabulary, file, getattr(pyorbslam3.Sensor, _SENSORS[settings.mode]), use_viewer=False
+        )
+
+    def track(
+        self,
+        stamp: int,
+        image: npt.NDArray[np.uint8],
+        depth: npt.NDArray[np.float32] | None = None,
+        imu: Floats | None = None,
+    ) -> Tracked:
+        """Follow the camera by one image.
+
+        Args:
+            stamp: Of the exposure (ns); later than the last one.
+            image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
+            depth: Metres along the optical axis, shape (h, w); ``inf`` where there is none. For
+                modes with depth only.
+            imu: For inertial modes: what was measured since the last image up to this one, in
+                order, shape (n, 7): stamp (ns), angular velocity (rad/s), specific force (m/s²).
+
+        Raises:
+            ValueError: An array is missing, superfluous, or of the wrong shape.
+        """
+        self._check(image, depth, imu)
+        self._stamps.append(stamp)
+        _wait_for_other_threads(self._left_alone + self._patience)
+        chunk = None if imu is None else imu * (1e-9, 1, 1, 1, 1, 1, 1)
+        if depth is None:
+            result = self._slam.track_monocular(image, stamp * 1e-9, chunk)
+        else:
+            # 0 is how ORB-SLAM3 knows that there is no depth.
+            known = np.where(np.isfinite(depth), depth, np.float32(0))
+            result = self._slam.track_rgbd(image, known, stamp * 1e-9, chunk)
+        tracked = self._tracked(result)
+        self._left_alone = time.monotonic()
+        return tracked
+
+    def map_points(self) -> Points:
+        """Return the points of the map seen so far, shape (n, 3), one in each 5 cm cell.
+
+        In the optical camera at the first key frame, as the poses. The library only tells which
+        points an image shows: this is the last that was heard of each place.
+        """
+        return np.array(list(self._cloud.values()), np.float32).reshape(-1, 3)
+
+    def close(self) -> None:
+        """End ORB-SLAM3's threads."""
+        if not self._slam.is_shutdown():
+            self._slam.shutdown()
+        self._folder.cleanup()
+
+    def _tracked(self, result: Any) -> Tracked:
+        state = result.state.name
+        valid = result.pose_valid and (state != "RECENTLY_LOST" or self._slam.imu_initialized())
+        corners = self._slam.tracked_keypoints()
+        inliers = np.zeros(len(corners), np.bool_)
+        reason = _REASONS.get(state, state)
+        if valid:
+            pose = np.asarray(result.pose_wc, np.float64)
+            before = self._anchor.maps
+            if not self._was_ok or self._slam.map_changed() or self._slam.inertial:
+                self._look_at_the_map(pose)
+            self._anchor.place(pose)
+            reason = ""
+            if self._anchor.maps > before > 0:
+                reason = "a new map, put where the camera was last known to be"
+            points = self._slam.tracked_map_points()
+            if len(points) and len(corners):
+                inliers[self._corners_of(points, pose, corners)] = True
+                self._gather(points)
+        self._was_ok = valid
+        return Tracked(
+            pose=self._anchor.last,
+            lost=not valid,
+            reason=reason,
+            state=state,
+            points=corners,
+            inliers=inliers,
+            matches=int(result.num_tracked_points) if valid else 0,
+            map_points=len(self._cloud),
+            began=self._began,
+            maps=self._anchor.maps,
+        )
+
+    def _look_at_the_map(self, pose: Floats) -> None:
+        """Ask for the first key frame of the present map, which only its trajectory tells."""
+        file = Path(self._folder.name) / "key_frames.tum"
+        self._slam.save_keyframe_trajectory_tum(str(file))
+        first = first_key_frame(file)
+        if first is not None:
+            self._anchor.world_may_have_changed(first, pose)
+            if self._began < 0:
+                nearest = np.abs(np.array(self._stamps) - first.stamp * 1e9).argmin()
+                self._began = self._stamps[nearest]
+
+    def _corners_of(self, points: Points, pose: Floats, corners: Points) -> npt.NDArray[np.int64]:
+        """Return which corners map points (n, 3) of ORB-SLAM3's world were found at."""
+        seen = (points - pose[:3, 3]) @ pose[:3, :3]
+        ahead = seen[seen[:, 2] > 0]
+        fx, fy, cx, cy = self._settings.intrinsics
+        pixels = ahead[:, :2] / ahead[:, 2:] * (fx, fy) + (cx, cy)
+        distance, corner = KDTree(corners).query(pixels)
+        return np.asarray(corner[distance < _REACH], np.int64)
+
+    def _gather(self, points: Points) -> None:
+        """Keep map points of ORB-SLAM3's world."""
+        placed = self._anchor.place_points(points)
+        cells = np.floor(placed / _CELL).astype(np.int64).tolist()
+        self._cloud.update(zip(map(tuple, cells), map(tuple, placed.tolist()), strict=True))
+
+    def _check(
+        self,
+        image: npt.NDArray[np.uint8],
+        depth: npt.NDArray[np.float32] | None,
+        imu: Floats | None,
+    ) -> None:
+        """Refuse what ORB-SLAM3 would end the process for, or not notice."""
+        mode, size = self._settings.mode, (self._settings.height, self._settings.width)
+        for name, array, wanted in (
+            ("depth", depth, "rgbd" in mode),
+            ("imu", imu, "inertial" in mode),
+        ):
+            if (array is not None) != wanted:
+                expected, found = ("an array", "none") if wanted else ("none", "an array")
+                raise ValueError(f"{name}: mode {mode!r} expects {expected}, found {found}")
+        if image.shape[:2] != size or image.shape[2:] not in {(), (3,)}:
+            raise ValueError(
+                f"image: expected shape {size} or {(*size, 3)}, as the camera announced, "
+                f"found {image.shape}"
+            )
+        if depth is not None and depth.shape != size:
+            raise ValueError(f"depth: expected shape {size}, found {depth.shape}")
+        if imu is not None and (imu.ndim != 2 or imu.shape[1] != 7):
+            raise ValueError(f"imu: expected shape (n, 7), found {imu.shape}")
+
+
+def _wait_for_other_threads(until: float) -> None:
+    """Return when this process computes next to nothing, or at a time (`time.monotonic`).
+
+    ORB-SLAM3's threads look for work every 3 and 5 ms, and do not tell when they have none.
+    """
+    while time.monotonic() + _QUIET < until:
+        before = time.process_time()
+        time.sleep(_QUIET)
+        if time.process_time() - before < _QUIET / 8:
+            return
+
+
+_QUIET = 0.004
+"""Seconds."""
+
+_SENSORS = {
+    "rgbd": "RGBD",
+    "monocular": "MONOCULAR",
+    "rgbd_inertial": "IMU_RGBD",
+    "monocular_inertial": "IMU_MONOCULAR",
+}
+
+_REASONS = {
+    "SYSTEM_NOT_READY": "not ready yet",
+    "NO_IMAGES_YET": "a new map has not begun yet",
+    "NOT_INITIALIZED": "the map has not begun yet",
+    "RECENTLY_LOST": "too few matches with the map; looking for a place seen before",
+    "LOST": "too few matches with the map",
+}
+"""What ORB-SLAM3's states mean to whoever reads a log."""

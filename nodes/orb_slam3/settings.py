@@ -1,0 +1,178 @@
+"""ORB-SLAM3's settings, made from what cameras and IMUs announce: nobody keeps a second file.
+
+The names and their meaning are those of ORB-SLAM3 1.0's ``Settings.cc``, file version 1.0. Every
+parameter that it requires is given, since it ends the process where one is missing.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from events import CameraAnnouncement, ImuAnnouncement
+
+Mode = Literal["rgbd", "monocular", "rgbd_inertial", "monocular_inertial"]
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Threshold = Annotated[int, msgspec.Meta(ge=1, le=255)]
+
+
+class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What ORB-SLAM3 can be told besides the calibration.
+
+    Attributes:
+        features: Corners sought in an image. With depth, it begins at the first image in which it
+            finds more than 500.
+        scale_factor: Between two levels of the image pyramid.
+        levels: Of the pyramid.
+        fast_threshold: Grey levels by which a corner differs from its surroundings.
+        min_fast_threshold: The same, for regions in which there is none by `fast_threshold`.
+        baseline: Metres between the two cameras of which ORB-SLAM3 takes an RGB-D camera for one.
+            It weighs depth: the variance of an error in it is ``(z² / (baseline fx))²`` square
+            metres per square pixel.
+        close: Metres; a point nearer than this is put into the map from its depth at once, a
+            farther one when it has been seen from two sides. Any depth that is there is used.
+        loop_closing: Whether places seen before correct the map.
+    """
+
+    features: Annotated[int, msgspec.Meta(ge=100, le=10_000)] = 1000
+    scale_factor: Annotated[float, msgspec.Meta(gt=1, le=2)] = 1.2
+    levels: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8
+    fast_threshold: Threshold = 20
+    min_fast_threshold: Threshold = 7
+    baseline: Positive = 0.1
+    close: Positive = 4.0
+    loop_closing: bool = True
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True):
+    """All that an ORB-SLAM3 process must know to begin.
+
+    Attributes:
+        mode: Which sensors it uses.
+        text: The settings file, as YAML.
+        width: Of the images, pixels.
+        height: Of the images, pixels.
+        intrinsics: fx, fy, cx, cy, in pixels.
+    """
+
+    mode: Mode
+    text: str
+    width: int
+    height: int
+    intrinsics: tuple[float, float, float, float]
+
+
+def make_settings(
+    mode: Mode,
+    camera: CameraAnnouncement,
+    imu: ImuAnnouncement | None = None,
+    orb: OrbSettings | None = None,
+) -> Settings:
+    """Return the settings for an announced camera, and an IMU if the mode is inertial.
+
+    Raises:
+        ValueError: The mode needs something that was not announced, or an IMU in a frame other
+            than the one that the camera is mounted on.
+    """
+    orb = orb or OrbSettings()
+    info = camera.info
+    if "rgbd" in mode and "depth" not in camera.images:
+        raise ValueError(
+            f"mode {mode!r}: expected {camera.source} to give depth, "
+            f"found {', '.join(camera.images)}"
+        )
+    lines = [
+        "%YAML:1.0",
+        'File.version: "1.0"',
+        'Camera.type: "PinHole"',
+        f"Camera1.fx: {_real(info.fx)}",
+        f"Camera1.fy: {_real(info.fy)}",
+        f"Camera1.cx: {_real(info.cx)}",
+        f"Camera1.cy: {_real(info.cy)}",
+    ]
+    if any(info.distortion):  # without: it need not undistort what has none
+        names = ("k1", "k2", "p1", "p2", "k3")
+        lines += [
+            f"Camera1.{name}: {_real(value)}"
+            for name, value in zip(names, info.distortion, strict=True)
+        ]
+    lines += [
+        f"Camera.width: {info.width}",
+        f"Camera.height: {info.height}",
+        f"Camera.fps: {max(round(camera.rate), 1)}",
+        "Camera.RGB: 1",
+        f"ORBextractor.nFeatures: {orb.features}",
+        f"ORBextractor.scaleFactor: {_real(orb.scale_factor)}",
+        f"ORBextractor.nLevels: {orb.levels}",
+        f"ORBextractor.iniThFAST: {orb.fast_threshold}",
+        f"ORBextractor.minThFAST: {min(orb.min_fast_threshold, orb.fast_threshold)}",
+        f"loopClosing: {int(orb.loop_closing)}",
+        *_VIEWER,
+    ]
+    if "rgbd" in mode:
+        lines += [
+            f"Stereo.b: {_real(orb.baseline)}",
+            f"Stereo.ThDepth: {_real(orb.close / orb.baseline)}",  # counted in baselines
+            "RGBD.DepthMapFactor: 1.0",  # our depth is in metres
+        ]
+    if "inertial" in mode:
+        lines += _inertial(mode, camera, imu)
+    return Settings(
+        mode=mode,
+        text="\n".join(lines) + "\n",
+        width=info.width,
+        height=info.height,
+        intrinsics=(info.fx, info.fy, info.cx, info.cy),
+    )
+
+
+def _inertial(mode: Mode, camera: CameraAnnouncement, imu: ImuAnnouncement | None) -> list[str]:
+    if imu is None:
+        raise ValueError(f"mode {mode!r}: expected an IMU beside {camera.source}, found none")
+    if imu.frame_id != camera.parent_frame_id:
+        raise ValueError(
+            f"mode {mode!r}: expected an IMU in {camera.parent_frame_id}, on which "
+            f"{camera.source} is mounted, found {imu.source} in {imu.frame_id}"
+        )
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(camera.orientation, scalar_first=True).as_matrix()
+    pose[:3, 3] = camera.position
+    return [
+        # A noise of 0 would make its covariances singular.
+        f"IMU.NoiseGyro: {_real(max(imu.gyroscope_noise_density, 1e-5))}",
+        f"IMU.NoiseAcc: {_real(max(imu.accelerometer_noise_density, 1e-4))}",
+        f"IMU.GyroWalk: {_real(max(imu.gyroscope_random_walk, 1e-7))}",
+        f"IMU.AccWalk: {_real(max(imu.accelerometer_random_walk, 1e-6))}",
+        f"IMU.Frequency: {_real(imu.rate)}",
+        "IMU.T_b_c1: !!opencv-matrix",
+        "   rows: 4",
+        "   cols: 4",
+        "   dt: f",
+        f"   data: [{', '.join(_real(value) for value in pose.ravel().tolist())}]",
+    ]
+
+
+def _real(value: float) -> str:
+    """Return a number that OpenCV's YAML reader takes for a real one: with a point."""
+    text = f"{value:.9g}"
+    mantissa, e, exponent = text.partition("e")
+    return text if "." in mantissa else f"{mantissa}.0{e}{exponent}"
+
+
+_VIEWER = (
+    "Viewer.KeyFrameSize: 0.05",
+    "Viewer.KeyFrameLineWidth: 1.0",
+    "Viewer.GraphLineWidth: 0.9",
+    "Viewer.PointSize: 2.0",
+    "Viewer.CameraSize: 0.08",
+    "Viewer.CameraLineWidth: 3.0",
+    "Viewer.ViewpointX: 0.0",
+    "Viewer.ViewpointY: -0.7",
+    "Viewer.ViewpointZ: -1.8",
+    "Viewer.ViewpointF: 500.0",
+)
+"""Required, although the viewer stays off."""

@@ -1,0 +1,235 @@
+"""The bag of visual words that ORB-SLAM3 recognises places with: training, file, and its place.
+
+A tree of binary descriptors, made by k-majority (Grana et al., *A fast approach for integrating
+ORB descriptors in the bag of words model*, 2013): k-means with Hamming distance, where a centre's
+bit is what most of its members have. The file is DBoW2's text format, as in ORB-SLAM3's own
+``ORBvoc.txt``: a line ``k L scoring weighting``, then one line a node after its parent's line,
+``parent leaf d0 … d31 weight``, the root not being written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+Bytes = npt.NDArray[np.uint8]
+Words = npt.NDArray[np.uint64]
+Floats = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int64]
+
+_BYTES = 32
+"""Of one ORB descriptor."""
+
+_SCORING, _WEIGHTING = 0, 0
+"""L1 norm and tf-idf, as ORB-SLAM3 expects (DBoW2's ScoringType and WeightingType)."""
+
+
+class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
+    """What a vocabulary is like.
+
+    Attributes:
+        branching: Children of a node, at most.
+        depth: Levels below the root, at most: up to ``branching ** depth`` words.
+        index_level: Level of the nodes by which ORB-SLAM3 sorts features before it compares them
+            one by one; 0 compares all with all. More is quicker and finds fewer matches.
+        seed: Of the choice of the first centres.
+    """
+
+    branching: Annotated[int, msgspec.Meta(ge=2, le=20)] = 10
+    depth: Annotated[int, msgspec.Meta(ge=1, le=6)] = 4
+    index_level: Annotated[int, msgspec.Meta(ge=0, le=2)] = 1
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+
+    def header_depth(self) -> int:
+        """Return L as the file states it.
+
+        ORB-SLAM3 takes the nodes four levels above L for its index (``transform(…, 4)``), however
+        deep the tree is.
+        """
+        return max(self.index_level + 4, self.depth)
+
+
+class Vocabulary(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """A tree, its nodes in an order in which a parent comes before its children.
+
+    Attributes:
+        branching: k of the file.
+        depth: L of the file.
+        parents: int64 (n,): parent's index; -1 for the root, which is node 0.
+        leaves: bool (n,): True for a word.
+        descriptors: uint8 (n, 32).
+        weights: float64 (n,): a word's inverse document frequency; 0 for other nodes.
+    """
+
+    branching: int
+    depth: int
+    parents: Integers
+    leaves: npt.NDArray[np.bool_]
+    descriptors: Bytes
+    weights: npt.NDArray[np.float64]
+
+    def words(self, descriptors: Bytes) -> Integers:
+        """Return the word of each descriptor: int64 (m,), indices of leaves.
+
+        From the root down, to the nearest child each time, as DBoW2 does.
+        """
+        queries, nodes = _pack(descriptors), _pack(self.descriptors)
+        children: list[list[int]] = [[] for _ in self.parents]
+        for child, parent in enumerate(self.parents[1:].tolist(), 1):
+            children[parent].append(child)
+        found = np.zeros(len(queries), np.int64)
+        waiting = np.arange(len(queries))
+        while len(waiting):
+            for node in np.unique(found[waiting]):
+                here = waiting[found[waiting] == node]
+                below = np.array(children[node])
+                nearest = _distances(queries[here, None], nodes[below]).argmin(1)
+                found[here] = below[nearest]
+            waiting = waiting[~self.leaves[found[waiting]]]
+        return found
+
+
+def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary:
+    """Make a vocabulary from the descriptors of images.
+
+    Args:
+        images: uint8 (n, 32) each: the descriptors of one image.
+        shape: What it shall be like.
+
+    Raises:
+        ValueError: There are no descriptors, or they are not of ORB's size.
+    """
+    shape = shape or TreeShape()
+    for found in images:
+        if found.dtype != np.uint8 or found.ndim != 2 or found.shape[1] != _BYTES:
+            raise ValueError(
+                f"expected descriptors as uint8 of shape (n, {_BYTES}), "
+                f"found {found.dtype} of shape {found.shape}"
+            )
+    total = sum(len(found) for found in images)
+    if total < shape.branching:
+        raise ValueError(
+            f"expected at least {shape.branching} descriptors to train a vocabulary from, "
+            f"found {total} in {len(images)} images"
+        )
+    descriptors = np.concatenate(images)
+    image_of = np.repeat(np.arange(len(images)), [len(found) for found in images])
+    parents, centres, node_of = _grow(_pack(descriptors), shape)
+    leaves = np.ones(len(parents), bool)
+    leaves[parents[1:]] = False
+    # One more than there are images: a word that all of them show keeps a weight above 0, below
+    # which DBoW2 would leave its features out, also of ORB-SLAM3's index for matching.
+    shown = np.unique(node_of * len(images) + image_of) // len(images)
+    counts = np.bincount(shown, minlength=len(parents))
+    weights = np.where(leaves, np.log((len(images) + 1) / np.maximum(counts, 1)), 0.0)
+    return Vocabulary(
+        branching=shape.branching,
+        depth=shape.header_depth(),
+        parents=parents,
+        leaves=leaves,
+        descriptors=centres.view(np.uint8),
+        weights=weights,
+    )
+
+
+def _grow(descriptors: Words, shape: TreeShape) -> tuple[Integers, Words, Integers]:
+    """Split all descriptors again and again, one level of the tree at a time.
+
+    Returns:
+        Parents (n,), centres (n, 4), and each descriptor's leaf.
+    """
+    rng = np.random.default_rng(shape.seed)
+    bits = np.unpackbits(descriptors.view(np.uint8), axis=1).astype(np.float32)
+    leaf_of = np.zeros(len(descriptors), np.int64)
+    parents = [np.array([-1])]
+    centres = [np.zeros((1, descriptors.shape[1]), np.uint64)]
+    count = 1
+    members = np.arange(len(descriptors))
+    for _ in range(shape.depth):
+        nodes, group = np.unique(leaf_of[members], return_inverse=True)
+        cluster, found = _split(descriptors[members], bits[members], group, shape.branching, rng)
+        used, child = np.unique(cluster, return_inverse=True)
+        parents.append(nodes[used // shape.branching])
+        centres.append(found[used])
+        leaf_of[members] = count + child
+        count += len(used)
+        # One descriptor, or many alike, cannot be split any further.
+        alike = (descriptors[members] == found[cluster]).all(1)
+        mixed = np.bincount(child, ~alike) > 0
+        members = members[mixed[child]]
+        members = members[np.argsort(leaf_of[members], kind="stable")]
+        if not len(members):
+            break
+    return np.concatenate(parents), np.concatenate(centres), leaf_of
+
+
+def _split(
+    descriptors: Words, bits: Floats, group: Integers, k: int, rng: np.random.Generator
+) -> tuple[Integers, Words]:
+    """Split each group into at most k clusters.
+
+    Args:
+        descriptors: uint64 (n, 4).
+        bits: The same, a number each, float32 (n, 256).
+        group: int64 (n,), ascending from 0 without gaps.
+        k: Clusters of a group.
+        rng: For the first centres.
+
+    Returns:
+        The cluster of each descriptor, ``group * k + j``; centres, uint64 (groups * k, 4).
+    """
+    starts = np.flatnonzero(np.diff(group, prepend=-1))
+    centres = np.zeros((len(starts), k, descriptors.shape[1]), np.uint64)
+    distances = np.full((len(group), k), _NONE, np.int64)
+    # k-means++ (Arthur & Vassilvitskii 2007) in all groups at once. The least of exponential
+    # variates divided by weights picks an item with a probability proportional to its weight.
+    weight = np.ones(len(group))
+    for j in range(k):
+        with np.errstate(divide="ignore"):
+            draw = rng.exponential(size=len(group)) / weight
+        least = np.minimum.reduceat(draw, starts)
+        picked = np.flatnonzero((draw == least[group]) & np.isfinite(draw))
+        centres[group[picked], j] = descriptors[picked]
+        open_ = np.isfinite(least)[group]
+        distances[open_, j] = _distances(descriptors[open_], centres[group[open_], j])
+        weight = distances.min(1).astype(np.float64) ** 2
+    used = distances[starts] != _NONE
+    cluster = group * k + distances.argmin(1)
+    for _ in range(_ITERATIONS):
+        sizes = np.bincount(cluster, minlength=len(starts) * k)
+        member = sparse.csr_array(
+            (np.ones(len(cluster), np.float32), (cluster, np.arange(len(cluster)))),
+            shape=(len(sizes), len(cluster)),
+        )
+        majority = np.packbits(2 * (member @ bits) >= sizes[:, None], axis=1)
+        centres[sizes.reshape(-1, k) > 0] = _pack(majority)[sizes > 0]
+        for j in range(k):
+            distances[:, j] = _distances(descriptors, centres[group, j])
+        distances[~used[group]] = _NONE
+        before, cluster = cluster, group * k + distances.argmin(1)
+        if np.array_equal(before, cluster):
+            break
+    return cluster, centres.reshape(len(starts) * k, -1)
+
+
+def _pack(descriptors: Bytes) -> Words:
+    """Return descriptors as uint64 (n, 4), for quick counting of bits."""
+    return np.ascontiguousarray(descriptors).view(np.uint64)
+
+
+def _distances(a: Words, b: Words) -> Integers:
+    """Return the Hamming distances along the last axis of two arrays that broadcast."""
+    distances: Integers = np.bitwise_count(a ^ b).sum(-1, dtype=np.int64)
+    return distances
+
+
+_NONE = 999
+"""Distance from a centre that is not there; more than any two descriptors have."""
+
+_ITERATIONS = 10
+"""Of moving the centres, at most; later ones change next to nothing."""

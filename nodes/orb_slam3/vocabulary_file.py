@@ -1,0 +1,149 @@
+"""Vocabularies as files: DBoW2's text format, checks, and where the project keeps its own."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from nodes.orb_slam3.vocabulary import TreeShape, Vocabulary
+
+_SCORING, _WEIGHTING = 0, 0
+"""L1 norm and tf-idf, which ORB-SLAM3 expects (DBoW2's ScoringType and WeightingType)."""
+
+_FIELDS = 2 + 32 + 1
+"""Numbers on a node's line: parent, leaf or not, descriptor, weight."""
+
+
+def cached_vocabulary(shape: TreeShape, cache_dir: Path | None = None) -> Path:
+    """Return where the vocabulary of this shape is kept, whether it is there or not.
+
+    Args:
+        shape: What it is like; part of the file's name.
+        cache_dir: ``$XDG_CACHE_HOME``, or ``~/.cache``, if not given.
+    """
+    base = cache_dir or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    key = hashlib.sha256(msgspec.json.encode(shape)).hexdigest()[:12]
+    return base / "visnav-runtime" / f"orb-vocabulary-{key}.txt"
+
+
+def find_vocabulary(setting: str) -> Path:
+    """Return the vocabulary that a node's setting names: a file, or, if empty, the cached one.
+
+    Raises:
+        ValueError: There is none, or it is not in DBoW2's text format.
+    """
+    path = Path(setting).expanduser() if setting else cached_vocabulary(TreeShape())
+    if not setting and not path.exists():
+        raise ValueError(
+            f"expected a vocabulary at {path}, found none; to make one from what the cameras of "
+            "a configuration see: python -m runtime vocabulary config.toml"
+        )
+    check_vocabulary(path)
+    return path
+
+
+def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
+    """Write a file in DBoW2's text format, whole or not at all; its folder is made if missing."""
+    header = f"{vocabulary.branching} {vocabulary.depth} {_SCORING} {_WEIGHTING}"
+    numbers = np.column_stack([vocabulary.parents, vocabulary.leaves, vocabulary.descriptors])
+    lines = (
+        f"{' '.join(map(str, row))} {weight:.9g}"
+        for row, weight in zip(numbers[1:].tolist(), vocabulary.weights[1:].tolist(), strict=True)
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    # No newline at the end: DBoW2 would read a node from the empty line after it.
+    part.write_text("\n".join([header, *lines]), encoding="ascii")
+    part.replace(path)
+
+
+def read_vocabulary(path: Path) -> Vocabulary:
+    """Read a file in DBoW2's text format.
+
+    Raises:
+        ValueError: It is missing or not in this format; the message says where.
+    """
+    branching, depth = check_vocabulary(path)
+    lines = path.read_text(encoding="ascii").splitlines()[1:]
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 2):
+        row = _numbers(path, number, line)
+        parent, leaf = row[:2]
+        if not 0 <= parent < number - 1 or (parent > 0 and rows[int(parent) - 1][1]):
+            raise ValueError(
+                f"{path}: line {number}: expected a parent that stands above and is no leaf, "
+                f"found {parent:g}"
+            )
+        if leaf not in {0, 1} or not all(0 <= value <= 255 for value in row[2:-1]):
+            raise ValueError(
+                f"{path}: line {number}: expected parent, 0 or 1, 32 bytes, weight, "
+                f"found {line[:60]!r}"
+            )
+        rows.append(row)
+    table = np.array([[-1, 0, *[0] * 32, 0], *rows])
+    return Vocabulary(
+        branching=branching,
+        depth=depth,
+        parents=table[:, 0].astype(np.int64),
+        leaves=table[:, 1].astype(bool),
+        descriptors=table[:, 2:-1].astype(np.uint8),
+        weights=table[:, -1].copy(),
+    )
+
+
+def check_vocabulary(path: Path) -> tuple[int, int]:
+    """Look whether a file can be a vocabulary, quickly also if it is large.
+
+    ORB-SLAM3 ends its process, or reads nonsense, if it is not.
+
+    Returns:
+        Branching and depth.
+
+    Raises:
+        ValueError: It is missing, or its beginning is not in DBoW2's text format.
+    """
+    try:
+        with path.open(encoding="ascii") as lines:
+            header, first = lines.readline(), lines.readline()
+    except OSError as error:
+        raise ValueError(f"{path}: expected a vocabulary file, found: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ValueError(
+            f"{path}: expected a vocabulary in DBoW2's text format, found a binary file"
+        ) from None
+    if path.suffix != ".txt":
+        raise ValueError(
+            f"{path}: expected a name that ends with .txt (ORB-SLAM3 reads any other as binary)"
+        )
+    words = header.split()
+    if len(words) != 4 or not all(word.isdecimal() for word in words):
+        raise ValueError(
+            f"{path}: line 1: expected four whole numbers (branching, depth, scoring, weighting), "
+            f"found {header.strip()[:60]!r}"
+        )
+    branching, depth, scoring, weighting = map(int, words)
+    if not (2 <= branching <= 20 and 1 <= depth <= 10 and scoring <= 5 and weighting <= 3):
+        raise ValueError(
+            f"{path}: line 1: expected branching 2 to 20, depth 1 to 10, scoring 0 to 5, "
+            f"weighting 0 to 3, found {header.strip()!r}"
+        )
+    _numbers(path, 2, first)
+    return branching, depth
+
+
+def _numbers(path: Path, number: int, line: str) -> list[float]:
+    """Return what stands on a node's line."""
+    try:
+        row = [float(word) for word in line.split()]
+    except ValueError:
+        row = []
+    if len(row) != _FIELDS:
+        raise ValueError(
+            f"{path}: line {number}: expected {_FIELDS} numbers (parent, leaf, 32 bytes, weight), "
+            f"found {line.strip()[:60]!r}"
+        )
+    return row

@@ -1,0 +1,98 @@
+"""A tilted wall with a random picture on it, and a camera that moves in front of it.
+
+What the camera sees is exact: the picture and its view are related by a homography, and depth is
+where the ray meets the plane.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
+
+Floats = npt.NDArray[np.float64]
+
+INFO = CameraInfo.from_fov(320, 240, math.radians(70.0))
+CAMERA = CameraAnnouncement(
+    stamp=0,
+    source="drone/front",
+    images=("rgb", "depth"),
+    info=INFO,
+    rate=30.0,
+    latency=0.04,
+    frame_id="front_optical",
+    parent_frame_id="base_link",
+    position=(0.15, 0.0, -0.02),
+    orientation=(0.5, 0.5, 0.5, 0.5),
+)
+IMU = ImuAnnouncement(
+    stamp=0,
+    source="drone/imu",
+    rate=200.0,
+    frame_id="base_link",
+    gyroscope_noise_density=1.7e-4,
+    gyroscope_random_walk=1.9e-5,
+    accelerometer_noise_density=2e-3,
+    accelerometer_random_walk=3e-3,
+)
+
+_NORMAL = np.array([0.25, 0.1, 1.0]) / np.linalg.norm([0.25, 0.1, 1.0])
+_DISTANCE = 2.0
+"""Of the plane from the first camera, along the normal; metres."""
+
+_MARGIN = 300
+"""Pixels of wall beyond what the first camera sees, on each side."""
+
+
+class View(NamedTuple):
+    """One exposure; `pose` is the camera in the first one's frame, shape (4, 4)."""
+
+    stamp: int
+    rgb: npt.NDArray[np.uint8]
+    depth: npt.NDArray[np.float32]
+    pose: Floats
+
+
+def views(count: int, blank: range = range(0)) -> list[View]:
+    """Return a flight in front of the wall, to the right and nearer, with blank pictures in it."""
+    wall = _wall()
+    return [_view(wall, k, blank=k in blank) for k in range(count)]
+
+
+def _wall() -> npt.NDArray[np.uint8]:
+    """Return a picture with corners of all sizes."""
+    rng = np.random.default_rng(5)
+    height, width = INFO.height + 2 * _MARGIN, INFO.width + 2 * _MARGIN
+    picture = np.full((height, width, 3), 128, np.uint8)
+    for _ in range(9000):
+        x, y = rng.integers(width), rng.integers(height)
+        w, h = rng.integers(3, 22, size=2)
+        colour = tuple(int(c) for c in rng.integers(20, 235, size=3))
+        cv2.rectangle(picture, (int(x), int(y)), (int(x + w), int(y + h)), colour, -1)
+    return picture
+
+
+def _view(wall: npt.NDArray[np.uint8], k: int, *, blank: bool) -> View:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("yx", (-0.006 * k, 0.002 * k)).as_matrix()
+    pose[:3, 3] = (0.012 * k, -0.003 * k, 0.008 * k)
+    # A ray R K⁻¹ u from c meets n·X = d where X ~ (c nᵀ + (d - n·c) I) R K⁻¹ u.
+    rays = pose[:3, :3] @ np.linalg.inv(INFO.matrix())
+    centre = pose[:3, 3]
+    left = _DISTANCE - _NORMAL @ centre
+    to_wall = INFO.matrix() @ (np.outer(centre, _NORMAL) + left * np.eye(3)) @ rays
+    to_wall = np.array([[1, 0, _MARGIN], [0, 1, _MARGIN], [0, 0, 1]]) @ to_wall
+    size = (INFO.width, INFO.height)
+    rgb = cv2.warpPerspective(wall, to_wall, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    u, v = np.meshgrid(np.arange(INFO.width), np.arange(INFO.height))
+    along = np.stack([u, v, np.ones_like(u)], -1) @ rays.T @ _NORMAL
+    depth = (left / along).astype(np.float32)
+    if blank:
+        rgb = np.full_like(rgb, 128)
+    return View(round(k * 1e9 / 30), np.asarray(rgb), depth, pose)

@@ -1,0 +1,139 @@
+"""ORB-SLAM3's settings say what was announced; read back as ORB-SLAM3 does, by OpenCV."""
+
+from __future__ import annotations
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from nodes.orb_slam3.settings import Mode, OrbSettings, make_settings
+from tests.nodes.orb_slam3.scene import CAMERA, IMU, INFO
+
+MODES: tuple[Mode, ...] = ("rgbd", "monocular", "rgbd_inertial", "monocular_inertial")
+
+
+def read(text: str) -> cv2.FileStorage:
+    return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+
+
+def number(text: str, name: str) -> float:
+    stored = read(text)  # which a node does not keep alive
+    node = stored.getNode(name)
+    assert node.isInt() or node.isReal(), name
+    return float(node.real())
+
+
+def test_the_cameras_intrinsics_and_rate_are_those_announced() -> None:
+    made = make_settings("rgbd", CAMERA)
+    # 320 pixels over 70 degrees: 160 / tan 35° = 228.50; pixel centres are whole numbers.
+    assert number(made.text, "Camera1.fx") == pytest.approx(228.5037, abs=1e-4)
+    assert number(made.text, "Camera1.fy") == pytest.approx(228.5037, abs=1e-4)
+    assert number(made.text, "Camera1.cx") == 159.5
+    assert number(made.text, "Camera1.cy") == 119.5
+    assert number(made.text, "Camera.width") == 320
+    assert number(made.text, "Camera.height") == 240
+    assert number(made.text, "Camera.fps") == 30
+    assert (made.mode, made.width, made.height) == ("rgbd", 320, 240)
+    assert made.intrinsics == (INFO.fx, INFO.fy, 159.5, 119.5)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_numbers_are_of_the_kind_that_orb_slam3_insists_on(mode: Mode) -> None:
+    camera = msgspec.structs.replace(
+        CAMERA,
+        info=msgspec.structs.replace(INFO, fx=256.0, fy=1e-7, cx=0.0),
+        rate=29.97,
+    )
+    text = make_settings(mode, camera, IMU, OrbSettings(baseline=2.0, close=4.0)).text
+    stored = read(text)
+    whole = {
+        "Camera.width", "Camera.height", "Camera.fps", "Camera.RGB", "ORBextractor.nFeatures",
+        "ORBextractor.nLevels", "ORBextractor.iniThFAST", "ORBextractor.minThFAST", "loopClosing",
+    }  # fmt: skip
+    names = stored.root().keys()
+    assert whole < {*names}
+    for name in names:
+        node = stored.getNode(name)
+        if name in whole:
+            assert node.isInt(), name
+        elif not node.isString() and name != "IMU.T_b_c1":
+            assert node.isReal(), name
+    assert number(text, "Camera1.fy") == pytest.approx(1e-7)
+
+
+def test_depth_is_in_metres_and_near_is_counted_in_baselines() -> None:
+    text = make_settings("rgbd", CAMERA, orb=OrbSettings(baseline=0.2, close=5.0)).text
+    assert number(text, "RGBD.DepthMapFactor") == 1.0
+    assert number(text, "Stereo.b") == pytest.approx(0.2)
+    assert number(text, "Stereo.ThDepth") == pytest.approx(25.0)
+    assert "Stereo" not in make_settings("monocular", CAMERA).text
+
+
+def test_the_imu_is_that_announced_and_the_camera_sits_on_it_as_mounted() -> None:
+    text = make_settings("rgbd_inertial", CAMERA, IMU).text
+    assert number(text, "IMU.NoiseGyro") == pytest.approx(1.7e-4)
+    assert number(text, "IMU.GyroWalk") == pytest.approx(1.9e-5)
+    assert number(text, "IMU.NoiseAcc") == pytest.approx(2e-3)
+    assert number(text, "IMU.AccWalk") == pytest.approx(3e-3)
+    assert number(text, "IMU.Frequency") == 200
+    # Optical (right, down, forward) in FRD (forward, right, down), 15 cm ahead, 2 cm up.
+    expected = np.array([[0, 0, 1, 0.15], [1, 0, 0, 0], [0, 1, 0, -0.02], [0, 0, 0, 1]])
+    stored = read(text)
+    found = stored.getNode("IMU.T_b_c1").mat()
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found.astype(np.float64), expected, atol=1e-7)
+
+
+def test_an_ideal_imu_gets_some_noise() -> None:
+    ideal = msgspec.structs.replace(
+        IMU,
+        gyroscope_noise_density=0.0,
+        gyroscope_random_walk=0.0,
+        accelerometer_noise_density=0.0,
+        accelerometer_random_walk=0.0,
+    )
+    text = make_settings("monocular_inertial", CAMERA, ideal).text
+    for name in ("NoiseGyro", "GyroWalk", "NoiseAcc", "AccWalk"):
+        assert number(text, f"IMU.{name}") > 0
+
+
+def test_distortion_is_told_only_where_there_is_some() -> None:
+    assert "k1" not in make_settings("monocular", CAMERA).text
+    info = msgspec.structs.replace(INFO, distortion=(-0.28, 0.07, 1e-4, -2e-5, 0.01))
+    text = make_settings("monocular", msgspec.structs.replace(CAMERA, info=info)).text
+    found = [number(text, f"Camera1.{name}") for name in ("k1", "k2", "p1", "p2", "k3")]
+    assert found == pytest.approx([-0.28, 0.07, 1e-4, -2e-5, 0.01])
+
+
+def test_orb_settings_are_passed_on() -> None:
+    orb = OrbSettings(
+        features=1500, scale_factor=1.3, levels=6, fast_threshold=10, min_fast_threshold=12,
+        loop_closing=False,
+    )  # fmt: skip
+    text = make_settings("monocular", CAMERA, orb=orb).text
+    assert number(text, "ORBextractor.nFeatures") == 1500
+    assert number(text, "ORBextractor.scaleFactor") == pytest.approx(1.3)
+    assert number(text, "ORBextractor.nLevels") == 6
+    assert number(text, "ORBextractor.iniThFAST") == 10
+    assert number(text, "ORBextractor.minThFAST") == 10  # never above the other
+    assert number(text, "loopClosing") == 0
+
+
+def test_what_a_mode_needs_must_have_been_announced() -> None:
+    grey = msgspec.structs.replace(CAMERA, images=("grey",))
+    with pytest.raises(ValueError, match="'rgbd': expected drone/front to give depth, found grey"):
+        make_settings("rgbd", grey)
+    with pytest.raises(ValueError, match="expected an IMU beside drone/front, found none"):
+        make_settings("monocular_inertial", grey)
+    elsewhere = msgspec.structs.replace(IMU, frame_id="gimbal")
+    with pytest.raises(ValueError, match=r"expected an IMU in base_link.*drone/imu in gimbal"):
+        make_settings("rgbd_inertial", CAMERA, elsewhere)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"features": 10}, {"scale_factor": 1.0}, {"baseline": 0}, {"ThDepth": 40}]
+)
+def test_settings_out_of_range_or_unknown_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert(wrong, OrbSettings)
