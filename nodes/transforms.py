@@ -71,8 +71,9 @@ class TransformTree:
         """Take in a transform. Those of one edge may come in any order.
 
         Raises:
-            ValueError: It is no transform, or no tree would be left: the child has another
-                parent, or is an ancestor of its parent, or is fixed to it.
+            ValueError: It is no transform; or no tree would be left, because the child has
+                another parent or is an ancestor of this one; or it is static where those before
+                it were not, or the other way round.
         """
         self._add(
             transform.frame_id,

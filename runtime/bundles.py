@@ -199,20 +199,29 @@ class Slot:
     def take(self, event: Event) -> None:
         """Keep an event and see what it completes.
 
+        Of two sources of which one is below the other (``drone/front/grey``), the upper one counts.
+
         Raises:
             AmbiguousSourceError: Another source has sent events for this field.
         """
-        if event.source != self._source:
-            if self._source is not None:
-                port = self.name.partition(".")[2]
-                raise AmbiguousSourceError(
-                    f"{self.name}: expected events of one source, found {self._source!r} and "
-                    f"{event.source!r}: name one in the node's table, "
-                    f'inputs = {{ "{port}" = "{self._source}" }}'
-                )
-            self._source = event.source
+        if event.source != self._source and not self._changes_to(event.source):
+            return
         self.events.append(event)
         self._matcher.match()
+
+    def _changes_to(self, source: str) -> bool:
+        """Hear another source from now on, if it is the first or above the one heard so far."""
+        before = self._source
+        if before is not None and source.startswith(f"{before}/"):
+            return False
+        if before is not None and not before.startswith(f"{source}/"):
+            port = self.name.partition(".")[2]
+            raise AmbiguousSourceError(
+                f"{self.name}: expected events of one source, found {before!r} and {source!r}: "
+                f'name one in the node\'s table, inputs = {{ "{port}" = "{before}" }}'
+            )
+        self._source = source
+        return True
 
     def find(self, stamp: int, tolerance: int) -> Any:
         """Return what belongs to a stamp, None if there is nothing, or `_WAIT` if it may come."""

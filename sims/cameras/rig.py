@@ -43,7 +43,7 @@ class _Exposure(NamedTuple):
     spec: CameraSpec
     stamp: int
     due: int
-    """When it is delivered (ns)."""
+    """When it is delivered (ns), unless the one before it is later."""
     qpos: npt.NDArray[np.float64]
     qvel: npt.NDArray[np.float64] | None
 
@@ -80,7 +80,6 @@ class CameraRig:
         self._renderer: Worker[CameraRenderer] | None = None
         self._seed = 0
         self._last: dict[str, asyncio.Future[None]] = {}
-        self._last_due = dict.fromkeys(self._specs, 0)
         self._in_flight = dict.fromkeys(self._specs, 0)
         self.lost = dict.fromkeys(self._specs, 0)
         """Exposures not delivered because a camera's settings ask for that."""
@@ -159,12 +158,10 @@ class CameraRig:
             self.skipped[camera] += 1
             return
         self._in_flight[camera] += 1
-        due = max(stamp + round(delay * 1e9), self._last_due[camera])
-        self._last_due[camera] = due
         done = asyncio.get_running_loop().create_future()
         before = self._last.get(camera)
         self._last[camera] = done
-        exposure = _Exposure(spec, stamp, due, qpos, qvel)
+        exposure = _Exposure(spec, stamp, stamp + round(delay * 1e9), qpos, qvel)
         self._node.start(self._deliver(exposure, before, done))
 
     def say_what_is_missing(self) -> None:
@@ -191,7 +188,8 @@ class CameraRig:
             frames = await self._renderer.call_for(
                 wait, CameraRenderer.render, stamp, qpos, (spec.name,), qvel
             )
-            if before is not None and not before.done():  # two processes: keep the order
+            # Of two processes, or of two delays, the later may be through first: keep the order.
+            if before is not None and not before.done():
                 await asyncio.wait([before])
             self._send(spec, frames[spec.name])
         finally:

@@ -150,6 +150,19 @@ def test_a_second_source_is_an_error_that_says_what_to_write() -> None:
     assert isinstance(caught.value.__cause__, AmbiguousSourceError)
 
 
+def test_of_a_source_and_one_below_it_the_upper_counts() -> None:
+    below = at(A, 1, 2, 3, source="x/grey")
+    both = sorted(below + at(A, 1, 2, 3) + at(B, 1, 2, 3), key=lambda e: e.stamp)
+    matcher: Matcher[Two] = Reader.sets.make("n")
+    for event in both:
+        matcher.slots["a" if isinstance(event, A) else "b"].take(event)
+    got = []
+    while matcher.statistics().buffered:
+        got.append(matcher.receive_nowait())
+    assert [each.a.stamp for each in got] == [1 * MS, 2 * MS, 3 * MS]
+    assert {each.a.source for each in got[1:]} == {"x"}
+
+
 def test_the_file_narrows_a_bundle_and_its_fields() -> None:
     twice = at(A, 1), at(B, 1, 9), at(A, 2, source="y"), at(B, 2, source="y")
     assert found(read(Reader, *twice, inputs={"sets": "y"})) == [(2 * MS, 2 * MS)]

@@ -44,6 +44,7 @@ CAMERAS = (
     like_plain("open", exposure=EXPOSURE),
     like_plain("open_grey", exposure=EXPOSURE, images=("grey",)),
     like_plain("open_depth", exposure=EXPOSURE, images=("depth",)),
+    like_plain("open_dim", exposure=EXPOSURE, light=0.5),
     like_plain("dim", light=0.5),
     like_plain("bright", light=1.6),
     like_plain("soft", blur=1.5),
@@ -171,6 +172,9 @@ def test_light_is_a_factor(renderer: CameraRenderer) -> None:
     np.testing.assert_allclose(rgb(bright), rgb(plain) * 1.6, atol=1.8)
     assert plain.depth is not None
     np.testing.assert_array_equal(plain.depth, dim.depth)
+    qvel = np.array([0.0, 10.0, 0.0, 0.0, 0.0, 0.0])
+    smeared = rgb(take(renderer, "open", qvel=qvel))
+    np.testing.assert_allclose(rgb(take(renderer, "open_dim", qvel=qvel)), smeared * 0.5, atol=1.51)
 
 
 def test_cameras_keep_their_own_light(renderer: CameraRenderer) -> None:
