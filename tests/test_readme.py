@@ -17,8 +17,8 @@ COMMANDS = re.findall(r"^    python -m runtime (.*?)(?: +#.*)?$", README, re.MUL
 TARGETS = sorted(set(re.findall(r"(?:^    |`)make ([a-z -]+?)(?:`|  +#|$)", README, re.MULTILINE)))
 
 SHORTER = {
-    "run": ["--set", "run.duration=1s", "--quiet"],
-    "sweep": ["--set", "run.duration=1s", "--set", "camera.width=96", "--set", "camera.height=96"],
+    "run": ["--set", "run.duration=1s", "--set", "evaluation.report=false", "--quiet"],
+    "sweep": ["--set", "run.duration=1s", "--set", "evaluation.report=false"],
     "bench": ["--help"],
 }
 """What is added to a command so that it takes a second."""
@@ -43,7 +43,15 @@ def a_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(c, marks=[pytest.mark.slow, pytest.mark.timeout(300)])
+        if c.startswith("sweep")
+        else c
+        for c in COMMANDS
+    ],
+)
 def test_each_command_runs(command: str, tmp_path: Path, a_run: Path) -> None:
     """As written, but for what makes it short and for where it writes."""
     words = shlex.split(command)

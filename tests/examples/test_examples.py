@@ -49,18 +49,77 @@ def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
     assert (tmp_path / "pictures.png").stat().st_size > 10_000
 
 
-def test_the_tour_of_the_yard_touches_nothing(tmp_path: Path) -> None:
-    """`yard` flies its whole tour, nearly blind here, and lands without a collision."""
-    blind = ["camera.width=64", "camera.height=64", "camera.rate=1", "evaluation.report=false"]
-    summary = run("yard", tmp_path, *blind, "run.stall=1", code=1)
-    assert summary["reason"] == "tour: tour flown"
-    # Armed, taken off, landed, disarmed: no collision among what happened.
-    assert summary["outputs"]["drone.happenings"] == 4
-
-
 def test_computer_vision_follows_the_trajectory(tmp_path: Path) -> None:
     """`computer_vision` ends with its trajectory, having given one set of images per update."""
     summary = run("computer_vision", tmp_path, "camera.rate=5")
     assert summary["reason"] == "trajectory ended"
     assert summary["events"]["Image"] == summary["events"]["SegmentationImage"] == 61
     assert summary["events"]["Odometry"] == 61
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200)
+def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
+    """`closed_loop` lands without a collision, and was where the truth says it should be."""
+    summary = run("closed_loop", tmp_path, "evaluation.report=false")
+    assert summary["reason"] == "pilot: tour flown"
+    assert summary["outputs"]["drone.happenings"] == 4
+    figures = summary["verdict"]["estimators"]["odometry"]
+    assert figures["lost_seconds"] == 0.0
+    assert figures["ate_percent"] < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200)
+def test_a_single_camera_keeps_within_two_percent(tmp_path: Path) -> None:
+    """`monocular` at 30 instead of 70 pictures a second, for the sake of time."""
+    summary = run("monocular", tmp_path, "camera.rate=30", "evaluation.report=false")
+    figures = summary["verdict"]["estimators"]["odometry"]
+    assert figures["alignment"] == "sim3"
+    assert figures["ate_percent"] < 2.0
+
+
+@pytest.mark.slow
+def test_poor_pictures_over_a_poor_link_are_late_and_some_are_missing(tmp_path: Path) -> None:
+    """`imperfect` loses one picture in twenty, and the estimates are as late as its settings say."""
+    summary = run("imperfect", tmp_path, "run.duration=8s", "evaluation.report=false")
+    figures = summary["verdict"]["estimators"]["odometry"]
+    link = summary["links"]["odometry.frames"]
+    assert link["lost"] + figures["estimates"] == pytest.approx(summary["events"]["Image"], abs=4)
+    assert 2 <= link["lost"] <= 20
+    assert figures["latency_p50_ms"] > 40 + 80 + 15
+
+
+@pytest.mark.slow
+def test_two_clouds_of_which_one_smears(tmp_path: Path) -> None:
+    """`mapping` writes both clouds, and the smeared one fills more cells."""
+    run("mapping", tmp_path, "run.duration=8s", "evaluation.report=false")
+    sizes = {p.stem: p.stat().st_size for p in (tmp_path / "clouds").glob("*.ply")}
+    assert sizes["latest"] > 1.2 * sizes["matched"] > 100_000
+
+
+@pytest.mark.slow
+def test_the_data_sets_hold_equal_stamps(tmp_path: Path) -> None:
+    """`dataset` writes both layouts with the same pictures."""
+    run("dataset", tmp_path, "run.duration=2s")
+    euroc = {int(p.stem) for p in (tmp_path / "euroc/mav0/cam0/data").glob("*.png")}
+    tum = {int(p.stem.replace(".", "")) for p in (tmp_path / "tum_rgbd/rgb").glob("*.png")}
+    assert euroc == tum
+    assert len(euroc) == 40
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_orb_slam3_takes_the_place_of_odometry(tmp_path: Path) -> None:
+    """`orb_slam3` tracks all the way with a vocabulary trained on the spot."""
+    pytest.importorskip("pyorbslam3")
+    vocabulary = tmp_path / "vocabulary.txt"
+    command = [sys.executable, "-m", "runtime", "vocabulary", "examples/orb_slam3.toml"]
+    done = subprocess.run(
+        [*command, "--out", str(vocabulary)], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    settings = [f'odometry.vocabulary="{vocabulary}"', "run.duration=15s"]
+    summary = run("orb_slam3", tmp_path / "out", *settings, "evaluation.report=false")
+    assert summary["not_deterministic"] == ["odometry"]
+    assert summary["verdict"]["estimators"]["odometry"]["lost_seconds"] == 0.0

@@ -25,7 +25,11 @@ def fly(folder: Path, config: Path, *settings: str, code: int = 0) -> dict[str, 
 
 @pytest.mark.parametrize("world", ["config.toml", "examples/yard.toml"])
 def test_odometry_keeps_within_a_third_of_a_percent(world: str, tmp_path: Path) -> None:
-    verdict = fly(tmp_path, ROOT / world, "evaluation.report=false")["verdict"]
+    summary = fly(tmp_path, ROOT / world, "evaluation.report=false")
+    assert summary["reason"] == "tour: tour flown"
+    # Armed, taken off, landed, disarmed: no collision among what happened.
+    assert summary["outputs"]["drone.happenings"] == 4
+    verdict = summary["verdict"]
     figures = verdict["estimators"]["odometry"]
     assert verdict["passed"]
     assert figures["alignment"] == "none"
