@@ -14,7 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from nodes.visual_odometry.tracker import Depth, Floats, Tracked, grey_and_depth
+from nodes.visual_odometry.tracker import (
+    Depth,
+    Floats,
+    Tracked,
+    grey_and_depth,
+    refuse_distortion,
+)
 
 SECOND = 1_000_000_000
 
@@ -50,10 +56,7 @@ class DenseOdometry:
     """
 
     def __init__(self, info: CameraInfo, settings: DenseSettings | None = None) -> None:
-        if any(info.distortion):
-            raise ValueError(
-                f"camera: expected pictures without distortion, found {info.distortion}"
-            )
+        refuse_distortion(info)
         self._info = info
         self._settings = settings = settings or DenseSettings()
         self._step = max(info.width // settings.width, 1)

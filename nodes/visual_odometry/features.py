@@ -28,6 +28,7 @@ from nodes.visual_odometry.tracker import (
     Tracked,
     grey_and_depth,
     inverse,
+    refuse_distortion,
 )
 
 SECOND = 1_000_000_000
@@ -92,10 +93,7 @@ class FeatureOdometry:
     """
 
     def __init__(self, info: CameraInfo, settings: FeatureSettings | None = None) -> None:
-        if any(info.distortion):
-            raise ValueError(
-                f"camera: expected pictures without distortion, found {info.distortion}"
-            )
+        refuse_distortion(info)
         self._info = info
         self._settings = settings or FeatureSettings()
         self._camera = (info.fx, info.fy, info.cx, info.cy)

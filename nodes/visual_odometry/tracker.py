@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import msgspec
@@ -53,6 +53,12 @@ class Tracker(Protocol):
         """
 
 
+def refuse_distortion(info: CameraInfo) -> None:
+    """Raise `ValueError` if a camera's pictures are distorted."""
+    if any(info.distortion):
+        raise ValueError(f"camera: expected pictures without distortion, found {info.distortion}")
+
+
 def grey_and_depth(
     info: CameraInfo, image: npt.NDArray[np.uint8], depth: Depth
 ) -> tuple[Grey, Depth]:
@@ -61,16 +67,30 @@ def grey_and_depth(
     Raises:
         ValueError: One of them has another size.
     """
-    size = (info.height, info.width)
-    for name, array in (("image", image), ("depth", depth)):
-        if array.shape[:2] != size or array.shape[2:] not in {(), (3,)}:
-            raise ValueError(
-                f"{name}: expected {size[1]}×{size[0]} pixels, as the camera announced, "
-                f"found shape {array.shape}"
-            )
+    _check_size(info, "depth", depth, {()})
+    return grey_picture(info, image), depth
+
+
+def grey_picture(info: CameraInfo, image: npt.NDArray[np.uint8]) -> Grey:
+    """Return a picture, shape (h, w, 3) red, green, blue, or (h, w), as grey.
+
+    Raises:
+        ValueError: It has another size than the camera's.
+    """
+    _check_size(info, "image", image, {(), (3,)})
     if image.ndim == 2:
-        return image, depth
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8), depth
+        return image
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def _check_size(
+    info: CameraInfo, name: str, array: npt.NDArray[Any], channels: set[tuple[int, ...]]
+) -> None:
+    if array.shape[:2] != (info.height, info.width) or array.shape[2:] not in channels:
+        raise ValueError(
+            f"{name}: expected {info.width}×{info.height} pixels, as the camera announced, "
+            f"found shape {array.shape}"
+        )
 
 
 def inverse(pose: Floats) -> Floats:
