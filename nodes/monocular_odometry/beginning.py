@@ -56,11 +56,6 @@ class Beginning:
         self._views: list[Floats] = []  # of the corners still followed; the first, …, the newest
         self._count = 0
 
-    @property
-    def pixels(self) -> Floats:
-        """Where the newest picture has the corners, shape (n, 2)."""
-        return self._views[-1] if self._views else np.empty((0, 2))
-
     def see(self, image: Grey) -> FirstMap | None:
         """Take the next picture; return a map once there is one."""
         if self._first is None or self._before is None:
@@ -79,16 +74,11 @@ class Beginning:
         if good.sum() < max(self._settings.least, 0.5 * self._count):
             self._restart(image)
             return None
-        since = (
-            np.median(np.linalg.norm(newest - self._views[-2], axis=1))
-            if (len(self._views) > 1)
-            else np.inf
-        )
-        if since < _SNAPSHOT:
+        if len(self._views) > 1 and _median_shift(self._views[-2], newest) < _SNAPSHOT:
             self._views[-1] = newest
         else:
             self._views.append(newest)
-        moved = float(np.median(np.linalg.norm(newest - self._views[0], axis=1)))
+        moved = _median_shift(self._views[0], newest)
         if moved < self._settings.shift:
             return None
         found = self._build()
@@ -169,3 +159,7 @@ class Beginning:
         none = np.zeros(len(points))
         seen = Observations(points, pixels, none, none.astype(np.bool_))
         return solve_pose(seen, np.eye(4), camera, self._settings.pixel_noise, 1.0).pose
+
+
+def _median_shift(before: Floats, after: Floats) -> float:
+    return float(np.median(np.linalg.norm(after - before, axis=1)))

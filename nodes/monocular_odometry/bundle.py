@@ -56,7 +56,7 @@ def adjust(
     moves = frame >= fixed
     begins = np.flatnonzero(np.diff(landmark, prepend=-1))
     for _ in range(steps):
-        residuals, by_pose, by_point, weights = _linearise(
+        residuals, by_pose, by_point, weights = linearise(
             poses, landmarks, frame, landmark, target, scale
         )
         weighted_pose = by_pose * weights[:, None, None]
@@ -93,11 +93,11 @@ def adjust(
             pose = poses[fixed + index]
             pose[:3, :3] = turn @ pose[:3, :3]
             pose[:3, 3] = turn @ pose[:3, 3] + step_pose[index, :3]
-    residuals, *_ = _linearise(poses, landmarks, frame, landmark, target, scale)
+    residuals, *_ = linearise(poses, landmarks, frame, landmark, target, scale)
     return poses, landmarks, np.asarray(noise * np.linalg.norm(residuals, axis=1))
 
 
-def _linearise(
+def linearise(
     poses: Floats,
     landmarks: Floats,
     frame: Indices,

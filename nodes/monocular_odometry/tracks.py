@@ -33,15 +33,21 @@ class Tracks:
         """Which have a place in the world, shape (n,)."""
         return np.asarray(np.isfinite(self.points[:, 0]))
 
-    def keep(self, rows: npt.NDArray[np.int64] | Mask) -> list[tuple[Floats, dict[int, View]]]:
+    def keep(self, rows: npt.NDArray[np.int64]) -> list[tuple[Floats, dict[int, View]]]:
         """Keep some; return points and views of the others that have a place."""
         kept = np.zeros(len(self), np.bool_)
         kept[rows] = True
         gone = np.flatnonzero(~kept & self.known)
         retired = [(self.points[row], self.views[row]) for row in gone.tolist()]
+        self.drop(np.flatnonzero(~kept))
+        return retired
+
+    def drop(self, rows: npt.NDArray[np.int64]) -> None:
+        """Follow some no longer."""
+        kept = np.ones(len(self), np.bool_)
+        kept[rows] = False
         self.views = [self.views[row] for row in np.flatnonzero(kept).tolist()]
         self.pixels, self.points = self.pixels[kept], self.points[kept]
-        return retired
 
     def see(self, keyframe: int, pixels: Floats) -> None:
         """Note where a new key frame has them, shape (n, 2)."""

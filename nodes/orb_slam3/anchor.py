@@ -35,12 +35,17 @@ class Anchor:
 
     A map that begins after tracking was lost is put where the camera was last known to be, since
     nothing better is known: so the way in between is missing, until the maps are merged.
+
+    Attributes:
+        map: Stamp of the present map's first key frame (seconds); -1 before there is one.
     """
 
     def __init__(self) -> None:
         self._first: dict[float, Floats] = {}  # first key frames of all maps, in our frame
         self._from_world = np.eye(4)
         self._last = np.eye(4)
+        self._doubted = False
+        self.map = -1.0
 
     @property
     def maps(self) -> int:
@@ -54,10 +59,22 @@ class Anchor:
             first: That key frame.
             pose: The camera now in the same world, shape (4, 4).
         """
-        if first.stamp not in self._first:
+        known = first.stamp in self._first
+        if not known:
             begin = np.linalg.inv(pose) @ first.pose  # first key frame in the camera now
             self._first[first.stamp] = self._last @ begin if self._first else np.eye(4)
-        self._from_world = self._first[first.stamp] @ np.linalg.inv(first.pose)
+        from_world = self._first[first.stamp] @ np.linalg.inv(first.pose)
+        # The world may turn between the moment of the pose and that of the key frame's: then the
+        # old one fits this pose, and the new one the next.
+        old_fits = self._jump(self._from_world, pose) < self._jump(from_world, pose)
+        self._doubted = known and old_fits and not self._doubted
+        if not self._doubted:
+            self._from_world = from_world
+            self.map = first.stamp
+
+    def _jump(self, from_world: Floats, pose: Floats) -> float:
+        """Return how far a pose would be from the last one."""
+        return float(np.linalg.norm((from_world @ pose)[:3, 3] - self._last[:3, 3]))
 
     def place(self, pose: Floats) -> Floats:
         """Return a pose in the frame of the very first key frame; remembered as the last one."""

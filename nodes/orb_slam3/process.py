@@ -50,7 +50,8 @@ class Tracked(msgspec.Struct, frozen=True, eq=False):
             metres, or, without depth and IMU, its own unit.
         lost: Whether the pose is not known; `pose` is then the last one that was.
         reason: Why it is lost, or what happened to the map.
-        state: ORB-SLAM3's own word: OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …
+        state: ORB-SLAM3's own word (OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …), or RESET when
+            it has just thrown its map away.
         points: float32 pixels (column, row) of all corners, without distortion, shape (n, 2).
         inliers: bool, shape (n,): those that agree with the map.
         matches: How many map points were found in the image.
@@ -101,7 +102,7 @@ class OrbSlam3Process:
         self._was_ok = False
         self._stamps: list[int] = []
         self._began = -1
-        self._cloud: dict[tuple[int, ...], tuple[float, ...]] = {}
+        self._clouds: dict[float, dict[tuple[int, ...], tuple[float, ...]]] = {}  # by map
         self._folder = tempfile.TemporaryDirectory(prefix="orb_slam3_")
         file = Path(self._folder.name) / "settings.yaml"
         file.write_text(settings.text, encoding="ascii")
@@ -129,7 +130,7 @@ class OrbSlam3Process:
         Raises:
             ValueError: An array is missing, superfluous, or of the wrong shape.
         """
-        self._check(image, depth, imu)
+        check_arrays(self._settings, image, depth, imu)
         self._stamps.append(stamp)
         _wait_for_other_threads(self._left_alone + self._patience)
         chunk = None if imu is None else imu * (1e-9, 1, 1, 1, 1, 1, 1)
@@ -149,7 +150,8 @@ class OrbSlam3Process:
         In the optical camera at the first key frame, as the poses. The library only tells which
         points an image shows: this is the last that was heard of each place.
         """
-        return np.array(list(self._cloud.values()), np.float32).reshape(-1, 3)
+        points = [point for cloud in self._clouds.values() for point in cloud.values()]
+        return np.array(points, np.float32).reshape(-1, 3)
 
     def close(self) -> None:
         """End ORB-SLAM3's threads."""
@@ -160,14 +162,17 @@ class OrbSlam3Process:
     def _tracked(self, result: Any) -> Tracked:
         state = result.state.name
         valid = result.pose_valid and (state != "RECENTLY_LOST" or self._slam.imu_initialized())
+        if valid and self._was_ok and np.array_equal(result.pose_wc, np.eye(4)):
+            # What it returns when it throws its map away; only a map's first pose is this one.
+            valid, state = False, "RESET"
         corners = self._slam.tracked_keypoints()
         inliers = np.zeros(len(corners), np.bool_)
         reason = _REASONS.get(state, state)
         if valid:
             pose = np.asarray(result.pose_wc, np.float64)
             before = self._anchor.maps
-            if not self._was_ok or self._slam.map_changed() or self._slam.inertial:
-                self._look_at_the_map(pose)
+            if not self._was_ok or before > 1 or self._slam.inertial:
+                self._look_at_the_map(pose)  # (it does not tell when it has merged two)
             self._anchor.place(pose)
             reason = ""
             if self._anchor.maps > before > 0:
@@ -185,7 +190,7 @@ class OrbSlam3Process:
             points=corners,
             inliers=inliers,
             matches=int(result.num_tracked_points) if valid else 0,
-            map_points=len(self._cloud),
+            map_points=sum(map(len, self._clouds.values())),
             began=self._began,
             maps=self._anchor.maps,
         )
@@ -196,7 +201,10 @@ class OrbSlam3Process:
         self._slam.save_keyframe_trajectory_tum(str(file))
         first = first_key_frame(file)
         if first is not None:
+            left, maps = self._anchor.map, self._anchor.maps
             self._anchor.world_may_have_changed(first, pose)
+            if self._anchor.map != left and self._anchor.maps == maps:
+                self._clouds.pop(left, None)  # merged: now it is known that these lay elsewhere
             if self._began < 0:
                 nearest = np.abs(np.array(self._stamps) - first.stamp * 1e9).argmin()
                 self._began = self._stamps[nearest]
@@ -214,32 +222,38 @@ class OrbSlam3Process:
         """Keep map points of ORB-SLAM3's world."""
         placed = self._anchor.place_points(points)
         cells = np.floor(placed / _CELL).astype(np.int64).tolist()
-        self._cloud.update(zip(map(tuple, cells), map(tuple, placed.tolist()), strict=True))
+        cloud = self._clouds.setdefault(self._anchor.map, {})
+        cloud.update(zip(map(tuple, cells), map(tuple, placed.tolist()), strict=True))
 
-    def _check(
-        self,
-        image: npt.NDArray[np.uint8],
-        depth: npt.NDArray[np.float32] | None,
-        imu: Floats | None,
-    ) -> None:
-        """Refuse what ORB-SLAM3 would end the process for, or not notice."""
-        mode, size = self._settings.mode, (self._settings.height, self._settings.width)
-        for name, array, wanted in (
-            ("depth", depth, "rgbd" in mode),
-            ("imu", imu, "inertial" in mode),
-        ):
-            if (array is not None) != wanted:
-                expected, found = ("an array", "none") if wanted else ("none", "an array")
-                raise ValueError(f"{name}: mode {mode!r} expects {expected}, found {found}")
-        if image.shape[:2] != size or image.shape[2:] not in {(), (3,)}:
-            raise ValueError(
-                f"image: expected shape {size} or {(*size, 3)}, as the camera announced, "
-                f"found {image.shape}"
-            )
-        if depth is not None and depth.shape != size:
-            raise ValueError(f"depth: expected shape {size}, found {depth.shape}")
-        if imu is not None and (imu.ndim != 2 or imu.shape[1] != 7):
-            raise ValueError(f"imu: expected shape (n, 7), found {imu.shape}")
+
+def check_arrays(
+    settings: Settings,
+    image: npt.NDArray[np.uint8],
+    depth: npt.NDArray[np.float32] | None,
+    imu: Floats | None,
+) -> None:
+    """Refuse what ORB-SLAM3 would end the process for, or not notice.
+
+    Raises:
+        ValueError: An array is missing, superfluous, or of the wrong shape.
+    """
+    mode, size = settings.mode, (settings.height, settings.width)
+    for name, array, wanted in (
+        ("depth", depth, "rgbd" in mode),
+        ("imu", imu, "inertial" in mode),
+    ):
+        if (array is not None) != wanted:
+            expected, found = ("an array", "none") if wanted else ("none", "an array")
+            raise ValueError(f"{name}: mode {mode!r} expects {expected}, found {found}")
+    if image.shape[:2] != size or image.shape[2:] not in {(), (3,)}:
+        raise ValueError(
+            f"image: expected shape {size} or {(*size, 3)}, as the camera announced, "
+            f"found {image.shape}"
+        )
+    if depth is not None and depth.shape != size:
+        raise ValueError(f"depth: expected shape {size}, found {depth.shape}")
+    if imu is not None and (imu.ndim != 2 or imu.shape[1] != 7):
+        raise ValueError(f"imu: expected shape (n, 7), found {imu.shape}")
 
 
 def _wait_for_other_threads(until: float) -> None:
@@ -268,6 +282,7 @@ _REASONS = {
     "SYSTEM_NOT_READY": "not ready yet",
     "NO_IMAGES_YET": "a new map has not begun yet",
     "NOT_INITIALIZED": "the map has not begun yet",
+    "RESET": "the map has been thrown away: the IMU's scale or gravity was not to be had from it",
     "RECENTLY_LOST": "too few matches with the map; looking for a place seen before",
     "LOST": "too few matches with the map",
 }

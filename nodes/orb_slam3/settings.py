@@ -1,6 +1,7 @@
 """ORB-SLAM3's settings, made from what cameras and IMUs announce: nobody keeps a second file.
 
-The names and their meaning are those of ORB-SLAM3 1.0's ``Settings.cc``, file version 1.0. Every
+In the older of the two forms that ORB-SLAM3 1.0 reads (the parsers of its ``Tracking.cc``): only
+there can it be told to begin without a shake, which RGB-D with an IMU waits for otherwise. Every
 parameter that it requires is given, since it ends the process where one is missing.
 """
 
@@ -87,23 +88,15 @@ def make_settings(
         )
     lines = [
         "%YAML:1.0",
-        'File.version: "1.0"',
         'Camera.type: "PinHole"',
-        f"Camera1.fx: {_real(info.fx)}",
-        f"Camera1.fy: {_real(info.fy)}",
-        f"Camera1.cx: {_real(info.cx)}",
-        f"Camera1.cy: {_real(info.cy)}",
-    ]
-    if any(info.distortion):  # without: it need not undistort what has none
-        names = ("k1", "k2", "p1", "p2", "k3")
-        lines += [
-            f"Camera1.{name}: {_real(value)}"
-            for name, value in zip(names, info.distortion, strict=True)
-        ]
-    lines += [
+        f"Camera.fx: {_real(info.fx)}",
+        f"Camera.fy: {_real(info.fy)}",
+        f"Camera.cx: {_real(info.cx)}",
+        f"Camera.cy: {_real(info.cy)}",
+        *_distortion(info.distortion),
         f"Camera.width: {info.width}",
         f"Camera.height: {info.height}",
-        f"Camera.fps: {max(round(camera.rate), 1)}",
+        f"Camera.fps: {_real(camera.rate)}",
         "Camera.RGB: 1",
         f"ORBextractor.nFeatures: {orb.features}",
         f"ORBextractor.scaleFactor: {_real(orb.scale_factor)}",
@@ -115,9 +108,9 @@ def make_settings(
     ]
     if "rgbd" in mode:
         lines += [
-            f"Stereo.b: {_real(orb.baseline)}",
-            f"Stereo.ThDepth: {_real(orb.close / orb.baseline)}",  # counted in baselines
-            "RGBD.DepthMapFactor: 1.0",  # our depth is in metres
+            f"Camera.bf: {_real(orb.baseline * info.fx)}",
+            f"ThDepth: {_real(orb.close / orb.baseline)}",  # counted in baselines
+            "DepthMapFactor: 1.0",  # our depth is in metres
         ]
     if "inertial" in mode:
         lines += _inertial(mode, camera, imu)
@@ -128,6 +121,14 @@ def make_settings(
         height=info.height,
         intrinsics=(info.fx, info.fy, info.cx, info.cy),
     )
+
+
+def _distortion(plumb_bob: tuple[float, ...]) -> list[str]:
+    k1, k2, p1, p2, k3 = plumb_bob
+    if any(plumb_bob):
+        k1 = k1 or 1e-12  # at 0, ORB-SLAM3 takes it that there is no distortion at all
+    values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
+    return [f"Camera.{name}: {_real(value)}" for name, value in values.items()]
 
 
 def _inertial(mode: Mode, camera: CameraAnnouncement, imu: ImuAnnouncement | None) -> list[str]:
@@ -147,8 +148,9 @@ def _inertial(mode: Mode, camera: CameraAnnouncement, imu: ImuAnnouncement | Non
         f"IMU.NoiseAcc: {_real(max(imu.accelerometer_noise_density, 1e-4))}",
         f"IMU.GyroWalk: {_real(max(imu.gyroscope_random_walk, 1e-7))}",
         f"IMU.AccWalk: {_real(max(imu.accelerometer_random_walk, 1e-6))}",
-        f"IMU.Frequency: {_real(imu.rate)}",
-        "IMU.T_b_c1: !!opencv-matrix",
+        f"IMU.Frequency: {max(round(imu.rate), 1)}",
+        "IMU.fastInit: 1",  # or it would wait until the vehicle is shaken
+        "Tbc: !!opencv-matrix",
         "   rows: 4",
         "   cols: 4",
         "   dt: f",

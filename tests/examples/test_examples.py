@@ -81,7 +81,7 @@ def test_a_single_camera_keeps_within_two_percent(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_poor_pictures_over_a_poor_link_are_late_and_some_are_missing(tmp_path: Path) -> None:
-    """`imperfect` loses one picture in twenty, and the estimates are as late as its settings say."""
+    """`imperfect` loses one picture in twenty; the estimates are as late as it asks for."""
     summary = run("imperfect", tmp_path, "run.duration=8s", "evaluation.report=false")
     figures = summary["verdict"]["estimators"]["odometry"]
     link = summary["links"]["odometry.frames"]

@@ -7,6 +7,7 @@ where the ray meets the plane.
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -65,6 +66,7 @@ def views(count: int, blank: range = range(0)) -> list[View]:
     return [_view(wall, k, blank=k in blank) for k in range(count)]
 
 
+@cache
 def _wall() -> npt.NDArray[np.uint8]:
     """Return a picture with corners of all sizes."""
     rng = np.random.default_rng(5)

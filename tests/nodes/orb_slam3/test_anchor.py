@@ -39,6 +39,28 @@ def test_a_world_that_turns_takes_its_first_key_frame_along() -> None:
     assert anchor.maps == 1
 
 
+def test_a_pose_from_just_before_the_world_turned_is_told_by_the_old_one() -> None:
+    anchor = Anchor()
+    anchor.world_may_have_changed(KeyFrame(0.5, np.eye(4)), pose(1.0))
+    anchor.place(pose(1.0))
+    turned = pose(-4.0, 0.7)
+    anchor.world_may_have_changed(KeyFrame(0.5, turned), pose(1.1))
+    np.testing.assert_allclose(anchor.place(pose(1.1)), pose(1.1), atol=1e-12)
+    anchor.world_may_have_changed(KeyFrame(0.5, turned), turned @ pose(1.2))
+    np.testing.assert_allclose(anchor.place(turned @ pose(1.2)), pose(1.2), atol=1e-12)
+
+
+def test_a_small_turn_is_followed_with_the_next_pose_at_the_latest() -> None:
+    anchor = Anchor()
+    anchor.world_may_have_changed(KeyFrame(0.5, np.eye(4)), pose(1.0))
+    anchor.place(pose(1.0))
+    turned = pose(0.02)
+    for _ in range(2):  # the camera stands still, so the old world seems right
+        anchor.world_may_have_changed(KeyFrame(0.5, turned), pose(1.0))
+        anchor.place(pose(1.0))
+    np.testing.assert_allclose(anchor.last, pose(0.98), atol=1e-12)
+
+
 def test_a_new_map_begins_where_the_camera_was_last_and_falls_into_place_when_merged() -> None:
     anchor = Anchor()
     anchor.world_may_have_changed(KeyFrame(0.0, np.eye(4)), np.eye(4))
@@ -47,11 +69,11 @@ def test_a_new_map_begins_where_the_camera_was_last_and_falls_into_place_when_me
     anchor.world_may_have_changed(KeyFrame(7.0, np.eye(4)), np.eye(4))
     np.testing.assert_allclose(anchor.place(np.eye(4)), pose(2.0, 0.3), atol=1e-12)
     np.testing.assert_allclose(anchor.place(pose(0.5)), pose(2.0, 0.3) @ pose(0.5), atol=1e-12)
-    assert anchor.maps == 2
+    assert (anchor.maps, anchor.map) == (2, 7.0)
     # Merged: the world is the first map's again, and its pose there is the truth.
     anchor.world_may_have_changed(KeyFrame(0.0, np.eye(4)), pose(3.1))
     np.testing.assert_allclose(anchor.place(pose(3.1)), pose(3.1), atol=1e-12)
-    assert anchor.maps == 2
+    assert (anchor.maps, anchor.map) == (2, 0.0)
 
 
 def test_a_new_map_may_begin_before_the_present_image() -> None:

@@ -27,10 +27,10 @@ def number(text: str, name: str) -> float:
 def test_the_cameras_intrinsics_and_rate_are_those_announced() -> None:
     made = make_settings("rgbd", CAMERA)
     # 320 pixels over 70 degrees: 160 / tan 35° = 228.50; pixel centres are whole numbers.
-    assert number(made.text, "Camera1.fx") == pytest.approx(228.5037, abs=1e-4)
-    assert number(made.text, "Camera1.fy") == pytest.approx(228.5037, abs=1e-4)
-    assert number(made.text, "Camera1.cx") == 159.5
-    assert number(made.text, "Camera1.cy") == 119.5
+    assert number(made.text, "Camera.fx") == pytest.approx(228.5037, abs=1e-4)
+    assert number(made.text, "Camera.fy") == pytest.approx(228.5037, abs=1e-4)
+    assert number(made.text, "Camera.cx") == 159.5
+    assert number(made.text, "Camera.cy") == 119.5
     assert number(made.text, "Camera.width") == 320
     assert number(made.text, "Camera.height") == 240
     assert number(made.text, "Camera.fps") == 30
@@ -48,26 +48,26 @@ def test_numbers_are_of_the_kind_that_orb_slam3_insists_on(mode: Mode) -> None:
     text = make_settings(mode, camera, IMU, OrbSettings(baseline=2.0, close=4.0)).text
     stored = read(text)
     whole = {
-        "Camera.width", "Camera.height", "Camera.fps", "Camera.RGB", "ORBextractor.nFeatures",
-        "ORBextractor.nLevels", "ORBextractor.iniThFAST", "ORBextractor.minThFAST", "loopClosing",
-    }  # fmt: skip
+        "Camera.width", "Camera.height", "Camera.RGB", "ORBextractor.nFeatures", "loopClosing",
+        "ORBextractor.nLevels", "ORBextractor.iniThFAST", "ORBextractor.minThFAST",
+    } | ({"IMU.Frequency", "IMU.fastInit"} if "inertial" in mode else set())  # fmt: skip
     names = stored.root().keys()
     assert whole < {*names}
     for name in names:
         node = stored.getNode(name)
         if name in whole:
             assert node.isInt(), name
-        elif not node.isString() and name != "IMU.T_b_c1":
+        elif not node.isString() and name != "Tbc":
             assert node.isReal(), name
-    assert number(text, "Camera1.fy") == pytest.approx(1e-7)
+    assert number(text, "Camera.fy") == pytest.approx(1e-7)
 
 
 def test_depth_is_in_metres_and_near_is_counted_in_baselines() -> None:
     text = make_settings("rgbd", CAMERA, orb=OrbSettings(baseline=0.2, close=5.0)).text
-    assert number(text, "RGBD.DepthMapFactor") == 1.0
-    assert number(text, "Stereo.b") == pytest.approx(0.2)
-    assert number(text, "Stereo.ThDepth") == pytest.approx(25.0)
-    assert "Stereo" not in make_settings("monocular", CAMERA).text
+    assert number(text, "DepthMapFactor") == 1.0
+    assert number(text, "Camera.bf") == pytest.approx(0.2 * 228.5037, abs=1e-4)
+    assert number(text, "ThDepth") == pytest.approx(25.0)
+    assert "Depth" not in make_settings("monocular", CAMERA).text
 
 
 def test_the_imu_is_that_announced_and_the_camera_sits_on_it_as_mounted() -> None:
@@ -80,7 +80,7 @@ def test_the_imu_is_that_announced_and_the_camera_sits_on_it_as_mounted() -> Non
     # Optical (right, down, forward) in FRD (forward, right, down), 15 cm ahead, 2 cm up.
     expected = np.array([[0, 0, 1, 0.15], [1, 0, 0, 0], [0, 1, 0, -0.02], [0, 0, 0, 1]])
     stored = read(text)
-    found = stored.getNode("IMU.T_b_c1").mat()
+    found = stored.getNode("Tbc").mat()
     assert found.dtype == np.float32
     np.testing.assert_allclose(found.astype(np.float64), expected, atol=1e-7)
 
@@ -98,12 +98,20 @@ def test_an_ideal_imu_gets_some_noise() -> None:
         assert number(text, f"IMU.{name}") > 0
 
 
-def test_distortion_is_told_only_where_there_is_some() -> None:
-    assert "k1" not in make_settings("monocular", CAMERA).text
-    info = msgspec.structs.replace(INFO, distortion=(-0.28, 0.07, 1e-4, -2e-5, 0.01))
+@pytest.mark.parametrize(
+    "distortion", [(0.0, 0.0, 0.0, 0.0, 0.0), (-0.28, 0.07, 1e-4, -2e-5, 0.01)]
+)
+def test_distortion_is_that_announced(distortion: tuple[float, ...]) -> None:
+    info = msgspec.structs.replace(INFO, distortion=distortion)
     text = make_settings("monocular", msgspec.structs.replace(CAMERA, info=info)).text
-    found = [number(text, f"Camera1.{name}") for name in ("k1", "k2", "p1", "p2", "k3")]
-    assert found == pytest.approx([-0.28, 0.07, 1e-4, -2e-5, 0.01])
+    found = [number(text, f"Camera.{name}") for name in ("k1", "k2", "p1", "p2", "k3")]
+    assert found == pytest.approx(distortion)
+
+
+def test_distortion_without_its_first_term_is_not_overlooked() -> None:
+    info = msgspec.structs.replace(INFO, distortion=(0.0, 0.0, 1e-3, 0.0, 0.0))
+    text = make_settings("rgbd", msgspec.structs.replace(CAMERA, info=info)).text
+    assert 0 < number(text, "Camera.k1") < 1e-9
 
 
 def test_orb_settings_are_passed_on() -> None:

@@ -1,0 +1,59 @@
+"""Corners on their way: what is kept of them, and how they are followed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nodes.monocular_odometry.flow import SPACING, follow_both_ways, inside, new_corners
+from nodes.monocular_odometry.tracks import Tracks
+from tests.nodes.monocular_odometry.world import FLAT, INFO, look, pose
+
+HERE, THERE = look(pose(), FLAT), look(pose(x=0.1), FLAT)
+SHIFT = -0.1 / 2.0 * INFO.fx
+"""Columns by which the floor moves between the two pictures."""
+
+
+def test_tracks_remember_their_views_and_hand_over_landmarks_that_leave() -> None:
+    tracks = Tracks(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), 0)
+    assert not tracks.known.any()
+    tracks.points[:2] = [[0, 0, 1], [0, 0, 2]]
+    gone = tracks.keep(np.array([1, 2]))
+    assert [(point.tolist(), views) for point, views in gone] == [([0, 0, 1], {0: (1, 2)})]
+    tracks.see(1, np.array([[3.5, 4.0], [5.5, 6.0]]))
+    tracks.add(np.array([[9.0, 9.0]]), 1)
+    assert tracks.views == [{0: (3, 4), 1: (3.5, 4)}, {0: (5, 6), 1: (5.5, 6)}, {1: (9, 9)}]
+    assert tracks.known.tolist() == [True, False, False]
+    tracks.drop(np.array([0]))
+    assert tracks.pixels.tolist() == [[5.5, 6], [9, 9]]
+    assert len(tracks) == len(tracks.views) == len(tracks.points) == 2
+
+
+def test_corners_keep_away_from_each_other_and_from_those_that_are_taken() -> None:
+    some = new_corners(HERE, np.empty((0, 2)), 40)
+    more = new_corners(HERE, some, 40)
+    together = np.concatenate([some, more])
+    gaps = np.linalg.norm(together[:, None] - together, axis=2) + 99 * np.eye(len(together))
+    assert gaps.min() > SPACING - 1
+    assert len(some) == 40
+    assert new_corners(np.zeros_like(HERE), some, 40).shape == (0, 2)
+
+
+def test_corners_are_followed_to_where_the_floor_has_moved() -> None:
+    corners = new_corners(HERE, np.empty((0, 2)), 60)
+    corners = corners[corners[:, 0] > 40]
+    for guess, levels in ((corners, 3), (corners + np.array([SHIFT + 2, 1.0]), 1)):
+        found, good = follow_both_ways(HERE, THERE, corners, guess, 15, levels)
+        assert good.mean() > 0.9
+        np.testing.assert_allclose(found[good] - corners[good], [[SHIFT, 0]] * good.sum(), atol=0.2)
+
+
+def test_a_corner_that_does_not_come_back_is_not_good() -> None:
+    corners = new_corners(HERE, np.empty((0, 2)), 60)
+    strange = look(pose(x=5.0, y=3.0), FLAT)
+    _, good = follow_both_ways(HERE, strange, corners, corners, 15, 1)
+    assert good.mean() < 0.3
+
+
+def test_the_rim_is_not_inside() -> None:
+    pixels = np.array([[3.0, 3.0], [2.9, 3.0], [6.9, 4.0], [7.0, 4.0], [5.0, 5.0]])
+    assert inside(pixels, (8, 10), 3).tolist() == [True, False, True, False, False]
