@@ -17,9 +17,11 @@ from events import (
     Odometry,
     PointCloud,
     PoseStamped,
+    TransformStamped,
 )
 from nodes.estimation import WORKER_ENVIRONMENT, pose_matrix
 from nodes.mapping.mapper import Mapper
+from nodes.transforms import TransformError, TransformTree
 from runtime import Bundle, Duration, Node, NodeConfig, Output, on
 
 
@@ -66,7 +68,7 @@ class Mapping(Node[MappingConfig]):
 
     def __init__(self) -> None:
         self._camera: CameraAnnouncement | None = None
-        self._here: Odometry | None = None
+        self._tree = TransformTree()
         self._frame_id = "map"
         self._stamp = 0
         self._used = 0
@@ -103,13 +105,25 @@ class Mapping(Node[MappingConfig]):
             )
         self._camera = announcement
         self.narrow("frames", announcement.source)
+        self._tree.add(
+            TransformStamped(
+                stamp=announcement.stamp,
+                source=announcement.source,
+                frame_id=announcement.parent_frame_id,
+                child_frame_id=announcement.frame_id,
+                translation=announcement.position,
+                rotation=announcement.orientation,
+                static=True,
+            )
+        )
 
     @on(Odometry)
     def moved(self, event: Odometry) -> None:
         """Note where the vehicle that carries the camera is."""
         camera = self._camera
         if camera is not None and camera.source.startswith(f"{event.source}/"):
-            self._here = event
+            self._frame_id = event.frame_id
+            self._tree.add_odometry(event)
 
     async def run(self) -> None:
         """Add frames to the cloud."""
@@ -157,11 +171,12 @@ class Mapping(Node[MappingConfig]):
         if self.config.pose == "matched":
             self._frame_id = pose.frame_id
             return pose_matrix(pose.position, pose.orientation)
-        if (here := self._here) is None:
+        try:
+            known = self._tree.span(camera.parent_frame_id)
+            newest = 0 if known is None else known[1]
+            return self._tree.lookup(self._frame_id, camera.frame_id, newest)
+        except TransformError:  # the vehicle has not said where it is
             return None
-        self._frame_id = here.frame_id
-        vehicle = pose_matrix(here.position, here.orientation)
-        return vehicle @ pose_matrix(camera.position, camera.orientation)
 
     async def _send(self) -> int:
         """Send the cloud, and return how many points it has."""
