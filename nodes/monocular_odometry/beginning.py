@@ -57,7 +57,11 @@ class Beginning:
         self._count = 0
 
     def see(self, image: Grey) -> FirstMap | None:
-        """Take the next picture; return a map once there is one."""
+        """Take the next picture, grey; return a map once there is one.
+
+        It begins again with this picture if too few corners are left, or if a long motion gave no
+        map: turning alone does not.
+        """
         if self._first is None or self._before is None:
             self._restart(image)
             return None

@@ -105,7 +105,21 @@ def linearise(
     target: Floats,
     scale: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return residuals (m, 2), their Jacobians by pose (m, 2, 6) and point (m, 2, 3), weights."""
+    """Return what all observations miss, and how that changes with poses and landmarks.
+
+    Args:
+        poses: World to camera, shape (k, 4, 4).
+        landmarks: Points in the world, shape (l, 3).
+        frame: Which pose each observation is of, shape (m,).
+        landmark: Which landmark, shape (m,).
+        target: Where it was seen, as a ray with z = 1, shape (m, 2).
+        scale: Standard deviations to a unit of that, shape (2,).
+
+    Returns:
+        Residuals in standard deviations, shape (m, 2); their derivatives by a small motion of the
+        camera's frame (translation, then rotation; left perturbation), shape (m, 2, 6), and by the
+        landmark, shape (m, 2, 3); Huber's weights, shape (m,), 0 behind the camera.
+    """
     turns, shifts = poses[frame, :3, :3], poses[frame, :3, 3]
     points = np.einsum("mij,mj->mi", turns, landmarks[landmark]) + shifts
     ahead = points[:, 2] > 1e-3

@@ -15,12 +15,13 @@ class MonocularSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
         window: Pixels along the side of the neighbourhood that optical flow compares; odd.
         levels: Times that flow halves the picture for large motions between two pictures.
         pixel_noise: Standard deviation of a followed corner, pixels.
-        shift: Median pixels of motion at which a new key frame is made.
-        keep: Share of the corners below which it is made, too.
+        shift: Median pixels of motion at which a new key frame is made, and a first map tried.
+        keep: Share of the corners, and of the landmarks, below which a key frame is made, too.
         keyframes: Key frames that are adjusted together.
         parallax: Degrees between two views of a corner from which its place is computed.
         least: Agreeing landmarks below which the camera is lost.
-        patience: Seconds that a lost camera looks for a place it knows; then it begins a new map.
+        patience: Seconds that a lost camera looks only for places it knows; then it also begins a
+            new map, whose unit of length is a guess.
     """
 
     corners: Annotated[int, msgspec.Meta(ge=60, le=2000)] = 250

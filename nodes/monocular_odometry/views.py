@@ -1,6 +1,6 @@
 """Geometry of several views: rays, triangulation, reprojection; and the first two views of all.
 
-Poses are world to camera, shape (4, 4); points metres of the map's own unit.
+Poses are world to camera, shape (4, 4); lengths are in the map's own unit.
 """
 
 from __future__ import annotations
@@ -13,18 +13,21 @@ import numpy.typing as npt
 
 from nodes.visual_odometry.tracker import Floats
 
-_THREE_PIXELS = 3.0
+_PLANE = 3.0
+"""Pixels up to which a corner fits a homography."""
+_EPIPOLAR = 1.0
+"""Pixels up to which it fits an essential matrix."""
 
 
 def rays(pixels: Floats, matrix: Floats) -> Floats:
-    """Return directions in the optical frame with z = 1, shape (n, 3)."""
+    """Return directions in the optical frame with z = 1, shape (n, 3), of pixels, shape (n, 2)."""
     x = (pixels[:, 0] - matrix[0, 2]) / matrix[0, 0]
     y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
     return np.stack([x, y, np.ones(len(pixels))], axis=1)
 
 
 def triangulate(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
-    """Return the points nearest to pairs of rays, in the least-squares sense of their middle.
+    """Return the points halfway between pairs of rays, where those pass each other closest.
 
     Args:
         first: Pose of the first camera.
@@ -49,14 +52,24 @@ def triangulate(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
 
 
 def parallax(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
-    """Return the angles between pairs of rays, degrees, shape (n,)."""
+    """Return the angles between pairs of rays, degrees, shape (n,); arguments as `triangulate`."""
     u, v = a @ first[:3, :3], b @ second[:3, :3]
     sine = np.linalg.norm(np.cross(u, v), axis=1)
     return np.asarray(np.degrees(np.arctan2(sine, np.sum(u * v, axis=1))))
 
 
 def reprojection_errors(pose: Floats, points: Floats, pixels: Floats, matrix: Floats) -> Floats:
-    """Return the distances of projected points from pixels, shape (n,); inf behind the camera."""
+    """Return how far points are seen from where they should be.
+
+    Args:
+        pose: Of the camera.
+        points: In the world, shape (n, 3).
+        pixels: Where they should be, shape (n, 2).
+        matrix: K, shape (3, 3).
+
+    Returns:
+        Pixels, shape (n,); ``inf`` behind the camera and for a point that is not finite.
+    """
     seen = points @ pose[:3, :3].T + pose[:3, 3]
     ahead = seen[:, 2] > 1e-6
     z = np.where(ahead, seen[:, 2], 1.0)
@@ -73,8 +86,10 @@ def centre(pose: Floats) -> Floats:
 def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
     """Return the motions that two views of the same corners allow.
 
-    A homography (the corners lie on a plane; up to four motions) and an essential matrix (they do
-    not) are both fitted; which of all is right shows in further views.
+    A homography (the corners lie on a plane; up to four motions: E. Malis and M. Vargas, "Deeper
+    understanding of the homography decomposition", INRIA 2007) and an essential matrix (they do
+    not: D. Nistér, "An efficient solution to the five-point relative pose problem", PAMI 2004) are
+    both fitted; which of all is right shows in further views.
 
     Args:
         first: Pixels in the first view, shape (n, 2).
@@ -87,14 +102,14 @@ def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
     found: list[Floats] = []
     cv2.setRNGSeed(1)
     plane: Any
-    plane, _ = cv2.findHomography(first, second, cv2.RANSAC, _THREE_PIXELS)
+    plane, _ = cv2.findHomography(first, second, cv2.RANSAC, _PLANE)
     if plane is not None:
         _, turns, shifts, _ = cv2.decomposeHomographyMat(plane, matrix)
         for turn, shift in zip(turns, shifts, strict=True):
             if (length := float(np.linalg.norm(shift))) > 1e-6:
                 found.append(_pose(turn, shift / length))
     essential: Any
-    essential, _ = cv2.findEssentialMat(first, second, matrix, cv2.RANSAC, 0.999, 1.0)
+    essential, _ = cv2.findEssentialMat(first, second, matrix, cv2.RANSAC, 0.999, _EPIPOLAR)
     if essential is not None and essential.shape == (3, 3):
         one, other, shift = cv2.decomposeEssentialMat(essential)
         found += [_pose(turn, sign * shift) for turn in (one, other) for sign in (1.0, -1.0)]

@@ -87,7 +87,7 @@ class OrbSlam3Process:
         ValueError: The vocabulary is none.
     """
 
-    def __init__(self, settings: Settings, vocabulary: Path, *, patience: float = 0.0) -> None:
+    def __init__(self, settings: Settings, vocabulary: Path, patience: float = 0.0) -> None:
         try:
             import pyorbslam3
         except ImportError as error:  # also where one of the system's libraries is missing

@@ -78,7 +78,7 @@ def solve_pose(
     jacobian = np.zeros((len(target), 3, 6))
     for _ in range(_STEPS):
         p = seen.landmarks @ pose[:3, :3].T + pose[:3, 3]
-        ahead = p[:, 2] > 0.05
+        ahead = p[:, 2] > 0.01
         inverse = 1.0 / np.where(ahead, p[:, 2], 1.0)
         x, y = p[:, 0] * inverse, p[:, 1] * inverse
         residuals = np.stack(

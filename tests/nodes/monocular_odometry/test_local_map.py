@@ -81,16 +81,16 @@ def test_a_corner_that_fits_nowhere_is_dropped() -> None:
 
 
 def test_landmarks_out_of_sight_still_hold_the_key_frames_that_saw_them() -> None:
-    errors = []
-    for gone in (True, False):
-        made = begin()
-        made.add_keyframe(BLANK, inverse(PLACES[2]), np.arange(80), project(PLACES[2]))
-        rows = np.arange(60, 80) if gone else np.arange(80)
-        moved = PLACES[3].copy()
-        moved[:3, 3] += 0.01
-        made.add_keyframe(BLANK, inverse(moved), rows, project(PLACES[3])[rows])
-        errors.append(np.abs(inverse(made.pose) - PLACES[3]).max())
-    assert max(errors) < 2e-3
+    made = begin()
+    made.tracks.points[:] = POINTS
+    here, there = project(PLACES[2]), project(PLACES[3])
+    here[:8] += (1.2, -0.8)  # the last to stay in sight are followed a little wrongly
+    there[:8] += (1.2, -0.8)
+    made.add_keyframe(BLANK, inverse(PLACES[2]), np.arange(80), here)
+    before = made.pose
+    made.add_keyframe(BLANK, inverse(PLACES[3]), np.arange(8), there[:8])
+    after = made._poses[2]
+    assert 0 < np.abs(after - before).max() < 3e-4
 
 
 def test_key_frames_that_nothing_needs_are_forgotten() -> None:

@@ -102,7 +102,7 @@ def test_a_camera_that_hurries_is_followed() -> None:
 
 
 def test_landmarks_that_leave_are_replaced_by_far_ones_in_time() -> None:
-    path: list[Place] = [(0.06 * i,) for i in range(54)]
+    path: list[Place] = [(0.06 * i,) for i in range(50)]
     said = follow(MonocularOdometry(INFO), pictures(path, BOARD))
     known = [each for each in said if each.initialised]
     assert not any(each.lost for each in known)
@@ -251,3 +251,14 @@ def test_a_distorted_camera_is_refused() -> None:
     bent = msgspec.structs.replace(INFO, distortion=(0.1, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="without distortion"):
         MonocularOdometry(bent)
+
+
+def test_a_place_is_found_again_after_being_carried_there() -> None:
+    odometry = MonocularOdometry(INFO)
+    *_, before = follow(odometry, pictures(RIGHT))
+    odometry.track(24 * FRAME, DARK)
+    there: Place = (0.75, 0.1, 0.0, 3.0)  # much farther than optical flow reaches
+    *_, after = follow(odometry, pictures([there] * 3), 25)
+    assert not after.lost
+    assert turned(after.pose, pose(*there)) < 0.5
+    assert unit(after, there) == pytest.approx(unit(before, RIGHT[-1]), rel=0.02)

@@ -28,7 +28,7 @@ RELIEF: tuple[Tile, ...] = (
     *((1.7 - 0.1 * i, -0.9 + 1.2 * i, -0.3 + 1.2 * i, 0.2, 0.9) for i in range(3)),
 )
 """A floor with boxes on it, along x."""
-BOARD: tuple[Tile, ...] = ((8.0, -40.0, 40.0, -40.0, 40.0), (2.0, -9.0, 1.0, -9.0, 9.0))
+BOARD: tuple[Tile, ...] = ((20.0, -99.0, 99.0, -99.0, 99.0), (2.0, -9.0, 0.4, -9.0, 9.0))
 """A board that ends on the right, and something far behind it."""
 _METRE = 120.0
 """Pixels of texture to a metre, two metres away."""
