@@ -77,6 +77,7 @@ class Evaluation(Node[EvaluationConfig]):
         self._live: dict[str, LiveErrors] = {}
         self._album = Album(self.config.pictures)
         self._files: dict[str, IO[str]] = {}
+        self._closed = False
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Take the first vehicle's truth, unless the file names another; expect estimators."""
@@ -134,6 +135,7 @@ class Evaluation(Node[EvaluationConfig]):
 
     async def on_shutdown(self) -> None:
         """Judge, and write what came of it."""
+        self._closed = True  # what comes from now on is judged, too, but too late for the files
         for file in self._files.values():
             file.close()
         if not self._records:
@@ -186,7 +188,7 @@ class Evaluation(Node[EvaluationConfig]):
 
     def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
         """Add a pose to a file: should the run be killed, what was said until then is there."""
-        if self.out is None:
+        if self.out is None or self._closed:
             return
         file = self._files.get(name)
         if file is None:

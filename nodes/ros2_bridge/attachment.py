@@ -1,0 +1,51 @@
+"""What goes with every message: its number, when it was said, and by whom.
+
+A ROS process that gets a malformed attachment ends, so there is one place that makes them.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+_LAYOUT = struct.Struct("<qqB16s")
+"""Two numbers, and a buffer of 16 bytes after its length, in Zenoh's own serialisation."""
+
+SIZE = _LAYOUT.size
+
+
+class Attachment(NamedTuple):
+    """What an attachment says.
+
+    Attributes:
+        sequence: Number of the message from its publisher, from 1.
+        stamp: Wall clock, nanoseconds since 1970.
+        gid: The publisher's, 16 bytes.
+    """
+
+    sequence: int
+    stamp: int
+    gid: bytes
+
+
+def pack(attachment: Attachment) -> bytes:
+    """Return the attachment's 33 bytes.
+
+    Raises:
+        ValueError: The GID has not 16 bytes.
+    """
+    if len(attachment.gid) != 16:
+        raise ValueError(f"gid: expected 16 bytes, found {len(attachment.gid)}")
+    return _LAYOUT.pack(attachment.sequence, attachment.stamp, 16, attachment.gid)
+
+
+def unpack(data: bytes) -> Attachment:
+    """Read an attachment.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if len(data) != SIZE or data[16] != 16:
+        raise ValueError(f"attachment: expected {SIZE} bytes with a GID of 16, found {data!r:.80}")
+    sequence, stamp, _, gid = _LAYOUT.unpack(data)
+    return Attachment(sequence, stamp, gid)

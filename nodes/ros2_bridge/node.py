@@ -1,0 +1,267 @@
+"""The bridge as a node: what it hears from the run and says to ROS 2, and the other way round."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    Imu,
+    Odometry,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    Range,
+    Score,
+    SegmentationImage,
+    Setpoint,
+    TransformStamped,
+)
+from nodes.ros2_bridge.calibration import camera_announcement
+from nodes.ros2_bridge.complaints import Complaints
+from nodes.ros2_bridge.hearing import Hearing
+from nodes.ros2_bridge.inbox import Inbox
+from nodes.ros2_bridge.keys import NodeName
+from nodes.ros2_bridge.messages import Time
+from nodes.ros2_bridge.publishing import Publishing
+from nodes.ros2_bridge.session import Session, SessionError
+from nodes.ros2_bridge.settings import Ros2BridgeConfig
+from nodes.ros2_bridge.stamps import Stamps
+from nodes.ros2_bridge.typestore import TypeStore
+from runtime import Node, Output, Stream, Tick, every, on
+from runtime.errors import FatalError
+
+WAITING = 8
+"""Pictures of one kind that wait to be published; the oldest is dropped, and counted."""
+
+
+class Ros2Bridge(Node[Ros2BridgeConfig]):
+    """ROS 2 sees the run as a node with ordinary topics, and the run hears topics of ROS 2.
+
+    ::
+
+        [[nodes]]
+        name = "ros2"
+        type = "nodes.ros2_bridge:Ros2Bridge"
+
+        [[nodes.subscriptions]]
+        topic = "/cmd_vel"
+        type = "geometry_msgs/msg/Twist"
+        as = "velocity"
+
+    What is announced has its topics from the start; what is not, from its first event. What comes
+    from outside and makes no sense is counted, logged now and then, and left out.
+    """
+
+    estimates = Output(PoseEstimate)
+    setpoints = Output(Setpoint)
+    pictures = Output(Image)
+    depth_pictures = Output(DepthImage)
+    inertial = Output(Imu)
+    odometry = Output(Odometry)
+    others = Output(Event)
+    """What mappings of the user's own make."""
+
+    def __init__(self) -> None:
+        self._session: Session | None = None
+        self._publishing: Publishing | None = None
+        self._lanes: dict[type[Event], Stream[Any]] = {
+            kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
+            for kind in (Image, DepthImage, SegmentationImage, PointCloud)
+        }
+        self._hearings: list[Hearing] = []
+        self._cameras: list[CameraAnnouncement] = []
+        self._stamps: Stamps | None = None
+        self._open = False
+        # What ROS sends comes at its own time.
+        self.deterministic = not self.config.subscriptions  # type: ignore[misc]
+
+    async def on_startup(self) -> None:
+        """Join the network, and wait for the cameras that ROS has.
+
+        Raises:
+            MissingDependencyError: rosbags is not installed.
+            FatalError: The settings make no sense together, or there is no session to be had.
+        """
+        config = self.config
+        if config.time == "wall" and self.clock.kind != "real":
+            self.log.fatal('time = "wall" needs clock = "real", found "%s"', self.clock.kind)
+        if config.subscriptions and self.clock.kind != "real":
+            self.log.warning(
+                "what ROS sends comes at its own time, so runs in lockstep will differ; "
+                'subscriptions are for clock = "real"'
+            )
+        self._complaints = Complaints(self.log.warning)
+        try:
+            self._store = await self.offload(TypeStore, config.distribution, config.definitions)
+            self._hearings = [
+                Hearing(each, config, self._store, self.name, self._complaints)
+                for each in config.subscriptions
+            ]
+            session = await self.offload(
+                Session,
+                NodeName(
+                    name=config.node_name, namespace=config.namespace, domain_id=config.domain_id
+                ),
+                keys=config.keys,
+                connect=config.connect,
+                listen=config.listen,
+                file=config.zenoh_config,
+            )
+        except (ValueError, SessionError) as error:
+            self.log.fatal("%s", error)
+        self._session = session
+        self._publishing = Publishing(session, self._store, config, self._time)
+        await self.offload(self._publishing.warm_up)
+        try:
+            for hearing in self._hearings:
+                if hearing.subscription.use == "camera":
+                    await self._find_camera(session, hearing)
+        except FatalError:
+            await self.offload(session.close)
+            raise
+
+    def announce(self) -> Iterable[Announcement]:
+        """Say which estimates and cameras will come from ROS."""
+        yield from self._cameras
+        for hearing in self._hearings:
+            said = hearing.subscription
+            if said.use == "estimate":
+                yield EstimatorAnnouncement(
+                    stamp=0,
+                    source=hearing.source,
+                    method=f"ROS 2: {hearing.topic.name}",
+                    scale_free=said.scale_free,
+                )
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Declare the publishers for what will be said."""
+        ours = {hearing.source for hearing in self._hearings}
+        if self._publishing is not None and announcement.source not in ours:
+            self._publishing.announced(announcement)
+
+    async def run(self) -> None:
+        """Subscribe, and publish pictures and clouds beside the loop, each kind in order."""
+        publishing, session = self._publishing, self._session
+        assert publishing is not None
+        assert session is not None
+        self._open = True
+        publishing.begin()
+        for kind, events in self._lanes.items():
+            self.start(self._lane(events, publishing.large[kind]))
+        for hearing in self._hearings:
+            await self.offload(session.subscribe, hearing.topic, self._inbox(hearing).take)
+
+    async def on_shutdown(self) -> None:
+        """Leave the network, and tell what went where."""
+        self._open = False
+        publishing, session = self._publishing, self._session
+        if publishing is None or session is None:
+            return
+        sent = [each for each in publishing.publishers if each.sent]
+        heard = sum(hearing.heard for hearing in self._hearings)
+        refused = sum(self._complaints.counts.values())
+        self.log.info(
+            "%d messages published on %d topics (%d pictures dropped); %d heard, %d refused or "
+            "dropped",
+            sum(each.sent for each in sent),
+            len(sent),
+            sum(lane.dropped for lane in self._lanes.values()),
+            heard,
+            refused,
+        )
+        if not await self.offload(session.close):
+            self.log.warning("a peer that stands still keeps the session from closing")
+
+    @on(Image, DepthImage, SegmentationImage, PointCloud)
+    def shown(self, event: Event) -> None:
+        """Have a picture or a cloud published beside the loop."""
+        self._lanes[next(kind for kind in self._lanes if isinstance(event, kind))].offer(event)
+
+    @on(Odometry, PoseStamped, PoseEstimate, TransformStamped, Imu, Range, Score)
+    def said(self, event: Event) -> None:
+        """Publish what is small, at once."""
+        if self._publishing is not None:
+            self._publishing.small(event)
+
+    @every(hz="clock_rate")
+    def tell_time(self, tick: Tick) -> None:  # noqa: ARG002
+        """Publish ``/clock``."""
+        if self._publishing is not None:
+            self._publishing.clock(self.clock.now())
+
+    async def _lane(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
+        async for event in events:
+            await self.offload(put, event)
+
+    def _inbox(self, hearing: Hearing) -> Inbox:
+        said = hearing.subscription
+
+        def deliver(data: bytes) -> None:
+            if self._open:
+                event = hearing.event(data, self.clock.now(), self._told())
+                if event is not None:
+                    self._send(event)
+
+        return Inbox(
+            asyncio.get_running_loop(),
+            deliver,
+            depth=said.depth,
+            rate=said.rate,
+            largest=self.config.largest,
+            complain=hearing.complain,
+        )
+
+    def _send(self, event: Event) -> None:
+        match event:
+            case PoseEstimate():
+                self.estimates.send(event)
+            case Setpoint():
+                self.setpoints.send(event)
+            case Image():
+                self.pictures.send(event)
+            case DepthImage():
+                self.depth_pictures.send(event)
+            case Imu():
+                self.inertial.send(event)
+            case Odometry():
+                self.odometry.send(event)
+            case _:
+                self.others.send(event)
+
+    async def _find_camera(self, session: Session, hearing: Hearing) -> None:
+        """Wait for a camera's calibration, and remember to announce it."""
+        wait, topic = hearing.subscription.wait, hearing.topic
+        data = await self.offload(session.first, topic, wait, self.config.largest)
+        if data is None:
+            self.log.fatal("%s: expected a calibration within %g s, found none", topic.name, wait)
+        try:
+            message = self._store.deserialize(data, topic.type)
+            images, frame_id = self._images_of(hearing.source), hearing.subscription.frame_id
+            announcement = camera_announcement(message, hearing.source, images, frame_id)
+            self._cameras.append(announcement)
+        except ValueError as error:
+            self.log.fatal("%s: %s", topic.name, error)
+
+    def _images_of(self, source: str) -> tuple[str, ...]:
+        kinds = {"image": "rgb", "depth": "depth"}
+        uses = [each.subscription.use for each in self._hearings if each.source == source]
+        return tuple(kinds[use] for use in uses if use in kinds)
+
+    def _told(self) -> Stamps:
+        """Return how messages tell the time, which is fixed when the first is made."""
+        if self._stamps is None:
+            wall = self.config.time == "wall"
+            self._stamps = Stamps(time.time_ns() - self.clock.now() if wall else 0)
+        return self._stamps
+
+    def _time(self, stamp: int) -> Time:
+        return self._told().out(stamp)

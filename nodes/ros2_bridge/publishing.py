@@ -1,0 +1,259 @@
+"""What the bridge says: publishers by source, and which message an event becomes.
+
+Pictures and clouds are put from a thread beside the loop, one of each kind at a time; the rest is
+small and put at once.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    Range,
+    Score,
+    SegmentationImage,
+    TransformStamped,
+)
+from nodes.ros2_bridge.frames import turn_points
+from nodes.ros2_bridge.keys import Topic
+from nodes.ros2_bridge.messages import Messages, Time
+from nodes.ros2_bridge.pictures import CloudWriter, CompressedWriter, ImageWriter
+from nodes.ros2_bridge.plan import NAMES, FrameNames, Publication, What, announced, publication
+from nodes.ros2_bridge.session import Publisher, Session
+from nodes.ros2_bridge.settings import Ros2BridgeConfig
+from nodes.ros2_bridge.transforms import Transforms
+from nodes.ros2_bridge.typestore import TypeStore
+
+
+class Publishing:
+    """Publishers of a session.
+
+    Args:
+        session: Where to publish.
+        store: Of the types.
+        config: The bridge's settings.
+        time: Returns a stamp as messages tell it.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        store: TypeStore,
+        config: Ros2BridgeConfig,
+        time: Callable[[int], Time],
+    ) -> None:
+        self._session = session
+        self._store = store
+        self._config = config
+        self._time = time
+        self._names = FrameNames()
+        self._messages = Messages(store, self._names)
+        self._transforms = Transforms(self._names, config.vehicle, config.tf)
+        self._cameras: dict[str, CameraAnnouncement] = {}
+        self._imus: dict[str, ImuAnnouncement] = {}
+        self._publishers: dict[tuple[What, str], Publisher | None] = {}
+        self._writers: dict[tuple[What, str], Any] = {}
+        self._lock = threading.Lock()
+        self.large: dict[type[Event], Callable[[Any], None]] = {
+            Image: self.image,
+            DepthImage: self.depth,
+            SegmentationImage: self.segmentation,
+            PointCloud: self.cloud,
+        }
+        self._small: dict[type[Event], Callable[[Any], None]] = {
+            Odometry: self.odometry,
+            PoseStamped: self.pose,
+            PoseEstimate: self.estimate,
+            TransformStamped: self.transform,
+            Imu: self.imu,
+            Range: self.range,
+            Score: self.score,
+        }
+
+    @property
+    def publishers(self) -> list[Publisher]:
+        """Return what was declared so far."""
+        return [each for each in self._publishers.values() if each is not None]
+
+    def announced(self, announcement: Announcement) -> None:
+        """Declare the publishers for what a node announced."""
+        if isinstance(announcement, CameraAnnouncement):
+            self._cameras[announcement.source] = announcement
+        elif isinstance(announcement, ImuAnnouncement):
+            self._imus[announcement.source] = announcement
+        self._transforms.announced(announcement)
+        for found in announced(announcement, self._config):
+            self._declare(found)
+
+    def warm_up(self) -> None:
+        """Have everything made that a first message needs, while there is time."""
+        for type_ in {found for _, found, _ in NAMES.values()}:
+            self._store.hash(type_)
+
+    def begin(self) -> None:
+        """Put what holds for the whole run."""
+        self._put_static()
+
+    # Beside the loop.
+
+    def image(self, event: Image) -> None:
+        """Put a picture, and its camera's calibration before it."""
+        self._info("info", event.stamp, event.source)
+        camera = self._cameras.get(event.source)
+        grey = event.encoding == "mono8" and camera is not None and "rgb" in camera.images
+        if self._config.raw:
+            self._picture("mono" if grey else "image", event, event.encoding)
+        if self._config.compressed and not grey:
+            what: What = "compressed"
+            if publisher := self._publisher(what, event.source):
+                writer = self._writers.get((what, event.source))
+                if writer is None:
+                    frame = self._names.name(event.frame_id)
+                    how, quality = self._config.compressed, self._config.jpeg_quality
+                    writer = CompressedWriter(self._store, frame, how, quality)
+                    self._writers[what, event.source] = writer
+                publisher.put(writer.write(self._time(event.stamp), event.data))
+
+    def depth(self, event: DepthImage) -> None:
+        """Put a depth image, and its camera's calibration before it."""
+        self._info("depth_info", event.stamp, event.source)
+        self._picture("depth", event, "32FC1")
+
+    def segmentation(self, event: SegmentationImage) -> None:
+        """Put object numbers."""
+        self._picture("segmentation", event, "32SC1")
+
+    def cloud(self, event: PointCloud) -> None:
+        """Put a cloud."""
+        if publisher := self._publisher("cloud", event.source):
+            writer = CloudWriter(self._store, self._names.name(event.frame_id))
+            points = turn_points(self._names.axes(event.frame_id), event.points)
+            publisher.put(writer.write(self._time(event.stamp), points, event.colors))
+
+    # At once.
+
+    def small(self, event: Event) -> None:
+        """Put what any of the following functions puts."""
+        kind = type(event)
+        put = self._small.get(kind)
+        if put is None:  # a subclass of a node's own
+            put = next(put for base, put in self._small.items() if issubclass(kind, base))
+            self._small[kind] = put
+        put(event)
+
+    def odometry(self, event: Odometry) -> None:
+        """Put a body's pose and twist, and where that puts ``base_link``."""
+        time = self._time(event.stamp)
+        if publisher := self._publisher("odometry", event.source):
+            publisher.put(self._messages.odometry(time, event))
+        self._tf(time, self._transforms.odometry(event))
+
+    def pose(self, event: PoseStamped) -> None:
+        """Put a pose; a camera's is that of its optical frame."""
+        time, camera = self._time(event.stamp), self._cameras.get(event.source)
+        if publisher := self._publisher("pose", event.source):
+            axes = "body" if camera is None else self._names.axes(camera.frame_id)
+            publisher.put(self._messages.pose(time, event, axes))
+        self._tf(time, self._transforms.pose(event))
+
+    def estimate(self, event: PoseEstimate) -> None:
+        """Put an estimate."""
+        time = self._time(event.stamp)
+        if publisher := self._publisher("estimate", event.source):
+            child = self._names.axes(event.child_frame_id)
+            make = self._messages.pose
+            if self._config.covariance:
+                make = self._messages.pose_with_covariance  # type: ignore[assignment]
+            publisher.put(make(time, event, child))
+        self._tf(time, self._transforms.estimate(event))
+
+    def transform(self, event: TransformStamped) -> None:
+        """Put a transform that a node sent, unless the bridge makes it itself."""
+        if event.static:
+            if self._transforms.add_static(event):
+                self._put_static()
+        else:
+            self._tf(self._time(event.stamp), self._transforms.moving(event))
+
+    def imu(self, event: Imu) -> None:
+        """Put an inertial measurement."""
+        if publisher := self._publisher("imu", event.source):
+            noise = self._imus.get(event.source)
+            publisher.put(self._messages.imu(self._time(event.stamp), event, noise))
+
+    def range(self, event: Range) -> None:
+        """Put a distance."""
+        if publisher := self._publisher("range", event.source):
+            publisher.put(self._messages.range(self._time(event.stamp), event))
+
+    def score(self, event: Score) -> None:
+        """Put a number, on a topic of its subject and metric."""
+        if publisher := self._publisher("score", f"{event.subject}/{event.metric}"):
+            publisher.put(self._messages.score(event))
+
+    def clock(self, now: int) -> None:
+        """Put the time."""
+        if publisher := self._publisher("clock", ""):
+            publisher.put(self._messages.clock(self._time(now)))
+
+    def _picture(
+        self, what: What, event: Image | DepthImage | SegmentationImage, encoding: str
+    ) -> None:
+        publisher = self._publisher(what, event.source)
+        if publisher is None:
+            return
+        writer = self._writers.get((what, event.source))
+        if writer is None:
+            writer = ImageWriter(self._store, self._names.name(event.frame_id), encoding)
+            self._writers[what, event.source] = writer
+        publisher.put(writer.write(self._time(event.stamp), event.data))
+
+    def _info(self, what: What, stamp: int, source: str) -> None:
+        camera = self._cameras.get(source)
+        publisher = self._publisher(what, source) if camera is not None else None
+        if camera is not None and publisher is not None:
+            frame = camera.frame_id
+            publisher.put(self._messages.camera_info(self._time(stamp), camera.info, frame))
+
+    def _tf(self, time: Time, transforms: Any) -> None:
+        if transforms and (publisher := self._publisher("tf", "")):
+            publisher.put(self._messages.transforms(time, transforms))
+
+    def _put_static(self) -> None:
+        transforms = self._transforms.static()
+        if transforms and (publisher := self._publisher("tf_static", "")):
+            publisher.put(self._messages.transforms(self._time(0), transforms))
+
+    def _publisher(self, what: What, source: str) -> Publisher | None:
+        """Return a publisher, declared now if nobody announced the source."""
+        try:
+            return self._publishers[what, source]
+        except KeyError:
+            found = publication(what, source, self._config)
+            if found is None:
+                self._publishers[what, source] = None
+                return None
+            return self._declare(found)
+
+    def _declare(self, found: Publication) -> Publisher:
+        with self._lock:  # lanes beside the loop may want one for the first time together
+            key = (found.what, found.source)
+            known = self._publishers.get(key)
+            if known is None:
+                hash_ = self._store.hash(found.type)
+                topic = Topic(name=found.topic, type=found.type, hash=hash_, qos=found.qos)
+                known = self._publishers[key] = self._session.publisher(topic)
+            return known

@@ -1,0 +1,158 @@
+"""What the file says of the bridge."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+import msgspec
+
+from nodes.ros2_bridge.incoming import READERS
+from nodes.ros2_bridge.keys import Qos, dds_type, topic_name
+from nodes.ros2_bridge.typestore import Distribution
+from runtime import NodeConfig
+
+Kind = Literal[
+    "images",
+    "depth",
+    "segmentation",
+    "clouds",
+    "imu",
+    "odometry",
+    "poses",
+    "tf",
+    "estimates",
+    "scores",
+    "ranges",
+    "clock",
+]
+
+KINDS: tuple[Kind, ...] = Kind.__args__  # type: ignore[attr-defined]
+
+_Positive = Annotated[int, msgspec.Meta(ge=1)]
+_Rate = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A topic to hear, and what its messages become.
+
+    Attributes:
+        topic: Relative to the namespace, or with a leading slash.
+        type: ``geometry_msgs/msg/PoseStamped``.
+        use: ``as`` in the file: what a message becomes. ``estimate`` (from PoseStamped,
+            PoseWithCovarianceStamped or Odometry), ``odometry`` (Odometry), ``velocity`` (Twist,
+            TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``, ``depth`` (Image),
+            ``imu`` (Imu), ``camera`` (CameraInfo; the run waits for the first one, and a camera
+            is announced).
+        mapping: Instead: ``module:function``, which takes a message and the `Reading` and
+            returns an event, or None.
+        source: Of the events; if empty, the node's name and the topic.
+        frame_id: If set, the frame that events name, whatever the message says.
+        scale_free: Whether an estimate's unit of length is its own.
+        reliable: Quality of service, as ROS shows it.
+        depth: How many messages wait at most.
+        rate: Messages a second at most; what comes faster is dropped.
+        wait: Seconds that the run's start waits for a ``camera``.
+    """
+
+    topic: str
+    type: str
+    use: str = msgspec.field(name="as", default="")
+    mapping: str = ""
+    source: str = ""
+    frame_id: str = ""
+    scale_free: bool = False
+    reliable: bool = True
+    depth: _Positive = 10
+    rate: _Rate = 1000.0
+    wait: Annotated[float, msgspec.Meta(ge=0)] = 10.0
+
+    def __post_init__(self) -> None:
+        dds_type(self.type)
+        topic_name("/", self.topic)
+        if bool(self.use) == bool(self.mapping):
+            raise ValueError(f'{self.topic}: expected either as = "…" or mapping = "…"')
+        if self.mapping and not re.fullmatch(r"\w+(\.\w+)*:\w+", self.mapping):
+            raise ValueError(
+                f'{self.topic}: mapping: expected "module:function", found {self.mapping!r}'
+            )
+        if self.use and (self.type, self.use) not in READERS:
+            known = [f"{use} from {type_}" for type_, use in READERS]
+            raise ValueError(
+                f"{self.topic}: expected one of: {', '.join(known)}; "
+                f"found {self.use} from {self.type}"
+            )
+
+    @property
+    def qos(self) -> Qos:
+        """Return the quality of service."""
+        return Qos(reliable=self.reliable, depth=self.depth)
+
+
+class Ros2BridgeConfig(NodeConfig):
+    """Settings of the bridge.
+
+    Attributes:
+        domain_id: ROS_DOMAIN_ID.
+        namespace: Before all topics' names that do not begin with a slash.
+        node_name: As ``ros2 node list`` shows it.
+        distribution: Of ROS 2, on the other side.
+        keys: ``rmw_zenoh``, or ``ros2dds`` for a bridge with zenoh-plugin-ros2dds.
+        connect: Zenoh endpoints; if not given, those of `zenoh_config`, or without such a file
+            ``tcp/localhost:7447``, where ``rmw_zenohd`` listens.
+        listen: The same for listening; without anything, any port of the loopback.
+        zenoh_config: A Zenoh configuration file (JSON5) for whatever else: TLS, access control,
+            shared memory.
+        publish: What to publish.
+        topics: Other names for topics, by the name that they would have.
+        time: ``simulated``: stamps count from the run's start, and ``/clock`` tells the time (set
+            ``use_sim_time``). ``wall``: they are shifted to the wall clock, and there is no
+            ``/clock``; with the real clock only.
+        clock_rate: Of ``/clock``, Hz.
+        vehicle: Whose truth ``/tf`` shows; if empty, the first that is announced.
+        tf: ``truth``, or the source of the estimates that place ``base_link`` instead.
+        covariance: Publish estimates as PoseWithCovarianceStamped.
+        raw: Publish images as they are.
+        compressed: Publish images as ``CompressedImage``, too; depth images are left as they are.
+        jpeg_quality: 1 to 100.
+        image_qos: ``reliable`` or ``best_effort``.
+        largest: Bytes of a message from outside at most.
+        definitions: Types that ROS 2 does not come with, and the ``.msg`` file of each.
+        subscriptions: What to hear.
+    """
+
+    domain_id: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
+    namespace: str = "/"
+    node_name: str = "visnav"
+    distribution: Distribution = "jazzy"
+    keys: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
+    connect: tuple[str, ...] | None = None
+    listen: tuple[str, ...] | None = None
+    zenoh_config: str = ""
+    publish: tuple[Kind, ...] = KINDS
+    topics: dict[str, str] = msgspec.field(default_factory=dict)
+    time: Literal["simulated", "wall"] = "simulated"
+    clock_rate: _Rate = 100.0
+    vehicle: str = ""
+    tf: str = "truth"
+    covariance: bool = False
+    raw: bool = True
+    compressed: Literal["", "jpeg", "png"] = ""
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
+    image_qos: Literal["reliable", "best_effort"] = "reliable"
+    largest: _Positive = 64 * 1024 * 1024
+    definitions: dict[str, str] = msgspec.field(default_factory=dict)
+    subscriptions: tuple[Subscription, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.namespace.startswith("/"):
+            raise ValueError(f"namespace: expected a leading slash, found {self.namespace!r}")
+        if self.namespace != "/":
+            topic_name("/", self.namespace)
+        topic_name("/", f"/{self.node_name}")
+        if "/" in self.node_name:
+            raise ValueError(f"node_name: expected no slash, found {self.node_name!r}")
+        for name in self.topics.values():
+            topic_name("/", name)
+        for type_ in self.definitions:
+            dds_type(type_)

@@ -1,0 +1,45 @@
+"""Times: nanoseconds of the run's clock to seconds and nanoseconds of a ROS message, and back."""
+
+from __future__ import annotations
+
+import msgspec
+
+SECOND = 1_000_000_000
+
+AHEAD = SECOND
+"""How far ahead of the run's clock a stamp from outside may be."""
+
+
+class Stamps(msgspec.Struct, frozen=True):
+    """How the run's clock stands to the time in messages.
+
+    Attributes:
+        offset: Nanoseconds to add on the way out.
+    """
+
+    offset: int = 0
+
+    def out(self, stamp: int) -> tuple[int, int]:
+        """Return the seconds and nanoseconds of a stamp."""
+        return divmod(stamp + self.offset, SECOND)
+
+    def back(self, seconds: int, nanoseconds: int, now: int) -> int:
+        """Return a message's time on the run's clock.
+
+        Args:
+            seconds: Of the message; both 0 stand for now.
+            nanoseconds: Of the message.
+            now: On the run's clock (ns).
+
+        Raises:
+            ValueError: It lies before the run, or ahead of its clock.
+        """
+        if seconds == 0 and nanoseconds == 0:
+            return now
+        stamp = int(seconds) * SECOND + int(nanoseconds) - self.offset
+        if not 0 <= stamp <= now + AHEAD:
+            raise ValueError(
+                f"stamp: expected a time of this run, from 0 s to {now / SECOND:.3f} s, "
+                f"found {stamp / SECOND:.3f} s"
+            )
+        return stamp

@@ -1,0 +1,135 @@
+"""Names on Zenoh, against what rmw_zenoh's design document and its users show."""
+
+from __future__ import annotations
+
+import pytest
+import zenoh
+
+from nodes.ros2_bridge.attachment import SIZE, Attachment, pack, unpack
+from nodes.ros2_bridge.gid import gid
+from nodes.ros2_bridge.keys import (
+    NodeName,
+    Qos,
+    Topic,
+    data_key,
+    dds_type,
+    endpoint_token,
+    graph_key,
+    node_token,
+    ros2dds_key,
+    ros_name,
+    topic_name,
+)
+from nodes.ros2_bridge.typestore import TypeStore
+
+STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+LISTENER = "aac3178e146ba6f1fc6e6a4085e77f21"
+TALKER = "8b20917502ee955ac4476e0266340d5c"
+
+
+def chatter(depth: int = 10) -> Topic:
+    return Topic(name="/chatter", type="std_msgs/msg/String", hash=STRING, qos=Qos(depth=depth))
+
+
+def test_the_token_of_a_node_is_that_of_the_design_document() -> None:
+    token = node_token(NodeName(name="listener"), LISTENER, 0)
+    assert token == f"@ros2_lv/0/{LISTENER}/0/0/NN/%/%/listener"
+
+
+def test_the_tokens_of_endpoints_are_those_of_the_design_document() -> None:
+    listener = endpoint_token(NodeName(name="listener"), LISTENER, 0, 10, "MS", chatter())
+    assert listener == (
+        f"@ros2_lv/0/{LISTENER}/0/10/MS/%/%/listener/%chatter/"
+        f"std_msgs::msg::dds_::String_/{STRING}/::,10:,:,:,,"
+    )
+    talker = endpoint_token(NodeName(name="talker"), TALKER, 0, 10, "MP", chatter(7))
+    assert talker == (
+        f"@ros2_lv/0/{TALKER}/0/10/MP/%/%/talker/%chatter/"
+        f"std_msgs::msg::dds_::String_/{STRING}/::,7:,:,:,,"
+    )
+
+
+def test_slashes_within_a_component_become_percent_signs() -> None:
+    node = NodeName(name="eye", namespace="/fleet/one", domain_id=7)
+    topic = Topic(name="/fleet/one/image", type="a/msg/B", hash="h")
+    assert endpoint_token(node, "z", 1, 2, "MP", topic) == (
+        "@ros2_lv/7/z/1/2/MP/%/%fleet%one/eye/%fleet%one%image/a::msg::dds_::B_/h/::,10:,:,:,,"
+    )
+    assert graph_key(7) == "@ros2_lv/7/**"
+
+
+@pytest.mark.parametrize(
+    ("qos", "text"),
+    [
+        (Qos(), "::,10:,:,:,,"),
+        (Qos(reliable=False, depth=5), "2::,5:,:,:,,"),
+        (Qos(transient_local=True, depth=1), ":1:,1:,:,:,,"),
+        (Qos(depth=42), "::,:,:,:,,"),
+    ],
+)
+def test_quality_of_service_names_only_what_is_not_default(qos: Qos, text: str) -> None:
+    assert qos.text() == text
+
+
+def test_the_key_of_a_topic_is_what_ros_puts_images_on() -> None:
+    image = "sensor_msgs/msg/Image"
+    topic = Topic(name="/spike/colorbars", type=image, hash=TypeStore().hash(image))
+    assert data_key(0, topic) == (
+        "0/spike/colorbars/sensor_msgs::msg::dds_::Image_/"
+        "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"
+    )
+    assert ros2dds_key(topic) == "spike/colorbars"
+
+
+def test_types_hash_as_ros_does_and_not_at_all_on_humble() -> None:
+    store = TypeStore()
+    assert store.hash("std_msgs/msg/String") == STRING
+    assert store.hash("geometry_msgs/msg/Twist").startswith("RIHS01_9c45bf16fe0983d80e3cfe750d68")
+    assert store.hash("tf2_msgs/msg/TFMessage").startswith("RIHS01_e369d0f05a23ae52508854b66f6a")
+    assert TypeStore("humble").hash("std_msgs/msg/String") == "TypeHashNotSupported"
+    with pytest.raises(ValueError, match=r"'std_msgs/msg/Strin'.*did you mean"):
+        store.hash("std_msgs/msg/Strin")
+
+
+def test_a_gid_is_the_hash_of_the_token_low_half_first() -> None:
+    # XXH3's published 128-bit hash of nothing is 99aa06d3014798d8 6001c324468d497f.
+    assert gid("") == bytes.fromhex("7f498d4624c30160d8984701d306aa99")
+
+
+def test_an_attachment_is_what_zenoh_serialises() -> None:
+    said = Attachment(3, 1_700_000_000_123_456_789, bytes(range(16)))
+    number, stamp = zenoh.ext.Int64(said.sequence), zenoh.ext.Int64(said.stamp)
+    expected = zenoh.ext.z_serialize((number, stamp, said.gid)).to_bytes()
+    assert pack(said) == expected
+    assert len(expected) == SIZE == 33
+    assert unpack(expected) == said
+
+
+def test_a_malformed_attachment_is_never_made_nor_taken() -> None:
+    with pytest.raises(ValueError, match="expected 16 bytes, found 3"):
+        pack(Attachment(1, 2, b"abc"))
+    with pytest.raises(ValueError, match="expected 33 bytes"):
+        unpack(bytes(33))
+    with pytest.raises(ValueError, match="expected 33 bytes"):
+        unpack(b"")
+
+
+def test_names_are_checked_as_ros_does() -> None:
+    assert topic_name("/", "pose") == "/pose"
+    assert topic_name("/fleet", "a/b") == "/fleet/a/b"
+    assert topic_name("/fleet", "/tf") == "/tf"
+    for wrong in ("", "/", "a//b", "1a", "a-b", "a/", "a b", "a/**"):
+        with pytest.raises(ValueError, match="expected a topic"):
+            topic_name("/", wrong)
+    for wrong in ("Image", "a/b", "a/msg/B/c", "a/msg/1", "a/msg/B*"):
+        with pytest.raises(ValueError, match="expected a type"):
+            dds_type(wrong)
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [("drone/camera", "drone/camera"), ("front-left/2d", "front_left/_2d"), ("", "_")],
+)
+def test_a_source_becomes_a_name_that_ros_allows(source: str, name: str) -> None:
+    assert ros_name(source) == name
+    topic_name("/", name)

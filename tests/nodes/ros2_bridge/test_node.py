@@ -1,0 +1,197 @@
+"""The bridge as a node on simulated time, with a plain Zenoh session beside it."""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import zenoh
+
+from events import CameraAnnouncement, EstimatorAnnouncement, Image
+from nodes.ros2_bridge.keys import Topic, data_key
+from nodes.ros2_bridge.messages import Messages
+from nodes.ros2_bridge.node import Ros2Bridge
+from nodes.ros2_bridge.plan import FrameNames
+from nodes.ros2_bridge.typestore import TypeStore
+from runtime.errors import ConfigError, FatalError, MissingDependencyError
+from runtime.testing import run_node
+from tests.nodes.ros2_bridge import said
+from tests.nodes.ros2_bridge.network import free_port, zenoh_session
+
+ANNOUNCED = [said.vehicle(), said.camera(), said.imu(), said.estimator()]
+POSE = "geometry_msgs/msg/PoseStamped"
+
+
+class Listener:
+    """A session that hears all, and where it can be reached."""
+
+    def __init__(self, session: zenoh.Session, locator: str) -> None:
+        self.session, self.locator = session, locator
+        self.samples: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        session.declare_subscriber("**", self.samples.put)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return {"connect": [self.locator], "listen": []}
+
+    def collect(self, last: str) -> dict[str, list[Any]]:
+        """Return the samples by key, up to the first whose key begins like `last`."""
+        found: dict[str, list[Any]] = {}
+        while True:
+            sample = self.samples.get(timeout=10)
+            found.setdefault(str(sample.key_expr), []).append(sample)
+            if str(sample.key_expr).startswith(last):
+                return found
+
+
+@pytest.fixture
+def listener() -> Iterator[Listener]:
+    locator = f"tcp/127.0.0.1:{free_port()}"
+    with zenoh_session(listen=locator) as session:
+        yield Listener(session, locator)
+
+
+def frames(count: int) -> list[Image]:
+    return [said.image(10_000_000 * (i + 1)) for i in range(count)]
+
+
+def test_in_lockstep_every_picture_is_published_in_order(listener: Listener) -> None:
+    pictures = frames(20)
+    odometry = said.odometry(300_000_000)
+    run_node(
+        Ros2Bridge, inputs=[*ANNOUNCED, *pictures, odometry], config=listener.config, duration=0.4
+    )
+    found = listener.collect("0/drone/odom/")
+    (key,) = [each for each in found if each.startswith("0/drone/camera/image_raw/")]
+    messages: list[Any] = [
+        said.store().deserialize(sample.payload.to_bytes(), "sensor_msgs/msg/Image")
+        for sample in found[key]
+    ]
+    stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in messages]
+    assert stamps == [each.stamp for each in pictures]
+    assert messages[0].data.tobytes() == pictures[0].data.tobytes()
+    (info,) = [each for each in found if each.startswith("0/drone/camera/camera_info/")]
+    assert len(found[info]) == 20
+    (clock,) = [each for each in found if each.startswith("0/clock/")]
+    assert len(found[clock]) >= 29
+
+
+def test_a_bridge_of_zenoh_s_for_dds_gets_its_own_keys_and_no_attachment(
+    listener: Listener,
+) -> None:
+    config = listener.config | {"keys": "ros2dds", "namespace": "/fleet"}
+    run_node(Ros2Bridge, inputs=[*ANNOUNCED, said.odometry(1)], config=config, duration=0.1)
+    found = listener.collect("fleet/drone/odom")
+    assert found["fleet/drone/odom"][0].attachment is None
+    assert set(found) <= {"fleet/drone/odom", "tf", "tf_static", "clock"}
+
+
+def test_only_what_is_asked_for_is_published_under_the_name_that_is_asked_for(
+    listener: Listener,
+) -> None:
+    config = listener.config | {
+        "publish": ["images", "odometry"],
+        "raw": False,
+        "compressed": "jpeg",
+        "topics": {"drone/odom": "/truth"},
+    }
+    inputs = [*ANNOUNCED, *frames(1), said.odometry(20_000_000)]
+    run_node(Ros2Bridge, inputs=inputs, config=config, duration=0.1)
+    found = listener.collect("0/truth/")
+    topics = {"/".join(key.split("/")[1:-2]) for key in found}
+    assert topics == {"truth", "drone/camera/camera_info", "drone/camera/image_raw/compressed"}
+
+
+def test_subscriptions_in_lockstep_are_warned_of_and_announced(
+    listener: Listener, caplog: pytest.LogCaptureFixture
+) -> None:
+    table = {"topic": "slam/pose", "type": POSE, "as": "estimate", "scale_free": True}
+    config = listener.config | {"subscriptions": [table]}
+    result = run_node(Ros2Bridge, config=config, duration=0.1, name="ros2")
+    (found,) = result.of(EstimatorAnnouncement)
+    assert (found.source, found.method, found.scale_free) == (
+        "ros2/slam/pose",
+        "ROS 2: /slam/pose",
+        True,
+    )
+    assert any("lockstep" in record.getMessage() for record in caplog.records)
+
+
+def test_a_camera_of_ros_is_waited_for_and_announced(listener: Listener) -> None:
+    type_ = "sensor_msgs/msg/CameraInfo"
+    topic = Topic(name="/eye/camera_info", type=type_, hash=said.store().hash(type_))
+    info = said.camera().info
+    data = Messages(said.store(), FrameNames()).camera_info((0, 0), info, "eye_optical")
+    done = threading.Event()
+
+    def publish() -> None:
+        while not done.wait(0.02):
+            listener.session.put(data_key(0, topic), bytes(data))
+
+    common = {"source": "eye"}
+    config = listener.config | {
+        "subscriptions": [
+            {"topic": "/eye/camera_info", "type": type_, "as": "camera"} | common,
+            {"topic": "/eye/image", "type": "sensor_msgs/msg/Image", "as": "image"} | common,
+        ]
+    }
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        result = run_node(Ros2Bridge, config=config, duration=0.1)
+    finally:
+        done.set()
+        thread.join()
+    (camera,) = result.of(CameraAnnouncement)
+    assert (camera.source, camera.images, camera.info) == ("eye", ("rgb",), info)
+
+
+def test_a_camera_that_never_comes_ends_the_run() -> None:
+    table = {"topic": "c", "type": "sensor_msgs/msg/CameraInfo", "as": "camera", "wait": 0.05}
+    config = {"connect": [], "subscriptions": [table]}
+    with pytest.raises(FatalError, match=r"/c: expected a calibration within 0\.05 s, found none"):
+        run_node(Ros2Bridge, config=config)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"time": "wall"}, 'needs clock = "real"'),
+        ({"listen": ["tcp/127.0.0.1:99999"]}, "expected a Zenoh session"),
+        ({"zenoh_config": "/no/such/file"}, "expected a file, found none"),
+        (
+            {"subscriptions": [{"topic": "a", "type": "a/msg/B", "mapping": "a:b"}]},
+            "known message type",
+        ),
+        ({"definitions": {"a/msg/B": "/no/such/file"}}, "a/msg/B: expected a readable"),
+    ],
+)
+def test_what_cannot_work_ends_the_run_with_a_reason(config: dict[str, Any], message: str) -> None:
+    with pytest.raises(FatalError, match=message):
+        run_node(Ros2Bridge, config={"connect": []} | config)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"namespace": "fleet"}, "leading slash"),
+        ({"node_name": "a/b"}, "no slash"),
+        ({"topics": {"a": "1b"}}, "expected a topic"),
+        ({"domain_id": 300}, "domain_id"),
+        ({"publish": ["smell"]}, "publish"),
+        ({"subscriptions": [{"topic": "a", "type": POSE, "as": "velocity"}]}, "found velocity"),
+    ],
+)
+def test_settings_that_are_wrong_say_where(config: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        run_node(Ros2Bridge, config=config)
+
+
+def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'visnav-runtime\[ros2\]'"):
+        TypeStore()
