@@ -10,10 +10,10 @@ import numpy as np
 from nodes.monocular_odometry.beginning import FirstMap
 from nodes.monocular_odometry.bundle import Indices, adjust
 from nodes.monocular_odometry.flow import new_corners
+from nodes.monocular_odometry.keyframes import Keyframe
 from nodes.monocular_odometry.settings import MonocularSettings
 from nodes.monocular_odometry.tracks import Tracks, View
 from nodes.monocular_odometry.views import parallax, rays, reprojection_errors, triangulate
-from nodes.visual_odometry.keyframes import Keyframe
 from nodes.visual_odometry.tracker import Floats, Grey, inverse
 
 _GOOD = 2.0
@@ -109,7 +109,7 @@ class LocalMap:
         """Return the newest key frame, to be remembered."""
         known = self.tracks.known
         points, pixels = self.tracks.points[known], self.tracks.pixels[known]
-        return Keyframe(self.image, self.pose, points, pixels, np.ones(len(points)))
+        return Keyframe(self.image, self.pose, points, pixels)
 
     def supposed(self) -> Floats:
         """Return where corners are, shape (n, 3): as if at the median depth, if that is unknown."""

@@ -22,9 +22,9 @@ from events import CameraInfo
 from nodes.monocular_odometry.beginning import Beginning
 from nodes.monocular_odometry.bundle import Indices
 from nodes.monocular_odometry.flow import follow_both_ways, inside
+from nodes.monocular_odometry.keyframes import Keyframe, find_again
 from nodes.monocular_odometry.local_map import LocalMap
 from nodes.monocular_odometry.settings import MonocularSettings
-from nodes.visual_odometry.keyframes import Keyframe, find_again
 from nodes.visual_odometry.pose import Observations, Solution, solve_pose
 from nodes.visual_odometry.tracker import Floats, Grey, inverse
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from nodes.orb_slam3.anchor import Anchor, first_key_frame
+from nodes.orb_slam3.cloud import Cloud
 from nodes.orb_slam3.settings import Settings
 from nodes.orb_slam3.vocabulary_file import check_vocabulary
 from runtime.errors import MissingDependencyError
@@ -33,9 +34,6 @@ INSTALL = (
 )
 
 _NO_POINTS = np.empty((0, 2), np.float32)
-
-_CELL = 0.05
-"""Metres."""
 
 _REACH = 6.0
 """Pixels between a map point, projected, and the corner that it was found at; a corner high in
@@ -79,15 +77,15 @@ class OrbSlam3Process:
         settings: Mode, settings file, size of images.
         vocabulary: In DBoW2's text format, its name ending with ``.txt``.
         patience: Real seconds that `track` leaves the other threads, at most, to be done with the
-            image before. Without, images that come faster than a camera takes them make the map
-            poorer.
+            image before. Without any, images that come faster than a camera takes them make the
+            map poorer, and lose it sooner without depth.
 
     Raises:
         MissingDependencyError: `pyorbslam3` cannot be imported.
         ValueError: The vocabulary is none.
     """
 
-    def __init__(self, settings: Settings, vocabulary: Path, patience: float = 0.0) -> None:
+    def __init__(self, settings: Settings, vocabulary: Path, patience: float = 0.02) -> None:
         try:
             import pyorbslam3
         except ImportError as error:  # also where one of the system's libraries is missing
@@ -99,10 +97,10 @@ class OrbSlam3Process:
         self._patience = patience
         self._left_alone = time.monotonic()
         self._anchor = Anchor()
-        self._was_ok = False
+        self._was_ok = self._new = False
         self._stamps: list[int] = []
         self._began = -1
-        self._clouds: dict[float, dict[tuple[int, ...], tuple[float, ...]]] = {}  # by map
+        self._cloud = Cloud()
         self._folder = tempfile.TemporaryDirectory(prefix="orb_slam3_")
         file = Path(self._folder.name) / "settings.yaml"
         file.write_text(settings.text, encoding="ascii")
@@ -132,6 +130,10 @@ class OrbSlam3Process:
         """
         check_arrays(self._settings, image, depth, imu)
         self._stamps.append(stamp)
+        if self._new:
+            # Compared with the first key frame by its words, which another thread must have
+            # found by now: if not, it is lost at once.
+            time.sleep(max(self._left_alone + _FIRST - time.monotonic(), 0.0))
         _wait_for_other_threads(self._left_alone + self._patience)
         chunk = None if imu is None else imu * (1e-9, 1, 1, 1, 1, 1, 1)
         if depth is None:
@@ -150,8 +152,7 @@ class OrbSlam3Process:
         In the optical camera at the first key frame, as the poses. The library only tells which
         points an image shows: this is the last that was heard of each place.
         """
-        points = [point for cloud in self._clouds.values() for point in cloud.values()]
-        return np.array(points, np.float32).reshape(-1, 3)
+        return self._cloud.points()
 
     def close(self) -> None:
         """End ORB-SLAM3's threads."""
@@ -180,8 +181,8 @@ class OrbSlam3Process:
             points = self._slam.tracked_map_points()
             if len(points) and len(corners):
                 inliers[self._corners_of(points, pose, corners)] = True
-                self._gather(points)
-        self._was_ok = valid
+                self._cloud.add(self._anchor.map, self._anchor.place_points(points))
+        self._new, self._was_ok = valid and not self._was_ok, valid
         return Tracked(
             pose=self._anchor.last,
             lost=not valid,
@@ -190,7 +191,7 @@ class OrbSlam3Process:
             points=corners,
             inliers=inliers,
             matches=int(result.num_tracked_points) if valid else 0,
-            map_points=sum(map(len, self._clouds.values())),
+            map_points=len(self._cloud),
             began=self._began,
             maps=self._anchor.maps,
         )
@@ -204,7 +205,7 @@ class OrbSlam3Process:
             left, maps = self._anchor.map, self._anchor.maps
             self._anchor.world_may_have_changed(first, pose)
             if self._anchor.map != left and self._anchor.maps == maps:
-                self._clouds.pop(left, None)  # merged: now it is known that these lay elsewhere
+                self._cloud.forget(left)  # merged: now it is known where they lay
             if self._began < 0:
                 nearest = np.abs(np.array(self._stamps) - first.stamp * 1e9).argmin()
                 self._began = self._stamps[nearest]
@@ -217,13 +218,6 @@ class OrbSlam3Process:
         pixels = ahead[:, :2] / ahead[:, 2:] * (fx, fy) + (cx, cy)
         distance, corner = KDTree(corners).query(pixels)
         return np.asarray(corner[distance < _REACH], np.int64)
-
-    def _gather(self, points: Points) -> None:
-        """Keep map points of ORB-SLAM3's world."""
-        placed = self._anchor.place_points(points)
-        cells = np.floor(placed / _CELL).astype(np.int64).tolist()
-        cloud = self._clouds.setdefault(self._anchor.map, {})
-        cloud.update(zip(map(tuple, cells), map(tuple, placed.tolist()), strict=True))
 
 
 def check_arrays(
@@ -270,6 +264,9 @@ def _wait_for_other_threads(until: float) -> None:
 
 _QUIET = 0.004
 """Seconds."""
+
+_FIRST = 0.1
+"""Seconds for the other threads after the first image of a map; also on a busy machine."""
 
 _SENSORS = {
     "rgbd": "RGBD",

@@ -1,15 +1,15 @@
-"""RGB-D odometry on corners: followed from key frames by optical flow, placed by their depth.
+"""RGB-D odometry on corners: patches of key frames found again, placed by their depth.
 
-A few corners, followed from the picture before, tell about where the camera is; then each picture
-is aligned with the last key frame, so that error grows with key frames and not with pictures.
-Landmarks live on from key frame to key frame, their places the mean of all depths read. See
-`pose`, `depth` and `keyframes` for the parts.
+A few corners, followed from the picture before, tell about where the camera is. Then landmarks of
+all key frames remembered are looked for as they should look from there, each in its first sight:
+error grows with new landmarks and not with pictures, and not at all where the camera returns in
+time. A landmark's depth is the mean of all readings. See `landmarks`, `patches`, `surfaces` and
+`pose` for the parts.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Annotated, Any
 
 import cv2
@@ -18,9 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from nodes.visual_odometry.depth import back_project, inverse_depth_at
-from nodes.visual_odometry.keyframes import Keyframe, find_again, fuse, make_keyframe, to_world
+from nodes.visual_odometry.corners import find_corners, squares
+from nodes.visual_odometry.landmarks import Landmarks
+from nodes.visual_odometry.patches import Rows, find_patches, half_width
 from nodes.visual_odometry.pose import Observations, Solution, solve_pose
+from nodes.visual_odometry.recognition import Place, describe, recognise, remember
+from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
 from nodes.visual_odometry.tracker import (
     Depth,
     Floats,
@@ -33,55 +36,93 @@ from nodes.visual_odometry.tracker import (
 
 SECOND = 1_000_000_000
 _FLOW_ENDS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
-_ROUND_TRIP = 0.5
-"""Pixels by which a corner followed there and back may miss itself."""
-_AGREES = 6.0
+_FLOW_WINDOW = 15
+_AGREES = 4.0
 """Standard deviations up to which a landmark agrees with a pose."""
 _FEW = 120
 """Corners that suffice to tell about where the camera is."""
-_REMEMBERED = 6
-"""Key frames in which a lost camera looks for itself."""
+_SEARCHED = 20
+"""Key frames in which a lost camera looks for itself,"""
+_AT_ONCE = 2
+"""so many in each picture, because each takes as long as following does."""
+_SURE = 0.6
+"""Share of the landmarks looked for that must agree with a pose that came from nowhere."""
+_NEAR = 64.0
+"""Pixels beyond the picture's edge up to which landmarks may soon be in view,"""
+_SOON = 8
+"""for so many pictures."""
+_READING = 0.5
+"""Noise of a reading of depth, which is a mean of many pixels but not of a true plane, in that of
+one pixel."""
 
 
 class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the method on features.
 
     Attributes:
-        corners: Landmarks of a key frame.
-        window: Pixels along the side of the neighbourhood that optical flow compares; odd.
+        spacing: Side of the squares of the picture of which each holds one landmark, pixels. Time
+            grows with their number.
+        window: Side of the patches that are compared, pixels; odd.
         levels: Times that flow halves the picture for large motions between two pictures.
-        pixel_noise: Standard deviation of a followed corner, pixels.
+        pixel_noise: Standard deviation of a patch's place, pixels.
         depth_noise: Standard deviation of inverse depth, 1/m: k of a sensor with sigma = k z².
-        keep: Share of a key frame's landmarks below which the next is made.
+        keyframes: Key frames remembered. One takes the memory of a grey picture.
+        keep: Share of the last key frame's landmarks below which the next is made.
         turn: Degrees of rotation at which it is made, too.
-        shift: Median pixels of motion at which it is made, too.
+        shift: Pixels of motion at a middling distance at which it is made, too.
         least: Agreeing landmarks below which the camera is lost.
         patience: Seconds that a lost camera looks for a place it knows; then it begins anew from
             its last pose.
     """
 
-    corners: Annotated[int, msgspec.Meta(ge=40, le=2000)] = 400
-    window: Annotated[int, msgspec.Meta(ge=5, le=51)] = 15
+    spacing: Annotated[int, msgspec.Meta(ge=12, le=128)] = 28
+    window: Annotated[int, msgspec.Meta(ge=7, le=31)] = 11
     levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 4
-    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.25
+    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.3
     depth_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.002
+    keyframes: Annotated[int, msgspec.Meta(ge=2, le=10_000)] = 200
     keep: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.6
     turn: Annotated[float, msgspec.Meta(gt=0)] = 12.0
-    shift: Annotated[float, msgspec.Meta(gt=0)] = 45.0
+    shift: Annotated[float, msgspec.Meta(gt=0)] = 40.0
     least: Annotated[int, msgspec.Meta(ge=6)] = 15
     patience: Annotated[float, msgspec.Meta(ge=0)] = 1.0
 
 
-class Matches(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks of the key frame that were followed into a picture.
+class Keyframe(msgspec.Struct, frozen=True, eq=False):
+    """A picture that brought landmarks.
 
     Attributes:
-        rows: Which they are, shape (n,).
-        seen: How the picture shows them.
+        image: Grey.
+        pose: World to camera, shape (4, 4).
+        place: By which to know it again.
     """
 
-    rows: npt.NDArray[np.int64]
-    seen: Observations
+    image: Grey
+    pose: Floats
+    place: Place
+
+
+class Sight(msgspec.Struct, frozen=True, eq=False):
+    """What a picture shows of the map.
+
+    Attributes:
+        pose: World to camera, shape (4, 4).
+        rows: Landmarks found, shape (n,).
+        pixels: Where, shape (n, 2).
+        agree: Which of them agree with the pose, shape (n,).
+        missed: Landmarks looked for and not found.
+    """
+
+    pose: Floats
+    rows: Rows
+    pixels: Floats
+    agree: npt.NDArray[np.bool_]
+    missed: Rows
+
+    @property
+    def share(self) -> float:
+        """How many of the landmarks looked for agree with the pose, of 1."""
+        return float(self.agree.sum()) / (len(self.rows) + len(self.missed))
 
 
 class FeatureOdometry:
@@ -98,204 +139,228 @@ class FeatureOdometry:
         self._settings = settings or FeatureSettings()
         self._camera = (info.fx, info.fy, info.cx, info.cy)
         self._pose = np.eye(4)  # world (the first camera) to camera
-        self._before: tuple[Grey, Floats, Floats] | None = None
-        self._keyframe: Keyframe | None = None
-        self._known: deque[Keyframe] = deque(maxlen=_REMEMBERED)
         self._lost_since: int | None = None
+        self._count = 0  # pictures so far
+        self._searched = 0  # key frames, since it was lost
+        self._near_until = 0
+        self._near: Rows | None = None  # landmarks that are or may soon be in view
+        self._forget()
 
     def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> Tracked:
         """Follow the camera by one picture; see `Tracker.track`."""
         grey, depth = grey_and_depth(self._info, image, depth)
-        if self._keyframe is None:
-            return self._begin(grey, depth, "")
-        expected = self._expect(grey)
-        matches = self._follow(grey, depth, self._keyframe, expected)
-        solution = self._solve(matches, expected)
-        if solution is None:
-            return self._lose(stamp, grey, depth, matches)
-        reason = ""
-        if self._lost_since is not None:
-            reason = "against a key frame"
-            self._lost_since = None
-        self._pose = solution.pose
-        agree = solution.errors < _AGREES
-        self._before = grey, matches.seen.landmarks[agree], matches.seen.pixels[agree]
-        self._renew(grey, depth, matches, agree)
+        inverse_of = inverse_depth(depth)
+        self._count += 1
+        if not len(self._map):
+            first = "" if self._lost_since is None else "by a first map"
+            return self._begin(stamp, grey, inverse_of, first)
+        sight = self._look(grey, inverse_of)
+        if sight is None:
+            return self._lose(stamp, grey, inverse_of)
+        reason = "" if self._lost_since is None else "against a key frame"
+        self._lost_since = None
+        self._pose = sight.pose
+        agree, rows = sight.agree, sight.rows
+        self._map.judge(self._count, rows[agree], np.concatenate([sight.missed, rows[~agree]]))
+        noise = self._settings.depth_noise
+        read = surfaces_at(inverse_of, sight.pixels[agree], noise)
+        self._map.fuse(self._pose, rows[agree], read, _READING * noise)
+        self._before = grey, rows[agree], sight.pixels[agree]
+        if self._is_far(rows[agree]):
+            self._add_keyframe(grey, inverse_of, rows[agree], sight.pixels[agree])
         return Tracked(
             pose=inverse(self._pose),
             reason=reason,
-            points=matches.seen.pixels.astype(np.float32),
+            points=sight.pixels.astype(np.float32),
             inliers=agree,
             matches=int(agree.sum()),
         )
 
-    def _begin(self, grey: Grey, depth: Depth, reason: str) -> Tracked:
-        """Make the first key frame, at the pose that holds now."""
-        frame = make_keyframe(grey, depth, self._pose, self._camera, self._settings.corners)
-        pixels = frame.pixels.astype(np.float32)
-        pose = inverse(self._pose)
-        if len(frame) < self._settings.least:
-            few = f"{len(frame)} corners with depth, of {self._settings.least} needed"
-            return Tracked(pose, True, few, pixels, np.zeros(len(frame), np.bool_))
-        self._keyframe = frame
-        self._known.append(frame)
-        self._before = grey, frame.landmarks, frame.pixels
-        self._lost_since = None
-        return Tracked(pose, False, reason, pixels, np.ones(len(frame), np.bool_), len(frame))
+    def _look(self, grey: Grey, inverse_of: Depth) -> Sight | None:
+        """Find the map in a picture, near the picture before or, if lost, near a key frame."""
+        expected = self._expect(grey)
+        sight = None if expected is None else self._find(grey, inverse_of, expected)
+        if sight is not None or self._lost_since is None:
+            return sight
+        pixels, descriptors = describe(grey)
+        for frame in self._next_searched():
+            found = recognise(pixels, descriptors, frame.place, self._info.matrix())
+            if found is not None:
+                self._near = None
+                sight = self._find(grey, inverse_of, found)
+                # Again from there: what was beyond the margin of the search is found now, or not.
+                sight = sight and self._find(grey, inverse_of, sight.pose)
+                if sight is not None and sight.share > _SURE:
+                    return sight
+        self._near = None
+        return None
 
-    def _expect(self, grey: Grey) -> Floats:
+    def _next_searched(self) -> list[Keyframe]:
+        """Return the next few key frames to look in: from picture to picture, back in time."""
+        frames = list(self._keyframes.values())[: -_SEARCHED - 1 : -1]
+        start, self._searched = self._searched % len(frames), self._searched + _AT_ONCE
+        return frames[start : start + _AT_ONCE]
+
+    def _expect(self, grey: Grey) -> Floats | None:
         """Return about where the camera is, by following a few corners from the picture before.
 
         Coarse to fine, and without a guess: where texture repeats, a guess that is off by half a
         brick would find the next brick.
         """
-        if self._before is None:
-            return self._pose
-        image, landmarks, pixels = self._before
+        image, rows, pixels = self._before
+        few = slice(None, None, max(len(rows) // _FEW, 1))
+        rows, pixels = rows[few], pixels[few]
         no_guess: Any = None
-        few = slice(None, None, max(len(pixels) // _FEW, 1))
-        landmarks, pixels = landmarks[few], pixels[few]
         there, arrived, _ = cv2.calcOpticalFlowPyrLK(
             image,
             grey,
             pixels.astype(np.float32).reshape(-1, 1, 2),
             no_guess,
-            winSize=(self._settings.window, self._settings.window),
+            winSize=(_FLOW_WINDOW, _FLOW_WINDOW),
             maxLevel=self._settings.levels,
             criteria=_FLOW_ENDS,
         )
         good = arrived.ravel() == 1
         if good.sum() < self._settings.least:
-            return self._pose
-        seen = Observations(
-            landmarks[good],
-            there.reshape(-1, 2)[good].astype(np.float64),
-            np.zeros(int(good.sum())),
-            np.zeros(int(good.sum()), np.bool_),
+            return None
+        places, there = self._map.places[rows[good]], there.reshape(-1, 2)[good].astype(np.float64)
+        solution = self._solve(places, there, self._pose)
+        if (solution.errors < 2 * _AGREES).mean() > 0.6:
+            return solution.pose
+        cv2.setRNGSeed(1)
+        found, turn, shift, _ = cv2.solvePnPRansac(
+            places,
+            there,
+            self._info.matrix(),
+            None,
+            flags=cv2.SOLVEPNP_EPNP,
+            reprojectionError=2.0,
         )
-        return self._refine(seen, self._pose).pose
+        if not found:
+            return None
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+        return pose
 
-    def _follow(self, grey: Grey, depth: Depth, frame: Keyframe, expected: Floats) -> Matches:
-        """Find the key frame's landmarks, beginning where an expected pose puts them."""
-        fx, fy, cx, cy = self._camera
-        height, width = grey.shape
-        points = frame.landmarks @ expected[:3, :3].T + expected[:3, 3]
-        z = np.maximum(points[:, 2], 0.05)
-        guess = np.stack([fx * points[:, 0] / z + cx, fy * points[:, 1] / z + cy], axis=1)
-        rim = self._settings.window // 2
-        visible = (points[:, 2] > 0.1) & _inside(guess, width, height, rim)
-        rows = np.flatnonzero(visible)
-        if not len(rows):
-            return Matches(rows, _nothing())
-        start = frame.pixels[rows].astype(np.float32).reshape(-1, 1, 2)
-        options: Any = {
-            "winSize": (self._settings.window, self._settings.window),
-            "criteria": _FLOW_ENDS,
-            "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        }
-        there, arrived, _ = cv2.calcOpticalFlowPyrLK(
-            frame.image,
-            grey,
+    def _find(self, grey: Grey, inverse_of: Depth, expected: Floats) -> Sight | None:
+        """Find the map in a picture that was taken near an expected pose."""
+        settings, landmarks = self._settings, self._map
+        size = self._info.width, self._info.height
+        near = self._near
+        if near is None or self._count >= self._near_until:
+            near = landmarks.in_view(expected, size, _NEAR, np.arange(len(landmarks)))
+            self._near, self._near_until = near, self._count + _SOON
+        rows = landmarks.awake(self._count, near)
+        rows = landmarks.in_view(expected, size, -half_width(settings.window) - 1.0, rows)
+        rows = landmarks.unhidden(expected, inverse_of, rows, settings.depth_noise)
+        rows, patches = landmarks.patches(expected, rows)
+        # The oldest of each square: they are the nearest to where all began.
+        _, oldest = np.unique(squares(patches.expected, settings.spacing), return_index=True)
+        rows, patches = rows[oldest], patches.take(oldest)
+        if len(rows) < settings.least:
+            return None
+        pixels, found = find_patches(patches, self._pictures(), grey, settings.window)
+        missed, rows, pixels = rows[~found], rows[found], pixels[found]
+        if len(rows) < settings.least:
+            return None
+        read = surfaces_at(inverse_of, pixels, settings.depth_noise)
+        places = landmarks.places[rows]
+        first = self._solve(places, pixels, expected, read.inverse, read.whole)
+        agree = first.errors < _AGREES
+        if agree.sum() < max(settings.least, 0.4 * len(agree)):
+            return None
+        last = self._solve(
+            places[agree], pixels[agree], first.pose, read.inverse[agree], read.whole[agree]
+        )
+        return Sight(last.pose, rows, pixels, agree, missed)
+
+    def _solve(
+        self,
+        places: Floats,
+        pixels: Floats,
+        start: Floats,
+        read: Floats | None = None,
+        whole: npt.NDArray[np.bool_] | None = None,
+    ) -> Solution:
+        if read is None or whole is None:
+            read, whole = np.zeros(len(places)), np.zeros(len(places), np.bool_)
+        settings = self._settings
+        return solve_pose(
+            Observations(places, pixels, read, whole),
             start,
-            guess[rows].astype(np.float32).reshape(-1, 1, 2),
-            maxLevel=1,
-            **options,
+            self._camera,
+            settings.pixel_noise,
+            _READING * settings.depth_noise,
         )
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            grey, frame.image, there, start.copy(), maxLevel=1, **options
-        )
-        miss = np.abs(back - start).reshape(-1, 2).max(axis=1)
-        pixels = there.reshape(-1, 2).astype(np.float64)
-        good = (arrived.ravel() == 1) & (returned.ravel() == 1) & (miss < _ROUND_TRIP)
-        good &= _inside(pixels, width, height, 3)
-        rows, pixels = rows[good], pixels[good]
-        far, measured = inverse_depth_at(depth, pixels)
-        return Matches(rows, Observations(frame.landmarks[rows], pixels, far, measured))
 
-    def _solve(self, matches: Matches, expected: Floats) -> Solution | None:
-        """Return the pose, if enough landmarks agree with it."""
-        least = self._settings.least
-        if len(matches.rows) < least:
-            return None
-        solution = self._refine(matches.seen, expected)
-        if (solution.errors < _AGREES).mean() < 0.6:  # the start was wrong, or much is
-            cv2.setRNGSeed(1)
-            found, turn, shift, _ = cv2.solvePnPRansac(
-                matches.seen.landmarks,
-                matches.seen.pixels,
-                self._info.matrix(),
-                None,
-                flags=cv2.SOLVEPNP_EPNP,
-                reprojectionError=2.0,
-            )
-            if not found:
-                return None
-            start = np.eye(4)
-            start[:3, :3], start[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-            solution = self._refine(matches.seen, start)
-        agree = solution.errors < _AGREES
-        if agree.sum() < max(least, 0.25 * len(agree)):
-            return None
-        final = self._refine(matches.seen.take(agree), solution.pose)
-        errors = solution.errors.copy()
-        errors[agree] = final.errors
-        return Solution(final.pose, errors)
+    def _is_far(self, rows: Rows) -> bool:
+        """Return whether the last key frame is nearly out of sight."""
+        settings, last = self._settings, next(reversed(self._keyframes.values()))
+        if len(rows) < settings.keep * self._at_keyframe:
+            return True
+        between = self._pose @ inverse(last.pose)
+        angle = math.acos(min(max((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0), 1.0))
+        _, z = self._map.project(self._pose, rows)
+        shift = self._info.fx * float(np.linalg.norm(between[:3, 3]) / np.median(z))
+        return math.degrees(angle) > settings.turn or shift > settings.shift
 
-    def _refine(self, seen: Observations, start: Floats) -> Solution:
-        noise = self._settings.pixel_noise, self._settings.depth_noise
-        return solve_pose(seen, start, self._camera, *noise)
+    def _add_keyframe(self, grey: Grey, inverse_of: Depth, rows: Rows, pixels: Floats) -> None:
+        """Remember this picture, and new landmarks between those seen."""
+        settings = self._settings
+        corners = find_corners(grey, settings.spacing, pixels)
+        seen = surfaces_at(inverse_of, corners, settings.depth_noise)
+        number = next(reversed(self._keyframes), -1) + 1
+        new = self._map.add(number, self._pose, corners[seen.whole], seen.take(seen.whole))
+        rows, pixels = np.concatenate([rows, new]), np.concatenate([pixels, corners[seen.whole]])
+        noise = settings.depth_noise
+        place = remember(grey, inverse_of, self._pose, self._camera, noise)
+        self._keyframes[number] = Keyframe(grey, self._pose, place)
+        self._at_keyframe = len(rows)
+        self._near = None
+        if len(self._keyframes) > settings.keyframes:
+            del self._keyframes[next(iter(self._keyframes))]
+            gone = self._map.forget_before(next(iter(self._keyframes)))
+            pixels, rows = pixels[rows >= gone], rows[rows >= gone] - gone
+        self._before = grey, rows, pixels
 
-    def _renew(
-        self, grey: Grey, depth: Depth, matches: Matches, agree: npt.NDArray[np.bool_]
-    ) -> None:
-        """Make a new key frame where the last one is nearly out of sight."""
-        settings, frame = self._settings, self._keyframe
-        assert frame is not None
-        turn = self._pose[:3, :3] @ frame.pose[:3, :3].T
-        angle = math.degrees(math.acos(min(max((np.trace(turn) - 1.0) / 2.0, -1.0), 1.0)))
-        seen, rows = matches.seen.take(agree), matches.rows[agree]
-        shift = float(np.median(np.linalg.norm(seen.pixels - frame.pixels[rows], axis=1)))
-        enough = len(rows) >= settings.keep * len(frame)
-        if enough and angle < settings.turn and shift < settings.shift:
-            return
-        far = np.maximum(seen.inverse, 1e-3)
-        again = to_world(back_project(seen.pixels, far, self._camera), self._pose)
-        landmarks, readings = fuse(
-            seen.landmarks, frame.readings[rows], again, 1.0 / far, seen.measured
-        )
-        kept = Keyframe(grey, self._pose, landmarks, seen.pixels, readings)
-        self._keyframe = make_keyframe(
-            grey, depth, self._pose, self._camera, settings.corners, kept
-        )
-        self._known.append(self._keyframe)
+    def _pictures(self) -> dict[int, Grey]:
+        return {number: frame.image for number, frame in self._keyframes.items()}
 
-    def _lose(self, stamp: int, grey: Grey, depth: Depth, matches: Matches) -> Tracked:
-        """Look for a place that is known; after a while, begin anew."""
-        if self._lost_since is None:
-            self._lost_since = stamp
-        self._before = None
-        for frame in reversed(self._known):
-            found = find_again(grey, frame, self._info.matrix())
-            if found is not None:
-                # The next picture is followed from there; this one is not trusted yet.
-                self._pose, self._keyframe = found[0], frame
-                break
-        else:
-            if stamp - self._lost_since >= self._settings.patience * SECOND:
-                return self._begin(grey, depth, "by a new map, begun at the last pose")
+    def _forget(self) -> None:
+        self._map = Landmarks(self._camera)
+        self._keyframes: dict[int, Keyframe] = {}
+        self._at_keyframe = 0
+        self._near = None
+        self._near_until = 0
+
+    def _begin(self, stamp: int, grey: Grey, inverse_of: Depth, reason: str) -> Tracked:
+        """Make the first key frame of a new map, at the pose that holds now, if it shows enough."""
+        corners = find_corners(grey, self._settings.spacing, np.empty((0, 2)))
+        count = int(surfaces_at(inverse_of, corners, self._settings.depth_noise).whole.sum())
+        if count < self._settings.least:
+            few = f"{count} corners with depth, of {self._settings.least} needed for a map"
+            return self._say_lost(stamp, few)
+        self._forget()
+        self._lost_since = None
+        self._add_keyframe(grey, inverse_of, np.empty(0, np.int64), np.empty((0, 2)))
+        _, _, pixels = self._before
         return Tracked(
             pose=inverse(self._pose),
-            lost=True,
-            reason=f"{len(matches.rows)} corners followed, of {self._settings.least} needed",
-            points=matches.seen.pixels.astype(np.float32),
-            inliers=np.zeros(len(matches.rows), np.bool_),
+            reason=reason,
+            points=pixels.astype(np.float32),
+            inliers=np.ones(count, np.bool_),
+            matches=count,
         )
 
+    def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> Tracked:
+        """Say that it is lost; after a while, begin anew."""
+        said = self._say_lost(stamp, "too little is seen of what is known")
+        assert self._lost_since is not None
+        if stamp - self._lost_since < self._settings.patience * SECOND:
+            return said
+        return self._begin(stamp, grey, inverse_of, "by a new map, begun at the last pose")
 
-def _inside(pixels: Floats, width: int, height: int, rim: int) -> npt.NDArray[np.bool_]:
-    x, y = pixels.T
-    return np.asarray((x >= rim) & (x < width - rim) & (y >= rim) & (y < height - rim))
-
-
-def _nothing() -> Observations:
-    return Observations(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), np.empty(0, np.bool_))
+    def _say_lost(self, stamp: int, reason: str) -> Tracked:
+        if self._lost_since is None:
+            self._lost_since, self._searched = stamp, 0
+        return Tracked(pose=inverse(self._pose), lost=True, reason=reason)

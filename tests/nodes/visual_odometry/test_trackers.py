@@ -11,7 +11,6 @@ import pytest
 from events import CameraInfo
 from nodes.visual_odometry.dense import DenseOdometry
 from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
-from nodes.visual_odometry.keyframes import find_again, make_keyframe
 from nodes.visual_odometry.tracker import Floats, Tracked, Tracker
 from tests.nodes.visual_odometry.world import INFO, look, pose
 
@@ -140,31 +139,3 @@ def test_features_tell_what_they_followed() -> None:
     *_, said = follow(FeatureOdometry(INFO), MOTIONS["right"])
     assert said.points.shape == (len(said.inliers), 2)
     assert said.matches == said.inliers.sum() > 50
-
-
-def test_a_landmark_on_an_edge_has_no_depth() -> None:
-    from nodes.visual_odometry.depth import inverse_depth_at
-
-    _, depth = look(pose())
-    edge = np.flatnonzero(np.diff(depth[120]) != 0)[0]
-    pixels = np.array([[float(edge), 120.0], [160.0, 120.0], [9.0, 120.0]])
-    inverse, good = inverse_depth_at(depth, pixels)
-    assert good.tolist() == [False, True, True]
-    assert inverse[1:] == pytest.approx([1 / 2.0, 1 / 3.0], rel=1e-4)
-
-
-@pytest.mark.parametrize("there", [pose(), pose(x=-0.3, yaw=8.0), pose(z=0.4)])
-def test_a_key_frame_is_recognised_from_elsewhere(there: Floats) -> None:
-    camera = (INFO.fx, INFO.fy, INFO.cx, INFO.cy)
-    keyframe = make_keyframe(*look(pose()), np.eye(4), camera, 400)
-    found = find_again(look(there)[0], keyframe, INFO.matrix())
-    assert found is not None
-    said, agree = found
-    assert agree > 20
-    np.testing.assert_allclose(np.linalg.inv(said)[:3, 3], there[:3, 3], atol=0.08)
-
-
-def test_what_is_not_in_the_picture_is_not_recognised() -> None:
-    camera = (INFO.fx, INFO.fy, INFO.cx, INFO.cy)
-    keyframe = make_keyframe(*look(pose()), np.eye(4), camera, 400)
-    assert find_again(look(pose(x=-6.0, y=6.0))[0], keyframe, INFO.matrix()) is None

@@ -1,0 +1,84 @@
+"""Reading depth at corners: where the surface is whole, between the pixels, as inverse depth.
+
+On a plane inverse depth is an affine function of the pixel, and a triangulating sensor's noise is
+the same at every distance in it; so that is what is smoothed, fitted, checked and weighted.
+"""
+
+from __future__ import annotations
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.visual_odometry.tracker import Depth, Floats
+
+REACH = 6
+"""Pixels around a corner over which its surface must be whole: what optical flow compares."""
+NEAREST = 0.05
+"""Metres; what is closer is dirt on the lens."""
+_FARTHEST = 0.02
+"""1/m: beyond 50 m depth says nothing of a metre's motion."""
+_HOLE = -200.0
+"""1/m: stands for no depth; so low that smoothing leaves a neighbour of a hole below zero."""
+_TORN = 0.02
+"""Share of its inverse depth by which a neighbourhood may differ from a plane."""
+_NOISY = 2.0
+"""The same, in standard deviations of a reading."""
+
+_GRID = np.array([(x, y) for y in range(-REACH, REACH + 1, 3) for x in range(-REACH, REACH + 1, 3)])
+_SPREAD = float((_GRID[:, 0] ** 2).sum())
+
+
+class Surfaces(msgspec.Struct, frozen=True, eq=False):
+    """The planes around some pixels.
+
+    Attributes:
+        inverse: Inverse depth at each, 1/m, shape (n,).
+        slope: Its change by a column and by a row, 1/m, shape (n, 2).
+        whole: Where there is one, shape (n,): elsewhere depth is torn or missing.
+    """
+
+    inverse: Floats
+    slope: Floats
+    whole: npt.NDArray[np.bool_]
+
+    def take(self, rows: npt.NDArray[np.bool_]) -> Surfaces:
+        """Return some of them."""
+        return Surfaces(self.inverse[rows], self.slope[rows], self.whole[rows])
+
+
+def inverse_depth(depth: Depth) -> Depth:
+    """Return inverse depth in 1/m, the mean of 3×3 pixels; below zero by holes, shape (h, w)."""
+    known = np.isfinite(depth) & (depth > NEAREST)
+    return np.asarray(cv2.blur(np.where(known, 1.0 / np.where(known, depth, 1.0), _HOLE), (3, 3)))
+
+
+def surfaces_at(inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
+    """Fit a plane to inverse depth around each pixel.
+
+    Args:
+        inverse: As `inverse_depth` gives it, shape (h, w).
+        pixels: Column and row, shape (n, 2).
+        noise: Standard deviation of one pixel's inverse depth, 1/m.
+    """
+    height, width = inverse.shape
+    centre = np.rint(pixels).astype(int)
+    columns = np.clip(centre[:, 0, None] + _GRID[:, 0], 0, width - 1)
+    rows = np.clip(centre[:, 1, None] + _GRID[:, 1], 0, height - 1)
+    around = inverse[rows, columns].astype(np.float64)
+    mean = around.mean(axis=1)
+    slope = around @ _GRID / _SPREAD
+    bend = np.abs(around - mean[:, None] - slope @ _GRID.T).max(axis=1)
+    whole = (around.min(axis=1) > 0) & (bend < np.maximum(_TORN * mean, _NOISY * noise))
+    value = mean + ((pixels - centre) * slope).sum(axis=1)
+    whole &= value > _FARTHEST
+    return Surfaces(np.where(whole, value, 0.0), slope, whole)
+
+
+def rays(pixels: Floats, camera: tuple[float, ...]) -> Floats:
+    """Return what pixels look at, 1 m along the optical axis, shape (n, 3)."""
+    fx, fy, cx, cy = camera
+    return np.stack(
+        [(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1
+    )
