@@ -41,6 +41,7 @@ def test_a_node_of_ones_own_scores_each_image(tmp_path: Path) -> None:
     assert summary["events"]["Score"] == 20
 
 
+@pytest.mark.slow
 def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
     """`two_cameras` gives 15 coloured pairs and 70 grey pictures a second."""
     summary = run("two_cameras", tmp_path, "run.duration=2s")
@@ -49,6 +50,7 @@ def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
     assert (tmp_path / "pictures.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_computer_vision_follows_the_trajectory(tmp_path: Path) -> None:
     """`computer_vision` ends with its trajectory, having given one set of images per update."""
     summary = run("computer_vision", tmp_path, "camera.rate=5")

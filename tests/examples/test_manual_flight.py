@@ -16,6 +16,7 @@ COMMAND = [sys.executable, "-m", "runtime", "run", "examples/manual_flight.toml"
 SMALLER = ["--set", "drone.cameras.front.width=96", "--set", "drone.cameras.front.height=96"]
 
 
+@pytest.mark.slow
 def test_held_keys_move_the_drone_on_both_axes(display: Display, tmp_path: Path) -> None:
     """Take off with t, hold w and d: it flies ahead and to the right; closing the window ends."""
     log = tmp_path / "log.txt"

@@ -135,6 +135,7 @@ def test_sizes_are_modest(name: str) -> None:
     assert len(model_to_bytes(model)) < 40e6
 
 
+@pytest.mark.slow
 def test_a_seed_decides_the_looks_and_not_the_place() -> None:
     """Same seed, same model to the byte; another seed, other textures, the same walls."""
     one, again, other = (load_world("hall", seed).compile() for seed in (1, 1, 2))
