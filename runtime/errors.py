@@ -13,6 +13,7 @@
     │   ├── ChannelClosedError you (or the end of the run) closed it
     │   ├── ChannelBusyError   two coroutines wait on one input
     │   └── AmbiguousSourceError  an input that matches stamps hears two sources
+    ├── WireError              bytes from elsewhere that are no event, or an event that cannot leave
     └── WorkerError
         ├── WorkerDiedError    the process ended: name, exit code and last output
         └── WorkerTimeoutError the process did not answer in time
@@ -85,6 +86,10 @@ class ChannelBusyError(ChannelError):
 
 class AmbiguousSourceError(ChannelError):
     """Two sources send events for one field of a bundle; the file must name one."""
+
+
+class WireError(VisnavError):
+    """Bytes are not an event that this process knows, or an event cannot be made into bytes."""
 
 
 class WorkerError(VisnavError):
