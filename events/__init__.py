@@ -35,7 +35,7 @@ from events.estimates import (
     TrackingRegained,
 )
 from events.geometry import Odometry, PoseStamped, TransformStamped
-from events.lifecycle import Shutdown
+from events.lifecycle import ParameterChanged, Shutdown
 from events.maps import PointCloud
 from events.scores import Score
 from events.sensors import (
@@ -82,6 +82,7 @@ __all__ = [
     "MagneticField",
     "NavSatFix",
     "Odometry",
+    "ParameterChanged",
     "PlannedPose",
     "PointCloud",
     "PoseEstimate",

@@ -17,3 +17,19 @@ class Shutdown(Event):
     category: ClassVar[Category] = Category.LIFECYCLE
 
     reason: str = ""
+
+
+class ParameterChanged(Event):
+    """Says that a setting of a node changed while the run went on.
+
+    Its source is the node, its stamp the moment from which on the new value holds.
+
+    Attributes:
+        key: The setting, as it stands in the file: ``gain``, ``cameras.front.loss``.
+        value: The new value, as TOML.
+    """
+
+    category: ClassVar[Category] = Category.LIFECYCLE
+
+    key: str
+    value: str

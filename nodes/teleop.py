@@ -25,6 +25,7 @@ from events import (
 from nodes.window import KEYS
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from runtime.errors import suggest
+from runtime.parameters import Changeable
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -103,11 +104,11 @@ class TeleopConfig(NodeConfig):
         keys: Which keys do what.
     """
 
-    speed: Positive = 2.0
-    climb: Positive = 1.0
-    yaw_rate: Positive = 1.0
-    acceleration: Positive = 4.0
-    altitude: Positive = 1.5
+    speed: Changeable[Positive] = 2.0
+    climb: Changeable[Positive] = 1.0
+    yaw_rate: Changeable[Positive] = 1.0
+    acceleration: Changeable[Positive] = 4.0
+    altitude: Changeable[Positive] = 1.5
     rate: Annotated[float, msgspec.Meta(ge=4)] = 30.0
     keys: Keys = Keys()
 

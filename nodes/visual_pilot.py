@@ -12,6 +12,7 @@ from events import Hover, PlannedPose, PoseEstimate, Quaternion, Vector3, Veloci
 from nodes.path import Path
 from nodes.tour import Pilot, TourConfig
 from runtime import Duration, Output, on
+from runtime.parameters import Changeable
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -26,10 +27,10 @@ class VisualPilotConfig(TourConfig):
         patience: How old the newest estimate may be; then the vehicle stops and waits.
     """
 
-    gain: Positive = 1.0
-    yaw_gain: Positive = 1.0
-    catch_up: Positive = 0.5
-    patience: Duration = Duration(0.5)  # immutable
+    gain: Changeable[Positive] = 1.0
+    yaw_gain: Changeable[Positive] = 1.0
+    catch_up: Changeable[Positive] = 0.5
+    patience: Changeable[Duration] = Duration(0.5)  # immutable
 
 
 class VisualPilot(Pilot[VisualPilotConfig]):
@@ -54,7 +55,7 @@ class VisualPilot(Pilot[VisualPilotConfig]):
 
     async def follow(self, path: Path) -> None:
         """Ask for the path's velocity, and for more where the estimate is beside the path."""
-        clock, config = self.clock, self.config
+        clock = self.clock
         step, last = round(path.step * 1e9), len(path.position) - 1
         begin = clock.now()
         for index in range(last + 1):
@@ -68,6 +69,7 @@ class VisualPilot(Pilot[VisualPilotConfig]):
             # Against the path at the time of the picture: its age then does not matter.
             seen = min(max(round((self.here.stamp - begin) / step), 0), last)
             to_go = path.position[seen] - self.here.position
+            config = self.config  # which may change on the way
             correction = config.gain * to_go
             size = math.sqrt(float(correction @ correction))
             if size > config.catch_up:

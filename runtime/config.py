@@ -3,6 +3,8 @@
 [run]                                   # -> RunConfig
 clock = "lockstep"
 
+[network]                               # -> NetworkConfig, for a run in several processes
+
 [[nodes]]                               # -> NodeSpec, one a node, in order
 name = "drone"
 type = "sims.multirotor:Multirotor"     # module:Class
@@ -69,6 +71,24 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     log: Literal["trace", "debug", "info", "warning", "error", "fatal"] = "info"
 
 
+class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The ``[network]`` table: how the processes of a run with ``--only`` find each other.
+
+    Attributes:
+        meet: A Zenoh endpoint at which they meet. Whichever process on its host comes first
+            listens there; the others connect to it. By default on this machine only.
+        zenoh: A Zenoh configuration file, which then says where to listen and connect instead:
+            for TLS, access control, a router.
+        lease: A process that is silent for so long is gone.
+        wait: How long to wait for the others at the start.
+    """
+
+    meet: str = "tcp/127.0.0.1:7450"
+    zenoh: str = ""
+    lease: Duration = Duration(0.8)  # immutable
+    wait: Duration = Duration(60)
+
+
 class NodeSpec(msgspec.Struct, frozen=True, kw_only=True):
     """One ``[[nodes]]`` table.
 
@@ -96,6 +116,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
 
     run: RunConfig
     nodes: tuple[NodeSpec, ...]
+    network: NetworkConfig = NetworkConfig()
 
 
 class _NodeHead(msgspec.Struct, frozen=True, kw_only=True):
@@ -141,10 +162,10 @@ def parse(table: Mapping[str, Any], where: str) -> Config:
         ConfigError: Something in it is wrong; `where` begins the message.
     """
     for key in table:
-        if key not in {"run", "nodes"}:
+        if key not in {"run", "network", "nodes"}:
             raise ConfigError(
-                f"{where}: expected tables [run] and [[nodes]], found {key!r}"
-                + suggest(key, ["run", "nodes"])
+                f"{where}: expected tables [run], [network] and [[nodes]], found {key!r}"
+                + suggest(key, ["run", "network", "nodes"])
             )
     run = convert(table.get("run", {}), RunConfig, f"{where}: run")
     if not run.name.strip() or "/" in run.name or "\0" in run.name or run.name.startswith("."):
@@ -168,7 +189,13 @@ def parse(table: Mapping[str, Any], where: str) -> Config:
                 f"found {show(spec.name)} a second time"
             )
         specs.append(spec)
-    return Config(run=run, nodes=tuple(specs))
+    network = convert(table.get("network", {}), NetworkConfig, f"{where}: network")
+    if not re.fullmatch(r"\w+/.+", network.meet):
+        raise ConfigError(
+            f"{where}: network.meet: expected a Zenoh endpoint such as tcp/192.168.0.7:7450, "
+            f"found {show(network.meet)}"
+        )
+    return Config(run=run, nodes=tuple(specs), network=network)
 
 
 def find_node(type_: str, where: str) -> type[Node[Any]]:
@@ -231,10 +258,10 @@ def to_builtins(config: Config) -> dict[str, Any]:
         if spec.links:
             head["links"] = msgspec.to_builtins(spec.links, enc_hook=float)
         nodes.append(head | msgspec.to_builtins(spec.config, enc_hook=float))
-    table: dict[str, Any] = _without_none(
-        {"run": msgspec.to_builtins(config.run, enc_hook=float), "nodes": nodes}
-    )
-    return table
+    table: dict[str, Any] = {"run": msgspec.to_builtins(config.run, enc_hook=float)}
+    if config.network != NetworkConfig():
+        table["network"] = msgspec.to_builtins(config.network, enc_hook=float)
+    return _without_none(table | {"nodes": nodes})  # type: ignore[no-any-return]
 
 
 def _without_none(value: Any) -> Any:
@@ -256,8 +283,11 @@ def _node(entry: Any, where: str) -> NodeSpec:
             f"{where}.name: expected a letter, then letters, digits, _ and -, "
             f"found {show(head.name)}"
         )
-    if head.name == "run":
-        raise ConfigError(f'{where}.name: expected any name but "run", which is the run itself')
+    if head.name in {"run", "network"}:
+        raise ConfigError(
+            f"{where}.name: expected any name but those of the file's other tables, found "
+            f"{show(head.name)}"
+        )
     where = f"{where} ({head.name})"
     cls = find_node(head.type, f"{where}: type")
     rest = {k: v for k, v in entry.items() if k not in keys}

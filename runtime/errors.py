@@ -13,6 +13,7 @@
     │   ├── ChannelClosedError you (or the end of the run) closed it
     │   ├── ChannelBusyError   two coroutines wait on one input
     │   └── AmbiguousSourceError  an input that matches stamps hears two sources
+    ├── PeerError              another process of the run is missing, gone, or of another mind
     ├── WireError              bytes from elsewhere that are no event, or an event that cannot leave
     └── WorkerError
         ├── WorkerDiedError    the process ended: name, exit code and last output
@@ -86,6 +87,10 @@ class ChannelBusyError(ChannelError):
 
 class AmbiguousSourceError(ChannelError):
     """Two sources send events for one field of a bundle; the file must name one."""
+
+
+class PeerError(VisnavError):
+    """Another process of the run is missing, gone, or does not fit to this one."""
 
 
 class WireError(VisnavError):

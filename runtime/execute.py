@@ -8,7 +8,7 @@ import gc
 import logging
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ def execute(
     handlers: list[logging.Handler] | None = None,
     log_events: bool = False,
     watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None = None,
+    only: Collection[str] = (),
 ) -> Summary:
     """Run a configuration to its end.
 
@@ -50,6 +51,7 @@ def execute(
         log_events: Log every event that is sent.
         watch: Given the supervisor, returns a context that lasts as long as the run: a progress
             bar, a monitor.
+        only: Nodes to run here; the others run in other processes. All, if empty.
 
     Raises:
         VisnavError: Something went wrong; what was recorded until then is complete.
@@ -61,7 +63,7 @@ def execute(
         handlers.append(file_handler(out / "log.txt"))
     loop = make_loop(config.run)
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
-        summary, after, error = runner.run(_run(config, out, handlers, log_events, watch))
+        summary, after, error = runner.run(_run(config, out, handlers, log_events, watch, only))
     if out is not None:
         encoded = msgspec.json.format(msgspec.json.encode(summary), indent=2)
         (out / "summary.json").write_bytes(encoded + b"\n")
@@ -96,6 +98,7 @@ async def _run(
     handlers: list[logging.Handler],
     log_events: bool,
     watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
+    only: Collection[str],
 ) -> tuple[Summary, list[Callable[[Path], Any]], Exception | None]:
     loop = asyncio.get_running_loop()
     steps.install(loop)
@@ -105,7 +108,7 @@ async def _run(
     taps: list[Tap] = [digest] if digest else []
     if log_events:
         taps.append(_log_event)
-    supervisor = Supervisor(config, clock, taps, out)
+    supervisor = Supervisor(config, clock, taps, out, only)
     watchdog = Watchdog(loop, config.run.stall, _report_stall)
     with (
         logging_to(handlers, config.run.log, clock.now),
@@ -118,20 +121,19 @@ async def _run(
             await supervisor.main()
         finally:
             watchdog.stop()
-        sim_ns = clock.now()
-        clock.close()
-    return (
-        summarise(
+        summary = summarise(
             supervisor,
             name=config.run.name,
-            sim_ns=sim_ns,
-            digest=digest.hexdigest() if digest else None,
+            sim_ns=clock.now(),
+            digest=digest,
             stalls=watchdog.stalls,
             longest_stalls=watchdog.longest,
-        ),
-        supervisor.after,
-        supervisor.error,
-    )
+        )
+        if supervisor.peers is not None:
+            summary = await supervisor.peers.part(summary)
+            await supervisor.peers.close()
+        clock.close()
+    return summary, supervisor.after, supervisor.error
 
 
 @contextlib.contextmanager

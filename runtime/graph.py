@@ -6,7 +6,7 @@ type of event, in the order of the nodes in the file and of the declarations in 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from runtime.links import Link
@@ -57,6 +57,11 @@ def listeners(
     return found
 
 
+def nobody(_: str) -> Iterable[Listener]:
+    """Return the listeners of an output in other processes, where there are none."""
+    return ()
+
+
 def connect(
     nodes: Sequence[Node[Any]],
     sources: Sources,
@@ -64,8 +69,11 @@ def connect(
     taps: Iterable[Tap] = (),
     fault: Fault | None = None,
     last: Iterable[Listener] = (),
-) -> None:
-    """Freeze every output's listeners. May be called again when nodes come or go.
+    elsewhere: Callable[[str], Iterable[Listener]] = nobody,
+) -> list[Listener]:
+    """Freeze every output's listeners, and return all that are here.
+
+    May be called again when nodes come or go.
 
     Args:
         nodes: In the order in which they hear events.
@@ -74,6 +82,7 @@ def connect(
         taps: See every event first.
         fault: Told of listeners that raise; without it, `send` raises what they do.
         last: Listeners after all nodes.
+        elsewhere: Given ``node.port``, returns its listeners in other processes.
     """
     heard = [
         listener
@@ -86,7 +95,8 @@ def connect(
     for node in nodes:
         others = [listener for listener in heard if listener.node != node.name]
         for sender in senders(node).values():
-            sender.connect(others, taps, fault)
+            sender.connect([*elsewhere(sender.name), *others], taps, fault)
+    return heard
 
 
 def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str, str, str]]:

@@ -23,7 +23,7 @@ import itertools
 import selectors
 import time
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 from runtime.clock import Clock
 from runtime.schedule import SECOND, Schedule
@@ -50,6 +50,13 @@ class _JumpingSelector(selectors.DefaultSelector):
         return super().select(timeout)
 
 
+class Gate(Protocol):
+    """Says when time may go on: other processes may have to, first."""
+
+    def may_go(self, key: tuple[int, int, int]) -> bool:
+        """Tell whether to go on to what is due next: at a time (ns), of a kind, with an order."""
+
+
 class _Timer(asyncio.TimerHandle):
     """A timer that comes after those set before it for the same time; a bare heap mixes them."""
 
@@ -72,6 +79,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
     def __init__(self, speed: float | None = None) -> None:
         self.schedule = Schedule()
         self.now = 0
+        self.gate: Gate | None = None
         self._held: list[tuple[int, int, _Work, asyncio.Future[Any]]] = []
         self._orders = itertools.count()
         self._jumps = 0
@@ -121,6 +129,21 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         """Let go of the threads; a time-out on them would be simulated, and over at once."""
         self._default_executor.shutdown(wait=False, cancel_futures=True)  # type: ignore[attr-defined]
 
+    def orders(self) -> tuple[int, int]:
+        """Return the numbers that the next things due will have: the schedule's, and all others'.
+
+        Of things due at one time, those with lower numbers come first.
+        """
+        order = next(self._orders)
+        self._orders = itertools.count(order)
+        return self.schedule.order, order
+
+    def move(self, now: int, orders: tuple[int, int]) -> None:
+        """Go on from a time, and with these numbers, as another process left off."""
+        self.now = max(self.now, now)
+        self.schedule.order = orders[0]
+        self._orders = itertools.count(orders[1])
+
     def _wake_up(self) -> None:
         with contextlib.suppress(RuntimeError):  # closed: nobody waits any more
             self.call_soon_threadsafe(_nothing)
@@ -142,8 +165,12 @@ class LockstepLoop(asyncio.SelectorEventLoop):
             due = entry if entry < held else held
             if timer < due:
                 due = timer
-            if due <= self.now:
+            if due < self.now:
                 due = self.now
+            if self.gate is not None and not self.gate.may_go(self._key(due, timer, held)):
+                return wait(None)
+            if due == self.now:
+                pass
             elif due == _NEVER:
                 return wait(None)
             elif self._pace and (events := self._wait_until(due)):
@@ -165,6 +192,16 @@ class LockstepLoop(asyncio.SelectorEventLoop):
                 return []
         self._jumps += 1
         return wait(0) if self._jumps % _POLL_EVERY == 0 or timeout == 0 else []
+
+    def _key(self, due: int, timer: int, held: int) -> tuple[int, int, int]:
+        """Return the place of what is due next among what is due in all processes."""
+        if due == _NEVER:
+            return (_NEVER, 3, 0)
+        if timer <= due:
+            return (due, 0, self._scheduled[0].order)  # type: ignore[attr-defined]
+        if held <= due:
+            return (due, 1, self._held[0][1])
+        return (due, 2, self.schedule.heap[0][1])
 
     def _wait_until(self, due: int) -> _Ready:
         """Sleep until simulated time may be `due` at the set speed, or until a file is ready."""

@@ -180,6 +180,18 @@ class Node(Generic[C]):
         """
         self.sources.setdefault(port, source)
 
+    def on_change(self, before: C) -> None:
+        """Hear that `config` is a new one: somebody changed a setting while the run goes on.
+
+        Called between two steps. Only settings marked as `runtime.parameters.Changeable` change.
+
+        Args:
+            before: The settings until now.
+
+        Raises:
+            ValueError: The node cannot do with it; the message says why, and `before` holds again.
+        """
+
     async def run(self) -> None:
         """Do what the node does; returning is allowed. Cancelled when the run ends."""
 

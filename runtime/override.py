@@ -31,8 +31,8 @@ def override(table: dict[str, Any], change: str) -> None:
     except tomllib.TOMLDecodeError:
         value = text.strip()
     nodes = _by_name(table.get("nodes"))
-    if keys[0] == "run":
-        target = table.setdefault("run", {})
+    if keys[0] in {"run", "network"}:
+        target = table.setdefault(keys[0], {})
     elif keys[0] in nodes:
         target = nodes[keys[0]]
     else:

@@ -50,12 +50,16 @@ class RealClock(Clock):
         """Return nanoseconds since the first update; 0 before it."""
         if self._origin is None:
             return 0
-        elapsed = time.monotonic_ns() - self._origin
+        elapsed = max(time.monotonic_ns() - self._origin, 0)
         return elapsed if self._speed == 1.0 else int(elapsed * self._speed)
 
     def start(self) -> None:
         """Let time run, from 0."""
-        self._origin = time.monotonic_ns()
+        self.start_at(time.monotonic_ns())
+
+    def start_at(self, origin: int) -> None:
+        """Let time run, from 0 at a time of `time.monotonic_ns`."""
+        self._origin = origin
         self._ring()
 
     async def beside(self, work: concurrent.futures.Future[R], latency: int = 0) -> R:

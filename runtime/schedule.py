@@ -8,7 +8,6 @@ the nodes in the file.
 from __future__ import annotations
 
 import heapq
-import itertools
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any, Protocol
@@ -48,13 +47,16 @@ class Schedule:
 
     def __init__(self) -> None:
         self.heap: list[tuple[int, int, Entry]] = []
-        self._orders = itertools.count()
+        self.order = 0
+        """Number of what is added next; of things due at one time, the lowest comes first."""
         self.on_sooner: Callable[[int], None] = _ignore
         """Called when something is added that is due before all else."""
 
     def add(self, due: int, entry: Entry) -> None:
         """Run `entry` at `due`, after all that was added for that time before."""
-        self._push((due, next(self._orders), entry))
+        order = self.order
+        self.order = order + 1
+        self._push((due, order, entry))
 
     def next_due(self) -> int | None:
         """Return the earliest due time, or `None` if nothing is due ever."""

@@ -7,14 +7,17 @@ import os
 import platform
 import time
 from collections import Counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from runtime.digest import Digest, combined
 from runtime.node import matchers, senders, streams
 from runtime.schedule import SECOND
-from runtime.supervisor import Supervisor
 from runtime.watchdog import Stall
+
+if TYPE_CHECKING:
+    from runtime.supervisor import Supervisor
 
 
 class TickSummary(msgspec.Struct, frozen=True):
@@ -59,6 +62,26 @@ class Verdict(msgspec.Struct, frozen=True):
     estimators: dict[str, dict[str, Any]]
 
 
+class ProcessSummary(msgspec.Struct, frozen=True):
+    """One of the processes of a run.
+
+    Attributes:
+        nodes: That ran in it.
+        place: Host and process number.
+        clock_offset_ms: Its monotonic clock, less that of the process whose summary this is.
+        round_trip_ms: Of the quickest question and answer; the offset is off by half of it at most.
+        waited: Most messages that waited for the network on their way there.
+        replaced: Events that newer ones replaced on their way there.
+    """
+
+    nodes: list[str]
+    place: str
+    clock_offset_ms: float | None = None
+    round_trip_ms: float | None = None
+    waited: int = 0
+    replaced: int = 0
+
+
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """One run.
 
@@ -72,6 +95,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         wall_seconds: Real seconds, from the first update to when the end was asked for.
         digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels
             depend on the graphics driver, so digests compare on one machine.) `None` if off.
+        digests: Fingerprint of each output's events, of which that of the run is made.
         not_deterministic: Nodes because of which equal runs may have unequal digests.
         verdict: What nodes concluded; `None` if none did.
         events: Events sent, by type.
@@ -84,6 +108,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         longest_stalls: The worst of them, by node.
         announcements: What nodes said they provide.
         environment: Machine and versions.
+        processes: Where which nodes ran, if not all in one process.
     """
 
     name: str
@@ -94,6 +119,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     sim_seconds: float
     wall_seconds: float
     digest: str | None
+    digests: dict[str, str]
     not_deterministic: list[str]
     verdict: Verdict | None
     events: dict[str, int]
@@ -106,6 +132,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     longest_stalls: dict[str, Stall]
     announcements: list[dict[str, Any]]
     environment: dict[str, str]
+    processes: list[ProcessSummary] = []
 
 
 def count_events(supervisor: Supervisor) -> tuple[Counter[str], Counter[str]]:
@@ -157,7 +184,7 @@ def summarise(
     *,
     name: str,
     sim_ns: int,
-    digest: str | None,
+    digest: Digest | None,
     stalls: Counter[str],
     longest_stalls: dict[str, Stall],
 ) -> Summary:
@@ -173,9 +200,10 @@ def summarise(
         error=None if supervisor.error is None else str(supervisor.error),
         sim_seconds=sim_ns / SECOND,
         wall_seconds=round(ended - (supervisor.first_update or ended), 6),
-        digest=digest,
+        digest=digest.hexdigest() if digest else None,
+        digests=digest.outputs() if digest else {},
         not_deterministic=sorted({n.name for n in supervisor.ever if not n.deterministic}),
-        verdict=_verdict(supervisor),
+        verdict=_verdict(supervisor.verdicts),
         events=dict(sorted(by_type.items())),
         outputs=dict(by_output),
         drops={port: s.dropped for port, s in by_input.items()},
@@ -193,11 +221,41 @@ def summarise(
     )
 
 
-def _verdict(supervisor: Supervisor) -> Verdict | None:
-    found = supervisor.verdicts
+def _verdict(found: dict[str, dict[str, Any]]) -> Verdict | None:
     if not found:
         return None
     return Verdict(all(each["passed"] for each in found.values()), found)
+
+
+def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
+    """Put together what the processes of one run say of it; where it runs together, once."""
+    first = parts[0]
+    digests = {name: each for part in parts for name, each in part.digests.items()}
+    verdicts = [part.verdict for part in parts if part.verdict is not None]
+    stalls: Counter[str] = Counter()
+    events: Counter[str] = Counter()
+    for part in parts:
+        events.update(part.events)
+        stalls.update(part.stalls)
+
+    def of_all(field: str) -> dict[str, Any]:
+        return {key: value for part in parts for key, value in getattr(part, field).items()}
+
+    return msgspec.structs.replace(
+        first,
+        error=next((part.error for part in parts if part.error), None),
+        sim_seconds=max(part.sim_seconds for part in parts),
+        wall_seconds=max(part.wall_seconds for part in parts),
+        digest=combined(digests) if all(part.digest for part in parts) else None,
+        digests=dict(sorted(digests.items())),
+        not_deterministic=sorted({node for part in parts for node in part.not_deterministic}),
+        verdict=_verdict({k: f for v in verdicts for k, f in v.estimators.items()}),
+        events=dict(sorted(events.items())),
+        stalls=dict(stalls),
+        longest_stalls=of_all("longest_stalls"),
+        processes=processes,
+        **{f: of_all(f) for f in ("outputs", "drops", "streams", "links", "ticks")},
+    )
 
 
 def environment() -> dict[str, str]:

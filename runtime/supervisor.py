@@ -18,25 +18,31 @@ import functools
 import inspect
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from typing_extensions import TypeVar
 
 from events import Announcement, Event, Shutdown, WindowClosed
 from runtime import graph
+from runtime.changing import Changing
 from runtime.clock import Clock
 from runtime.config import Config
-from runtime.errors import FatalError, NodeError, NodeTimeoutError, RefusedError
+from runtime.errors import FatalError, NodeError, NodeTimeoutError, PeerError, RefusedError
 from runtime.life import Life, log_error, wrap
 from runtime.limits import real_time_limit
 from runtime.links import Link
 from runtime.node import Node, make_node, streams
+from runtime.probes import Probes
 from runtime.schedule import Once, Tick, Ticker
 from runtime.sender import Deliver, Listener, Tap
 from runtime.streams import Stream
 from runtime.worker import Worker
+
+if TYPE_CHECKING:
+    from runtime.peers.peers import Peers
 
 W = TypeVar("W")
 
@@ -55,10 +61,16 @@ class Supervisor:
         clock: The run's clock.
         taps: See every event before its listeners do.
         out: Folder for what nodes write, or `None`.
+        only: Nodes that run here, if others run in other processes.
     """
 
     def __init__(
-        self, config: Config, clock: Clock, taps: Sequence[Tap] = (), out: Path | None = None
+        self,
+        config: Config,
+        clock: Clock,
+        taps: Sequence[Tap] = (),
+        out: Path | None = None,
+        only: Collection[str] = (),
     ) -> None:
         self.out = out
         self.seed = config.run.seed
@@ -82,9 +94,19 @@ class Supervisor:
         """What nodes concluded, by what they judged."""
         self.after: list[Callable[[Path], Any]] = []
         """What is to be called with the run's folder at the very end."""
+        self.probes = Probes(self)
+        self.changing = Changing(self)
         self._config = config
         self._taps = tuple(taps)
-        self._lives = {spec.name: Life(spec) for spec in config.nodes}
+        self._lives = {
+            spec.name: Life(spec) for spec in config.nodes if not only or spec.name in only
+        }
+        self.peers: Peers | None = None
+        """The other processes of the run, if there are any."""
+        if len(self._lives) < len(config.nodes):
+            from runtime.peers.peers import Peers
+
+            self.peers = Peers(config, only, clock, self)
         self._running = False
         self._ended = asyncio.Event()
         self._begin: asyncio.Task[None] | None = None
@@ -102,10 +124,18 @@ class Supervisor:
 
     # The host of the nodes.
 
-    def stop(self, reason: str, error: Exception | None = None) -> None:
-        """End the run in order; the first reason counts."""
+    def stop(self, reason: str, error: Exception | None = None, *, told: bool = False) -> None:
+        """End the run in order; the first reason counts.
+
+        Args:
+            reason: For the summary.
+            error: What went wrong, if anything did.
+            told: Whether another process says so, and need not be told.
+        """
         if self._ended.is_set():
             return
+        if self.peers is not None:
+            self.peers.stopping(None if told else reason, error)
         self.reason = reason
         self.error = error
         self.ended = time.monotonic()
@@ -124,9 +154,14 @@ class Supervisor:
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as part of a node."""
         life = self._lives[node.name]
-        task = self._group.create_task(self._guard(node, coro), name=node.name)
+        guarded = self._guard(node, coro)
+        guarded.__qualname__ = getattr(coro, "__qualname__", guarded.__qualname__)  # type: ignore[attr-defined]
+        task = self._group.create_task(guarded, name=node.name)
         life.tasks.add(task)
+        self.probes.on_task(node.name, task)
         task.add_done_callback(life.tasks.discard)
+        # Cancelled before its first step, the task has not begun what it guards.
+        task.add_done_callback(lambda _: coro.close())
 
     def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
         """Call a function of a node at a rate, from the first update on."""
@@ -137,6 +172,7 @@ class Supervisor:
         ticker = Ticker(full_name, hz, call, fault, before=self.tickers.get(full_name))
         self.tickers[full_name] = ticker
         self._lives[node.name].tickers.append(ticker)
+        self.probes.on_ticker(ticker)
         if self._running and self._lives[node.name].started:
             self._add(ticker)
         return ticker
@@ -163,6 +199,7 @@ class Supervisor:
             **options,
         )
         self._lives[node.name].workers.append(worker)
+        self.probes.on_worker(worker)
         await worker.ready()
         return worker
 
@@ -179,39 +216,64 @@ class Supervisor:
         elif fatal:
             self.stop(f"{name} failed", wrapped)
         else:
-            life.recovering = True
-            task = self._group.create_task(self._recover(life), name=f"recover {name}")
-            self._recoveries.add(task)
-            task.add_done_callback(self._recoveries.discard)
+            self.restart(name)
+
+    def restart(self, name: str, *, anyway: bool = False) -> None:
+        """Take a node out, and bring up a new one in its place if its `on_error` wants that.
+
+        Args:
+            name: Of the node.
+            anyway: Bring one up whatever that says: somebody asked for it.
+        """
+        life = self._lives[name]
+        life.recovering = True
+        task = self._group.create_task(self._recover(life, anyway), name=f"recover {name}")
+        self._recoveries.add(task)
+        task.add_done_callback(self._recoveries.discard)
 
     # Beginning.
 
     async def _start_all(self) -> None:
         try:
+            if self.peers is not None:
+                await self.peers.meet()
             for life in self._lives.values():
                 await self._start_up(life)
                 if self._ended.is_set():  # it stopped the run and did not wait for anything after
                     return
-            for life in self._lives.values():
-                self.announcements += self._announced(life)
+            said = {name: self._announced(life) for name, life in self._lives.items()}
+            mine = list(chain(*said.values()))
+            self.announcements += await self.peers.announce(said) if self.peers else mine
             for life in self._lives.values():
                 self._hear(life)
+            if self.peers is not None:
+                self._connect()  # so that each knows what the others hear
+                await self.peers.begin()
+        except PeerError as error:
+            log.error("%s", error, extra={"told": True})
+            self.stop("the processes of the run did not come together", error)
+            return
         except NodeError as error:
             log_error(error, last=True)
             self.stop("start-up failed", error)
             return
-        for announcement in self.announcements:
+        for announcement in mine:
             for tap in self._taps:
                 tap(None, announcement)
         self._connect()
         self._running = True
         self.first_update = time.monotonic()
-        self.clock.start()
+        if self.peers is None:
+            self.clock.start()
         if self._config.run.duration:
             end = self.clock.now() + round(self._config.run.duration * 1e9)
             self.clock.schedule.add(end, Once(lambda: self.stop("duration")))
-        for life in self._lives.values():
-            self._begin_node(life)
+        for index, spec in enumerate(self._config.nodes):
+            if spec.name in self._lives:
+                self.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
+                self._begin_node(self._lives[spec.name])
+        if self.peers is not None:
+            self.peers.begun()
 
     async def _start_up(self, life: Life) -> None:
         spec = life.spec
@@ -260,7 +322,20 @@ class Supervisor:
         sources = {node.name: node.sources for node in nodes}
         links = {life.spec.name: life.links for life in self._lives.values()}
         end = Listener("run", self._hear_end, (Shutdown, WindowClosed))
-        graph.connect(nodes, sources, links, self._taps, self._listener_failed, [end])
+        elsewhere = self.peers.listeners if self.peers is not None else graph.nobody
+        heard = self.probes.looking(
+            graph.connect(
+                nodes, sources, links, self._taps, self._listener_failed, [end], elsewhere
+            )
+        )
+        if self.peers is not None:
+            self.peers.connect(heard, self._listener_failed)
+        self.changing.connect(heard, self._taps, self._listener_failed)
+        self.probes.on_connected(nodes, [self.changing.sender])
+
+    def connect(self) -> None:
+        """Freeze anew who hears whom: another process has come, or gone."""
+        self._connect()
 
     def _begin_node(self, life: Life) -> None:
         node = life.node
@@ -313,11 +388,10 @@ class Supervisor:
         reason = getattr(event, "reason", "") or type(event).__name__
         self.stop(f"{event.source}: {reason}")
 
-    async def _recover(self, life: Life) -> None:
-        """Take a failed node out, and bring up a new one in its place if that is wanted."""
+    async def _recover(self, life: Life, anyway: bool) -> None:
         # Shielded: the end of the run ends this task, but must not cut an on_shutdown short.
         await asyncio.shield(self._group.create_task(self._retire(life)))
-        if life.spec.on_error == "drop":
+        if life.spec.on_error == "drop" and not anyway:
             log.warning("%s: left out from here on", life.spec.name)
             return
         while not self._ended.is_set():
@@ -351,8 +425,14 @@ class Supervisor:
             await asyncio.wait(self._recoveries)
         if not self._running:  # what has started may still send farewells to what has, too
             self._connect()
-        for life in reversed(self._lives.values()):
+        for name, life in reversed(self._lives.items()):
+            if self.peers is not None:
+                await self.peers.turn_to_end(name)
             await self._retire(life)
+            if self.peers is not None:
+                self.peers.retired(name)
+        if self.peers is not None:
+            await self.peers.turn_to_end("")
 
     async def _retire(self, life: Life) -> None:
         """End one node, unless that is done: it hears nothing afterwards."""

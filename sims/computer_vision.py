@@ -90,7 +90,7 @@ class FreeCamera(Node[FreeCameraConfig]):
         self._rows = (
             await self.offload(read_tum, Path(config.trajectory)) if (config.trajectory) else None
         )
-        specs = tuple(msgspec.structs.replace(c, rate=config.rate) for c in config.cameras)
+        specs = _at_rate(config)
         self._cameras = [spec.name for spec in specs]
         outputs = CameraOutputs(self.images, self.depth, self.segmentation, self.camera_poses)
         self._rig = CameraRig(self, specs, outputs, config.camera_processes, config.render_threads)
@@ -104,6 +104,10 @@ class FreeCamera(Node[FreeCameraConfig]):
     def announce(self) -> Iterable[Announcement]:
         """Say what cameras these are."""
         return self._rig.announcements(self.name)
+
+    def on_change(self, before: FreeCameraConfig) -> None:  # noqa: ARG002
+        """Deliver pictures as the settings now say."""
+        self._rig.change(_at_rate(self.config))
 
     async def run(self) -> None:
         """Say once where the cameras sit."""
@@ -234,3 +238,8 @@ def pose_at(rows: npt.NDArray[np.float64], seconds: float) -> tuple[Vector3, Qua
         q = (math.sin((1 - share) * angle) * q0 + math.sin(share * angle) * q1) / math.sin(angle)
     qx, qy, qz, qw = q.tolist()
     return (x, y, z), (qw, qx, qy, qz)
+
+
+def _at_rate(config: FreeCameraConfig) -> tuple[CameraSpec, ...]:
+    """Return the cameras, all at the rate of the updates."""
+    return tuple(msgspec.structs.replace(c, rate=config.rate) for c in config.cameras)

@@ -15,10 +15,15 @@ from runtime.cli.check import check
 from runtime.cli.export import export
 from runtime.cli.graph import graph
 from runtime.cli.nodes import nodes
+from runtime.cli.recover import recover
 from runtime.cli.report import report
 from runtime.cli.run import leave_threads_behind, run
+from runtime.cli.set import set_
 from runtime.cli.sweep import sweep
+from runtime.cli.top import top
+from runtime.cli.trace import trace
 from runtime.cli.vocabulary import vocabulary
+from runtime.cli.web import web
 from runtime.errors import VisnavError
 
 app = typer.Typer(
@@ -34,6 +39,11 @@ app.command()(nodes)
 app.command()(sweep)
 app.command()(report)
 app.command()(export)
+app.command()(recover)
+app.command()(trace)
+app.command()(top)
+app.command()(web)
+app.command("set")(set_)
 app.command()(vocabulary)
 app.command(  # the arguments, --help among them, are the benchmarks' own
     context_settings={

@@ -41,39 +41,83 @@ def run(
         Log | None,
         typer.Option(help='Least level to print, or "events" for every event that is sent.'),
     ] = None,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NODE,…",
+            help="Run just these nodes here; other processes, also elsewhere, run the others.",
+        ),
+    ] = None,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
     ] = False,
+    trace: Annotated[
+        Path | None,
+        typer.Option(help="Write a trace for ui.perfetto.dev; compressed if it ends with .gz."),
+    ] = None,
+    top: Annotated[
+        bool, typer.Option("--top", help="Show the monitor's screen instead of a progress bar.")
+    ] = False,
+    web: Annotated[
+        int | None, typer.Option(metavar="PORT", help="Show the monitor as a page, on this port.")
+    ] = None,
 ) -> None:
     """Run the nodes of a file until they, its duration or Ctrl-C end the run.
 
-    Results go to runs/<name>: summary.json, log.txt, the resolved config.toml, and whatever the
-    nodes write. Ends with 0, also after Ctrl-C, SIGTERM or a closed window (a second Ctrl-C is
-    immediate); with 1 if a threshold of the run was not met; with 2 if something failed.
+    Results go to runs/<name> (with --only, to runs/<name>-<first node>): summary.json, log.txt,
+    the resolved config.toml, and whatever the nodes write. Ends with 0, also after Ctrl-C, SIGTERM
+    or a closed window (a second Ctrl-C is immediate); with 1 if a threshold of the run was not
+    met; with 2 if something failed.
     """
-    from runtime.cli.progress import progress
+    from runtime.cli.watching import Lookers
     from runtime.config import load
     from runtime.execute import execute
-    from runtime.logs import terminal_handler
 
     changes = list(overrides or [])
     if log is not None and log is not Log.events:
         changes.append(f"run.log={log.value}")
     settings = load(config, changes)
     warn_unconnected(settings)
-    folder = out or Path("runs") / settings.run.name
+    nodes_here = chosen(settings, only)
+    name = "-".join([settings.run.name, *nodes_here[:1]])
+    folder = out or Path("runs") / name
+    lookers = Lookers(settings, name, quiet=quiet, trace=trace, top=top, web=web)
     summary = execute(
         settings,
         folder,
-        handlers=[terminal_handler()],
+        handlers=lookers.handlers,
         log_events=log is Log.events,
-        watch=None if quiet else progress(settings.run),
+        watch=lookers.watch,
+        only=nodes_here,
     )
     if not quiet:
         report(summary, folder)
     code = 0 if summary.verdict is None or summary.verdict.passed else 1
     leave_threads_behind(code)
     raise typer.Exit(code)
+
+
+def chosen(settings: Config, only: str | None) -> list[str]:
+    """Return the nodes that ``--only`` names, in file order; none if all run here.
+
+    Raises:
+        ConfigError: It names a node that there is not, or none.
+    """
+    from runtime.errors import ConfigError, suggest
+
+    if only is None:
+        return []
+    names = [spec.name for spec in settings.nodes]
+    wanted = [name.strip() for name in only.split(",") if name.strip()]
+    for name in wanted:
+        if name not in names:
+            raise ConfigError(
+                f"--only {only}: expected nodes of the file ({', '.join(names)}), found {name}"
+                + suggest(name, names)
+            )
+    if not wanted:
+        raise ConfigError("--only: expected names of nodes with commas between, found none")
+    return [] if set(wanted) == set(names) else [name for name in names if name in wanted]
 
 
 def warn_unconnected(settings: Config) -> None:

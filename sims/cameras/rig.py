@@ -105,6 +105,10 @@ class CameraRig:
             processes=self._processes,
         )
 
+    def change(self, specs: tuple[CameraSpec, ...]) -> None:
+        """Deliver from the next exposure on as these say; what is drawn stays as it was."""
+        self._specs = {spec.name: spec for spec in specs}
+
     def announcements(self, parent_frame_id: str) -> Iterable[CameraAnnouncement]:
         """Say what the cameras will provide."""
         name = self._node.name

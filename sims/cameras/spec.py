@@ -14,6 +14,7 @@ import mujoco
 import events
 from events.base import Quaternion, Vector3
 from runtime import Duration
+from runtime.parameters import Changeable
 from sims.frames import from_euler, half_turn_quaternion, half_turn_vector, multiply
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
@@ -65,8 +66,8 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     noise: NonNegative = 0.0
     depth_noise: NonNegative = 0.0
     latency: Duration = Duration(0.04)
-    jitter: Duration = Duration(0)
-    loss: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
+    jitter: Changeable[Duration] = Duration(0)
+    loss: Changeable[Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]] = 0.0
     render_time: Duration = Duration(0)
 
     def __post_init__(self) -> None:

@@ -155,6 +155,10 @@ class Multirotor(Node[MultirotorConfig]):
         )
         yield from self._rig.announcements(FRAME)
 
+    def on_change(self, before: MultirotorConfig) -> None:  # noqa: ARG002
+        """Deliver pictures as the settings now say."""
+        self._rig.change(self.config.cameras)
+
     async def run(self) -> None:
         """Say once where the cameras sit."""
         for mounting in self._rig.transforms(FRAME):

@@ -6,6 +6,7 @@ of these are in `sims.worlds.materials`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,8 +154,11 @@ def share(stencil: npt.NDArray[np.uint8]) -> Picture:
 
 def smooth(low: float, high: float, value: Picture) -> Picture:
     """Return a soft step (Hermite) from 0 where `value` <= low to 1 where it is >= high."""
-    t = np.clip((value - low) / (high - low), 0.0, 1.0)
-    return np.asarray(t * t * (3.0 - 2.0 * t), dtype=np.float32)
+    out = np.empty(value.shape, np.float32)
+    for rows in _strips(out):
+        t = np.clip((value[rows] - low) / (high - low), 0.0, 1.0)
+        out[rows] = t * t * (3.0 - 2.0 * t)
+    return out
 
 
 def mix(below: Picture, above: Picture | Colour, amount: Picture | float) -> Picture:
@@ -162,15 +166,28 @@ def mix(below: Picture, above: Picture | Colour, amount: Picture | float) -> Pic
     if not isinstance(above, np.ndarray):
         # One row of it: numpy is slow where the innermost loop is three long.
         above = np.tile(np.asarray(above, np.float32), (1, below.shape[1], 1))
-    out = above - below
-    out *= _three(amount) if isinstance(amount, np.ndarray) else np.float32(amount)
-    out += below
-    return np.asarray(out, dtype=np.float32)
+    out = np.empty(below.shape, np.float32)
+    for rows in _strips(out):
+        under, over = below[rows], above if len(above) == 1 else above[rows]
+        part = over - under
+        part *= _three(amount[rows]) if isinstance(amount, np.ndarray) else np.float32(amount)
+        np.add(part, under, out=out[rows], casting="same_kind")
+    return out
 
 
 def shade(picture: Picture, amount: Picture) -> Picture:
     """Make a picture brighter (amount > 0) or darker, shape (h, w), as a share of itself."""
-    return np.asarray(picture * _three(1.0 + amount), dtype=np.float32)
+    out = np.empty(picture.shape, np.float32)
+    for rows in _strips(out):
+        out[rows] = picture[rows] * _three(1.0 + amount[rows])
+    return out
+
+
+def _strips(picture: Picture) -> Iterator[slice]:
+    """Yield runs of rows of about 64 kB, which stay in a processor's cache while worked on."""
+    count = max(1, 65536 // max(picture[:1].nbytes, 1))
+    for top in range(0, len(picture), count):
+        yield slice(top, top + count)
 
 
 def _three(amount: Picture) -> Picture:

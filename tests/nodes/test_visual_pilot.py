@@ -14,6 +14,9 @@ from runtime.testing import NodeResult, run_nodes, spec
 from sims.multirotor.node import Multirotor
 
 SECOND = 1_000_000_000
+FLOOR = """<mujoco><worldbody>
+  <light pos="0 0 4"/><geom name="floor" type="plane" size="9 9 1"/>
+</worldbody></mujoco>"""
 WAYPOINTS = [[0.0, 0.0, -1.5], [3.0, 0.0, -1.5], [3.0, 2.5, -1.5]]
 
 
@@ -53,10 +56,17 @@ class Oracle(Node[OracleConfig]):
         )
 
 
-def fly(duration: float = 30.0, delay: str = "60ms", **oracle: Any) -> NodeResult:
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("world") / "floor.xml"
+    path.write_text(FLOOR)
+    return str(path)
+
+
+def fly(world: str, duration: float = 30.0, delay: str = "60ms", **oracle: Any) -> NodeResult:
     return run_nodes(
         [
-            spec(Multirotor, "drone", {"world": "hall"}),
+            spec(Multirotor, "drone", {"world": world}),
             spec(Oracle, "oracle", oracle),
             spec(
                 VisualPilot,
@@ -77,19 +87,19 @@ def beside_the_plan(result: NodeResult) -> np.ndarray:
     return np.array([np.subtract(truth[p.stamp], p.position) for p in plans])
 
 
-def test_right_estimates_though_late_keep_the_vehicle_on_its_path() -> None:
-    result = fly()
+def test_right_estimates_though_late_keep_the_vehicle_on_its_path(world: str) -> None:
+    result = fly(world)
     assert result.reason == "pilot: tour flown"
     assert np.linalg.norm(beside_the_plan(result), axis=1).max() < 0.3
 
 
-def test_an_estimate_that_is_off_takes_the_vehicle_off() -> None:
-    error = beside_the_plan(fly(shift=(0.0, 0.0, -0.4)))
+def test_an_estimate_that_is_off_takes_the_vehicle_off(world: str) -> None:
+    error = beside_the_plan(fly(world, shift=(0.0, 0.0, -0.4)))
     assert error[-100:, 2].mean() == pytest.approx(0.4, abs=0.03)
 
 
-def test_without_estimates_it_stops_and_waits() -> None:
-    result = fly(blind=(5.0, 8.0))
+def test_without_estimates_it_stops_and_waits(world: str) -> None:
+    result = fly(world, blind=(5.0, 8.0))
     waits = [event for event in result.of(Hover) if 5.0 < event.stamp / SECOND < 8.0]
     assert len(waits) == 1
     while_blind: list[Event] = [

@@ -1,7 +1,9 @@
-"""Starting the command line in a process of its own, as a user would."""
+"""Starting the command line in a process of its own, as a user would, or in this one, quickly."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import subprocess
@@ -9,6 +11,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
+
+from runtime.cli import main
 
 ROOT = Path(__file__).parents[2]
 
@@ -44,6 +49,25 @@ def command(
         finally:
             process.kill()
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def command_here(*arguments: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Do what `command` does in this process: for commands that run no nodes."""
+    words = ["runtime", *map(str, arguments)]
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with (
+        mock.patch.object(sys, "argv", words),
+        mock.patch.object(sys, "path", [*sys.path]),
+        mock.patch.dict(os.environ, {"COLUMNS": "200", "NO_COLOR": "1"}),
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 def summary(folder: Path) -> Any:

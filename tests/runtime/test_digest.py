@@ -113,7 +113,7 @@ print(digest(said("x"), measured(np.arange(5), {"a", "b", "c", "d", "e"})))
         subprocess.run(
             [sys.executable, "-c", code], check=True, capture_output=True, text=True
         ).stdout
-        for _ in range(3)
+        for _ in range(2)
     }
     assert found == {digest(said("x"), measured(np.arange(5), set("abcde"))) + "\n"}
 
@@ -123,8 +123,8 @@ def test_many_small_events_and_one_large_are_taken_in_alike() -> None:
     events = [said(str(i) * 50) for i in range(3000)]
     looked_at, not_looked_at = Digest(), Digest()
     for event in events:
-        looked_at.add(event)
-        not_looked_at.add(event)
+        looked_at(None, event)
+        not_looked_at(None, event)
         looked_at.hexdigest()
     assert looked_at.hexdigest() == not_looked_at.hexdigest() == digest(*events)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import time
+import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -152,6 +154,28 @@ def test_start_and_every_belong_to_the_node() -> None:
     result = run_node(Busy, duration=0.5)
     assert [p.stamp for p in result.of(Ping)] == [0, 200_000_000, 400_000_000]
     assert DIARY == ["cancelled"]
+
+
+def test_what_is_started_as_the_node_ends_need_not_have_begun() -> None:
+    """A task that is cancelled before its first step leaves no warning of its coroutine."""
+
+    class Late(Node):
+        async def run(self) -> None:
+            self.stop("enough")
+            while True:
+                self.start(self.beside())
+                await asyncio.sleep(0)
+
+        async def beside(self) -> None:
+            DIARY.append("begun")
+            await asyncio.get_running_loop().create_future()
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert run_node(Late).reason == "enough"
+        gc.collect()
+    assert DIARY
+    assert [str(warning.message) for warning in caught] == []
 
 
 def test_stop_ends_the_run_with_its_reason() -> None:

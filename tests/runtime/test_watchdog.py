@@ -100,7 +100,7 @@ def test_a_blocking_handler_is_reported_with_node_and_line(clock: str, way: str)
     stall = dog.longest["Blocker"]
     assert __file__ in stall.line
     assert ("in wait_for_a_queue" if way == "queue" else "in block") in stall.line
-    assert 0.04 < stall.seconds < 0.2
+    assert 0.04 < stall.seconds < 5
 
 
 def test_the_line_is_the_one_that_blocks() -> None:

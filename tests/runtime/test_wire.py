@@ -35,7 +35,7 @@ class Measured(Event, eq=False):
 
 def digest(event: Event) -> str:
     found = Digest()
-    found.add(event)
+    found(None, event)
     return found.hexdigest()
 
 

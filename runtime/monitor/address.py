@@ -1,0 +1,96 @@
+"""Where runs listen: a Unix socket each, in a folder that is its user's alone."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import stat
+import tempfile
+from pathlib import Path
+
+from runtime.errors import suggest
+from runtime.monitor.timekeeping import CommandError
+
+_LONGEST = 100
+"""Bytes of a Unix socket's path at most (108 on Linux, 104 elsewhere)."""
+
+
+def folder() -> Path:
+    """Return the folder of the sockets, made if missing.
+
+    Raises:
+        CommandError: Others than its user may get at it.
+    """
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    path = Path(base) / "visnav" if base else Path(tempfile.gettempdir()) / f"visnav-{os.getuid()}"
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = path.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise CommandError(
+            f"{path}: expected a folder that only its user may enter, found mode "
+            f"{stat.S_IMODE(found.st_mode):o} of user {found.st_uid}"
+        )
+    return path
+
+
+def socket_of(run: str) -> Path:
+    """Return where a run of this process is to listen.
+
+    Raises:
+        CommandError: The folder is no good.
+    """
+    place, end = folder(), f"-{os.getpid()}.sock"
+    name = re.sub(r"[^\w.-]", "_", run)
+    room = _LONGEST - len(os.fsencode(place)) - 1 - len(end)
+    short = os.fsencode(name)[: max(room, 1)].decode(errors="ignore")
+    return place / f"{short}{end}"
+
+
+def runs() -> dict[str, Path]:
+    """Return the runs that listen now, by name; of two of one name the process is named, too."""
+    listening = [path for path in sorted(folder().glob("*.sock")) if _answers(path)]
+    names = [path.stem.rpartition("-")[0] for path in listening]
+    return {
+        path.stem if names.count(name) > 1 else name: path
+        for name, path in zip(names, listening, strict=True)
+    }
+
+
+def find(run: str | None) -> Path:
+    """Return where a run listens.
+
+    Args:
+        run: Its name, ``name-process`` if there are two, or the path of its socket; `None` if
+            there is but one.
+
+    Raises:
+        CommandError: There is none such, or none at all, or there are several.
+    """
+    if run is not None and run.endswith(".sock"):
+        return Path(run)
+    found = runs()
+    listed = ", ".join(found)
+    if not found:
+        raise CommandError("expected a run to look at, found none that goes on")
+    if run is None and len(found) > 1:
+        raise CommandError(f"expected the name of one of several runs: {listed}")
+    if run is not None and run not in found:
+        raise CommandError(f"expected one of {listed}; found {run!r}{suggest(run, found)}")
+    return found[run] if run is not None else next(iter(found.values()))
+
+
+def _answers(path: Path) -> bool:
+    """Tell whether somebody listens at a socket; remove what a killed run has left."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            with contextlib.suppress(OSError):
+                path.unlink()
+            return False
+        except OSError:
+            return False
+    return True

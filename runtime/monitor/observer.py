@@ -1,0 +1,233 @@
+"""Making snapshots of a run, and doing what it is asked; all on the run's loop."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from typing import Any
+
+import msgspec
+
+from runtime.config import Config
+from runtime.errors import suggest
+from runtime.life import Life
+from runtime.monitor.command import Command, Pause, Restart, Resume, Set, Speed, Step, Stop
+from runtime.monitor.meter import Meter
+from runtime.monitor.records import LastRecords
+from runtime.monitor.snapshot import (
+    ClockState,
+    InputState,
+    LinkState,
+    NodeCondition,
+    NodeState,
+    OutputState,
+    Snapshot,
+    TickState,
+)
+from runtime.monitor.timekeeping import CommandError, Timekeeper
+from runtime.node import senders, streams
+from runtime.parameters import settings
+from runtime.schedule import SECOND
+from runtime.summary import count_drops
+from runtime.supervisor import Supervisor
+
+
+class Observer:
+    """Looks at one run.
+
+    Args:
+        supervisor: Of the run.
+        config: Of the run.
+        records: Its log.
+    """
+
+    def __init__(self, supervisor: Supervisor, config: Config, records: LastRecords) -> None:
+        self._supervisor = supervisor
+        self._config = config
+        self._records = records
+        self._keeper = Timekeeper(supervisor.clock)
+        self._meter: Meter | None = None
+        self._counts: Counter[str] = Counter()
+        self._number = 0
+        self._real = time.perf_counter()
+        self._run = 0
+
+    def begin(self) -> None:
+        """Begin to measure: somebody looks."""
+        if self._meter is None:
+            self._meter = Meter(self._supervisor.clock)
+            self._supervisor.probes.attach(self._meter)
+            self._real, self._run = time.perf_counter(), self._supervisor.clock.now()
+
+    def end(self) -> None:
+        """Measure no more: nobody looks."""
+        if self._meter is not None:
+            self._supervisor.probes.detach(self._meter)
+            self._meter = None
+
+    # Seeing.
+
+    def take(self) -> Snapshot:
+        """Return what there is to see since the last time."""
+        supervisor = self._supervisor
+        real, now = time.perf_counter(), supervisor.clock.now()
+        interval, passed = max(real - self._real, 1e-9), (now - self._run) / SECOND
+        self._real, self._run = real, now
+        self._number += 1
+        meter = self._meter or Meter(supervisor.clock)
+        snapshot = Snapshot(
+            run=self._config.run.name,
+            pid=os.getpid(),
+            number=self._number,
+            interval=interval,
+            ended=supervisor.reason,
+            clock=ClockState(
+                kind=supervisor.clock.kind,
+                now=now / SECOND,
+                duration=float(self._config.run.duration),
+                speed=passed / interval,
+                asked=self._keeper.asked,
+                paused=self._keeper.paused,
+                fixed=self._keeper.fixed(),
+            ),
+            nodes=[self._node(life, meter, interval) for life in supervisor._lives.values()],
+            outputs=self._outputs(meter, now, passed),
+            inputs=[
+                InputState(
+                    name=stream.name,
+                    buffered=stream.statistics().buffered,
+                    peak=found.peak,
+                    bound=found.bound,
+                    dropped=found.dropped,
+                )
+                for stream, found in self._inputs()
+            ],
+            links=[
+                LinkState(name=link.name, lost=link.lost, thinned=link.thinned)
+                for link in supervisor.links.values()
+            ],
+            ticks=[
+                TickState(
+                    name=name,
+                    hz=ticker.hz,
+                    calls=ticker.calls,
+                    missed=ticker.missed,
+                    late_p99_us=ticker.late.quantile(0.99) / 1e3,
+                    late_max_us=ticker.late.maximum / 1e3,
+                )
+                for name, ticker in supervisor.tickers.items()
+            ],
+            log=self._records.lines(),
+        )
+        meter.reset()
+        return snapshot
+
+    def _node(self, life: Life, meter: Meter, interval: float) -> NodeState:
+        steps = meter.nodes.get(life.spec.name)
+        return NodeState(
+            name=life.spec.name,
+            type=life.spec.type_name,
+            condition=self._condition(life),
+            failures=life.failures,
+            share=steps.busy / 1e9 / interval if steps else 0.0,
+            steps=steps.count / interval if steps else 0.0,
+            longest_ms=steps.longest / 1e6 if steps else 0.0,
+            calls=sum(worker.outstanding() for worker in life.workers),
+            settings=settings(life.node.config if life.node else life.spec.config),
+        )
+
+    def _condition(self, life: Life) -> NodeCondition:
+        if life.recovering:
+            return "left out" if life.spec.on_error == "drop" else "restarting"
+        if self._supervisor.reason and not life.started:
+            return "over"
+        if life.node is None:
+            return "waiting"
+        if not life.started:
+            return "starting"
+        return "running" if self._supervisor._running else "ready"
+
+    def _outputs(self, meter: Meter, now: int, passed: float) -> list[OutputState]:
+        counts: Counter[str] = Counter()
+        events: dict[str, str] = {}
+        for node in self._supervisor.ever:
+            for sender in senders(node).values():
+                counts[sender.name] += sender.sent().total()
+                events[sender.name] = sender.event.__name__
+        before, self._counts = self._counts, counts
+        found = []
+        for name, event in events.items():
+            flow = meter.outputs.get(name)
+            recent = flow if flow is not None and flow.count else None
+            found.append(
+                OutputState(
+                    name=name,
+                    event=event,
+                    count=counts[name],
+                    rate=(counts[name] - before[name]) / passed if passed > 0 else 0.0,
+                    age=(now - flow.last) / SECOND if flow is not None else None,
+                    latency_ms=recent.total / recent.count / 1e6 if recent else None,
+                    latency_max_ms=recent.longest / 1e6 if recent else None,
+                )
+            )
+        return found
+
+    def _inputs(self) -> list[tuple[Any, Any]]:
+        drops = count_drops(self._supervisor)
+        return [
+            (stream, drops[stream.name])
+            for life in self._supervisor._lives.values()
+            if life.node is not None
+            for stream in streams(life.node).values()
+        ]
+
+    # Doing.
+
+    def do(self, command: Command) -> str:
+        """Do what was asked, and return what was done.
+
+        Raises:
+            VisnavError: It cannot be done; the message says why.
+        """
+        keeper = self._keeper
+        match command:
+            case Pause():
+                keeper.pause()
+                return "paused"
+            case Resume():
+                keeper.resume()
+                return "runs"
+            case Step(seconds=None):
+                keeper.step(None)
+                return "one step"
+            case Step(seconds=seconds):
+                keeper.step(seconds)
+                return f"runs for {seconds:g} s"
+            case Speed(factor=factor):
+                keeper.pace(factor)
+                return "as fast as it can" if factor is None else f"{factor:g} × real time"
+            case Stop():
+                self._supervisor.stop("stopped by hand")
+                return "ends"
+            case Restart(node=node):
+                return self._restart(node)
+            case Set(text=text):
+                values = self._supervisor.changing.set(text)
+                return ", ".join(f"{key} = {value}" for key, value in values.items()) or "as it was"
+
+    def _restart(self, name: str) -> str:
+        lives = self._supervisor._lives
+        if name not in lives:
+            raise CommandError(f"expected the name of a node, found {name!r}{suggest(name, lives)}")
+        condition = self._condition(lives[name])
+        if condition not in {"running", "left out"}:
+            raise CommandError(f"expected a node that runs, and {name} is {condition}")
+        self._supervisor.restart(name, anyway=True)
+        return f"{name} restarts"
+
+
+def told(command: Command) -> str:
+    """Return a command in words, for the log."""
+    words = [str(v) for v in msgspec.structs.astuple(command) if v is not None]
+    return " ".join([type(command).__name__.lower(), *words])

@@ -1,0 +1,198 @@
+"""The end of the monitor that is in the run: a Unix socket, served by a thread of its own.
+
+The run's loop does nothing but make a snapshot or do what it was asked, when the thread asks it
+to; encoding and sending is the thread's. The rhythm is the thread's, too, because time on the
+run's loop may be simulated.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from runtime.errors import VisnavError
+from runtime.monitor.address import socket_of
+from runtime.monitor.command import (
+    LONGEST_LINE,
+    UNREADABLE,
+    Answer,
+    Asked,
+    Set,
+    Watch,
+    decode_from_client,
+    encode,
+)
+from runtime.monitor.observer import Observer, told
+from runtime.monitor.timekeeping import CommandError
+
+R = TypeVar("R")
+
+log = logging.getLogger("visnav.runtime")
+
+PERIOD = 0.2
+"""Real seconds between two snapshots."""
+
+
+class Server:
+    """Serves those who look at a run.
+
+    Args:
+        observer: Looks at the run, and does what is asked.
+        loop: The run's loop, on which the observer is called.
+        path: Of the socket.
+    """
+
+    def __init__(self, observer: Observer, loop: asyncio.AbstractEventLoop, path: Path) -> None:
+        self._observer = observer
+        self._run_loop = loop
+        self._path = path
+        self._watching: set[asyncio.StreamWriter] = set()
+        self._clients: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
+        self._ready = threading.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._end = asyncio.Event()
+        self._last = b""
+        self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
+
+    def start(self) -> None:
+        """Listen."""
+        self._thread.start()
+        self._ready.wait()
+
+    def stop(self) -> None:
+        """Send those who watch how it ended, and listen no more; on the run's loop."""
+        try:
+            if self._watching:
+                self._last = encode(self._observer.take()) + b"\n"
+            self._observer.end()
+        except Exception:  # who looks on must not spoil a run's end
+            log.exception("the monitor failed")
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join(5.0)
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except OSError as error:
+            log.warning("the monitor cannot listen at %s: %s", self._path, error)
+        finally:
+            self._ready.set()
+
+    async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        server = await asyncio.start_unix_server(self._accept, self._path, limit=LONGEST_LINE)
+        self._path.chmod(0o600)
+        self._ready.set()
+        publishing = asyncio.create_task(self._publish())
+        await self._end.wait()
+        publishing.cancel()
+        server.close()
+        for writer in self._watching:
+            writer.write(self._last)
+            with contextlib.suppress(OSError, TimeoutError):
+                await asyncio.wait_for(writer.drain(), 1.0)
+        for writer in self._clients.values():
+            writer.close()  # what was written still goes out; the tasks then read an end
+        if self._clients:
+            await asyncio.wait(list(self._clients), timeout=1.0)
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+    async def _publish(self) -> None:
+        """Send snapshots to those who watch."""
+        while True:
+            await asyncio.sleep(PERIOD)
+            if not self._watching:
+                continue
+            try:
+                line = encode(await self._on_run_loop(self._observer.take)) + b"\n"
+            except Exception:
+                log.exception("the monitor failed")
+                continue
+            for writer in self._watching:
+                if writer.transport.get_write_buffer_size() < LONGEST_LINE:  # else it is too slow
+                    writer.write(line)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients[task] = writer
+        try:
+            async for line in reader:
+                await self._hear(line, writer)
+        except (OSError, ValueError):  # gone, or a line without an end
+            pass
+        finally:
+            del self._clients[task]
+            if writer in self._watching:
+                self._watching.remove(writer)
+                if not self._watching and not self._end.is_set():
+                    self._run_loop.call_soon_threadsafe(self._observer.end)
+            writer.close()
+
+    async def _hear(self, line: bytes, writer: asyncio.StreamWriter) -> None:
+        try:
+            message = decode_from_client(line)
+        except UNREADABLE as error:
+            answer = Answer(number=-1, done=False, text=f"expected a command: {error}")
+            writer.write(encode(answer) + b"\n")
+            return
+        match message:
+            case Watch():
+                if not self._watching:
+                    await self._on_run_loop(self._observer.begin)
+                self._watching.add(writer)
+            case Asked():
+                writer.write(encode(await self._answer(message)) + b"\n")
+
+    async def _answer(self, asked: Asked) -> Answer:
+        try:
+            text = await self._on_run_loop(lambda: self._observer.do(asked.command))
+        except VisnavError as error:
+            return Answer(number=asked.number, done=False, text=str(error))
+        if not isinstance(asked.command, Set):  # which says so itself
+            log.info("asked by hand: %s", told(asked.command))
+        return Answer(number=asked.number, done=True, text=text)
+
+    async def _on_run_loop(self, call: Callable[[], R]) -> R:
+        """Have a function called on the run's loop, and return its result."""
+        done: concurrent.futures.Future[R] = concurrent.futures.Future()
+
+        def do() -> None:
+            if not done.set_running_or_notify_cancel():
+                return
+            try:
+                done.set_result(call())
+            except Exception as error:
+                done.set_exception(error)
+
+        self._run_loop.call_soon_threadsafe(do)
+        return await asyncio.wrap_future(done)
+
+
+@contextlib.contextmanager
+def serving(observer: Observer, run: str) -> Iterator[Path | None]:
+    """Let a run be looked at while the block lasts; called on its loop.
+
+    Yields:
+        The socket's path; `None` if there can be none.
+    """
+    try:
+        path = socket_of(run)
+    except (CommandError, OSError) as error:
+        log.warning("nobody can look at this run: %s", error)
+        yield None
+        return
+    server = Server(observer, asyncio.get_running_loop(), path)
+    server.start()
+    try:
+        yield path
+    finally:
+        server.stop()

@@ -1,0 +1,110 @@
+"""Pausing, stepping and pacing simulated time.
+
+In real time none of this is possible: sensors and vehicles do not wait.
+"""
+
+from __future__ import annotations
+
+from runtime.clock import Clock
+from runtime.errors import VisnavError
+from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.schedule import SECOND
+
+
+class CommandError(VisnavError):
+    """A run cannot do what it was asked; the message says why."""
+
+
+class Timekeeper:
+    """Has the say over a run's clock; a `runtime.lockstep.Gate` while time is to stand.
+
+    Args:
+        clock: The run's clock.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._loop = clock._loop if isinstance(clock, LockstepClock) else None
+        self._limit = 0
+        """The time (ns) beyond which nothing happens while this is the loop's gate."""
+
+    def fixed(self) -> str:
+        """Say why nothing here is possible; empty if it is."""
+        if self._loop is None:
+            return "the run is in real time, which cannot be stopped: sensors do not wait"
+        if self._loop.gate not in {None, self}:
+            return "the run goes on in other processes, too, and time is common to all"
+        return ""
+
+    @property
+    def paused(self) -> bool:
+        """Whether time stands, or will when a step has been taken."""
+        return self._loop is not None and self._loop.gate is self
+
+    @property
+    def asked(self) -> float | None:
+        """The speed that was asked for; `None`: as fast as it can, or real time."""
+        if self._loop is None or not self._loop._pace:
+            return None
+        return round(1.0 / (self._loop._pace * SECOND), 9)
+
+    def may_go(self, key: tuple[int, int, int]) -> bool:
+        """Tell whether to go on to what is due next; asked by the loop."""
+        return key[0] <= self._limit
+
+    def pause(self) -> None:
+        """Let time stand.
+
+        Raises:
+            CommandError: It cannot.
+        """
+        loop = self._checked()
+        self._limit = loop.now
+        loop.gate = self
+
+    def resume(self) -> None:
+        """Let time run.
+
+        Raises:
+            CommandError: It cannot be stopped, and so it runs.
+        """
+        loop = self._checked()
+        loop.gate = None
+        loop._wall_origin = None  # or it would hurry to make good for the pause
+
+    def step(self, seconds: float | None) -> None:
+        """Let time run a little, and then stand.
+
+        Args:
+            seconds: How far; `None`: to the next thing due, and all that is due with it.
+
+        Raises:
+            CommandError: It cannot.
+        """
+        loop = self._checked()
+        begin = max(loop.now, self._limit) if loop.gate is self else loop.now
+        if seconds is None:
+            due = loop.schedule.next_due()
+            self._limit = begin if due is None else max(due, begin)
+        else:
+            self._limit = begin + round(seconds * SECOND)
+        loop.gate = self
+        loop._wall_origin = None
+
+    def pace(self, factor: float | None) -> None:
+        """Let time run at a speed.
+
+        Args:
+            factor: Simulated seconds per real second; `None`: as fast as it can.
+
+        Raises:
+            CommandError: It cannot.
+        """
+        loop = self._checked()
+        loop._pace = 0.0 if factor is None else 1.0 / (factor * SECOND)
+        loop._wall_origin = None
+
+    def _checked(self) -> LockstepLoop:
+        if reason := self.fixed():
+            raise CommandError(reason)
+        assert self._loop is not None
+        return self._loop

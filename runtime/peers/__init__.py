@@ -1,0 +1,14 @@
+"""One run in several processes: each has some of the file's nodes, and what they say crosses.
+
+    messages   what processes say to each other
+    session    how it gets there: Zenoh, in this module only
+    line       a thread that writes to one process, so that the loop never waits for a network
+    meeting    who is there: nodes, equal files, and what is missing
+    offsets    how far another machine's clock is from ours
+    turns      lockstep: one process at a time goes on, the one with the next thing due
+    crossing   outputs here that are heard there, and the other way round
+    peers      all of it together, for the supervisor
+
+An event that crosses is heard once its sender's process has nothing more to do at that instant.
+A handler that returns True ends the delivery in its own process only.
+"""

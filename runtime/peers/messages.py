@@ -1,0 +1,203 @@
+"""What processes of one run say to each other: msgpack maps with a tag, and at most one event."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from runtime.errors import WireError
+
+Key = tuple[int, int, int]
+"""When something is due: nanoseconds, kind (timers, then work, then the schedule), order."""
+
+NEVER: Key = (1 << 62, 3, 0)
+
+
+class Message(msgspec.Struct, frozen=True, tag=True, omit_defaults=True):
+    """Base of all messages."""
+
+
+class Hello(Message, frozen=True):
+    """Who I am.
+
+    Attributes:
+        nodes: That run here.
+        config: The whole file, with its defaults.
+        place: Host and process number, for messages to people.
+        began: When the process began, in seconds since 1970: of two with one node, the later is
+            wrong here.
+        knows_you: Whether it has had the other's hello.
+        running: Whether the first update was already.
+        left_out: Nodes that this run goes on without.
+    """
+
+    nodes: tuple[str, ...]
+    config: dict[str, Any]
+    place: str
+    began: float
+    knows_you: bool = False
+    running: bool = False
+    left_out: tuple[str, ...] = ()
+
+
+class Announced(Message, frozen=True):
+    """What each of my nodes announced, as frames of `runtime.wire`."""
+
+    said: dict[str, tuple[bytes, ...]]
+
+
+class Wanted(msgspec.Struct, frozen=True):
+    """What one input or handler hears.
+
+    Attributes:
+        kinds: Types of events, by `runtime.wire.kind_of`; their subclasses come too.
+        source: Only this source and those below it; `None` for all.
+        latest: Whether all but the newest may be skipped.
+    """
+
+    kinds: tuple[str, ...]
+    source: str | None
+    latest: bool
+
+
+class Hearing(Message, frozen=True):
+    """What my nodes hear."""
+
+    wanted: tuple[Wanted, ...]
+
+
+class Ping(Message, frozen=True):
+    """Ask what time it is there."""
+
+    sent: int
+
+
+class Pong(Message, frozen=True):
+    """My monotonic clock, in nanoseconds, and that of the ping."""
+
+    sent: int
+    here: int
+
+
+class Ready(Message, frozen=True):
+    """My nodes can begin."""
+
+
+class Begin(Message, frozen=True):
+    """The first update is (or was) then.
+
+    Attributes:
+        origin: On my monotonic clock, in nanoseconds.
+        now: In lockstep, the time of the run's clock (ns) at which you join.
+    """
+
+    origin: int
+    now: int = 0
+
+
+class Said(Message, frozen=True):
+    """An event of an output (``node.port``); its frame is the payload."""
+
+    output: str
+    serial: int = 0
+
+
+class Stop(Message, frozen=True):
+    """End the run; `error` says what went wrong, if anything did."""
+
+    reason: str
+    error: str | None = None
+    serial: int = 0
+
+
+class Retired(Message, frozen=True):
+    """A node of mine has ended, and hears nothing any more."""
+
+    node: str
+    serial: int = 0
+
+
+class Parted(Message, frozen=True):
+    """What there is to say of the run in my process: a part of the summary, as JSON."""
+
+    part: bytes
+
+
+class Turn(Message, frozen=True):
+    """It is your turn in lockstep.
+
+    Attributes:
+        epoch: Turns of an earlier one are void.
+        now: Nanoseconds of the run's clock.
+        orders: Counters that order what is due at one time: of the schedule, and of the loop.
+        keys: What each process has due next.
+        unread: Processes that have messages to take in before time goes on.
+        sent: How many ordered messages each process (row) has sent to each other one.
+    """
+
+    epoch: int
+    now: int
+    orders: tuple[int, int]
+    keys: tuple[Key, ...]
+    unread: tuple[int, ...]
+    sent: tuple[tuple[int, ...], ...]
+
+
+class Call(Message, frozen=True):
+    """Give me a turn: something came from outside."""
+
+
+class Standing(Message, frozen=True):
+    """Where I stand, after a process went or came: what a new turn is made of.
+
+    Attributes:
+        processes: Ids of all that I know to be there.
+        epoch: Of the last turn that I know of.
+        now: As in `Turn`.
+        orders: As in `Turn`.
+        key: What I have due next.
+        sent: How many ordered messages I have sent to each process.
+    """
+
+    processes: tuple[str, ...]
+    epoch: int
+    now: int
+    orders: tuple[int, int]
+    key: Key
+    sent: tuple[int, ...]
+
+
+Any_ = (
+    Hello
+    | Announced
+    | Hearing
+    | Ping
+    | Pong
+    | Ready
+    | Begin
+    | Said
+    | Stop
+    | Retired
+    | Parted
+    | Turn
+    | Call
+    | Standing
+)
+Ordered = Said | Stop | Retired
+"""In lockstep these are taken in at one's turn, in the order of their serial numbers."""
+
+encode = msgspec.msgpack.Encoder().encode
+_decoder: msgspec.msgpack.Decoder[Any_] = msgspec.msgpack.Decoder(Any_)
+
+
+def decode(data: bytes) -> Any_:
+    """Read a message.
+
+    Raises:
+        WireError: It is none.
+    """
+    try:
+        return _decoder.decode(data)
+    except msgspec.DecodeError as error:
+        raise WireError(f"expected a message of a process, found something else: {error}") from None

@@ -1,0 +1,384 @@
+"""The other processes of a run, as its supervisor sees them."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Iterable, Mapping
+from typing import Protocol
+
+import msgspec
+
+from events import Announcement, Event
+from runtime.clock import Clock
+from runtime.config import Config
+from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
+from runtime.limits import real_time_limit
+from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.peers.crossing import Crossing, hearing
+from runtime.peers.meeting import name_of
+from runtime.peers.member import Member
+from runtime.peers.messages import (
+    Announced,
+    Any_,
+    Begin,
+    Call,
+    Hearing,
+    Hello,
+    Message,
+    Ordered,
+    Parted,
+    Ping,
+    Pong,
+    Ready,
+    Retired,
+    Said,
+    Standing,
+    Stop,
+    Turn,
+)
+from runtime.peers.roster import Roster
+from runtime.peers.turns import Turns
+from runtime.realtime import RealClock
+from runtime.sender import Listener
+from runtime.steps import Fault
+from runtime.summary import ProcessSummary, Summary, merged
+from runtime.wire import pack, unpack
+
+log = logging.getLogger("visnav.runtime")
+
+LEAD = 50_000_000
+"""Nanoseconds between the word to begin and the first update: it must reach everybody before."""
+
+EXCHANGES = 20
+"""Of the time with another process: the quickest counts."""
+
+PARTING = 5.0
+"""Seconds that a process has, in the end, to tell what there was."""
+
+
+class Run(Protocol):
+    """What the other processes can bring about here."""
+
+    def stop(self, reason: str, error: Exception | None = None, *, told: bool = False) -> None:
+        """End the run; `told` if another process says so."""
+
+    def connect(self) -> None:
+        """Freeze anew who hears whom."""
+
+
+class Peers:
+    """All processes of a run but this one.
+
+    Args:
+        config: The whole file.
+        only: Nodes that run here.
+        clock: The run's clock here.
+        run: The run here.
+    """
+
+    def __init__(self, config: Config, only: Iterable[str], clock: Clock, run: Run) -> None:
+        self._config = config
+        self._clock = clock
+        self._run = run
+        self._roster = Roster(config, only, self)
+        self._crossing: Crossing | None = None
+        self._loop: LockstepLoop | None = None
+        self._turns: Turns | None = None
+        self._announced = Announced({})
+        self._early: list[tuple[Member, Any_, Event | None]] = []
+        self._begun = self._ending = False
+        self._origin = 0
+        self._retired: set[str] = set()
+        self._left_out: set[str] = set()
+
+    # Before the run.
+
+    async def meet(self) -> None:
+        """Wait until all nodes of the file are there.
+
+        Raises:
+            PeerError: They are not within the limit, or somebody runs another file or our nodes.
+        """
+        roster = self._roster
+        await roster.meet()
+        self._crossing = Crossing(self._config.nodes, roster.owners(), roster.me, self._leave)
+        if isinstance(self._clock, LockstepClock):
+            loop = asyncio.get_running_loop()
+            assert isinstance(loop, LockstepLoop)
+            self._loop = loop
+            self._turns = Turns(roster.me, roster.count, loop, self._send_to, self._do)
+
+    async def announce(self, said: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
+        """Tell the others what the nodes here announce; return what all do, in file order."""
+        self._announced = Announced(
+            {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in said.items()}
+        )
+        self._tell(self._announced)
+        others = self._roster.present
+        await self._roster.until(lambda: all(m.announced is not None for m in others()))
+        everything = dict(said)
+        for member in others():
+            if member.announced is not None:
+                for name, frames in member.announced.said.items():
+                    everything[name] = [_announcement(frame) for frame in frames]
+        return [a for name in self._roster.nodes for a in everything.get(name, ())]
+
+    async def begin(self) -> None:
+        """Agree on when the first update is, and wait for it.
+
+        Who comes back to a run that goes on joins it where it is.
+        """
+        roster = self._roster
+        reference = self._reference()
+        if reference is not None and self._turns is None:
+            for _ in range(EXCHANGES):
+                count = reference.offset.exchanges
+                reference.line.send(Ping(time.monotonic_ns()))
+                await roster.until(lambda n=count: reference.offset.exchanges > n)  # type: ignore[misc]
+        self._tell(Ready())
+        if reference is None:
+            await roster.until(lambda: all(m.ready for m in roster.present()))
+            self._origin = time.monotonic_ns() + LEAD
+            self._tell(Begin(self._origin))
+        else:
+            await roster.until(lambda: reference.begin is not None)
+            assert reference.begin is not None
+            self._origin = reference.begin.origin - reference.offset.ns
+            if self._loop is not None:
+                self._loop.move(reference.begin.now, self._loop.orders())
+        if isinstance(self._clock, RealClock):
+            await asyncio.sleep(max(self._origin - time.monotonic_ns(), 0) / 1e9)
+            self._clock.start_at(self._origin)
+
+    def begun(self) -> None:
+        """Let what the others say arrive: the nodes here have begun."""
+        self._begun = True
+        self._roster.settle()
+        if self._loop is not None:
+            self._loop.move(0, (len(self._roster.nodes) << 33, self._roster.me << 32))
+            self._gather()
+        early, self._early = self._early, []
+        for item in early:
+            self.heard(*item)
+
+    # During the run.
+
+    def listeners(self, output: str) -> list[Listener]:
+        """Return who hears an output in other processes."""
+        return self._crossing.listeners(output) if self._crossing else []
+
+    def connect(self, listeners: list[Listener], fault: Fault) -> None:
+        """Say who hears here what is said elsewhere, and tell the others."""
+        if self._crossing is None:
+            return
+        self._crossing.connect(listeners, fault)
+        wanted = hearing(each for each in listeners if each.node != "run")
+        for member in self._roster.present():
+            if member.told != wanted:
+                member.told = wanted
+                member.line.send(Hearing(wanted))
+
+    def stopping(self, reason: str | None, error: Exception | None) -> None:
+        """Tell the others that the run ends, unless they know: then there is no reason."""
+        self._ending = True
+        if reason is not None:
+            self._tell_in_order(Stop(reason, None if error is None else str(error)))
+
+    async def turn_to_end(self, node: str) -> None:
+        """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
+        nodes = self._roster.nodes
+        after = set(nodes[nodes.index(node) + 1 if node else 0 :])
+        await self._roster.until(
+            lambda: not any(after & {*m.nodes} - self._retired for m in self._roster.present()),
+            despite=True,
+        )
+
+    def retired(self, node: str) -> None:
+        """Tell the others that a node here has ended."""
+        self._tell_in_order(Retired(node))
+
+    # After the run.
+
+    async def part(self, mine: Summary) -> Summary:
+        """Exchange what each process has to say of the run; return all of it together."""
+        roster = self._roster
+        self._tell(Parted(msgspec.json.encode(mine)))
+        try:
+            async with real_time_limit(PARTING):
+                await roster.until(
+                    lambda: all(m.parted is not None for m in roster.present()), despite=True
+                )
+        except TimeoutError:
+            silent = [name_of(m.nodes) for m in roster.present() if m.parted is None]
+            log.warning("no summary of %s", "; ".join(silent))
+        parts = {roster.me: mine}
+        processes = {roster.me: ProcessSummary(list(roster.here), roster.hello.place)}
+        for member in roster.present():
+            processes[member.number] = member.summary()
+            if member.parted is not None:
+                parts[member.number] = msgspec.json.decode(member.parted, type=Summary)
+        return merged(
+            [part for _, part in sorted(parts.items())], [p for _, p in sorted(processes.items())]
+        )
+
+    async def close(self) -> None:
+        """Say the last words, and leave."""
+        self._ending = True
+        self._turns = None
+        if self._loop is not None:
+            self._loop.gate = None
+        await self._roster.close()
+
+    # What the roster tells.
+
+    def heard(self, member: Member, message: Any_, event: Event | None) -> None:
+        """Take in a message of another process.
+
+        Raises:
+            WireError: It makes no sense.
+        """
+        match message:
+            case Announced():
+                member.announced = message
+                if self._begun:  # it was gone, and needs ours again
+                    member.line.send(self._announced)
+            case Parted():
+                member.parted = message.part
+            case Begin():
+                member.begin = message
+            case Ready():
+                member.ready = True
+                if self._begun:
+                    self._welcome(member)
+            case Hearing() if self._crossing is not None:
+                self._crossing.wants(member.number, message.wanted)
+                if self._begun:
+                    self._run.connect()
+            case Stop() if not self._begun:
+                self._do(member.number, message, None)
+            case Hello() | Hearing() | Ping() | Pong():
+                pass
+            case _ if not self._begun:
+                self._early.append((member, message, event))
+            case _ if self._turns is not None:
+                self._turns.take(member.number, message, event)
+            case Said() | Stop() | Retired():
+                self._do(member.number, message, event)
+            case Turn() | Call() | Standing():
+                raise WireError("expected the run to be in lockstep there, too")
+
+    def lost(self, member: Member) -> None:
+        """Deal with the loss of a process as its nodes' `on_error` says."""
+        lost = set(member.nodes) - self._retired
+        self._retired |= lost
+        name = name_of(member.nodes)
+        gone = PeerError(f"{name}: their process is gone ({member.place})")
+        if not (self._begun or self._ending):
+            self._roster.fail(gone)
+            return
+        if self._ending or not lost:
+            self._gather()
+            return
+        if self._crossing is not None:
+            self._crossing.wants(member.number, ())
+        rules = {spec.on_error for spec in self._config.nodes if spec.name in lost}
+        if "stop" in rules:
+            log.error("%s", gone, extra={"told": True})
+            self._gather()
+            self._run.stop(f"{name} lost", gone)
+        elif "restart" in rules:
+            log.error("%s: waiting for its return", gone)
+            if self._turns is not None:
+                self._turns.suspend()
+        else:
+            log.error("%s: left out from here on", gone)
+            self._left_out |= lost
+            self._roster.settle(left_out=self._left_out)
+            self._gather()
+        self._run.connect()
+
+    def unsent(self, member: Member, error: VisnavError) -> None:
+        """End the run over an event that no message can hold; a process that goes is noticed."""
+        if isinstance(error, WireError):
+            self._run.stop("an event cannot leave this process", error)
+        elif not self._ending:
+            log.warning("to %s: %s", name_of(member.nodes), error)
+
+    def _do(self, number: int, message: Ordered, event: Event | None) -> None:
+        """Do what another process says; in lockstep, at our turn."""
+        try:
+            match message:
+                case Said() if self._crossing is not None and event is not None:
+                    self._crossing.arrive(number, message.output, event)
+                case Stop():
+                    member = self._roster.numbered(number)
+                    where = name_of(member.nodes) if member else "?"
+                    failed = PeerError(f"at {where}: {message.error}") if message.error else None
+                    self._run.stop(message.reason, failed, told=True)
+                case Retired():
+                    self._retired.add(message.node)
+        except WireError as error:
+            log.warning("from process %d: %s", number, error)
+        self._roster.notify()
+
+    def _welcome(self, member: Member) -> None:
+        """Let a process that was gone take part again."""
+        log.warning("%s: back, at %s", name_of(member.nodes), member.place)
+        self._retired -= {*member.nodes}
+        member.line.send(Begin(self._origin, 0 if self._loop is None else self._loop.now))
+        self._gather(new=(member.number,))
+        self._run.connect()
+
+    def _gather(self, new: tuple[int, ...] = ()) -> None:
+        """In lockstep, share the turns among those who are there."""
+        if self._turns is None or self._loop is None or not self._begun:
+            return
+        present = self._roster.present()
+        self._loop.gate = self._turns if present else None
+        if present:
+            numbers = [self._roster.me, *(m.number for m in present)]
+            self._turns.gather(numbers, self._roster.ids(), new)
+
+    def _reference(self) -> Member | None:
+        """Return the process whose clock counts, or `None` if it is this one."""
+        present = self._roster.present()
+        running = [m for m in present if m.hello is not None and m.hello.running]
+        first = min(running or present, key=lambda m: m.number, default=None)
+        return first if first and (running or first.number < self._roster.me) else None
+
+    # Sending.
+
+    def _tell(self, message: Message) -> None:
+        for member in self._roster.present():
+            member.line.send(message)
+
+    def _tell_in_order(self, message: Ordered) -> None:
+        """Send a message that others take in in its place among the events."""
+        for member in self._roster.present():
+            if self._turns is not None and self._begun:
+                self._turns.post(member.number, message)
+            else:
+                member.line.send(message)
+
+    def _leave(self, process: int, output: str, event: Event, skip: bool) -> None:
+        """Let an event leave for another process."""
+        if self._turns is not None:
+            self._turns.post(process, Said(output), event)
+        elif member := self._roster.numbered(process):
+            try:
+                member.line.send(Said(output), event, output if skip else "")
+            except ChannelFullError as error:
+                raise ChannelFullError(f"{output}: {error}") from None
+
+    def _send_to(self, number: int, message: Message, event: Event | None) -> None:
+        if member := self._roster.numbered(number):
+            member.line.send(message, event)
+
+
+def _announcement(frame: bytes) -> Announcement:
+    event = unpack(frame)
+    if not isinstance(event, Announcement):
+        raise WireError(f"expected an announcement, found {type(event).__name__}")
+    return event

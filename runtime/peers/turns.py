@@ -1,0 +1,249 @@
+"""Lockstep in several processes: one at a time goes on, the one with the next thing due.
+
+Each process has a loop on simulated time. Whoever has the turn runs on until somebody else has
+something due before its own next thing, or until it has said something that others must hear
+first; then it passes the turn on, with the time, and with the counters that order what is due at
+one time. So everything happens in the order in which one process would have done it, and workers
+and threads go on beside in all processes at once.
+
+Here are no sockets: what is said goes out through `send`, what is heard comes in by `take`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import msgspec
+
+from events import Event
+from runtime.peers.messages import NEVER, Call, Key, Message, Ordered, Standing, Turn
+
+Send = Callable[[int, Message, Event | None], None]
+Deliver = Callable[[int, Ordered, Event | None], None]
+
+
+class Timeline(Protocol):
+    """The simulated time of one process."""
+
+    @property
+    def now(self) -> int:
+        """Nanoseconds."""
+
+    def orders(self) -> tuple[int, int]:
+        """Return what the next things added will be numbered with."""
+
+    def move(self, now: int, orders: tuple[int, int]) -> None:
+        """Go to a time, and go on with these numbers."""
+
+
+class Turns:
+    """One process's part in whose turn it is.
+
+    Args:
+        me: Number of this process; they are numbered in the order of their first nodes.
+        count: How many there are.
+        timeline: This process's time.
+        send: Sends a message to a process.
+        deliver: Given the messages of others, in order, at this process's turn.
+    """
+
+    def __init__(
+        self, me: int, count: int, timeline: Timeline, send: Send, deliver: Deliver
+    ) -> None:
+        self.holding = False
+        self._me = me
+        self._timeline = timeline
+        self._send = send
+        self._deliver = deliver
+        self._keys: list[Key] = [NEVER] * count
+        self._unread: set[int] = set()
+        self._calls: set[int] = set()
+        self._epoch = 0
+        self._oldest = 1
+        self._next: Turn | None = None
+        self._outbox: list[tuple[int, Ordered, Event | None]] = []
+        self._inbox: list[tuple[int, Ordered, Event | None]] = []
+        self._sent = [[0] * count for _ in range(count)]
+        self._received = [0] * count
+        self._told: Key = NEVER
+        self._called = False
+        self._others: Key = NEVER
+        self._alive: frozenset[int] = frozenset()
+        self._ids: tuple[str, ...] = ()
+        self._standings: dict[int, Standing] = {}
+        self._to_stand = False
+
+    # Who is there.
+
+    def gather(self, alive: Sequence[int], ids: Sequence[str], new: Sequence[int] = ()) -> None:
+        """Begin anew with these processes, by number and id: the turn may be lost.
+
+        Args:
+            alive: Who is there, this process included.
+            ids: Their ids; all must speak of the same before there is a turn again.
+            new: Those who were not there before, or not as they are now.
+        """
+        self._alive = frozenset(alive)
+        self._ids = tuple(sorted(ids))
+        self._standings = {n: s for n, s in self._standings.items() if n in self._alive}
+        self.holding = False
+        self._next = None
+        self._oldest = self._epoch + 1
+        self._to_stand = True
+        for each in new:
+            self._received[each] = 0
+            self._sent[self._me][each] = 0
+            self._inbox = [item for item in self._inbox if item[0] != each]
+        self._outbox = [item for item in self._outbox if item[0] in self._alive]
+
+    def suspend(self) -> None:
+        """Let time stand until processes are gathered again."""
+        self.holding = False
+        self._next = None
+        self._to_stand = False
+        self._oldest = self._epoch + 1
+
+    # What the loop asks, whenever nothing is ready.
+
+    def may_go(self, key: Key) -> bool:
+        """Tell whether time may go on to what is due here next."""
+        if self._to_stand:
+            self._stand(key)
+        if not self.holding:
+            if (self._outbox or key < self._told) and not self._called and self._epoch:
+                self._called = True
+                for other in self._alive - {self._me}:
+                    self._send(other, Call(), None)
+            return False
+        if not (self._outbox or self._unread or self._calls):
+            if key == NEVER == self._others:  # what comes now comes from outside
+                return False
+            if key <= self._others:
+                return True
+        self._flush()
+        self._unread |= self._calls & self._alive
+        self._calls.clear()
+        self._pass(key)
+        return False
+
+    def post(self, other: int, message: Ordered, event: Event | None = None) -> None:
+        """Send a message that the other takes in before time goes on."""
+        self._outbox.append((other, message, event))
+
+    # What comes from others.
+
+    def take(
+        self, other: int, message: Turn | Call | Standing | Ordered, event: Event | None
+    ) -> None:
+        """Take in a message of another process."""
+        match message:
+            case Turn():
+                if message.epoch >= self._oldest:
+                    self._next = message
+            case Call():
+                self._calls.add(other)  # of all of us, since only one has the turn
+            case Standing():
+                self._standings[other] = message
+                self._resume()
+            case _:
+                self._received[other] += 1
+                self._inbox.append((other, message, event))
+        self._begin()
+
+    def _begin(self) -> None:
+        """Take the turn that was passed to us once all that was said before is here."""
+        turn = self._next
+        if turn is None or any(
+            self._received[other] < turn.sent[other][self._me] for other in self._alive - {self._me}
+        ):
+            return
+        self._next = None
+        self.holding = True
+        self._called = False
+        self._epoch = turn.epoch
+        self._oldest = turn.epoch
+        self._sent = [list(row) for row in turn.sent]
+        self._keys = list(turn.keys)
+        self._unread = set(turn.unread) - {self._me}
+        self._others = min(self._keys[n] for n in self._alive - {self._me})
+        self._timeline.move(turn.now, turn.orders)
+        inbox, self._inbox = sorted(self._inbox, key=lambda item: item[1].serial), []
+        for other, message, event in inbox:
+            self._deliver(other, message, event)
+
+    def _flush(self) -> None:
+        outbox, self._outbox = self._outbox, []
+        schedule, order = self._timeline.orders()
+        for serial, (other, message, event) in enumerate(outbox, order):
+            self._sent[self._me][other] += 1
+            self._unread.add(other)
+            self._send(other, msgspec.structs.replace(message, serial=serial), event)
+        self._timeline.move(self._timeline.now, (schedule, order + len(outbox)))
+
+    def _pass(self, key: Key) -> None:
+        """Give the turn to whoever must hear something, or else has the next thing due."""
+        others = self._alive - {self._me}
+        self._told = self._keys[self._me] = key
+        if waiting := self._unread & others:
+            to = min(waiting)
+        else:
+            to = min(others, key=lambda n: self._keys[n])
+        self.holding = False
+        self._send(
+            to,
+            Turn(
+                epoch=self._epoch,
+                now=self._timeline.now,
+                orders=self._timeline.orders(),
+                keys=tuple(self._keys),
+                unread=tuple(sorted(self._unread & others)),
+                sent=tuple(tuple(row) for row in self._sent),
+            ),
+            None,
+        )
+
+    # After somebody went or came.
+
+    def _stand(self, key: Key) -> None:
+        """Say where we stand to whoever makes the next turn."""
+        self._to_stand = False
+        self._told = key
+        standing = Standing(
+            processes=self._ids,
+            epoch=self._epoch,
+            now=self._timeline.now,
+            orders=self._timeline.orders(),
+            key=key,
+            sent=tuple(self._sent[self._me]),
+        )
+        maker = min(self._alive)
+        if maker == self._me:
+            self._standings[self._me] = standing
+            self._resume()
+        else:
+            self._send(maker, standing, None)
+
+    def _resume(self) -> None:
+        """Make a turn, if it is ours to make and all have said where they stand."""
+        found = [self._standings.get(n) for n in sorted(self._alive)]
+        if min(self._alive, default=-1) != self._me or any(
+            s is None or s.processes != self._ids for s in found
+        ):
+            return
+        standings = {n: self._standings.pop(n) for n in self._alive}
+        keys, sent = [NEVER] * len(self._keys), [[0] * len(self._keys) for _ in self._keys]
+        for n, standing in standings.items():
+            keys[n], sent[n] = standing.key, list(standing.sent)
+        self._next = Turn(
+            epoch=max(s.epoch for s in standings.values()) + 1,
+            now=max(s.now for s in standings.values()),
+            orders=(
+                max(s.orders[0] for s in standings.values()),
+                max(s.orders[1] for s in standings.values()),
+            ),
+            keys=tuple(keys),
+            unread=tuple(sorted(self._alive)),
+            sent=tuple(tuple(row) for row in sent),
+        )
+        self._begin()

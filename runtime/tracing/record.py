@@ -1,0 +1,186 @@
+"""Noting steps and events while the run runs: a tuple each, and nothing else on the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import functools
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from events import Event
+from runtime.clock import Clock
+from runtime.probes import Call
+from runtime.realtime import RealClock
+from runtime.sender import Sender, Tap
+from runtime.supervisor import Supervisor
+from runtime.tracing.spool import CHUNK, Pace, Spool
+from runtime.tracing.write import write_trace
+
+OUTSIDE = "?"
+"""The node of what was offloaded by nobody's task."""
+
+
+class Recorder:
+    """A probe that notes what it sees, for a `Spool`.
+
+    Each note is a tuple that begins with its kind::
+
+        "step", node, what, begin, end, run, cause
+        "event", time, run, sender, type of event, source, stamp, identity, cause, listeners
+        "thread", thread, node, function, submitted, begin, end
+        "worker", process, method, asked, answered
+
+    Times are nanoseconds of `time.perf_counter_ns`; `run` and `stamp` are of the run's clock, but
+    for `run` in real time (see `Pace`).
+    An identity is `id` of the event; a cause is the identity of what the innermost step was given.
+
+    Args:
+        clock: The run's clock.
+        spool: Takes the notes, a list at a time.
+    """
+
+    def __init__(self, clock: Clock, spool: Spool) -> None:
+        # In real time the two clocks are one but for origin and speed, so one look is enough.
+        self._now = time.perf_counter_ns if isinstance(clock, RealClock) else clock.now
+        self._clock = clock
+        self._spool = spool
+        self._notes: list[tuple[Any, ...]] = []
+        self._cause = [0]
+        self.beside: deque[tuple[Any, ...]] = spool.beside
+        """Notes of other threads, which must not touch the loop's list."""
+        self.tap: Tap = self._make_tap()
+
+    def around(self, node: str, what: str, call: Call) -> Call:
+        """Return a function that calls `call` and notes when it began and ended."""
+        notes, add, current, now = self._notes, self._notes.append, self._cause, self._now
+        time_ns, flush, identity = time.perf_counter_ns, self._flush, id
+
+        def noting(argument: Any) -> Any:
+            before = current[0]
+            current[0] = cause = identity(argument)
+            run, begin = now(), time_ns()
+            try:
+                return call(argument)
+            finally:
+                add(("step", node, what, begin, time_ns(), run, cause))
+                current[0] = before
+                if len(notes) > CHUNK:
+                    flush()
+
+        return noting
+
+    def _make_tap(self) -> Tap:
+        notes, add, current, now = self._notes, self._notes.append, self._cause, self._now
+        time_ns, flush, identity = time.perf_counter_ns, self._flush, id
+
+        def tap(sender: Sender[Any] | None, event: Event) -> None:
+            add(
+                (
+                    "event",
+                    time_ns(),
+                    now(),
+                    sender,
+                    type(event),
+                    event.source,
+                    event.stamp,
+                    identity(event),
+                    current[0],
+                    None if sender is None else sender._candidates,
+                )
+            )
+            if len(notes) > CHUNK:
+                flush()
+
+        return tap
+
+    def asked(self, process: str, method: str, answer: concurrent.futures.Future[Any]) -> None:
+        """Note a worker's call once it is answered."""
+        asked = time.perf_counter_ns()
+        answer.add_done_callback(
+            lambda _: self.beside.append(("worker", process, method, asked, time.perf_counter_ns()))
+        )
+
+    def close(self) -> None:
+        """Hand over what is left, while the run's clock still goes."""
+        if isinstance(self._clock, RealClock):
+            real, run, speed = time.perf_counter_ns(), self._clock.now(), self._clock._speed
+            self._spool.pace = Pace(round(real - run / speed), speed)
+        self._flush()
+
+    def _flush(self) -> None:
+        self._spool.put(self._notes.copy())
+        self._notes.clear()
+
+
+class NotingExecutor(concurrent.futures.Executor):
+    """Notes who offloads what, and when a thread does it.
+
+    Args:
+        inner: Does the work.
+        note: Takes a note from any thread.
+    """
+
+    def __init__(
+        self, inner: concurrent.futures.Executor, note: Callable[[tuple[Any, ...]], None]
+    ) -> None:
+        self._inner = inner
+        self._note = note
+
+    def submit(
+        self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
+    ) -> concurrent.futures.Future[Any]:
+        """Have a function called in a thread."""
+        submitted, node = time.perf_counter_ns(), _current_node()
+        inner = fn.func if isinstance(fn, functools.partial) else fn
+        name = getattr(inner, "__qualname__", type(inner).__name__)
+
+        def noting() -> Any:
+            begin = time.perf_counter_ns()
+            try:
+                return fn(*args, **kwargs)
+            finally:
+                thread = threading.current_thread().name
+                self._note(("thread", thread, node, name, submitted, begin, time.perf_counter_ns()))
+
+        return self._inner.submit(noting)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the threads."""
+        self._inner.shutdown(wait, cancel_futures=cancel_futures)
+
+
+@contextlib.contextmanager
+def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
+    """Trace a run while the block lasts, then write the trace.
+
+    Args:
+        supervisor: Of the run; nothing has been sent yet.
+        path: Of the trace; compressed if it ends with ``.gz``.
+        name: Of the run.
+    """
+    spool = Spool(path.with_name(path.name + ".part"))
+    recorder = Recorder(supervisor.clock, spool)
+    supervisor.probes.attach(recorder)
+    supervisor.executor = NotingExecutor(supervisor.executor, recorder.beside.append)
+    try:
+        yield
+    finally:
+        recorder.close()
+        spool.close()
+        order = [node.name for node in supervisor.ever]
+        write_trace(spool, path, name=name, clock=supervisor.clock.kind, nodes=order)
+
+
+def _current_node() -> str:
+    """Return whose task runs, by its name."""
+    try:
+        task = asyncio.current_task()
+    except RuntimeError:  # another thread's
+        return OUTSIDE
+    return OUTSIDE if task is None else task.get_name()

@@ -1,0 +1,108 @@
+"""The command line's end of the monitor, with runs in processes of their own."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.runtime.samples_cli import command, config_file, start, summary
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
+LOOP = """
+[[nodes]]
+name = "drone"
+type = "tests.runtime.samples_loop:Camera"
+[[nodes]]
+name = "vo"
+type = "tests.runtime.samples_loop:Estimator"
+[[nodes]]
+name = "pilot"
+type = "tests.runtime.samples_loop:Pilot"
+"""
+
+
+@contextmanager
+def running(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a small loop at real speed until it is told to end."""
+    path = config_file(folder, run="speed = 1.0", settings=LOOP)
+    with start(["run", path, "-q", *options], folder) as process:
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=20)
+
+
+@pytest.mark.slow
+def test_a_parameter_is_set_from_another_terminal(tmp_path: Path, sockets: Path) -> None:
+    with running(tmp_path) as process:
+        _wait_for(sockets, process)
+        done = command("set", "pilot.gain=2", folder=tmp_path)
+        assert (done.returncode, done.stdout) == (0, "gain = 2.0\n")
+        refused = command("set", "pilot.height=3", "--run", "sample", folder=tmp_path)
+        assert refused.returncode == 2
+        assert "error: pilot.height: cannot change while the run goes on" in refused.stderr
+    log = (tmp_path / "runs" / "sample" / "log.txt").read_text()
+    assert "pilot.gain is now 2.0" in log
+    assert summary(tmp_path / "runs" / "sample")["reason"] == "Ctrl-C"
+    assert list(sockets.iterdir()) == []
+    gone = command("set", "pilot.gain=2", folder=tmp_path)
+    assert gone.returncode == 2
+    assert "error: expected a run to look at, found none" in gone.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_the_page_shows_a_run_in_a_browser(tmp_path: Path, sockets: Path) -> None:
+    assert BROWSER is not None
+    with running(tmp_path, "--web", "0", "--set", "run.duration=5") as process:
+        assert process.stdout is not None
+        url = process.stdout.readline().split()[-1]
+        shown = subprocess.run(
+            [
+                BROWSER,
+                "--headless",
+                "--no-sandbox",
+                "--virtual-time-budget=2000",
+                "--dump-dom",
+                url,
+            ],
+            capture_output=True,
+            text=True,
+            timeout=50,
+            check=True,
+        ).stdout
+    # The browser's virtual time waits for the stream, which ends with the run.
+    assert re.search(r"<h1[^>]*>sample   [3-5]\.\d+ of 5 s", shown)
+    assert re.search(r"<td[^>]*>drone.images</td><td[^>]*>Image</td><td[^>]*>\d+</td>", shown)
+    assert 'value="pilot.gain=1.0"' in shown
+
+
+@pytest.mark.slow
+def test_a_trace_is_written_and_read(tmp_path: Path, sockets: Path) -> None:
+    path = config_file(tmp_path, run="duration = 1", settings=LOOP)
+    done = command("run", path, "-q", "--trace", "t.json.gz", folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    told = command("trace", "t.json.gz", folder=tmp_path)
+    assert "path 1: drone/front Image → vo PoseEstimate → pilot VelocitySetpoint" in told.stdout
+    assert re.search(r"│ 1 +│ +10 │ +30.00 │ +30.00 │ +30.00 │", told.stdout)
+    refused = command("trace", path, folder=tmp_path)
+    assert refused.returncode == 2
+    assert "sample.toml: expected a trace, found:" in refused.stderr
+
+
+def _wait_for(sockets: Path, process: subprocess.Popen[str]) -> None:
+    for _ in range(200):
+        if sockets.exists() and list(sockets.glob("*.sock")):
+            return
+        assert process.poll() is None
+        time.sleep(0.05)  # another process is starting
+    raise AssertionError("expected a run that listens")

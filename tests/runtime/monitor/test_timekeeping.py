@@ -1,0 +1,110 @@
+"""Time that stands, steps and goes at a speed."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.monitor.timekeeping import CommandError, Timekeeper
+
+MS = 1_000_000
+
+
+class Outside:
+    """Calls functions on a lockstep loop from another thread, one after the other."""
+
+    def __init__(self, loop: LockstepLoop, calls: list[Callable[[], None]]) -> None:
+        self._loop = loop
+        self._calls = calls
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        for call in self._calls:
+            done = threading.Event()
+
+            def do(call: Callable[[], None] = call, done: threading.Event = done) -> None:
+                call()
+                self._loop.call_soon(done.set)
+
+            self._loop.call_soon_threadsafe(do)
+            assert done.wait(10)
+
+
+def test_time_stands_until_it_may_go_on() -> None:
+    seen: list[tuple[str, int]] = []
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, LockstepLoop)
+        clock = LockstepClock(loop)
+        keeper = Timekeeper(clock)
+
+        async def ticks() -> None:
+            for n in range(100):
+                await clock.sleep_until(n * 10 * MS)
+                seen.append(("tick", clock.now() // MS))
+
+        def see(what: str) -> Callable[[], None]:
+            return lambda: seen.append((what, loop.now // MS))
+
+        keeper.pause()
+        assert keeper.paused
+        Outside(
+            loop,
+            [
+                see("paused"),
+                lambda: keeper.step(0.025),
+                see("stepped"),
+                lambda: keeper.step(0.01),
+                see("stepped"),
+                lambda: keeper.step(None),
+                see("stepped"),
+                keeper.resume,
+            ],
+        )
+        await ticks()
+
+    with asyncio.Runner(loop_factory=LockstepLoop) as runner:
+        runner.run(main())
+    ticks = [time for what, time in seen if what == "tick"]
+    assert ticks == [n * 10 for n in range(100)]  # nothing was lost
+    others = [each for each in seen if each[0] != "tick" or each[1] <= 40]
+    assert others[:1] == [("paused", 0)] or others[:2] == [("tick", 0), ("paused", 0)]
+    assert [time for what, time in others if what == "stepped"] == [20, 30, 40]
+
+
+def test_a_speed_holds_from_now_on_and_can_be_taken_back() -> None:
+    loop = LockstepLoop(speed=2.0)
+    try:
+        keeper = Timekeeper(LockstepClock(loop))
+        assert keeper.asked == 2.0
+        loop.now = 1_000_000_000
+        loop._wall_origin = 5.0
+        keeper.pace(4.0)
+        assert keeper.asked == 4.0
+        assert loop._wall_origin is None  # or it would hurry to where it was going
+        keeper.pace(None)
+        assert keeper.asked is None
+    finally:
+        loop.close()
+
+
+def test_time_that_is_common_to_several_processes_is_left_alone() -> None:
+    class Others:
+        def may_go(self, key: tuple[int, int, int]) -> bool:
+            return True
+
+    loop = LockstepLoop()
+    try:
+        loop.gate = Others()
+        keeper = Timekeeper(LockstepClock(loop))
+        with pytest.raises(CommandError, match="goes on in other processes"):
+            keeper.pause()
+        assert not keeper.paused
+    finally:
+        loop.close()

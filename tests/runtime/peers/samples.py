@@ -1,0 +1,183 @@
+"""Nodes that talk across processes, and several of these in one: each on a thread of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from events import Announcement, Event, Image
+from runtime import Input, Node, NodeConfig, Output, RefusedError, Tick, every, on
+from runtime.config import Config, parse
+from runtime.execute import execute
+from runtime.summary import Summary
+from runtime.supervisor import Supervisor
+
+
+class Asked(Event):
+    """A question."""
+
+    count: int = 0
+
+
+class Answered(Event):
+    """An answer, and what the answerer had heard until then."""
+
+    count: int
+    heard: tuple[str, ...]
+
+
+class Offer(Announcement):
+    """Something to hear of before the run."""
+
+    rate: float
+
+
+class Asker(Node):
+    """Asks at a rate, tells whose answers it heard, and shows pictures."""
+
+    questions = Output(Asked)
+    pictures = Output(Image)
+    answers = Input(Answered)
+
+    def announce(self) -> Iterable[Announcement]:
+        return [Offer(stamp=0, source=self.name, rate=50.0)]
+
+    @every(hz=50)
+    def ask(self, tick: Tick) -> None:
+        self.questions.send(Asked(stamp=tick.stamp, source=self.name, count=tick.index))
+        if tick.index % 10 == 0:
+            data = self.rng.integers(0, 255, (40, 60, 3), np.uint8)
+            self.pictures.send(Image(stamp=tick.stamp, source=self.name, frame_id="f", data=data))
+
+    async def run(self) -> None:
+        async for answer in self.answers:
+            self.log.debug("%s", answer)
+
+    async def on_shutdown(self) -> None:
+        self.questions.send(Asked(stamp=self.clock.now(), source=self.name, count=-1))
+
+
+class AnswererConfig(NodeConfig):
+    """Settings of an answerer."""
+
+    takes: float = 0.005
+    handles: bool = False
+
+
+class Answerer(Node[AnswererConfig]):
+    """Answers after a while; says what it has heard of everything, in order."""
+
+    questions = Input(Asked, keep="latest")
+    answers = Output(Answered)
+
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+        self.offers: list[str] = []
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        self.offers.append(f"{announcement.source}: {announcement}")
+
+    @on(Asked, Answered, Image)
+    def hears(self, event: Event) -> bool:
+        self.heard.append(f"{type(event).__name__} {event.source} {event.stamp}")
+        return self.config.handles
+
+    @every(hz=50)
+    def tick(self, tick: Tick) -> None:
+        self.heard.append(f"tick {tick.index}")
+
+    async def run(self) -> None:
+        async for question in self.questions:
+            seen = tuple(self.heard)
+            self.heard.clear()
+            await self.offload_for(self.config.takes, time.sleep, 0.0001)
+            self.answers.send(
+                Answered(
+                    stamp=question.stamp,
+                    source=self.name,
+                    count=question.count,
+                    heard=(*self.offers, *seen),
+                )
+            )
+
+
+class Refuser(Node):
+    """Fails in the middle."""
+
+    @every(hz=10)
+    def tick(self, tick: Tick) -> None:
+        if tick.index == 3:
+            raise RefusedError(self.name, "no more")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def settings(
+    *nodes: tuple[str, str, dict[str, Any]], meet: str = "", wait: float = 20, **run: Any
+) -> Config:
+    """Return a configuration of nodes of this module: name, class, settings."""
+    table = {
+        "run": {"name": "apart", "duration": 1.0} | run,
+        "network": {"meet": meet or f"tcp/127.0.0.1:{free_port()}", "wait": wait},
+        "nodes": [{"name": name, "type": f"{__name__}:{cls}", **rest} for name, cls, rest in nodes],
+    }
+    return parse(table, "test.toml")
+
+
+class Process(threading.Thread):
+    """Some nodes of a configuration, on a thread; what a process would do."""
+
+    def __init__(self, config: Config, only: str, out: Path | None = None) -> None:
+        super().__init__(name=only, daemon=True)
+        self.summary: Summary | None = None
+        self.error: Exception | None = None
+        self._config = config
+        self._only = only.split(",")
+        self._out = out
+        self._up = threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        try:
+            self.summary = execute(self._config, self._out, only=self._only, watch=self._watch)
+        except Exception as error:
+            self.error = error
+
+    def up(self) -> Process:
+        """Wait until it has begun to look for the others."""
+        assert self._up.wait(10)
+        return self
+
+    @contextlib.contextmanager
+    def _watch(self, supervisor: Supervisor) -> Iterator[None]:
+        self._up.set()
+        yield
+
+    def done(self, timeout: float = 30) -> Process:
+        self.join(timeout)
+        assert not self.is_alive(), f"{self.name} still runs"
+        return self
+
+    def ended(self) -> Summary:
+        self.done()
+        if self.error is not None:
+            raise self.error
+        assert self.summary is not None
+        return self.summary
+
+
+def apart(config: Config, *onlys: str) -> list[Summary]:
+    """Run each group of nodes in a process of its own; return what each says in the end."""
+    return [process.ended() for process in [Process(config, only) for only in onlys]]

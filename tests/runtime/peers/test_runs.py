@@ -1,0 +1,70 @@
+"""One run in several processes is the run that it is in one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from runtime.errors import PeerError
+from runtime.execute import execute
+from tests.runtime.peers.samples import Process, apart, settings
+
+THREE: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("asker", "Asker", {}),
+    ("one", "Answerer", {}),
+    ("other", "Answerer", {"takes": 0.02}),
+)
+
+
+@pytest.mark.parametrize(
+    "onlys",
+    [
+        ("asker", "one,other"),
+        ("one,other", "asker"),
+        ("asker,other", "one"),
+        ("other", "one", "asker"),
+    ],
+    ids=str,
+)
+def test_in_lockstep_the_digest_is_that_of_one_process(onlys: tuple[str, ...]) -> None:
+    """Also of answers that hold all that was heard before, in order."""
+    config = settings(*THREE)
+    alone = execute(config)
+    for summary in apart(config, *onlys):
+        assert summary.digests == alone.digests
+        assert summary.digest == alone.digest
+        assert summary.outputs == alone.outputs
+        assert summary.sim_seconds == alone.sim_seconds
+        assert {*summary.streams} == {*alone.streams}
+        assert [len(each.nodes) for each in summary.processes] == [
+            len(only.split(",")) for only in sorted(onlys, key=lambda only: "aot".index(only[0]))
+        ]
+
+
+def test_in_real_time_everything_crosses_too() -> None:
+    config = settings(*THREE, clock="real", duration=0.6)
+    for summary in apart(config, "asker", "one,other"):
+        assert summary.outputs["asker.questions"] == pytest.approx(31, abs=3)
+        assert summary.outputs["one.answers"] > 20
+        assert summary.outputs["other.answers"] > 10
+        trips = [each.round_trip_ms for each in summary.processes]
+        assert trips.count(None) < len(trips) or summary.processes[0].clock_offset_ms is None
+
+
+def test_handled_ends_the_delivery_in_its_own_process_only() -> None:
+    """Both answerers hear the question though the first one handles it."""
+    config = settings(
+        ("asker", "Asker", {}), ("one", "Answerer", {"handles": True}), ("other", "Answerer", {})
+    )
+    assert "other.answers" not in execute(config).outputs
+    both = apart(config, "asker,one", "other")[0].outputs
+    assert both["other.answers"] > 0
+
+
+def test_an_error_in_one_process_ends_all_and_says_whose_it_is() -> None:
+    config = settings(("asker", "Asker", {}), ("refuser", "Refuser", {}))
+    here, there = Process(config, "asker"), Process(config, "refuser")
+    assert "refuser: no more" in str(there.done().error)
+    assert isinstance(here.done().error, PeerError)
+    assert "at refuser: refuser: no more" in str(here.error)

@@ -1,0 +1,127 @@
+"""Looking at steps of nodes that run, and leaving no trace of it."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import Future
+from typing import Any
+
+import pytest
+
+from events import Event
+from runtime.node import Node, senders
+from runtime.probes import Call
+from runtime.sender import Sender, Tap
+from runtime.steps import Steps
+from runtime.supervisor import Supervisor
+from runtime.testing import spec
+from tests.runtime.samples_loop import MS, Camera, Estimator, Pilot, look
+from tests.runtime.samples_workers import Plant
+
+NODES = [spec(Camera, "drone"), spec(Estimator, "vo"), spec(Pilot, "pilot")]
+
+
+class Gardener(Node):
+    """Has a worker, and asks it something."""
+
+    async def run(self) -> None:
+        plant = await self.worker(Plant)
+        await plant.call(Plant.pid)
+
+
+class Eye:
+    """A probe that notes what it sees."""
+
+    def __init__(self) -> None:
+        self.steps: list[str] = []
+        self.events: list[str] = []
+        self.calls: list[str] = []
+        self.tap: Tap | None = self._tap
+
+    def around(self, node: str, what: str, call: Call) -> Call:
+        def seeing(argument: Any) -> Any:
+            self.steps.append(f"{node}.{what}")
+            return call(argument)
+
+        return seeing
+
+    def asked(self, process: str, method: str, answer: Future[Any]) -> None:
+        self.calls.append(f"{process}: {method}")
+
+    def _tap(self, sender: Sender[Any] | None, event: Event) -> None:
+        self.events.append(type(event).__name__)
+
+
+def insides(supervisor: Supervisor) -> list[Any]:
+    """Return all that a probe could leave behind."""
+    lives = supervisor._lives.values()
+    return [
+        [
+            (s.name, s.send.__name__, [c.deliver for c in s._candidates], s._taps)
+            for life in lives
+            if life.node
+            for s in senders(life.node).values()
+        ],
+        [ticker._call for life in lives for ticker in life.tickers],
+        [
+            steps._step == steps._coro.send
+            for life in lives
+            for task in life.tasks
+            if isinstance(steps := task.get_coro(), Steps)
+        ],
+    ]
+
+
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
+def test_a_probe_sees_ticks_handlers_steps_and_events_while_it_is_there(clock: str) -> None:
+    eye = Eye()
+
+    async def body(supervisor: Supervisor) -> None:
+        await supervisor.clock.sleep(0.05)
+        before = insides(supervisor)
+        supervisor.probes.attach(eye)
+        assert insides(supervisor) != before
+        await supervisor.clock.sleep_until(150 * MS)
+        supervisor.probes.detach(eye)
+        assert insides(supervisor) == before
+
+    look(NODES, body, duration=0.3, clock=clock)
+    # From 50 to 150 ms: one exposure, its image, what the estimator makes of it, and a set-point.
+    assert eye.events == ["Image", "PoseEstimate", "VelocitySetpoint"]
+    assert list(dict.fromkeys(eye.steps)) == [
+        "drone.expose", "drone.deliver", "vo.run", "pilot.fly"
+    ]  # fmt: skip
+    assert eye.steps.count("pilot.fly") == 1
+
+
+def test_a_probe_is_put_around_a_node_that_restarts() -> None:
+    eye = Eye()
+
+    async def body(supervisor: Supervisor) -> None:
+        supervisor.probes.attach(eye)
+        supervisor.restart("pilot", anyway=True)  # half a second later it is up again
+
+    look(NODES, body, duration=0.75)  # set-points at 530, 630 and 730 ms
+    assert eye.steps.count("pilot.fly") == 3
+
+
+def test_a_link_does_not_hide_the_handler_behind_it() -> None:
+    eye = Eye()
+
+    async def body(supervisor: Supervisor) -> None:
+        supervisor.probes.attach(eye)
+
+    pilot = spec(Pilot, "pilot", links={"fly": {"delay": 0.01}})
+    look([*NODES[:2], pilot], body, duration=0.15)  # set-points at 40 and 140 ms
+    assert eye.steps.count("pilot.fly") == 2
+
+
+def test_a_probe_hears_of_a_workers_calls() -> None:
+    eye = Eye()
+
+    async def body(supervisor: Supervisor) -> None:
+        supervisor.probes.attach(eye)
+        await asyncio.sleep(0)
+
+    look([spec(Gardener, "gardener")], body, duration=0.1)
+    assert eye.calls == ["gardener.Plant: pid"]
