@@ -12,6 +12,7 @@ the settings; who asks for it is in `runtime.monitor`, and who does it in `runti
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin
 
@@ -19,7 +20,7 @@ import msgspec
 import tomli_w
 
 from runtime.config import convert
-from runtime.errors import ConfigError, suggest
+from runtime.errors import ConfigError
 from runtime.node import NodeConfig
 from runtime.override import override
 
@@ -77,7 +78,7 @@ def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
 def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
     """Return the keys of the settings that can change; ``cameras.*.loss`` is every camera's."""
     found = []
-    for field in msgspec.structs.fields(type_):
+    for field in _fields(type_):
         key = f"{before}{field.encode_name}"
         inner = _struct_in(field.type)
         if _is_marked(field.type):
@@ -93,11 +94,9 @@ def _checked(name: str, before: NodeConfig, after: NodeConfig) -> Change:
     for path, value in _differences(_table(before), _table(after)):
         key = ".".join(path)
         if not _may_change(type(before), path):
-            known = changeable(type(before))
-            listed = ", ".join(known) or "nothing"
+            listed = ", ".join(changeable(type(before))) or "nothing"
             raise ConfigError(
-                f"{name}.{key}: cannot change while the run goes on: of {name}, "
-                f"{listed} can" + suggest(key, known)
+                f"{name}.{key}: cannot change while the run goes on: of {name}, {listed} can"
             )
         values[key] = toml(value)
     return Change(name, after, values)
@@ -153,13 +152,18 @@ def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
     for name in path:
         if struct is None:
             return False
-        field = next((f for f in msgspec.structs.fields(struct) if f.encode_name == name), None)
+        field = next((f for f in _fields(struct) if f.encode_name == name), None)
         if field is None:  # the name of an entry of a list
             continue
         if _is_marked(field.type):
             return True
         struct = _struct_in(field.type)
     return False
+
+
+@functools.cache  # reading annotations takes some tenths of a millisecond
+def _fields(type_: type[msgspec.Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    return msgspec.structs.fields(type_)
 
 
 def _is_marked(type_: Any) -> bool:
@@ -179,7 +183,7 @@ def settings(config: NodeConfig) -> dict[str, str]:
     found: dict[str, str] = {}
 
     def walk(type_: Any, value: Any, before: str) -> None:
-        for field in msgspec.structs.fields(type_):
+        for field in _fields(type_):
             key, inner = f"{before}{field.encode_name}", value.get(field.encode_name)
             struct = _struct_in(field.type)
             if inner is None:

@@ -43,21 +43,15 @@ class Packed(msgspec.Struct, frozen=True):
     offsets: tuple[int, ...]
     size: int
 
-    def write(self, frame: Buffer) -> None:
-        """Write the frame into a buffer of at least `size` bytes: the one copy there is."""
-        view = memoryview(frame).cast("B")
-        _LENGTH.pack_into(view, 0, len(self.head))
-        view[_LENGTH.size : _LENGTH.size + len(self.head)] = self.head
+    def frame(self) -> bytes:
+        """Return the frame: the one copy there is of the arrays."""
+        parts: list[Buffer] = [_LENGTH.pack(len(self.head)), self.head]
+        place = _LENGTH.size + len(self.head)
         for array, offset in zip(self.arrays, self.offsets, strict=True):
-            np.frombuffer(view, np.uint8, array.nbytes, offset)[:] = array.reshape(-1).view(
-                np.uint8
-            )
-
-    def frame(self) -> bytearray:
-        """Return the frame."""
-        frame = bytearray(self.size)
-        self.write(frame)
-        return frame
+            parts += [bytes(offset - place), array.reshape(-1).view(np.uint8).data]
+            place = offset + array.nbytes
+        parts.append(bytes(self.size - place))
+        return b"".join(parts)
 
 
 def kind_of(event: type[Event]) -> str:

@@ -1,7 +1,13 @@
-"""A thread that writes to one other process, so that the loop never waits for a network."""
+"""The way to one other process: a message goes at once if it is sure to, else by a thread.
+
+Zenoh waits where the network is slow, and the loop must not. A small message goes out on the spot
+as long as little is under way, by what the other process says has arrived; then Zenoh has room for
+it. All others are written by a thread, in order.
+"""
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -9,12 +15,18 @@ from collections.abc import Callable
 from events import Event
 from runtime.errors import ChannelFullError, VisnavError
 from runtime.peers.messages import Message, encode
-from runtime.wire import pack
+from runtime.wire import Packed, pack
 
-Put = Callable[[bytes, bytes | bytearray], None]
+Put = Callable[[bytes, bytes], None]
 
 BOUND = 1024
 """Events that may wait for the network: as many as an input keeps."""
+
+SMALL = 8192
+"""Bytes of a message that the loop may write itself: copying them takes a microsecond."""
+
+UNDER_WAY = 32768
+"""Bytes that may be under way for that: Zenoh's queue holds four times as many."""
 
 
 class Line:
@@ -39,13 +51,16 @@ class Line:
         self._queue: deque[_Waiting] = deque()
         self._skippable: dict[str, _Waiting] = {}
         self._events = 0
-        self._something = threading.Condition()
+        self._under_way = 0
+        self._writing = False
+        self._lock = threading.Lock()
+        self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._closed = False
         self._thread = threading.Thread(target=self._write, name=f"to {name}", daemon=True)
         self._thread.start()
 
     def send(self, message: Message, event: Event | None = None, skip: str = "") -> None:
-        """Put a message at the end of the line.
+        """Send a message, or put it at the end of those that wait.
 
         Args:
             message: What to say.
@@ -53,66 +68,94 @@ class Line:
             skip: If given, the event takes the place of one with the same word that still waits.
 
         Raises:
+            WireError: The event cannot be made into bytes.
             ChannelFullError: Too many events wait already, and this one may not replace one.
         """
-        with self._something:
+        packed = None if event is None else pack(event)
+        with self._lock:
+            if self._closed:
+                return
             before = self._skippable.get(skip)
             if before is not None:
-                before.event = event
+                before.packed = packed
                 self.replaced += 1
-                return
-            if event is not None:
-                if self._events >= BOUND:
-                    raise ChannelFullError(
-                        f"expected room for one more event to {self.name}, found {BOUND} that "
-                        "wait for the network: send less, or read them with keep=latest there"
-                    )
-                self._events += 1
-            waiting = _Waiting(message, event, skip)
-            self._queue.append(waiting)
-            if skip:
-                self._skippable[skip] = waiting
-            self.peak = max(self.peak, len(self._queue))
-            self._something.notify()
+            elif self._goes_at_once(packed):
+                self._put_now(message, packed)
+            else:
+                self._wait(_Waiting(message, packed, skip))
+
+    def arrived(self, count: int) -> None:
+        """Take in how many bytes have arrived at the other end."""
+        with self._lock:
+            self._under_way = max(self._under_way - count, 0)
 
     def close(self, timeout: float = 2.0) -> None:
         """Write what waits, for so many seconds at most, and end."""
-        with self._something:
+        with self._lock:
             self._closed = True
-            self._something.notify()
+            self._wake.put(None)
         self._thread.join(timeout)
 
     def abandon(self) -> None:
         """Write no more: there is nobody."""
-        with self._something:
+        with self._lock:
             self._queue.clear()
             self._closed = True
-            self._something.notify()
+            self._wake.put(None)
+
+    def _goes_at_once(self, packed: Packed | None) -> bool:
+        small = packed is None or packed.size <= SMALL
+        idle = not (self._queue or self._writing)
+        return small and idle and self._under_way < UNDER_WAY
+
+    def _put_now(self, message: Message, packed: Packed | None) -> None:
+        head = encode(message)
+        frame = b"" if packed is None else packed.frame()
+        self._under_way += len(head) + len(frame)
+        try:
+            self._put(head, frame)
+        except VisnavError as error:
+            self._failed(error)
+
+    def _wait(self, waiting: _Waiting) -> None:
+        if waiting.packed is not None:
+            if self._events >= BOUND:
+                raise ChannelFullError(
+                    f"expected room for one more event to {self.name}, found {BOUND} that wait "
+                    'for the network: send less, or read them with keep="latest" there'
+                )
+            self._events += 1
+        self._queue.append(waiting)
+        if waiting.skip:
+            self._skippable[waiting.skip] = waiting
+        self.peak = max(self.peak, len(self._queue))
+        self._wake.put(None)
 
     def _write(self) -> None:
         while True:
-            with self._something:
-                while not self._queue:
+            self._wake.get()
+            with self._lock:
+                if not self._queue:
                     if self._closed:
                         return
-                    self._something.wait()
+                    continue
                 waiting = self._queue.popleft()
+                self._writing = True
                 self._skippable.pop(waiting.skip, None)
-                if waiting.event is not None:
+                if waiting.packed is not None:
                     self._events -= 1
-            try:
-                frame = b"" if waiting.event is None else pack(waiting.event).frame()
-                self._put(encode(waiting.message), frame)
-            except VisnavError as error:
-                self._failed(error)
+            self._put_now(waiting.message, waiting.packed)
+            self._writing = False
+            if self._closed:
+                self._wake.put(None)  # look again whether anything is left
 
 
 class _Waiting:
     """One message in the line."""
 
-    __slots__ = ("event", "message", "skip")
+    __slots__ = ("message", "packed", "skip")
 
-    def __init__(self, message: Message, event: Event | None, skip: str) -> None:
+    def __init__(self, message: Message, packed: Packed | None, skip: str) -> None:
         self.message = message
-        self.event = event
+        self.packed = packed
         self.skip = skip

@@ -29,6 +29,7 @@ class Member:
         ready: Whether its nodes can begin.
         begin: When the first update is, if it has said so.
         told: What it was told that nodes here hear.
+        arrived: Bytes that came from it and that it has not been told of.
         parted: What it had to say of the run, as JSON.
     """
 
@@ -43,6 +44,7 @@ class Member:
         self.ready = False
         self.begin: Begin | None = None
         self.told: tuple[Wanted, ...] | None = None
+        self.arrived = 0
         self.parted: bytes | None = None
         self.line = Line(id_, put, failed)
 

@@ -144,6 +144,12 @@ class Turn(Message, frozen=True):
     sent: tuple[tuple[int, ...], ...]
 
 
+class Ack(Message, frozen=True):
+    """So many bytes have arrived."""
+
+    arrived: int
+
+
 class Call(Message, frozen=True):
     """Give me a turn: something came from outside."""
 
@@ -181,6 +187,7 @@ Any_ = (
     | Retired
     | Parted
     | Turn
+    | Ack
     | Call
     | Standing
 )

@@ -20,6 +20,7 @@ from runtime.peers.crossing import Crossing, hearing
 from runtime.peers.meeting import name_of
 from runtime.peers.member import Member
 from runtime.peers.messages import (
+    Ack,
     Announced,
     Any_,
     Begin,
@@ -240,6 +241,8 @@ class Peers:
             WireError: It makes no sense.
         """
         match message:
+            case Said() if self._begun and self._turns is None:  # first, since there are many
+                self._do(member.number, message, event)
             case Announced():
                 member.announced = message
                 if self._begun:  # it was gone, and needs ours again
@@ -258,7 +261,7 @@ class Peers:
                     self._run.connect()
             case Stop() if not self._begun:
                 self._do(member.number, message, None)
-            case Hello() | Hearing() | Ping() | Pong():
+            case Hello() | Hearing() | Ping() | Pong() | Ack():
                 pass
             case _ if not self._begun:
                 self._early.append((member, message, event))
@@ -299,11 +302,14 @@ class Peers:
             self._gather()
         self._run.connect()
 
+    def found_again(self, member: Member) -> None:
+        """Go on with a process that the network had parted from us."""
+        log.warning("%s: found again, at %s", name_of(member.nodes), member.place)
+        self._take_back(member)
+
     def unsent(self, member: Member, error: VisnavError) -> None:
-        """End the run over an event that no message can hold; a process that goes is noticed."""
-        if isinstance(error, WireError):
-            self._run.stop("an event cannot leave this process", error)
-        elif not self._ending:
+        """Say what could not be sent; that a process has gone is noticed elsewhere."""
+        if not self._ending:
             log.warning("to %s: %s", name_of(member.nodes), error)
 
     def _do(self, number: int, message: Ordered, event: Event | None) -> None:
@@ -326,8 +332,11 @@ class Peers:
     def _welcome(self, member: Member) -> None:
         """Let a process that was gone take part again."""
         log.warning("%s: back, at %s", name_of(member.nodes), member.place)
-        self._retired -= {*member.nodes}
         member.line.send(Begin(self._origin, 0 if self._loop is None else self._loop.now))
+        self._take_back(member)
+
+    def _take_back(self, member: Member) -> None:
+        self._retired -= {*member.nodes}
         self._gather(new=(member.number,))
         self._run.connect()
 

@@ -24,11 +24,14 @@ from runtime.errors import PeerError, VisnavError, WireError
 from runtime.limits import real_time_limit
 from runtime.peers.meeting import check_fits, missing, name_of, say_missing
 from runtime.peers.member import Member
-from runtime.peers.messages import Any_, Hello, Ping, Pong, Said, decode
+from runtime.peers.messages import Ack, Any_, Hello, Ping, Pong, Said, decode
 from runtime.peers.session import Session
 from runtime.wire import unpack
 
 log = logging.getLogger("visnav.runtime")
+
+ACK_EVERY = 8192
+"""Bytes after which the other end is told that they have arrived."""
 
 GREET_EVERY = 0.2
 """Seconds between two greetings of a process that has not answered."""
@@ -46,6 +49,9 @@ class Told(Protocol):
 
     def lost(self, member: Member) -> None:
         """Do without a process of the run."""
+
+    def found_again(self, member: Member) -> None:
+        """Go on with a process that went on without us, too."""
 
     def unsent(self, member: Member, error: VisnavError) -> None:
         """Deal with what could not be sent to a process."""
@@ -99,7 +105,8 @@ class Roster:
             PeerError: They are not within the limit, or somebody runs another file or our nodes.
         """
         network = self._network
-        self._session = await asyncio.to_thread(Session, self._run, network, self._hear, self._see)
+        self._session = await asyncio.to_thread(Session, self._run, network)
+        await asyncio.to_thread(self._session.appear, self._hear, self._see)
         threading.Thread(target=self._greet, name="greet", daemon=True).start()
         if absent := self._missing():
             log.info("waiting for %s at %s", name_of(absent), network.meet)
@@ -197,6 +204,13 @@ class Roster:
         except WireError as error:
             log.warning("from %s: %s", member.place, error)
             return
+        if isinstance(message, Ack):
+            member.line.arrived(message.arrived)
+            return
+        member.arrived += len(head) + len(payload)
+        if member.arrived >= ACK_EVERY:
+            member.line.send(Ack(member.arrived))
+            member.arrived = 0
         if isinstance(message, Ping):  # answered here: a detour by the loop would take time
             member.line.send(Pong(message.sent, received))
         elif isinstance(message, Pong):
@@ -220,9 +234,8 @@ class Roster:
         with self._lock:
             if other not in self._members:
 
-                def put(message: bytes, payload: bytes | bytearray) -> None:
-                    while self._session is None:  # the line was quicker than who opens it
-                        time.sleep(0.001)
+                def put(message: bytes, payload: bytes) -> None:
+                    assert self._session is not None
                     self._session.put(other, message, payload)
 
                 def failed(error: VisnavError) -> None:
@@ -266,9 +279,11 @@ class Roster:
         if self._numbers:
             number = self._numbers.get(hello.nodes, -1)
             member.unfit = number < 0 or self._numbered.get(number, member) is not member
-            if not member.unfit:
+            if not member.unfit and number not in self._numbered:
                 member.number = number
                 self._numbered[number] = member
+                if hello.running and self.hello.running:
+                    self._told.found_again(member)
 
     def _came(self, member: Member) -> None:
         if member.hello is None:

@@ -33,8 +33,6 @@ class Session:
     Args:
         run: The run's name; processes of other runs are not seen.
         network: Where processes meet, and how they talk.
-        heard: Told of messages.
-        seen: Told of processes that come and go, this one not included.
 
     Raises:
         PeerError: The session cannot be opened.
@@ -43,7 +41,7 @@ class Session:
         id: By which the other processes know this one.
     """
 
-    def __init__(self, run: str, network: NetworkConfig, heard: Heard, seen: Seen) -> None:
+    def __init__(self, run: str, network: NetworkConfig) -> None:
         try:
             self._session = zenoh.open(_configuration(network))
         except (zenoh.ZError, OSError) as error:
@@ -51,6 +49,15 @@ class Session:
         self.id = str(self._session.info.zid())
         self._prefix = f"visnav/{re.sub(r'[^A-Za-z0-9_.-]', '_', run)}"
         self._publishers: dict[str, Any] = {}
+        self._kept: list[Any] = []
+
+    def appear(self, heard: Heard, seen: Seen) -> None:
+        """Be seen by the others, and see them.
+
+        Args:
+            heard: Told of messages.
+            seen: Told of processes that come and go, this one not included.
+        """
 
         def take(sample: zenoh.Sample) -> None:
             head = sample.attachment
@@ -63,7 +70,7 @@ class Session:
             if other != self.id:
                 seen(other, sample.kind == zenoh.SampleKind.PUT)
 
-        self._kept: list[Any] = [
+        self._kept = [
             self._session.declare_subscriber(
                 f"{self._prefix}/to/{self.id}/*", zenoh.handlers.Callback(take, indirect=False)
             ),
@@ -75,7 +82,7 @@ class Session:
             ),
         ]
 
-    def put(self, other: str, message: bytes, payload: bytes | bytearray) -> None:
+    def put(self, other: str, message: bytes, payload: bytes) -> None:
         """Send a message to a process; waits if the network does."""
         if other not in self._publishers:
             self._publishers[other] = self._session.declare_publisher(

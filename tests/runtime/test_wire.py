@@ -96,7 +96,7 @@ def test_bytes_that_are_no_event_are_an_error(data: bytes) -> None:
 @given(st.data())
 def test_damaged_events_are_an_error_or_another_event(data: st.DataObject) -> None:
     event = Measured(stamp=1, source="a", one=np.arange(12.0).reshape(3, 4))
-    frame = pack(event).frame()
+    frame = bytearray(pack(event).frame())
     place = data.draw(st.integers(0, len(frame) - 1))
     frame[place] = data.draw(st.integers(0, 255))
     with contextlib.suppress(WireError):

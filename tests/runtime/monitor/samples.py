@@ -32,7 +32,6 @@ def snapshot(**changes: Any) -> Snapshot:
         run="sample",
         pid=1,
         number=1,
-        interval=0.2,
         ended="",
         clock=msgspec.structs.replace(clock, **of_clock),
         nodes=[

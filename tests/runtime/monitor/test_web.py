@@ -81,6 +81,15 @@ async def test_whoever_should_not_is_sent_away(request_: str, status: int) -> No
         assert (await say(port, request_)).startswith(f"HTTP/1.1 {status} ")
 
 
+async def test_the_page_shows_at_once_what_is_known() -> None:
+    stand = Stand(snapshot())
+    async with serving(stand) as port:
+        await say(port, get(f"/?token={TOKEN}"))
+        page = await say(port, get(f"/?token={TOKEN}"))
+    assert 'const first = {"fixed": "", "headline": "sample ' in page
+    assert "[b]wind[/b]" in page
+
+
 async def test_commands_go_to_the_run_if_they_bear_the_token() -> None:
     stand = Stand()
     async with serving(stand) as port:

@@ -27,7 +27,7 @@ duration = "{duration}"
 speed = 1.0
 
 [network]
-meet = "tcp/127.0.0.1:{port}"
+meet = "{meet}"
 
 [[nodes]]
 name = "asker"
@@ -53,13 +53,15 @@ class Rig:
         self.file = folder / "apart.toml"
         self.started: list[subprocess.Popen[str]] = []
 
-    def write(self, *, clock: str, on_error: str, duration: str = "60s") -> None:
+    def write(self, *, clock: str, on_error: str, duration: str = "60s", meet: str = "") -> None:
+        meet = meet or f"tcp/127.0.0.1:{free_port()}"
         self.file.write_text(
-            FILE.format(clock=clock, on_error=on_error, duration=duration, port=free_port())
+            FILE.format(clock=clock, on_error=on_error, duration=duration, meet=meet)
         )
 
-    def start(self, only: str, out: str) -> subprocess.Popen[str]:
+    def start(self, only: str, out: str, where: str = "") -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "runtime", "run", str(self.file), "--quiet"]
+        command = [*where.split(), *command]
         options = ["--only", only, "--out", str(self.folder / out), "--log", "debug"]
         process = subprocess.Popen(
             [*command, *options],

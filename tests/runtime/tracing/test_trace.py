@@ -105,6 +105,12 @@ def test_an_error_in_a_traced_node_is_that_nodes(tmp_path: Path) -> None:
     assert read_trace(tmp_path / "t.json").events
 
 
+def test_a_trace_without_a_place_is_refused_before_the_run(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="expected a place for a trace, found: "):
+        traced(tmp_path / "file" / "t.json")
+
+
 def test_shares_leave_out_what_a_step_called_in_others() -> None:
     def slice_(tid: int, name: str, ts: float, dur: float) -> TraceEvent:
         return TraceEvent(ph="X", pid=LOOP, tid=tid, name=name, ts=ts, dur=dur)
