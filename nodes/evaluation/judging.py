@@ -40,6 +40,7 @@ class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         lost_seconds: Time without a pose.
         latency_p99_ms: From exposure to estimate.
         available_rmse_m: Error of the newest pose there was at each control tick.
+        plan_rmse_m: How far the vehicle was from its `PlannedPose`.
     """
 
     ate_rmse_m: float | None = None
@@ -50,6 +51,7 @@ class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     lost_seconds: float | None = None
     latency_p99_ms: float | None = None
     available_rmse_m: float | None = None
+    plan_rmse_m: float | None = None
 
     def missed(self, figures: dict[str, Any]) -> list[str]:
         """Return a sentence for each threshold that is not met."""
@@ -180,6 +182,25 @@ def judge(
             "available_age_ms": float(np.mean(of_ticks.stamps - of_ticks.since)) / MILLISECOND,
         }
     return Judgement(figures, estimate, moved, of_images, of_ticks, lost)
+
+
+def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
+    """Return how far the vehicle flew from where its pilot meant it to be.
+
+    Args:
+        truth: Its true poses.
+        plan: Where it was to be at each stamp, in the same frame.
+
+    Returns:
+        Root mean square and maximum of the distances, metres; empty if the truth covers no stamp
+        of the plan.
+    """
+    rows = np.flatnonzero(truth.covers(plan.stamps))
+    if not len(rows):
+        return {}
+    there = truth.at(plan.stamps[rows])
+    distances = position_errors(there.positions, plan.positions[rows])
+    return {"plan_rmse_m": _rms(distances), "plan_max_m": float(distances.max())}
 
 
 def choose_alignment(record: EstimatorRecord) -> How:

@@ -23,7 +23,7 @@ from events import (
     VehicleAnnouncement,
 )
 from nodes.evaluation.album import Album
-from nodes.evaluation.judging import Judgement, Thresholds, judge
+from nodes.evaluation.judging import Judgement, Thresholds, beside_the_plan, judge
 from nodes.evaluation.live import LiveErrors, RecentTruth
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import file_name, write_results
@@ -153,6 +153,8 @@ class Evaluation(Node[EvaluationConfig]):
     def _finish(self) -> tuple[dict[str, Judgement], dict[str, Any]]:
         config = self.config
         truth = self._truth.trajectory() if len(self._truth) else None
+        plan = self._plan.trajectory() if len(self._plan) else None
+        flown = {} if truth is None or plan is None else beside_the_plan(truth, plan)
         judgements = {}
         for name, record in self._records.items():
             if truth is None:
@@ -169,6 +171,7 @@ class Evaluation(Node[EvaluationConfig]):
                 )
         estimators = {}
         for name, judgement in judgements.items():
+            judgement.figures.update(flown)
             failed = config.thresholds.missed(judgement.figures)
             if judgement.figures.get("ate_rmse_m") is None:
                 failed.append(judgement.figures.get("why", "expected estimates, found none"))
@@ -180,8 +183,8 @@ class Evaluation(Node[EvaluationConfig]):
             "thresholds": msgspec.to_builtins(config.thresholds),
         }
         if self.out is not None:
-            rows = self._plan if len(self._plan) else self._setpoints
-            plan = rows.trajectory() if len(rows) else None
+            if plan is None and len(self._setpoints):
+                plan = self._setpoints.trajectory()
             write_results(self.out, truth, plan, judgements, verdict)
             self._album.write(self.out / "frames")
         return judgements, verdict

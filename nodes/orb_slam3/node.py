@@ -12,9 +12,8 @@ import numpy.typing as npt
 from events import Announcement, DepthImage, Image, Imu, ImuAnnouncement
 from nodes.estimation import Estimator, EstimatorConfig
 from nodes.orb_slam3.process import OrbSlam3Process
-from nodes.orb_slam3.settings import Mode, OrbSettings, Settings, make_settings
-from nodes.orb_slam3.vocabulary import TreeShape
-from nodes.orb_slam3.vocabulary_file import cached_vocabulary
+from nodes.orb_slam3.settings import Mode, OrbSettings, make_settings
+from nodes.orb_slam3.vocabulary_file import find_vocabulary
 from runtime import Bundle, Duration, on
 
 
@@ -39,7 +38,7 @@ class OrbSlam3Config(EstimatorConfig):
     mode: Mode = "rgbd"
     vocabulary: str = ""
     orb: OrbSettings = OrbSettings()
-    patience: Duration = Duration(0.2)  # immutable
+    patience: Duration = Duration(0.02)  # immutable
 
 
 class OrbSlam3(Estimator[OrbSlam3Config]):
@@ -77,7 +76,7 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         """Track each picture; skip those that come meanwhile."""
         config = self.config
         slam = await self.worker(
-            start_slam,
+            OrbSlam3Process,
             make_settings(config.mode, self.the_camera(), self._imu, config.orb),
             self._vocabulary(),
             float(config.patience),
@@ -104,17 +103,12 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         """Return the vocabulary's file.
 
         Raises:
-            FatalError: There is none.
+            FatalError: There is none, or it is in another format.
         """
-        named = self.config.vocabulary
-        path = Path(named).expanduser() if named else cached_vocabulary(TreeShape())
-        if not path.exists():
-            self.log.fatal(
-                "expected a vocabulary at %s, found none: make one with "
-                "`python -m runtime vocabulary CONFIG`, or name one with vocabulary = …",
-                path,
-            )
-        return path
+        try:
+            return find_vocabulary(self.config.vocabulary)
+        except ValueError as error:
+            self.log.fatal("%s", error)
 
     def _take_samples(self, until: int) -> npt.NDArray[np.float64] | None:
         """Return what was measured since the last picture, shape (n, 7)."""
@@ -125,8 +119,3 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
             sample = self._samples.popleft()
             rows.append((sample.stamp, *sample.angular_velocity, *sample.linear_acceleration))
         return np.array(rows, np.float64).reshape(-1, 7)
-
-
-def start_slam(settings: Settings, vocabulary: Path, patience: float) -> OrbSlam3Process:
-    """Start ORB-SLAM3 in the process that will run it."""
-    return OrbSlam3Process(settings, vocabulary, patience=patience)

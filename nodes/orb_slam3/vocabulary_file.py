@@ -37,7 +37,7 @@ def find_vocabulary(setting: str) -> Path:
         ValueError: There is none, or it is not in DBoW2's text format.
     """
     path = Path(setting).expanduser() if setting else cached_vocabulary(TreeShape())
-    if not setting and not path.exists():
+    if not path.exists():
         raise ValueError(
             f"expected a vocabulary at {path}, found none; to make one from what the cameras of "
             "a configuration see: python -m runtime vocabulary config.toml"

@@ -19,6 +19,8 @@ MAIN = {
     "drift_percent": ("drift at the end, in percent of the path", "%"),
     "available_rmse_m": ("error of the newest pose at control ticks, RMS", "m"),
     "available_rot_rmse_deg": ("rotation error of the same, RMS", "°"),
+    "plan_rmse_m": ("distance of the flight from its plan, RMS", "m"),
+    "plan_max_m": ("greatest distance of the flight from its plan", "m"),
     "latency_p50_ms": ("latency, median", "ms"),
     "latency_p99_ms": ("latency, 99th percentile", "ms"),
     "lost_seconds": ("time without a pose", "s"),

@@ -1,7 +1,7 @@
-"""From Zenoh's threads to the loop: bounded, at a bounded rate, with one wake-up for each burst.
+"""From the threads that read topics to the loop: bounded, with one wake-up for each burst.
 
-What comes faster is dropped where it arrives, before its bytes are copied. The loop is given back
-between messages when they have held it for `BUDGET`.
+What comes faster than is allowed is dropped where it is read, before its bytes are copied. The
+loop is given back between messages when they have held it for `BUDGET`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Inbox:
         depth: How many wait at most; the oldest is dropped.
         rate: Messages a second at most; a burst of `depth` may come at once.
         largest: Bytes of a message at most.
-        complain: Told, in Zenoh's thread, why a message is dropped.
+        complain: Told, in the thread that reads, why a message is dropped.
         now: Real seconds.
     """
 

@@ -9,8 +9,11 @@ import numpy as np
 
 from events import (
     CameraInfo,
+    FluidPressure,
     Imu,
     ImuAnnouncement,
+    MagneticField,
+    NavSatFix,
     Odometry,
     PoseEstimate,
     PoseStamped,
@@ -74,8 +77,8 @@ class Messages:
         )
         pose = self._pose(event.frame_id, axes, event.position, event.orientation)
         message = self._store.message("nav_msgs/msg/Odometry")(
-            header=self._header(time, event.frame_id),
-            child_frame_id=self._frames.name(event.child_frame_id),
+            header=self._header(time, event.frame_id, event.source),
+            child_frame_id=self._frames.name(event.child_frame_id, event.source),
             pose=make["pose_covariance"](pose=pose, covariance=_ZEROS_36),
             twist=make["twist_covariance"](twist=twist, covariance=_ZEROS_36),
         )
@@ -84,7 +87,7 @@ class Messages:
     def pose(self, time: Time, event: PoseStamped | PoseEstimate, child: Axes) -> bytearray:
         """Return a geometry_msgs/PoseStamped; `child` are the axes of the frame that is placed."""
         message = self._store.message("geometry_msgs/msg/PoseStamped")(
-            header=self._header(time, event.frame_id),
+            header=self._header(time, event.frame_id, event.source),
             pose=self._pose(event.frame_id, child, event.position, event.orientation),
         )
         return self._store.serialize(message)
@@ -97,7 +100,7 @@ class Messages:
             covariance = turn_covariance(axes, np.array(event.covariance))
         pose = self._pose(event.frame_id, child, event.position, event.orientation)
         message = self._store.message("geometry_msgs/msg/PoseWithCovarianceStamped")(
-            header=self._header(time, event.frame_id),
+            header=self._header(time, event.frame_id, event.source),
             pose=self._make["pose_covariance"](pose=pose, covariance=covariance),
         )
         return self._store.serialize(message)
@@ -113,7 +116,7 @@ class Messages:
             gyroscope = _diagonal(noise.gyroscope_noise_density**2 * noise.rate)
             accelerometer = _diagonal(noise.accelerometer_noise_density**2 * noise.rate)
         message = self._store.message("sensor_msgs/msg/Imu")(
-            header=self._header(time, event.frame_id),
+            header=self._header(time, event.frame_id, event.source),
             orientation=self._make["quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
             orientation_covariance=_UNKNOWN,
             angular_velocity=self._vector(turn_vector(axes, event.angular_velocity)),
@@ -173,7 +176,7 @@ class Messages:
         type_ = self._store.message("sensor_msgs/msg/Range")
         more = {"variance": 0.0} if "variance" in type_.__annotations__ else {}  # since Iron
         message = type_(
-            header=self._header(time, "base_link"),
+            header=self._header(time, "base_link", event.source),
             radiation_type=type_.INFRARED,
             field_of_view=0.0,
             min_range=event.min_range,
@@ -183,12 +186,45 @@ class Messages:
         )
         return self._store.serialize(message)
 
+    def pressure(self, time: Time, event: FluidPressure) -> bytearray:
+        """Return a sensor_msgs/FluidPressure."""
+        message = self._store.message("sensor_msgs/msg/FluidPressure")(
+            header=self._header(time, "base_link", event.source),
+            fluid_pressure=event.fluid_pressure,
+            variance=event.variance,
+        )
+        return self._store.serialize(message)
+
+    def magnetic_field(self, time: Time, event: MagneticField) -> bytearray:
+        """Return a sensor_msgs/MagneticField; its covariance of zeros says: not known."""
+        message = self._store.message("sensor_msgs/msg/MagneticField")(
+            header=self._header(time, "base_link", event.source),
+            magnetic_field=self._vector(turn_vector("body", event.magnetic_field)),
+            magnetic_field_covariance=_ZEROS_9,
+        )
+        return self._store.serialize(message)
+
+    def fix(self, time: Time, event: NavSatFix) -> bytearray:
+        """Return a sensor_msgs/NavSatFix of a plain GPS fix, whose covariance is not known."""
+        status = self._store.message("sensor_msgs/msg/NavSatStatus")
+        type_ = self._store.message("sensor_msgs/msg/NavSatFix")
+        message = type_(
+            header=self._header(time, "base_link", event.source),
+            status=status(status=status.STATUS_FIX, service=status.SERVICE_GPS),
+            latitude=event.latitude,
+            longitude=event.longitude,
+            altitude=event.altitude,
+            position_covariance=_ZEROS_9,
+            position_covariance_type=type_.COVARIANCE_TYPE_UNKNOWN,
+        )
+        return self._store.serialize(message)
+
     def score(self, event: Score) -> bytearray:
         """Return a std_msgs/Float64."""
         return self._store.serialize(self._store.message("std_msgs/msg/Float64")(data=event.value))
 
-    def _header(self, time: Time, frame_id: str) -> Any:
-        return make_header(self._store, time, self._frames.name(frame_id))
+    def _header(self, time: Time, frame_id: str, source: str = "") -> Any:
+        return make_header(self._store, time, self._frames.name(frame_id, source))
 
     def _pose(self, parent: str, child: Axes, position: Vector3, orientation: Quaternion) -> Any:
         axes = self._frames.axes(parent)

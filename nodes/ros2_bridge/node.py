@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
 from collections.abc import Callable, Iterable
 from typing import Any
+
+import msgspec
 
 from events import (
     Announcement,
@@ -13,8 +16,12 @@ from events import (
     DepthImage,
     EstimatorAnnouncement,
     Event,
+    FluidPressure,
     Image,
     Imu,
+    LaserScan3D,
+    MagneticField,
+    NavSatFix,
     Odometry,
     PointCloud,
     PoseEstimate,
@@ -35,9 +42,11 @@ from nodes.ros2_bridge.publishing import Publishing
 from nodes.ros2_bridge.session import Session, SessionError
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
 from nodes.ros2_bridge.stamps import Stamps
+from nodes.ros2_bridge.telling import Telling, event_type
 from nodes.ros2_bridge.typestore import TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
 from runtime.errors import FatalError
+from runtime.ports import Handles
 
 WAITING = 8
 """Pictures of one kind that wait to be published; the oldest is dropped, and counted."""
@@ -75,12 +84,15 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self._publishing: Publishing | None = None
         self._lanes: dict[type[Event], Stream[Any]] = {
             kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
-            for kind in (Image, DepthImage, SegmentationImage, PointCloud)
+            for kind in (Image, DepthImage, SegmentationImage, PointCloud, LaserScan3D)
         }
         self._hearings: list[Hearing] = []
+        self._tellings: list[tuple[Telling, Stream[Event]]] = []
         self._cameras: list[CameraAnnouncement] = []
         self._stamps: Stamps | None = None
         self._open = False
+        if self.config.publications:
+            self._hear_more()
         # What ROS sends comes at its own time.
         self.deterministic = not self.config.subscriptions  # type: ignore[misc]
 
@@ -106,6 +118,13 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                 Hearing(each, config, self._store, self.name, self._complaints)
                 for each in config.subscriptions
             ]
+            self._tellings = [
+                (
+                    Telling(each, config, self._store, self._complaints),
+                    Stream(f"{self.name}.{each.topic}", each.depth, "drop_oldest", soon=True),
+                )
+                for each in config.publications
+            ]
             session = await self.offload(
                 Session,
                 NodeName(
@@ -121,6 +140,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self._session = session
         self._publishing = Publishing(session, self._store, config, self._time)
         await self.offload(self._publishing.warm_up)
+        for telling, _ in self._tellings:
+            self._publishing.declare(telling)
         try:
             for hearing in self._hearings:
                 if hearing.subscription.use == "camera":
@@ -157,6 +178,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         publishing.begin()
         for kind, events in self._lanes.items():
             self.start(self._lane(events, publishing.large[kind]))
+        for telling, waiting in self._tellings:
+            self.start(self._lane(waiting, functools.partial(publishing.own, telling)))
         for hearing in self._hearings:
             await self.offload(session.subscribe, hearing.topic, self._inbox(hearing).take)
 
@@ -170,33 +193,61 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         heard = sum(hearing.heard for hearing in self._hearings)
         refused = sum(self._complaints.counts.values())
         self.log.info(
-            "%d messages published on %d topics (%d pictures dropped); %d heard, %d refused or "
-            "dropped",
+            "%d messages published on %d topics (%d pictures, %d others dropped); %d heard, "
+            "%d refused or dropped",
             sum(each.sent for each in sent),
             len(sent),
             sum(lane.dropped for lane in self._lanes.values()),
+            sum(waiting.dropped for _, waiting in self._tellings),
             heard,
             refused,
         )
         if not await self.offload(session.close):
             self.log.warning("a peer that stands still keeps the session from closing")
 
-    @on(Image, DepthImage, SegmentationImage, PointCloud)
+    @on(Image, DepthImage, SegmentationImage, PointCloud, LaserScan3D)
     def shown(self, event: Event) -> None:
         """Have a picture or a cloud published beside the loop."""
         self._lanes[next(kind for kind in self._lanes if isinstance(event, kind))].offer(event)
 
-    @on(Odometry, PoseStamped, PoseEstimate, TransformStamped, Imu, Range, Score)
+    @on(
+        *(Odometry, PoseStamped, PoseEstimate, TransformStamped, Score),
+        *(Imu, Range, FluidPressure, MagneticField, NavSatFix),
+    )
     def said(self, event: Event) -> None:
         """Publish what is small, at once."""
         if self._publishing is not None:
             self._publishing.small(event)
+
+    def tell(self, event: Event) -> None:
+        """Have a mapping of the user's own make a message of an event, beside the loop."""
+        for telling, waiting in self._tellings:
+            if telling.wants(event):
+                waiting.offer(event)
 
     @every(hz="clock_rate")
     def tell_time(self, tick: Tick) -> None:  # noqa: ARG002
         """Publish ``/clock``."""
         if self._publishing is not None:
             self._publishing.clock(self.clock.now())
+
+    def _hear_more(self) -> None:
+        """Have `tell` called with the events that the file's publications are of.
+
+        Raises:
+            FatalError: One is of no type of event.
+        """
+        try:
+            events = tuple({event_type(each) for each in self.config.publications})
+        except ValueError as error:
+            self.log.fatal("%s", error)
+        declared = self.declared
+        # Which events these are is this node's own matter, and not its class's.
+        self.declared = msgspec.structs.replace(  # type: ignore[misc]
+            declared,
+            handlers={**declared.handlers, "tell": Handles(events, None)},
+            listening=[*declared.listening, "tell"],
+        )
 
     async def _lane(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
         async for event in events:

@@ -116,22 +116,26 @@ class CompressedWriter:
 
 
 class CloudWriter:
-    """Writes ``sensor_msgs/msg/PointCloud2`` with the fields x, y, z and rgb.
+    """Writes ``sensor_msgs/msg/PointCloud2`` with the fields x, y, z and, if wanted, rgb.
 
     Args:
         store: Of the types.
         frame_id: Of the points.
+        fields: ``xyz`` leaves out rgb, and its four bytes of each point empty.
     """
 
-    def __init__(self, store: TypeStore, frame_id: str) -> None:
+    def __init__(
+        self, store: TypeStore, frame_id: str, fields: Literal["xyz", "xyzrgb"] = "xyzrgb"
+    ) -> None:
         self._store = store
         self._header = frame_id
+        self._names = ("x", "y", "z", "rgb") if fields == "xyzrgb" else ("x", "y", "z")
 
     def write(
         self,
         stamp: tuple[int, int],
         points: npt.NDArray[np.float32],
-        colors: npt.NDArray[np.uint8],
+        colors: npt.NDArray[np.uint8] | None = None,
     ) -> bytearray:
         """Return the message.
 
@@ -139,11 +143,12 @@ class CloudWriter:
             stamp: Seconds and nanoseconds.
             points: Metres in ROS's axes, shape (n, 3).
             colors: Red, green, blue, shape (n, 3), or (0, 3) for none: then all are white.
+                Not for ``xyz``.
         """
         count = len(points)
         message = self._store.message("sensor_msgs/msg/PointCloud2")
         field = self._store.message("sensor_msgs/msg/PointField")
-        names = enumerate(("x", "y", "z", "rgb"))
+        names = enumerate(self._names)
         frame = self._store.serialize(
             message(
                 header=make_header(self._store, stamp, self._header),
@@ -164,7 +169,8 @@ class CloudWriter:
         frame[-1] = dense
         rows = np.frombuffer(frame, _POINT, count, begin)
         rows["xyz"] = points
-        rows["bgr"] = colors[:, ::-1] if len(colors) else 255
+        if colors is not None:
+            rows["bgr"] = colors[:, ::-1] if len(colors) else 255
         return frame
 
 

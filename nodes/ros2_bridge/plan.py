@@ -28,6 +28,7 @@ What = Literal[
     "compressed",
     "depth",
     "depth_info",
+    "compressed_depth",
     "segmentation",
     "cloud",
     "imu",
@@ -36,6 +37,11 @@ What = Literal[
     "estimate",
     "score",
     "range",
+    "pressure",
+    "magnetic",
+    "fix",
+    "lidar",
+    "path",
     "tf",
     "tf_static",
     "clock",
@@ -48,6 +54,11 @@ NAMES: dict[What, tuple[str, str, Kind]] = {
     "compressed": ("{}/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "images"),
     "depth": ("{}/depth/image_raw", "sensor_msgs/msg/Image", "depth"),
     "depth_info": ("{}/depth/camera_info", "sensor_msgs/msg/CameraInfo", "depth"),
+    "compressed_depth": (
+        "{}/depth/image_raw/compressedDepth",
+        "sensor_msgs/msg/CompressedImage",
+        "depth",
+    ),
     "segmentation": ("{}/segmentation/image_raw", "sensor_msgs/msg/Image", "segmentation"),
     "cloud": ("{}/points", "sensor_msgs/msg/PointCloud2", "clouds"),
     "imu": ("{}/imu", "sensor_msgs/msg/Imu", "imu"),
@@ -56,6 +67,11 @@ NAMES: dict[What, tuple[str, str, Kind]] = {
     "estimate": ("{}/pose", "geometry_msgs/msg/PoseStamped", "estimates"),
     "score": ("scores/{}", "std_msgs/msg/Float64", "scores"),
     "range": ("{}/range", "sensor_msgs/msg/Range", "ranges"),
+    "pressure": ("{}/pressure", "sensor_msgs/msg/FluidPressure", "pressures"),
+    "magnetic": ("{}/mag", "sensor_msgs/msg/MagneticField", "magnetic_fields"),
+    "fix": ("{}/fix", "sensor_msgs/msg/NavSatFix", "fixes"),
+    "lidar": ("{}/lidar", "sensor_msgs/msg/PointCloud2", "lidars"),
+    "path": ("{}/path", "nav_msgs/msg/Path", "paths"),
     "tf": ("/tf", "tf2_msgs/msg/TFMessage", "tf"),
     "tf_static": ("/tf_static", "tf2_msgs/msg/TFMessage", "tf"),
     "clock": ("/clock", "rosgraph_msgs/msg/Clock", "clock"),
@@ -65,10 +81,12 @@ _QOS: dict[What, Qos] = {
     "tf": Qos(depth=100),
     "tf_static": Qos(depth=1, transient_local=True),
     "clock": Qos(depth=1, reliable=False),
+    "path": Qos(depth=1),
 }
 
 _PICTURES: set[What] = {
-    "image", "mono", "info", "compressed", "depth", "depth_info", "segmentation", "cloud"
+    "image", "mono", "info", "compressed", "depth", "depth_info", "compressed_depth",
+    "segmentation", "cloud", "lidar"
 }  # fmt: skip
 
 
@@ -121,9 +139,9 @@ def announced(announcement: Announcement, config: Ros2BridgeConfig) -> Iterator[
         case ImuAnnouncement():
             whats = ["imu"]
         case VehicleAnnouncement():
-            whats = ["odometry"]
+            whats = ["odometry", "path"]
         case EstimatorAnnouncement():
-            whats = ["estimate"]
+            whats = ["estimate", "path"]
     for what in whats:
         if found := publication(what, announcement.source, config):
             yield found
@@ -140,7 +158,11 @@ def camera_topics(images: tuple[str, ...], config: Ros2BridgeConfig) -> Iterator
         if config.compressed:
             yield "compressed"
     if "depth" in images:
-        yield from ("depth", "depth_info")
+        yield "depth_info"
+        if config.raw or not config.compressed_depth:
+            yield "depth"
+        if config.compressed_depth:
+            yield "compressed_depth"
     if "segmentation" in images:
         yield "segmentation"
 
@@ -153,32 +175,59 @@ class CameraFrames(msgspec.Struct, frozen=True):
 
 
 class FrameNames:
-    """Our frames' names and axes, and what ROS calls them."""
+    """Our frames' names and axes, and what ROS calls them.
+
+    Of one vehicle alone, frames have the names of REP 105 (``odom``, ``base_link``). Once there is
+    a second, the vehicle's name stands before those of each: ``drone/odom``, ``drone/base_link``.
+    Whose frame is meant follows from who speaks: ``drone/camera`` is of ``drone``.
+    """
 
     def __init__(self) -> None:
-        self._cameras: dict[str, CameraFrames] = {}
-        """By optical frame."""
+        self._cameras: dict[str, tuple[str, str]] = {}
+        """Optical frame to the camera's source and its own name."""
+        self._vehicles: list[str] = []
+
+    def add_vehicle(self, source: str) -> None:
+        """Take in a vehicle."""
+        if source not in self._vehicles:
+            self._vehicles.append(source)
 
     def add(self, camera: CameraAnnouncement) -> CameraFrames:
         """Take in a camera: its frames have its own name, or its vehicle's too if that is taken."""
-        known = self._cameras.get(camera.frame_id)
-        if known is not None:
-            return known
-        name = ros_name(camera.source.rpartition("/")[2])
-        if any(each.link == f"{name}_link" for each in self._cameras.values()):
-            name = ros_name(camera.source).replace("/", "_")
-        frames = CameraFrames(f"{name}_link", f"{name}_optical_frame")
-        self._cameras[camera.frame_id] = frames
-        return frames
+        if camera.frame_id not in self._cameras:
+            name = ros_name(camera.source.rpartition("/")[2])
+            if any(known == name for _, known in self._cameras.values()):
+                name = ros_name(camera.source).replace("/", "_")
+            self._cameras[camera.frame_id] = (camera.source, name)
+        found = self.camera(camera.frame_id)
+        assert found is not None
+        return found
 
     def camera(self, frame_id: str) -> CameraFrames | None:
         """Return the frames of the camera with this optical frame, if there is one."""
-        return self._cameras.get(frame_id)
+        known = self._cameras.get(frame_id)
+        if known is None:
+            return None
+        source, name = known
+        prefix = ""
+        if len(self._vehicles) > 1 and (vehicle := self._carrier(source)):
+            prefix, name = f"{ros_name(vehicle)}/", ros_name(source.rpartition("/")[2])
+        return CameraFrames(f"{prefix}{name}_link", f"{prefix}{name}_optical_frame")
 
-    def name(self, frame_id: str) -> str:
-        """Return what ROS calls a frame."""
-        camera = self._cameras.get(frame_id)
-        return frame_id if camera is None else camera.optical
+    def vehicle(self, source: str) -> str:
+        """Return the vehicle that a source belongs to: else the first; empty if there is none."""
+        return self._carrier(source) or (self._vehicles[0] if self._vehicles else "")
+
+    def name(self, frame_id: str, source: str = "") -> str:
+        """Return what ROS calls a frame that a source speaks of."""
+        if frame_id == "map":
+            return frame_id
+        camera = self.camera(frame_id)
+        if camera is not None:
+            return camera.optical
+        if len(self._vehicles) > 1:
+            return f"{ros_name(self.vehicle(source))}/{frame_id}"
+        return frame_id
 
     def axes(self, frame_id: str) -> Axes:
         """Return how a frame's axes lie."""
@@ -186,3 +235,9 @@ class FrameNames:
             return "world"
         known = frame_id in self._cameras or frame_id.endswith("_optical")
         return "optical" if known else "body"
+
+    def _carrier(self, source: str) -> str:
+        for vehicle in self._vehicles:
+            if source == vehicle or source.startswith(f"{vehicle}/"):
+                return vehicle
+        return ""

@@ -15,25 +15,35 @@ from events import (
     CameraAnnouncement,
     DepthImage,
     Event,
+    FluidPressure,
     Image,
     Imu,
     ImuAnnouncement,
+    LaserScan3D,
+    MagneticField,
+    NavSatFix,
     Odometry,
     PointCloud,
     PoseEstimate,
     PoseStamped,
+    Quaternion,
     Range,
     Score,
     SegmentationImage,
     TransformStamped,
+    Vector3,
 )
-from nodes.ros2_bridge.frames import turn_points
+from nodes.ros2_bridge.depth import CompressedDepthWriter
+from nodes.ros2_bridge.frames import turn_points, turn_rotation, turn_vector
 from nodes.ros2_bridge.keys import Topic
 from nodes.ros2_bridge.messages import Messages, Time
+from nodes.ros2_bridge.paths import Path
 from nodes.ros2_bridge.pictures import CloudWriter, CompressedWriter, ImageWriter
 from nodes.ros2_bridge.plan import NAMES, FrameNames, Publication, What, announced, publication
 from nodes.ros2_bridge.session import Publisher, Session
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
+from nodes.ros2_bridge.stamps import SECOND
+from nodes.ros2_bridge.telling import Telling, Writing
 from nodes.ros2_bridge.transforms import Transforms
 from nodes.ros2_bridge.typestore import TypeStore
 
@@ -60,18 +70,24 @@ class Publishing:
         self._config = config
         self._time = time
         self._names = FrameNames()
+        self._writing = Writing(store, self._names, time)
         self._messages = Messages(store, self._names)
         self._transforms = Transforms(self._names, config.vehicle, config.tf)
         self._cameras: dict[str, CameraAnnouncement] = {}
         self._imus: dict[str, ImuAnnouncement] = {}
         self._publishers: dict[tuple[What, str], Publisher | None] = {}
         self._writers: dict[tuple[What, str], Any] = {}
+        self._paths: dict[str, tuple[Path, int]] = {}
+        """By source: the path, and when it is to be sent again."""
+        self._own: dict[str, Publisher] = {}
+        """By topic: what mappings of the user's own make."""
         self._lock = threading.Lock()
         self.large: dict[type[Event], Callable[[Any], None]] = {
             Image: self.image,
             DepthImage: self.depth,
             SegmentationImage: self.segmentation,
             PointCloud: self.cloud,
+            LaserScan3D: self.lidar,
         }
         self._small: dict[type[Event], Callable[[Any], None]] = {
             Odometry: self.odometry,
@@ -80,13 +96,17 @@ class Publishing:
             TransformStamped: self.transform,
             Imu: self.imu,
             Range: self.range,
+            FluidPressure: self.pressure,
+            MagneticField: self.magnetic_field,
+            NavSatFix: self.fix,
             Score: self.score,
         }
 
     @property
     def publishers(self) -> list[Publisher]:
         """Return what was declared so far."""
-        return [each for each in self._publishers.values() if each is not None]
+        declared = [each for each in self._publishers.values() if each is not None]
+        return declared + list(self._own.values())
 
     def announced(self, announcement: Announcement) -> None:
         """Declare the publishers for what a node announced."""
@@ -107,6 +127,10 @@ class Publishing:
         """Put what holds for the whole run."""
         self._put_static()
 
+    def declare(self, telling: Telling) -> None:
+        """Declare the publisher of a mapping of the user's own."""
+        self._own[telling.topic.name] = self._session.publisher(telling.topic)
+
     # Beside the loop.
 
     def image(self, event: Image) -> None:
@@ -121,7 +145,7 @@ class Publishing:
             if publisher := self._publisher(what, event.source):
                 writer = self._writers.get((what, event.source))
                 if writer is None:
-                    frame = self._names.name(event.frame_id)
+                    frame = self._names.name(event.frame_id, event.source)
                     how, quality = self._config.compressed, self._config.jpeg_quality
                     writer = CompressedWriter(self._store, frame, how, quality)
                     self._writers[what, event.source] = writer
@@ -130,7 +154,18 @@ class Publishing:
     def depth(self, event: DepthImage) -> None:
         """Put a depth image, and its camera's calibration before it."""
         self._info("depth_info", event.stamp, event.source)
-        self._picture("depth", event, "32FC1")
+        config = self._config
+        if config.raw or not config.compressed_depth:
+            self._picture("depth", event, "32FC1")
+        what: What = "compressed_depth"
+        if config.compressed_depth and (publisher := self._publisher(what, event.source)):
+            writer = self._writers.get((what, event.source))
+            if writer is None:
+                frame = self._names.name(event.frame_id, event.source)
+                farthest, steps = config.depth_max, config.depth_quantization
+                writer = CompressedDepthWriter(self._store, frame, farthest, steps)
+                self._writers[what, event.source] = writer
+            publisher.put(writer.write(self._time(event.stamp), event.data))
 
     def segmentation(self, event: SegmentationImage) -> None:
         """Put object numbers."""
@@ -139,11 +174,30 @@ class Publishing:
     def cloud(self, event: PointCloud) -> None:
         """Put a cloud."""
         if publisher := self._publisher("cloud", event.source):
-            writer = CloudWriter(self._store, self._names.name(event.frame_id))
+            frame = self._names.name(event.frame_id, event.source)
             points = turn_points(self._names.axes(event.frame_id), event.points)
+            writer = CloudWriter(self._store, frame)
             publisher.put(writer.write(self._time(event.stamp), points, event.colors))
 
+    def lidar(self, event: LaserScan3D) -> None:
+        """Put a sweep of a lidar."""
+        if publisher := self._publisher("lidar", event.source):
+            frame = self._names.name(event.frame_id, event.source)
+            points = turn_points(self._names.axes(event.frame_id), event.points)
+            writer = CloudWriter(self._store, frame, "xyz")
+            publisher.put(writer.write(self._time(event.stamp), points))
+
+    def own(self, telling: Telling, event: Event) -> None:
+        """Put what a mapping of the user's own makes of an event."""
+        message = telling.message(event, self._writing)
+        if message is not None:
+            self._own[telling.topic.name].put(message)
+
     # At once.
+
+    def knows(self, kind: type[Event]) -> bool:
+        """Tell whether `small` has a message for events of a type."""
+        return issubclass(kind, tuple(self._small))
 
     def small(self, event: Event) -> None:
         """Put what any of the following functions puts."""
@@ -160,6 +214,7 @@ class Publishing:
         if publisher := self._publisher("odometry", event.source):
             publisher.put(self._messages.odometry(time, event))
         self._tf(time, self._transforms.odometry(event))
+        self._path(event, event.child_frame_id)
 
     def pose(self, event: PoseStamped) -> None:
         """Put a pose; a camera's is that of its optical frame."""
@@ -179,6 +234,7 @@ class Publishing:
                 make = self._messages.pose_with_covariance  # type: ignore[assignment]
             publisher.put(make(time, event, child))
         self._tf(time, self._transforms.estimate(event))
+        self._path(event, event.child_frame_id)
 
     def transform(self, event: TransformStamped) -> None:
         """Put a transform that a node sent, unless the bridge makes it itself."""
@@ -199,6 +255,21 @@ class Publishing:
         if publisher := self._publisher("range", event.source):
             publisher.put(self._messages.range(self._time(event.stamp), event))
 
+    def pressure(self, event: FluidPressure) -> None:
+        """Put a pressure."""
+        if publisher := self._publisher("pressure", event.source):
+            publisher.put(self._messages.pressure(self._time(event.stamp), event))
+
+    def magnetic_field(self, event: MagneticField) -> None:
+        """Put a magnetic field."""
+        if publisher := self._publisher("magnetic", event.source):
+            publisher.put(self._messages.magnetic_field(self._time(event.stamp), event))
+
+    def fix(self, event: NavSatFix) -> None:
+        """Put a place on Earth."""
+        if publisher := self._publisher("fix", event.source):
+            publisher.put(self._messages.fix(self._time(event.stamp), event))
+
     def score(self, event: Score) -> None:
         """Put a number, on a topic of its subject and metric."""
         if publisher := self._publisher("score", f"{event.subject}/{event.metric}"):
@@ -209,6 +280,30 @@ class Publishing:
         if publisher := self._publisher("clock", ""):
             publisher.put(self._messages.clock(self._time(now)))
 
+    def _path(self, event: Odometry | PoseEstimate, child: str) -> None:
+        """Add a pose to the path of its source, and now and then put the path."""
+        publisher = self._publisher("path", event.source)
+        if publisher is None:
+            return
+        config, frame = self._config, self._names.name(event.frame_id, event.source)
+        path, due = self._paths.get(event.source, (None, event.stamp))
+        if path is None or path.frame != frame:
+            path = Path(self._store, frame, config.path_step, config.path_length)
+            self._paths[event.source] = (path, due)
+        axes = self._names.axes(event.frame_id)
+        position: Vector3 = turn_vector(axes, event.position)
+        far = path.far(position)
+        if not far and event.stamp < due:
+            return
+        child_axes = self._names.axes(child)
+        rotation: Quaternion = turn_rotation(axes, child_axes, event.orientation)
+        time = self._time(event.stamp)
+        if far:
+            path.add(time, position, rotation)
+        if event.stamp >= due:
+            publisher.put(path.message(time, position, rotation))
+            self._paths[event.source] = (path, event.stamp + round(SECOND / config.path_rate))
+
     def _picture(
         self, what: What, event: Image | DepthImage | SegmentationImage, encoding: str
     ) -> None:
@@ -217,7 +312,8 @@ class Publishing:
             return
         writer = self._writers.get((what, event.source))
         if writer is None:
-            writer = ImageWriter(self._store, self._names.name(event.frame_id), encoding)
+            frame = self._names.name(event.frame_id, event.source)
+            writer = ImageWriter(self._store, frame, encoding)
             self._writers[what, event.source] = writer
         publisher.put(writer.write(self._time(event.stamp), event.data))
 

@@ -5,6 +5,7 @@ Zenoh has threads of its own and no asyncio: what it calls runs there, and must 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import threading
@@ -27,11 +28,17 @@ from nodes.ros2_bridge.keys import (
 )
 
 Take = Callable[[int, Callable[[], bytes]], None]
-"""Called in Zenoh's thread with a message's size and what returns its bytes."""
+"""Called in a thread with a message's size and what returns its bytes."""
 
 WAIT_BEFORE_DROP = 300
 """Microseconds that a put waits for a peer that does not read; Zenoh's default is 1000."""
 
+
+WAITING = 64
+"""Messages that Zenoh keeps until they are read; it lets the sender wait when there are more."""
+
+PAUSE = 0.001
+"""Seconds between two looks at what has come: what comes faster is taken in handfuls."""
 
 CLOSING = 3.0
 """Seconds."""
@@ -102,17 +109,15 @@ class Session:
 
     def subscribe(self, topic: Topic, take: Take) -> None:
         """Declare a subscription, and show it to ROS."""
-
-        def heard(sample: zenoh.Sample) -> None:
-            payload = sample.payload
-            take(len(payload), payload.to_bytes)
-
-        # Called where Zenoh delivers: with a thread between, a flood would pile up before it.
-        self._kept.append(
-            self._session.declare_subscriber(
-                self._key(topic), zenoh.handlers.Callback(heard, indirect=False)
-            )
+        # Not called by Zenoh for each message: each call takes the interpreter from the loop, and
+        # under a flood the loop would wait for it again and again.
+        subscriber = self._session.declare_subscriber(
+            self._key(topic), zenoh.handlers.FifoChannel(WAITING)
         )
+        self._kept.append(subscriber)
+        threading.Thread(
+            target=_read, args=(subscriber, take), name=f"hears {topic.name}", daemon=True
+        ).start()
         if self._keys == "rmw_zenoh":
             self._keep(endpoint_token(self._node, self.zid, 0, next(self._ids), "MS", topic))
 
@@ -178,6 +183,19 @@ class Publisher:
             self.sent += 1
         except zenoh.ZError:
             self.failed += 1
+
+
+def _read(subscriber: Any, take: Take) -> None:
+    """Take messages, in a thread, until the subscription or the session is closed."""
+    with contextlib.suppress(zenoh.ZError):
+        sample = subscriber.recv()
+        while True:
+            while sample is not None:
+                payload = sample.payload
+                take(len(payload), payload.to_bytes)
+                sample = subscriber.try_recv()
+            time.sleep(PAUSE)
+            sample = subscriber.recv()
 
 
 def _configuration(

@@ -24,10 +24,18 @@ Kind = Literal[
     "estimates",
     "scores",
     "ranges",
+    "pressures",
+    "magnetic_fields",
+    "fixes",
+    "lidars",
     "clock",
+    "paths",
 ]
 
-KINDS: tuple[Kind, ...] = Kind.__args__  # type: ignore[attr-defined]
+EVERYTHING: tuple[Kind, ...] = Kind.__args__  # type: ignore[attr-defined]
+
+KINDS: tuple[Kind, ...] = tuple(kind for kind in EVERYTHING if kind != "paths")
+"""What tells each thing once; paths tell poses again and again."""
 
 _Positive = Annotated[int, msgspec.Meta(ge=1)]
 _Rate = Annotated[float, msgspec.Meta(gt=0)]
@@ -72,10 +80,8 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         topic_name("/", self.topic)
         if bool(self.use) == bool(self.mapping):
             raise ValueError(f'{self.topic}: expected either as = "…" or mapping = "…"')
-        if self.mapping and not re.fullmatch(r"\w+(\.\w+)*:\w+", self.mapping):
-            raise ValueError(
-                f'{self.topic}: mapping: expected "module:function", found {self.mapping!r}'
-            )
+        if self.mapping:
+            _importable(self.topic, "mapping", "module:function", self.mapping)
         if self.use and (self.type, self.use) not in READERS:
             known = [f"{use} from {type_}" for type_, use in READERS]
             raise ValueError(
@@ -87,6 +93,47 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def qos(self) -> Qos:
         """Return the quality of service."""
         return Qos(reliable=self.reliable, depth=self.depth)
+
+
+class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A topic to publish beyond those that the bridge knows of.
+
+    Attributes:
+        topic: Relative to the namespace, or with a leading slash.
+        type: ``sensor_msgs/msg/BatteryState``.
+        event: ``module:Class`` of the events that become its messages; subclasses come too.
+        mapping: ``module:function``, which takes an event and the `Writing` and returns a message
+            of `type`, or None. It is called in a thread beside the loop.
+        source: Take only events of this source or below it.
+        reliable: Quality of service, as ROS shows it.
+        transient_local: Whether late joiners get the last `depth` messages.
+        depth: How many messages are kept, and how many events wait at most.
+    """
+
+    topic: str
+    type: str
+    event: str
+    mapping: str
+    source: str = ""
+    reliable: bool = True
+    transient_local: bool = False
+    depth: _Positive = 10
+
+    def __post_init__(self) -> None:
+        dds_type(self.type)
+        topic_name("/", self.topic)
+        _importable(self.topic, "event", "module:Class", self.event)
+        _importable(self.topic, "mapping", "module:function", self.mapping)
+
+    @property
+    def qos(self) -> Qos:
+        """Return the quality of service."""
+        return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
+
+
+def _importable(topic: str, what: str, form: str, found: str) -> None:
+    if not re.fullmatch(r"\w+(\.\w+)*:\w+", found):
+        raise ValueError(f'{topic}: {what}: expected "{form}", found {found!r}')
 
 
 class Ros2BridgeConfig(NodeConfig):
@@ -109,16 +156,26 @@ class Ros2BridgeConfig(NodeConfig):
             ``use_sim_time``). ``wall``: they are shifted to the wall clock, and there is no
             ``/clock``; with the real clock only.
         clock_rate: Of ``/clock``, Hz.
-        vehicle: Whose truth ``/tf`` shows; if empty, the first that is announced.
+        vehicle: Whose truth ``/tf`` shows; if empty, all that are announced: with the vehicle's
+            name before its frames if there are several.
         tf: ``truth``, or the source of the estimates that place ``base_link`` instead.
+        path_rate: Messages a second, at most, of the way that a vehicle or an estimate has come.
+        path_step: Metres from one pose of a path to the next.
+        path_length: Poses of a path at most; beyond that, every other is left out and the step
+            doubled, so that a path always reaches back to its start.
         covariance: Publish estimates as PoseWithCovarianceStamped.
         raw: Publish images as they are.
-        compressed: Publish images as ``CompressedImage``, too; depth images are left as they are.
+        compressed: Publish images as ``CompressedImage``, too.
+        compressed_depth: Publish depth images as compressed_depth_image_transport does, too.
+        depth_max: Metres beyond which such depth is unknown.
+        depth_quantization: Metres near which steps of such depth are a hundredth of the depth;
+            farther away they grow with its square.
         jpeg_quality: 1 to 100.
         image_qos: ``reliable`` or ``best_effort``.
         largest: Bytes of a message from outside at most.
         definitions: Types that ROS 2 does not come with, and the ``.msg`` file of each.
         subscriptions: What to hear.
+        publications: What to publish beyond that.
     """
 
     domain_id: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
@@ -129,20 +186,27 @@ class Ros2BridgeConfig(NodeConfig):
     connect: tuple[str, ...] | None = None
     listen: tuple[str, ...] | None = None
     zenoh_config: str = ""
-    publish: tuple[Kind, ...] = KINDS
+    publish: tuple[Kind, ...] = EVERYTHING
     topics: dict[str, str] = msgspec.field(default_factory=dict)
     time: Literal["simulated", "wall"] = "simulated"
     clock_rate: _Rate = 100.0
     vehicle: str = ""
     tf: str = "truth"
+    path_rate: _Rate = 2.0
+    path_step: _Rate = 0.05
+    path_length: Annotated[int, msgspec.Meta(ge=3)] = 1000
     covariance: bool = False
     raw: bool = True
     compressed: Literal["", "jpeg", "png"] = ""
+    compressed_depth: bool = False
+    depth_max: _Rate = 10.0
+    depth_quantization: _Rate = 100.0
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
     image_qos: Literal["reliable", "best_effort"] = "reliable"
     largest: _Positive = 64 * 1024 * 1024
     definitions: dict[str, str] = msgspec.field(default_factory=dict)
     subscriptions: tuple[Subscription, ...] = ()
+    publications: tuple[OwnPublication, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.namespace.startswith("/"):

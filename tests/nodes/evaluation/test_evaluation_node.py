@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from events import Event, Image, PositionSetpoint, Score, TrackedFeatures
+from events import Event, Image, PlannedPose, PositionSetpoint, Score, TrackedFeatures
 from nodes.evaluation import Evaluation
 from nodes.evaluation.results import read_errors
 from nodes.trajectory.formats import read_tum
@@ -138,6 +138,26 @@ def test_an_estimator_that_says_nothing_has_failed(tmp_path: Path) -> None:
 def test_without_a_truth_there_is_no_verdict_but_a_reason(tmp_path: Path) -> None:
     verdict = judged(tmp_path, announced(), [estimate(0)])
     assert "no odometry" in verdict["estimators"]["est"]["failed"][0]
+
+
+def test_the_flight_is_held_against_its_plan(tmp_path: Path) -> None:
+    """Half a metre aside, and once two metres; set-points are no plan."""
+    estimates: list[Event] = [estimate(s) for s in FRAMES]
+    orders: list[Event] = [PositionSetpoint(stamp=0, source="tour", position=(9.0, 9.0, 9.0))]
+    figures = judged(tmp_path, announced(), truth(10), estimates, orders)["estimators"]["est"]
+    assert "plan_rmse_m" not in figures
+    plan: list[Event] = [
+        PlannedPose(stamp=s, source="pilot", position=(x, y, z + (2.0 if n == 5 else 0.5)), yaw=0.0)
+        for n, s in enumerate(FRAMES)
+        for x, y, z in [place(s)]
+    ]
+    limits = {"plan_rmse_m": 0.1}
+    verdict = judged(tmp_path, announced(), truth(10), estimates, plan, orders, thresholds=limits)
+    figures = verdict["estimators"]["est"]
+    rmse = math.sqrt((100 * 0.25 + 4.0) / 101)
+    assert figures["plan_rmse_m"] == pytest.approx(rmse, abs=1e-6)
+    assert figures["plan_max_m"] == pytest.approx(2.0, abs=1e-6)
+    assert figures["failed"] == [f"plan_rmse_m: expected at most 0.1, found {rmse:.4g}"]
 
 
 def test_files_hold_what_was_said(tmp_path: Path) -> None:

@@ -43,8 +43,16 @@ def test_only_a_single_camera_alone_has_no_scale(mode: str, scale_free: bool) ->
 
 def test_a_missing_vocabulary_is_an_error_with_the_command_that_makes_one(tmp_path: Path) -> None:
     missing = str(tmp_path / "none.txt")
-    with pytest.raises(NodeError, match="python -m runtime vocabulary CONFIG"):
+    with pytest.raises(NodeError, match=r"python -m runtime vocabulary config\.toml"):
         run(camera("drone/front", "rgb", "depth"), vocabulary=missing)
+
+
+def test_a_file_in_another_format_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    """ORB-SLAM3 would end its process, or read nonsense."""
+    other = tmp_path / "other.txt"
+    other.write_text("no vocabulary\n")
+    with pytest.raises(NodeError, match=r"other\.txt: line 1: expected four whole numbers"):
+        run(camera("drone/front", "rgb", "depth"), vocabulary=str(other))
 
 
 def test_depth_is_asked_for_in_the_modes_that_use_it(tmp_path: Path) -> None:

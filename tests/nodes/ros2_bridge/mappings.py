@@ -6,6 +6,10 @@ from typing import Any, cast
 
 from events import Event
 from nodes.ros2_bridge.incoming import Reading
+from nodes.ros2_bridge.telling import Writing
+
+PERCENT = 100
+BATTERY = "sensor_msgs/msg/BatteryState"
 
 
 class Battery(Event):
@@ -28,3 +32,30 @@ def broken(message: Any, reading: Reading) -> Event | None:
 
 def no_event(message: Any, reading: Reading) -> Event | None:
     return cast("Event", "not an event")
+
+
+def tell_battery(event: Battery, writing: Writing) -> Any:
+    if event.percentage < 0.0:
+        return None
+    header = writing.header(event.stamp, "base_link", event.source)
+    return writing.make(BATTERY, header=header, percentage=event.percentage, present=True)
+
+
+def tell_broken(event: Battery, writing: Writing) -> Any:
+    raise KeyError("no such thing")
+
+
+def tell_another_type(event: Battery, writing: Writing) -> Any:
+    return writing.make("std_msgs/msg/Float64", data=event.percentage)
+
+
+def tell_nonsense(event: Battery, writing: Writing) -> Any:
+    return "not a message"
+
+
+def tell_a_text_for_a_number(event: Battery, writing: Writing) -> Any:
+    return writing.make(BATTERY, percentage="full")
+
+
+def tell_no_such_field(event: Battery, writing: Writing) -> Any:
+    return writing.make(BATTERY, charm=1.0)

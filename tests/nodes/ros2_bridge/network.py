@@ -34,6 +34,14 @@ listen = ["tcp/127.0.0.1:{port}"]
 """
 
 SUBSCRIPTIONS = """
+compressed = "jpeg"
+compressed_depth = true
+
+[[nodes.publications]]
+topic = "battery"
+type = "sensor_msgs/msg/BatteryState"
+event = "tests.nodes.ros2_bridge.mappings:Battery"
+mapping = "tests.nodes.ros2_bridge.mappings:tell_battery"
 [[nodes.subscriptions]]
 topic = "/cmd_vel"
 type = "geometry_msgs/msg/Twist"

@@ -12,8 +12,12 @@ from events import (
     Announcement,
     DepthImage,
     Event,
+    FluidPressure,
     Image,
     Imu,
+    LaserScan3D,
+    MagneticField,
+    NavSatFix,
     PointCloud,
     PoseEstimate,
     PoseStamped,
@@ -23,6 +27,7 @@ from events import (
 )
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from tests.nodes.ros2_bridge import said
+from tests.nodes.ros2_bridge.mappings import Battery
 
 
 class TalkerConfig(NodeConfig):
@@ -67,6 +72,11 @@ class Talker(Node[TalkerConfig]):
                 stamp=now, source="mapper", points=points, colors=np.full((3, 3), 9, np.uint8)
             ),
             Range(stamp=now, source="drone", range=1.0, min_range=0.1, max_range=5.0),
+            FluidPressure(stamp=now, source="drone", fluid_pressure=1e5),
+            MagneticField(stamp=now, source="drone", magnetic_field=(1e-5, 2e-5, 3e-5)),
+            NavSatFix(stamp=now, source="drone", latitude=47.0, longitude=8.0, altitude=400.0),
+            LaserScan3D(stamp=now, source="drone/lidar", frame_id="base_link", points=points),
+            Battery(stamp=now, source="drone", percentage=0.75),
             Score(stamp=now, source="e", subject="vo", metric="ate", value=0.25, unit="m"),
         ):
             self.things.send(event)

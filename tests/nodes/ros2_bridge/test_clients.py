@@ -21,21 +21,30 @@ pytest.importorskip("zenoh_ros2_sdk")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(150)]
 
 TOPICS = {
+    "/battery": "sensor_msgs/msg/BatteryState",
     "/clock": "rosgraph_msgs/msg/Clock",
     "/cmd_vel": "geometry_msgs/msg/Twist",
     "/drone/camera/camera_info": "sensor_msgs/msg/CameraInfo",
     "/drone/camera/depth/camera_info": "sensor_msgs/msg/CameraInfo",
     "/drone/camera/depth/image_raw": "sensor_msgs/msg/Image",
+    "/drone/camera/depth/image_raw/compressedDepth": "sensor_msgs/msg/CompressedImage",
     "/drone/camera/image_raw": "sensor_msgs/msg/Image",
+    "/drone/camera/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
     "/drone/camera/pose": "geometry_msgs/msg/PoseStamped",
+    "/drone/fix": "sensor_msgs/msg/NavSatFix",
     "/drone/imu": "sensor_msgs/msg/Imu",
+    "/drone/lidar/lidar": "sensor_msgs/msg/PointCloud2",
+    "/drone/mag": "sensor_msgs/msg/MagneticField",
     "/drone/odom": "nav_msgs/msg/Odometry",
+    "/drone/path": "nav_msgs/msg/Path",
+    "/drone/pressure": "sensor_msgs/msg/FluidPressure",
     "/drone/range": "sensor_msgs/msg/Range",
     "/mapper/points": "sensor_msgs/msg/PointCloud2",
     "/scores/vo/ate": "std_msgs/msg/Float64",
     "/slam/pose": "geometry_msgs/msg/PoseStamped",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/vo/path": "nav_msgs/msg/Path",
     "/vo/pose": "geometry_msgs/msg/PoseStamped",
 }
 
@@ -75,6 +84,18 @@ def test_the_client_decodes_every_topic(seen: tuple[Any, Any, str]) -> None:
     assert heard["/drone/camera/camera_info"]["header"]["frame_id"] == "camera_optical_frame"
     assert heard["/mapper/points"]["width"] == 3
     assert heard["/scores/vo/ate"]["data"] == 0.25
+    assert heard["/drone/pressure"]["fluid_pressure"] == 1e5
+    assert heard["/drone/mag"]["magnetic_field"] == {"x": 1e-5, "y": -2e-5, "z": -3e-5}
+    assert heard["/drone/fix"]["latitude"] == 47.0
+    assert [f["name"] for f in heard["/drone/lidar/lidar"]["fields"]] == ["x", "y", "z"]
+    assert heard["/battery"]["percentage"] == 0.75
+    for path in (heard["/drone/path"], heard["/vo/path"]):
+        assert path["header"]["frame_id"] == path["poses"][0]["header"]["frame_id"] == "map"
+    assert heard["/drone/path"]["poses"][0]["pose"]["position"] == {"x": 2.5, "y": 1.0, "z": 3.0}
+    assert heard["/drone/camera/image_raw/compressed"]["format"] == "rgb8; jpeg compressed bgr8"
+    packed = heard["/drone/camera/depth/image_raw/compressedDepth"]
+    assert packed["format"] == "32FC1; compressedDepth png"
+    assert packed["data"]["first"] == [0, 0, 0, 0]
     assert [t["child_frame_id"] for t in heard["/tf_static"]["transforms"]] == [
         "odom",
         "camera_link",

@@ -87,6 +87,25 @@ async def test_a_flood_is_dropped_before_its_bytes_are_read() -> None:
     assert box.said["too many messages"] == 10_000 - read
 
 
+async def test_every_message_of_a_flood_is_delivered_or_counted() -> None:
+    """Whatever thread it comes in, and however slowly the loop reads."""
+    box = Box(depth=5, rate=2000.0, cost=1e-5)
+    sizes = [1, 1, 1, 200]
+
+    def flood() -> None:
+        for number in range(2500):
+            box.clock.now += 1e-4
+            box.inbox.take(sizes[number % 4], lambda: b"x")
+
+    async with asyncio.TaskGroup() as group:
+        for _ in range(4):
+            group.create_task(asyncio.to_thread(flood))
+    await asyncio.sleep(0.01)
+    assert box.said["message too large"] == 4 * 2500 // 4
+    assert box.said["too many messages"] > 0
+    assert len(box.got) + box.said.total() == 10_000
+
+
 async def test_what_is_too_large_is_not_read() -> None:
     box = Box()
     box.inbox.take(101, lambda: 1 / 0)  # type: ignore[arg-type,return-value]

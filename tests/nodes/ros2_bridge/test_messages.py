@@ -7,7 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from events import Imu, PoseEstimate, PoseStamped, Range, Score
+from events import (
+    FluidPressure,
+    Imu,
+    MagneticField,
+    NavSatFix,
+    PoseEstimate,
+    PoseStamped,
+    Range,
+    Score,
+)
 from nodes.ros2_bridge.messages import Messages, Transform
 from nodes.ros2_bridge.plan import FrameNames
 from nodes.ros2_bridge.typestore import TypeStore
@@ -115,6 +124,22 @@ def test_transforms_clock_range_and_score_arrive_as_they_are(messages: Messages)
     assert (message.range, message.min_range, message.max_range) == (1.5, 0.5, 4.0)
     score = Score(stamp=0, source="e", subject="vo", metric="ate", value=0.25, unit="m")
     assert read(messages.score(score), "std_msgs/msg/Float64").data == 0.25
+
+
+def test_pressure_field_and_fix_are_in_the_bodys_frame_and_axes(messages: Messages) -> None:
+    pressure = FluidPressure(stamp=0, source="drone", fluid_pressure=101_325.0, variance=4.0)
+    message = read(messages.pressure(TIME, pressure), "sensor_msgs/msg/FluidPressure")
+    assert (message.fluid_pressure, message.variance) == (101_325.0, 4.0)
+    assert (message.header.frame_id, message.header.stamp.nanosec) == ("base_link", 7)
+    field = MagneticField(stamp=0, source="drone", magnetic_field=(2e-5, 1e-6, 4e-5))
+    message = read(messages.magnetic_field(TIME, field), "sensor_msgs/msg/MagneticField")
+    assert xyz(message.magnetic_field) == (2e-5, -1e-6, -4e-5)
+    assert not message.magnetic_field_covariance.any()
+    fix = NavSatFix(stamp=0, source="drone", latitude=47.4, longitude=8.5, altitude=488.0)
+    message = read(messages.fix(TIME, fix), "sensor_msgs/msg/NavSatFix")
+    assert (message.latitude, message.longitude, message.altitude) == (47.4, 8.5, 488.0)
+    assert (message.status.status, message.status.service) == (0, 1)
+    assert message.position_covariance_type == 0
 
 
 def test_a_range_of_humble_has_no_variance() -> None:

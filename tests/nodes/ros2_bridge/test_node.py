@@ -8,10 +8,21 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 import zenoh
 
-from events import CameraAnnouncement, EstimatorAnnouncement, Image
+from events import (
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    FluidPressure,
+    Image,
+    LaserScan3D,
+    MagneticField,
+    NavSatFix,
+)
 from nodes.ros2_bridge.keys import Topic, data_key
 from nodes.ros2_bridge.messages import Messages
 from nodes.ros2_bridge.node import Ros2Bridge
@@ -20,6 +31,7 @@ from nodes.ros2_bridge.typestore import TypeStore
 from runtime.errors import ConfigError, FatalError, MissingDependencyError
 from runtime.testing import run_node
 from tests.nodes.ros2_bridge import said
+from tests.nodes.ros2_bridge.mappings import Battery
 from tests.nodes.ros2_bridge.network import free_port, zenoh_session
 
 ANNOUNCED = [said.vehicle(), said.camera(), said.imu(), said.estimator()]
@@ -107,6 +119,59 @@ def test_only_what_is_asked_for_is_published_under_the_name_that_is_asked_for(
     assert topics == {"truth", "drone/camera/camera_info", "drone/camera/image_raw/compressed"}
 
 
+def test_further_sensors_paths_and_mappings_of_the_users_own(listener: Listener) -> None:
+    """Each event becomes its message, and a path grows but is sent seldom."""
+    mapping = "tests.nodes.ros2_bridge.mappings"
+    table = {
+        "topic": "battery",
+        "type": "sensor_msgs/msg/BatteryState",
+        "event": f"{mapping}:Battery",
+        "mapping": f"{mapping}:tell_battery",
+        "transient_local": True,
+    }
+    publish = ["pressures", "magnetic_fields", "fixes", "lidars", "paths", "depth"]
+    config = listener.config | {"publications": [table], "publish": publish, "path_rate": 10.0}
+    config |= {"compressed_depth": True}
+    optical, points = "drone/camera_optical", np.eye(3, dtype=np.float32)
+    depth, ms = np.full((48, 64), 2.5, np.float32), 1_000_000
+    inputs = [
+        *ANNOUNCED,
+        FluidPressure(stamp=1, source="drone", fluid_pressure=1e5),
+        MagneticField(stamp=1, source="drone", magnetic_field=(1.0, 2.0, 3.0)),
+        NavSatFix(stamp=1, source="drone", latitude=1.0, longitude=2.0, altitude=3.0),
+        LaserScan3D(stamp=1, source="drone/lidar", frame_id="lidar", points=points),
+        DepthImage(stamp=1, source="drone/camera", frame_id=optical, data=depth),
+        Battery(stamp=1, source="drone", percentage=0.5),
+        Battery(stamp=2, source="drone", percentage=-1.0),
+        *[
+            msgspec.structs.replace(said.odometry(t * ms), position=(0.1 * t, 0.0, 0.0))
+            for t in range(10, 260)
+        ],
+        FluidPressure(stamp=300 * ms, source="last", fluid_pressure=1e5),
+    ]
+    run_node(Ros2Bridge, inputs=inputs, config=config, duration=0.4)
+    found = {k.rsplit("/", 2)[0]: v for k, v in listener.collect("0/last/pressure/").items()}
+    assert {name: len(samples) for name, samples in found.items()} == {
+        "0/drone/pressure": 1,
+        "0/drone/mag": 1,
+        "0/drone/fix": 1,
+        "0/drone/lidar/lidar": 1,
+        "0/drone/camera/depth/camera_info": 1,
+        "0/drone/camera/depth/image_raw": 1,
+        "0/drone/camera/depth/image_raw/compressedDepth": 1,
+        "0/battery": 1,
+        "0/drone/path": 3,
+        "0/last/pressure": 1,
+    }
+    paths: list[Any] = [
+        said.store().deserialize(sample.payload.to_bytes(), "nav_msgs/msg/Path")
+        for sample in found["0/drone/path"]
+    ]
+    assert [len(path.poses) for path in paths] == [1, 101, 201]
+    last = paths[-1].poses[-1]
+    assert (last.header.frame_id, last.pose.position.y) == ("map", pytest.approx(21.0))
+
+
 def test_subscriptions_in_lockstep_are_warned_of_and_announced(
     listener: Listener, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -167,6 +232,10 @@ def test_a_camera_that_never_comes_ends_the_run() -> None:
         (
             {"subscriptions": [{"topic": "a", "type": "a/msg/B", "mapping": "a:b"}]},
             "known message type",
+        ),
+        (
+            {"publications": [{"topic": "a", "type": POSE, "event": "a:B", "mapping": "a:b"}]},
+            "a: event: expected something that can be imported",
         ),
         ({"definitions": {"a/msg/B": "/no/such/file"}}, "a/msg/B: expected a readable"),
     ],

@@ -80,6 +80,17 @@ def test_a_cloud_has_the_bytes_that_rosbags_makes(count: int) -> None:
     np.testing.assert_array_equal(packed & 255, colours[:, 2])
 
 
+def test_a_sweep_has_no_colours() -> None:
+    points = RANDOM.random((5, 3), np.float32)
+    data = CloudWriter(said.store(), "lidar", "xyz").write((1, 2), points)
+    message: Any = said.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
+    assert bytes(said.store().serialize(message)) == bytes(data)
+    assert [(f.name, f.offset) for f in message.fields] == [("x", 0), ("y", 4), ("z", 8)]
+    rows = message.data.reshape(5, message.point_step)
+    np.testing.assert_array_equal(rows[:, :12].copy().view(np.float32), points)
+    assert not rows[:, 12:].any()
+
+
 @pytest.mark.parametrize("shape", [(48, 64, 3), (48, 64)])
 def test_a_png_holds_the_picture_and_names_it_as_image_transport_does(
     shape: tuple[int, ...],

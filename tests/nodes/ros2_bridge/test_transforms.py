@@ -80,11 +80,48 @@ def test_an_estimate_may_place_the_body_instead_of_the_truth() -> None:
     assert tree.estimate(msgspec.structs.replace(in_odom, source="other")) == []
 
 
-def test_another_vehicle_does_not_move_the_body() -> None:
+def test_with_several_vehicles_each_has_its_name_before_its_frames() -> None:
+    other = msgspec.structs.replace(said.vehicle(), source="other", position=(9.0, 0.0, 0.0))
+    tree = made(said.vehicle(), said.camera(), other, said.camera("other/camera"))
+    moved = msgspec.structs.replace(said.odometry(), source="other", position=(9.0, 0.0, -5.0))
+    every = tree.static() + tree.odometry(said.odometry()) + tree.odometry(moved)
+    assert {each.child: each.parent for each in every} == {
+        f"{name}/{child}": parent if parent == "map" else f"{name}/{parent}"
+        for name in ("drone", "other")
+        for child, parent in {
+            "odom": "map",
+            "base_link": "odom",
+            "camera_link": "base_link",
+            "camera_optical_frame": "camera_link",
+        }.items()
+    }
+    np.testing.assert_allclose(lookup(every, "drone/base_link")[:3, 3], (2.5, 1, 3), atol=1e-12)
+    np.testing.assert_allclose(lookup(every, "other/base_link")[:3, 3], (0, 9, 5), atol=1e-12)
+    np.testing.assert_allclose(lookup(every, "other/camera_link")[:3, 3], (0.1, 8.8, 4.7))
+
+
+def test_an_estimate_places_its_own_vehicle_and_the_truth_the_others() -> None:
     other = msgspec.structs.replace(said.vehicle(), source="other")
-    tree = made(said.vehicle(), other)
+    tree = made(said.vehicle(), other, body="other/vo")
+    moved = msgspec.structs.replace(said.odometry(), source="other")
+    assert [each.child for each in tree.odometry(said.odometry())] == ["drone/base_link"]
+    assert tree.odometry(moved) == []
+    estimate = PoseEstimate(
+        stamp=1, source="other/vo", position=(0.0, 0.0, 0.0), orientation=(1.0, 0.0, 0.0, 0.0)
+    )
+    (found,) = tree.estimate(estimate)
+    assert (found.parent, found.child) == ("other/odom", "other/base_link")
+
+
+def test_a_vehicle_that_is_chosen_is_alone() -> None:
+    other = msgspec.structs.replace(said.vehicle(), source="other")
+    tree = Transforms(FrameNames(), "other", "truth")
+    tree.announced(said.vehicle())
+    tree.announced(other)
     assert [each.child for each in tree.static()] == ["odom"]
-    assert tree.odometry(msgspec.structs.replace(said.odometry(), source="other")) == []
+    assert tree.odometry(said.odometry()) == []
+    moved = msgspec.structs.replace(said.odometry(), source="other")
+    assert [each.child for each in tree.odometry(moved)] == ["base_link"]
 
 
 def test_two_cameras_of_one_name_have_frames_of_their_own() -> None:

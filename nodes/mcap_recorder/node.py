@@ -1,0 +1,169 @@
+"""Records a run: everything that is said, as MCAP, beside the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+
+from events import Announcement, Event
+from nodes.mcap_recorder.backlog import Backlog
+from nodes.mcap_recorder.disk import RecordingError
+from nodes.mcap_recorder.order import Order
+from nodes.mcap_recorder.recording import Recording, spare_cores
+from nodes.mcap_recorder.settings import McapRecorderConfig
+from runtime import Input, Node
+
+_WAITING = 1 << 16
+"""Events that may come while simulated time waits: more than are ever said at one moment."""
+
+
+class McapRecorder(Node[McapRecorderConfig]):
+    """Writes all events to a file that ROS 2's tools, Foxglove and `nodes.replay` read.
+
+    ::
+
+        [[nodes]]
+        name = "recorder"
+        type = "nodes.mcap_recorder:McapRecorder"
+
+    Put it first in the file: it then hears events before those that they cause, and those that
+    another node handles. The order in the recording is the order in which it heard.
+    """
+
+    events = Input(Event, bound=_WAITING, overflow="drop_oldest")
+
+    def __init__(self) -> None:
+        self._recording: Recording | None = None
+        self._backlog = Backlog(self.config.memory, self.config.when_full)
+        self._failed: asyncio.Future[RecordingError] | None = None
+        self._warned_at = 1
+        self._waits = 0
+        self._waited = 0.0
+
+    async def on_startup(self) -> None:
+        """Open the file.
+
+        Raises:
+            MissingDependencyError: mcap or rosbags is not installed.
+            FatalError: It cannot be written.
+        """
+        if self.out is None:
+            self.log.warning("the run writes no files, so nothing is recorded")
+            return
+        config = self.config
+        if config.when_full == "wait" and self.clock.kind == "real":
+            self._backlog.when_full = "drop_images"
+        loop = asyncio.get_running_loop()
+        self._failed = loop.create_future()
+        try:
+            self._recording = await self.offload(self._open, loop)
+        except RecordingError as error:
+            self.log.fatal("%s", error)
+        assert self._recording is not None
+        self._recording.start()
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Record what will be provided."""
+        if self._recording is not None:
+            self._backlog.put(0, announcement)
+
+    async def run(self) -> None:
+        """Hand all that is said to the thread that writes."""
+        if self._recording is None:
+            return
+        self.start(self._watch())
+        clock, backlog, put = self.clock, self._backlog, self._backlog.put
+        waits = backlog.when_full == "wait"
+        async for event in self.events:
+            put(clock.now(), event)
+            if backlog.dropped >= self._warned_at:
+                self._warn()
+            if waits and backlog.is_full:
+                await self._wait()
+
+    async def on_shutdown(self) -> None:
+        """Write what still waits, and the index.
+
+        Raises:
+            FatalError: The disk is full, or the like.
+        """
+        recording, backlog = self._recording, self._backlog
+        if recording is None:
+            return
+        while self.events.statistics().buffered:
+            backlog.put(self.clock.now(), self.events.receive_nowait())
+        await self.offload(recording.close, self.clock.now())
+        lost = backlog.dropped + recording.unwritten
+        self.events.dropped += lost
+        result = recording.result
+        self.log.info(
+            "%s: %d events, %.1f MB; at most %.1f MB waited%s",
+            recording.path,
+            result.written,
+            result.size / 1e6,
+            backlog.peak / 1e6,
+            f", and simulated time {self._waits} times for the disk, {self._waited:.1f} s in all"
+            if self._waits
+            else "",
+        )
+        if lost:
+            self.log.warning("%d events are not in the recording", lost)
+        if recording.error is not None and self._failed is not None and not self._failed.done():
+            self.log.fatal("%s", recording.error)
+
+    def _open(self, loop: asyncio.AbstractEventLoop) -> Recording:
+        assert self.out is not None
+
+        def complain(what: str) -> None:
+            loop.call_soon_threadsafe(self.log.warning, "%s", what)
+
+        def failed(error: RecordingError) -> None:
+            loop.call_soon_threadsafe(self._fail, error)
+
+        order = Order(
+            path=str(self._path(self.out)),
+            config=self.config,
+            attachment=str(self.out / "config.toml"),
+            niceness=5,
+            cores=spare_cores() if self.clock.kind == "real" else (),
+        )
+        return Recording(order, self._backlog, failed, complain)
+
+    def _path(self, out: Path) -> Path:
+        """Return the file; should the node be restarted in the run, one beside that of before."""
+        path = out / self.config.file
+        number = 1
+        while self.clock.now() > 0 and path.exists():
+            number += 1
+            path = out / self.config.file.replace(".mcap", f"-{number}.mcap")
+        return path
+
+    def _fail(self, error: RecordingError) -> None:
+        if self._failed is not None and not self._failed.done():
+            self._failed.set_result(error)
+
+    async def _watch(self) -> None:
+        """End the run when nothing can be recorded any more."""
+        assert self._failed is not None
+        self.log.fatal("%s", await self._failed)
+
+    async def _wait(self) -> None:
+        """Have simulated time wait until there is room."""
+        if not self._waits:
+            self.log.info(
+                "the disk is slower than the run: simulated time waits, now and again, with "
+                "%.0f MB to write",
+                self._backlog.bytes / 1e6,
+            )
+        began = time.monotonic()
+        await self.offload(self._backlog.wait_for_room)
+        self._waits += 1
+        self._waited += time.monotonic() - began
+
+    def _warn(self) -> None:
+        dropped = self._backlog.dropped
+        self._warned_at = 10 * dropped
+        self.log.warning(
+            "the disk is too slow: %d events dropped so far (%s)", dropped, self._backlog.when_full
+        )

@@ -1,0 +1,49 @@
+"""What a run and the process that records for it say to each other, beside the events."""
+
+from __future__ import annotations
+
+import sys
+
+import msgspec
+
+from nodes.mcap_recorder.settings import McapRecorderConfig
+
+
+class Order(msgspec.Struct, frozen=True):
+    """What to do.
+
+    Attributes:
+        path: The file to write.
+        config: The recorder's settings.
+        attachment: A file to add, if it is there.
+        niceness: How much to stand back for others.
+        cores: To run on; all if empty.
+    """
+
+    path: str
+    config: McapRecorderConfig
+    attachment: str
+    niceness: int
+    cores: tuple[int, ...]
+
+
+class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A line of what the process says.
+
+    Attributes:
+        what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``.
+        text: For messages.
+        written: Events in the file.
+        size: Bytes of the file.
+    """
+
+    what: str
+    text: str = ""
+    written: int = 0
+    size: int = 0
+
+
+def command(order: Order) -> list[str]:
+    """Return the command that starts such a process."""
+    text = msgspec.json.encode(order).decode()
+    return [sys.executable, "-m", "nodes.mcap_recorder.process", text]

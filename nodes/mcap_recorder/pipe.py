@@ -1,0 +1,104 @@
+"""Events through a pipe: what the thread that feeds writes, and the process that records reads.
+
+i64 LE   time of publication (ns), or of the end
+u32 LE   length of the frame
+u8       0: an event, 1: an announcement, 2: the end
+frame    of `runtime.wire`
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from typing_extensions import Buffer
+
+from runtime.wire import Packed
+
+EVENT, ANNOUNCEMENT, END = 0, 1, 2
+
+_HEAD = struct.Struct("<qIB")
+_LENGTH = struct.Struct("<I")
+_MOST = 512
+"""Buffers of a call of writev(2), which takes 1024."""
+
+
+class Piece(NamedTuple):
+    """What comes out of the pipe."""
+
+    time: int
+    what: int
+    frame: bytearray
+
+
+def pieces(time: int, packed: Packed, what: int) -> list[Buffer]:
+    """Return the bytes of an event, as buffers, none of them copied."""
+    head = _LENGTH.pack(len(packed.head)) + packed.head
+    found: list[Buffer] = [_HEAD.pack(time, packed.size, what) + head]
+    at = len(head)
+    for array, offset in zip(packed.arrays, packed.offsets, strict=True):
+        if offset > at:
+            found.append(bytes(offset - at))
+        if array.nbytes:
+            found.append(array.reshape(-1).view(np.uint8).data)
+        at = offset + array.nbytes
+    if packed.size > at:
+        found.append(bytes(packed.size - at))
+    return found
+
+
+def end(time: int) -> bytes:
+    """Return what ends the pipe in order."""
+    return _HEAD.pack(time, 0, END)
+
+
+def write_all(file: int, buffers: Sequence[Buffer]) -> None:
+    """Write buffers to a file descriptor, waiting as long as it takes; Python's lock is free.
+
+    Raises:
+        OSError: Nobody reads any more.
+    """
+    views = [memoryview(buffer).cast("B") for buffer in buffers]
+    while views:
+        written = os.writev(file, views[:_MOST])
+        while views and written >= len(views[0]):
+            written -= len(views.pop(0))
+        if written:
+            views[0] = views[0][written:]
+
+
+def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator[Piece]:
+    """Yield what comes, up to the end of the pipe; half a piece at its end is left out.
+
+    Args:
+        file: The descriptor to read.
+        idle: Seconds without anything after which `while_idle` is called, again and again.
+        while_idle: See `idle`.
+    """
+    while True:
+        while not select.select([file], [], [], idle)[0]:
+            while_idle()
+        head = _read(file, _HEAD.size)
+        if len(head) < _HEAD.size:
+            return
+        time, length, what = _HEAD.unpack(head)
+        frame = _read(file, length)
+        if len(frame) < length:
+            return
+        yield Piece(time, what, frame)
+
+
+def _read(file: int, size: int) -> bytearray:
+    """Return as many bytes, or fewer at the end."""
+    buffer = bytearray(size)
+    view, got = memoryview(buffer), 0
+    while got < size:
+        count = os.readv(file, [view[got:]])
+        if count == 0:
+            return bytearray(view[:got])
+        got += count
+    return buffer

@@ -1,0 +1,205 @@
+"""A file that is being written: a thread hands what waits to a process, and hears how that does.
+
+The loop puts events into the backlog, and asks nothing here that waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+
+import msgspec
+from typing_extensions import Buffer
+
+from events import Announcement
+from nodes.mcap_recorder import pipe
+from nodes.mcap_recorder.backlog import Backlog, Waiting
+from nodes.mcap_recorder.disk import RecordingError
+from nodes.mcap_recorder.order import Answer, Order, command
+from runtime.errors import MissingDependencyError, WireError
+from runtime.wire import pack
+
+_PAUSE = 0.005
+"""Seconds between two looks at an empty backlog: cheaper than waking the thread at every event."""
+
+_AT_ONCE = 1 << 16
+"""Bytes that are handed over together."""
+
+_IN_A_ROW = 16
+"""Events between two chances for the loop to run, which needs Python's lock too."""
+
+_PIPE = 1 << 20
+"""Bytes that the pipe holds: Linux allows no more without privileges."""
+
+
+class Recording:
+    """Hands a backlog to a process that writes it.
+
+    Args:
+        order: To the process.
+        backlog: Where events come from.
+        failed: Called in a thread, once, with what ended the writing.
+        complain: Called in a thread with what could not be recorded.
+
+    Raises:
+        RecordingError: The file cannot be made.
+        MissingDependencyError: A library is not installed.
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        backlog: Backlog,
+        failed: Callable[[RecordingError], None],
+        complain: Callable[[str], None],
+    ) -> None:
+        self.path = order.path
+        self.backlog = backlog
+        self.error: RecordingError | None = None
+        self.result = Answer("")
+        """What the process said at its end."""
+        self.unwritten = 0
+        """Events that are not in the file."""
+        self._handed = 0
+        self._failed = failed
+        self._complain = complain
+        self._closing = threading.Event()
+        self._end = 0
+        self._child = subprocess.Popen(  # noqa: S603  # our own module
+            command(order),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            process_group=0,  # so that a terminal's Ctrl-C does not reach it
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        assert self._child.stdin is not None
+        assert self._child.stdout is not None
+        self._answers = self._child.stdout
+        self._file = self._child.stdin.fileno()
+        with contextlib.suppress(OSError, AttributeError):  # elsewhere it is smaller
+            fcntl.fcntl(self._file, fcntl.F_SETPIPE_SZ, _PIPE)
+        first = self._answer()
+        if first.what != "ready":
+            self._child.stdin.close()
+            self._answers.close()
+            self._child.wait()
+            if first.what == "missing":
+                raise MissingDependencyError(first.text)
+            raise RecordingError(first.text)
+        self._feeder = threading.Thread(target=self._feed, name="recording", daemon=True)
+        self._listener = threading.Thread(target=self._listen, name="recording", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._listener.start()
+        self._feeder.start()
+
+    def close(self, end: int) -> None:
+        """Hand over what still waits, and return when the file is closed. Not on a loop.
+
+        Args:
+            end: Time of the run's clock (ns) at which it ends.
+        """
+        self._end = end
+        self._closing.set()
+        self._feeder.join()
+        self._listener.join()
+        self._child.wait()
+        if self.result.what in {"done", "error"}:  # one that was killed did not count
+            self.unwritten += self._handed - self.result.written
+
+    # The thread that feeds.
+
+    def _feed(self) -> None:
+        try:
+            self._hand_over()
+            pipe.write_all(self._file, [pipe.end(self._end)])
+        except OSError:
+            pass  # the process is gone, and the listener knows why
+        finally:
+            assert self._child.stdin is not None
+            with contextlib.suppress(OSError):
+                self._child.stdin.close()
+            self.backlog.release()
+        while not self._closing.wait(_PAUSE):
+            self._let_go()
+        self._let_go()
+
+    def _hand_over(self) -> None:
+        parts: list[Buffer] = []
+        taken: list[Waiting] = []
+        size = 0
+        while True:
+            closing = self._closing.is_set()  # before the look: what was put before it is written
+            waiting = self.backlog.take()
+            if waiting is not None:
+                taken.append(waiting)
+                size += waiting.size
+                parts += self._pieces(waiting)
+                if size < _AT_ONCE and len(taken) < _IN_A_ROW:
+                    continue
+            if taken:
+                try:
+                    pipe.write_all(self._file, parts)
+                except OSError:
+                    self.unwritten += len(taken)
+                    raise
+                self._handed += len(taken)
+                for each in taken:
+                    self.backlog.done(each)
+                parts, taken, size = [], [], 0
+            elif closing:
+                return
+            else:
+                self._closing.wait(_PAUSE)
+
+    def _pieces(self, waiting: Waiting) -> list[Buffer]:
+        event = waiting.event
+        what = pipe.ANNOUNCEMENT if isinstance(event, Announcement) else pipe.EVENT
+        try:
+            return pipe.pieces(waiting.time, pack(event), what)
+        except WireError as error:
+            self._complain(str(error))
+            return []
+
+    def _let_go(self) -> None:
+        while (waiting := self.backlog.take()) is not None:
+            self.unwritten += 1
+            self.backlog.done(waiting)
+
+    # The thread that listens.
+
+    def _listen(self) -> None:
+        while True:
+            answer = self._answer()
+            if answer.what == "complaint":
+                self._complain(answer.text)
+                continue
+            break
+        self._answers.close()
+        self.result = answer
+        if answer.what != "done":
+            self.error = RecordingError(answer.text)
+            self._failed(self.error)
+
+    def _answer(self) -> Answer:
+        line = self._answers.readline()
+        try:
+            return msgspec.json.decode(line, type=Answer)
+        except msgspec.DecodeError:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._child.wait(1.0)
+            code = self._child.returncode
+            return Answer("error", f"{self.path}: the process that writes it ended with {code}")
+
+
+def spare_cores() -> tuple[int, ...]:
+    """Return all cores but the first, which is left to the loop; none if there is no other."""
+    if not hasattr(os, "sched_getaffinity"):
+        return ()
+    return tuple(sorted(os.sched_getaffinity(0))[1:])

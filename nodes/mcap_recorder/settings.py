@@ -1,0 +1,48 @@
+"""What the file says of a recording."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from nodes.mcap_recorder.backlog import WhenFull
+from nodes.mcap_recorder.mcap_file import Compression
+from nodes.ros2_bridge.typestore import Distribution
+from runtime import NodeConfig
+
+Bytes = Annotated[int, msgspec.Meta(ge=1 << 16)]
+
+
+class McapRecorderConfig(NodeConfig):
+    """Settings of a recording.
+
+    Attributes:
+        file: Its name in the run's folder. One that was there is replaced.
+        images: How pictures are kept: ``raw``, ``png`` (smaller, and no loss), or
+            ``jpeg`` (small; a replay gives what is left).
+        depth: How depth is kept: ``raw``, or ``png``: whole millimetres, up to 65 m.
+        jpeg_quality: 1 to 100.
+        compression: Of the file's chunks: ``zstd``, ``lz4`` (quicker, larger) or ``none``.
+        chunk_size: Bytes of a chunk before compression. A chunk also ends 0.4 s after its
+            first event, real or on the run's clock.
+        memory: Bytes of events that may wait to be written.
+        when_full: What happens if more would wait. ``wait``: simulated time waits for the disk;
+            real time cannot, and does as ``drop_images``: pictures and clouds are left out until
+            there is room. ``drop_oldest``: what has waited longest is left out. What is left out
+            is counted among the run's drops, and logged.
+        fsync: Wait for the disk at the end of each chunk. Without it, what is written survives
+            the end of the process, but not a power cut.
+        distribution: Of ROS 2, whose types the messages have.
+    """
+
+    file: Annotated[str, msgspec.Meta(pattern=r"^[^/]+\.mcap$")] = "recording.mcap"
+    images: Literal["raw", "png", "jpeg"] = "raw"
+    depth: Literal["raw", "png"] = "raw"
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
+    compression: Compression = "zstd"
+    chunk_size: Bytes = 4 << 20
+    memory: Bytes = 256 << 20
+    when_full: WhenFull = "wait"
+    fsync: bool = False
+    distribution: Distribution = "jazzy"

@@ -1,0 +1,264 @@
+"""Data sets in the layout of EuRoC MAV, as published, and as `nodes.dataset` writes them.
+
+M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The world's z points up; it
+is turned to NED by half a turn about x. The body keeps the axes that the data set gives it: with
+EuRoC's own those of its IMU, which is no FRD, but cameras and truth agree on it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    CameraInfo,
+    DepthImage,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+)
+from nodes.estimation import pose_tuples
+from nodes.replay.folders import (
+    in_order,
+    read_depth,
+    read_image,
+    rotation_to_ned,
+    standing,
+    to_child,
+    vector_to_ned,
+)
+from nodes.replay.reader import Reader, ReplayError, Timed, Wants
+from nodes.trajectory.table import read_rows
+
+_TRUTH = "state_groundtruth_estimate0"
+_BODY = "base_link"
+
+
+class Sensor(msgspec.Struct, frozen=True):
+    """A sensor.yaml: its lines by key, and all lists of numbers as such."""
+
+    path: Path
+    texts: dict[str, str]
+    lists: dict[str, list[float]]
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """Return a number.
+
+        Raises:
+            ReplayError: There is none.
+        """
+        try:
+            return float(self.texts[key])
+        except (KeyError, ValueError):
+            if default is not None:
+                return default
+            found = self.texts.get(key, "nothing")
+            raise ReplayError(f"{self.path}: {key}: expected a number, found {found}") from None
+
+    def list(self, key: str, *lengths: int) -> list[float]:
+        """Return a list of numbers.
+
+        Raises:
+            ReplayError: There is none of such a length.
+        """
+        found = self.lists.get(key, [])
+        if len(found) not in lengths:
+            counts = " or ".join(map(str, lengths))
+            raise ReplayError(f"{self.path}: {key}: expected {counts} numbers, found {found}")
+        return found
+
+
+class Euroc(Reader):
+    """Reads the cameras, the first IMU and the ground truth of a data set.
+
+    Args:
+        folder: The one with cam0 in it (mav0).
+        vehicle: Source of the truth; sensors are below it.
+
+    Raises:
+        ReplayError: Something in it is not as published.
+    """
+
+    def __init__(self, folder: Path, vehicle: str) -> None:
+        super().__init__()
+        self._folder = folder
+        self._vehicle = vehicle
+        self._pictures: dict[str, list[tuple[int, Path]]] = {}
+        self._depths: dict[str, tuple[list[tuple[int, Path]], float]] = {}
+        self._announcements: list[Announcement] = []
+        try:
+            for camera in sorted(folder.glob("cam[0-9]*")):
+                self._announcements.append(self._camera(camera))
+            self._imu = self._rows("imu0", 7, "timestamp, w x 3, a x 3")
+            if self._imu:
+                self._announcements.append(self._imu_announcement())
+            self._truth = self._rows(_TRUTH, 17, "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3")
+        except ReplayError:
+            raise
+        except ValueError as error:
+            raise ReplayError(str(error)) from None
+        firsts = [rows[0][0] for rows in (self._imu, self._truth) if rows]
+        firsts += [rows[0][0] for rows in self._pictures.values() if rows]
+        if not firsts:
+            raise ReplayError(f"{folder}: expected the data of cameras or an IMU, found none")
+        self._origin = min(firsts)
+        if self._truth:
+            pictures = [rows[0][0] for rows in self._pictures.values() if rows]
+            first = min(pictures, default=self._truth[0][0])
+            row = next((row for row in self._truth if row[0] >= first), self._truth[0])
+            moved = self._moved(*row)
+            self._announcements.insert(0, standing(vehicle, moved.position, moved.orientation))
+
+    def announcements(self) -> Sequence[Announcement]:
+        """Return the vehicle where it begins, its cameras and its IMU."""
+        return self._announcements
+
+    def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
+        """Yield IMU, truth and pictures, all at their own stamps."""
+
+        def inside(stamp: int) -> bool:
+            time = stamp - self._origin
+            return start <= time and (end is None or time < end)
+
+        streams: list[Iterator[Event]] = []
+        if wants(Imu, f"{self._vehicle}/imu0"):
+            streams.append(self._measured(*row) for row in self._imu if inside(row[0]))
+        if wants(Odometry, self._vehicle):
+            streams.append(self._moved(*row) for row in self._truth if inside(row[0]))
+        for source, (rows, factor) in self._depths.items():
+            if wants(DepthImage, source):
+                streams.append(
+                    self._seen_depths(source, (row for row in rows if inside(row[0])), factor)
+                )
+        for source, rows in self._pictures.items():
+            if wants(Image, source):
+                streams.append(self._seen(source, (row for row in rows if inside(row[0]))))
+        return in_order(streams)
+
+    def _seen(self, source: str, rows: Iterator[tuple[int, Path]]) -> Iterator[Event]:
+        for stamp, path in rows:
+            yield read_image(path, stamp - self._origin, source, f"{source}_optical")
+
+    def _seen_depths(
+        self, source: str, rows: Iterator[tuple[int, Path]], factor: float
+    ) -> Iterator[Event]:
+        for stamp, path in rows:
+            yield read_depth(path, stamp - self._origin, source, f"{source}_optical", factor)
+
+    def _measured(self, stamp: int, values: list[float]) -> Imu:
+        return Imu(
+            stamp=stamp - self._origin,
+            source=f"{self._vehicle}/imu0",
+            frame_id=_BODY,
+            angular_velocity=(values[0], values[1], values[2]),
+            linear_acceleration=(values[3], values[4], values[5]),
+        )
+
+    def _moved(self, stamp: int, values: list[float]) -> Odometry:
+        """Return the truth; the data set has no angular velocity, so that is 0."""
+        x, y, z, qw, qx, qy, qz, u, v, w = values[:10]
+        return Odometry(
+            stamp=stamp - self._origin,
+            source=self._vehicle,
+            child_frame_id=_BODY,
+            position=vector_to_ned((x, y, z)),
+            orientation=rotation_to_ned((qw, qx, qy, qz)),
+            linear_velocity=to_child((qw, qx, qy, qz), (u, v, w)),
+            angular_velocity=(0.0, 0.0, 0.0),
+        )
+
+    def _camera(self, folder: Path) -> CameraAnnouncement:
+        sensor = read_sensor(folder / "sensor.yaml")
+        source = f"{self._vehicle}/{folder.name}"
+        width, height = sensor.list("resolution", 2)
+        fx, fy, cx, cy = sensor.list("intrinsics", 4)
+        k1, k2, p1, p2, *k3 = sensor.list("distortion_coefficients", 4, 5)
+        model = sensor.texts.get("distortion_model", "")
+        if model != "radial-tangential" and any((k1, k2, p1, p2)):
+            raise ReplayError(
+                f"{sensor.path}: distortion_model: expected radial-tangential, found {model!r}"
+            )
+        position, orientation = pose_tuples(np.reshape(sensor.list("data", 16), (4, 4)))
+        self._pictures[source] = rows = self._index(folder)
+        images = ["grey"]
+        if rows and read_image(rows[0][1], 0, source, "").encoding == "rgb8":
+            images = ["rgb"]
+        depth = self._folder / folder.name.replace("cam", "depth")
+        if depth.is_dir():
+            factor = read_sensor(depth / "sensor.yaml").number("depth_factor")
+            self._depths[source] = self._index(depth), factor
+            images.append("depth")
+        return CameraAnnouncement(
+            stamp=0,
+            source=source,
+            images=tuple(images),
+            info=CameraInfo(
+                width=int(width),
+                height=int(height),
+                fx=fx,
+                fy=fy,
+                cx=cx,
+                cy=cy,
+                distortion=(k1, k2, p1, p2, k3[0] if k3 else 0.0),
+            ),
+            rate=sensor.number("rate_hz"),
+            latency=0.0,
+            frame_id=f"{source}_optical",
+            parent_frame_id=_BODY,
+            position=position,
+            orientation=orientation,
+        )
+
+    def _imu_announcement(self) -> ImuAnnouncement:
+        sensor = read_sensor(self._folder / "imu0" / "sensor.yaml")
+        return ImuAnnouncement(
+            stamp=0,
+            source=f"{self._vehicle}/imu0",
+            rate=sensor.number("rate_hz"),
+            frame_id=_BODY,
+            gyroscope_noise_density=sensor.number("gyroscope_noise_density", 0.0),
+            gyroscope_random_walk=sensor.number("gyroscope_random_walk", 0.0),
+            accelerometer_noise_density=sensor.number("accelerometer_noise_density", 0.0),
+            accelerometer_random_walk=sensor.number("accelerometer_random_walk", 0.0),
+        )
+
+    def _index(self, folder: Path) -> list[tuple[int, Path]]:
+        rows = read_rows(folder / "data.csv", ",", (2,), "timestamp, filename")
+        return sorted((row.nanoseconds(), folder / "data" / row.fields[1]) for row in rows)
+
+    def _rows(self, name: str, columns: int, meaning: str) -> list[tuple[int, list[float]]]:
+        path = self._folder / name / "data.csv"
+        if not path.is_file():
+            return []
+        rows = read_rows(path, ",", (columns,), meaning)
+        return sorted((row.nanoseconds(), row.numbers(1, columns)) for row in rows)
+
+
+def read_sensor(path: Path) -> Sensor:
+    """Read a sensor.yaml: plain ``key: value`` lines, and lists in brackets.
+
+    Raises:
+        ReplayError: It cannot be read.
+    """
+    try:
+        text = re.sub(r"#.*", "", path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ReplayError(f"{path}: expected a sensor's description, found: {error}") from None
+    lists = {}
+    for key, content in re.findall(r"(\w+):\s*\[([^\]]*)\]", text):
+        try:
+            lists[key] = [float(value) for value in content.split(",") if value.strip()]
+        except ValueError:
+            raise ReplayError(f"{path}: {key}: expected numbers, found {content!r:.80}") from None
+    texts = {
+        key: value.strip() for key, value in re.findall(r"^\s*(\w+):[ \t]*([^\[\n]+)$", text, re.M)
+    }
+    return Sensor(path, texts, lists)

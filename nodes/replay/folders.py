@@ -1,0 +1,109 @@
+"""What data sets in folders have in common: a world with z up, pictures in files, rows to merge."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from events import DepthImage, Event, Image, Quaternion, Vector3, VehicleAnnouncement
+from nodes.dataset.world import vector_to_nwu
+from nodes.replay.reader import ReplayError, Timed
+
+vector_to_ned = vector_to_nwu
+"""Take a vector from north, west, up to NED; the same half turn goes both ways."""
+
+
+def rotation_to_ned(rotation: Quaternion) -> Quaternion:
+    """Take a rotation from a child frame to NWU to the rotation from that frame to NED."""
+    w, x, y, z = rotation
+    return (x, -w, z, -y)  # the inverse of (0, 1, 0, 0) ⊗ rotation
+
+
+def to_child(rotation: Quaternion, vector: Vector3) -> Vector3:
+    """Take a vector from the parent to the child frame of a unit quaternion."""
+    w, qx, qy, qz = rotation
+    qx, qy, qz = -qx, -qy, -qz
+    x, y, z = vector
+    tx, ty, tz = 2 * (qy * z - qz * y), 2 * (qz * x - qx * z), 2 * (qx * y - qy * x)
+    return (
+        x + w * tx + qy * tz - qz * ty,
+        y + w * ty + qz * tx - qx * tz,
+        z + w * tz + qx * ty - qy * tx,
+    )
+
+
+def standing(source: str, position: Vector3, orientation: Quaternion) -> VehicleAnnouncement:
+    """Return the announcement of a vehicle of which no more is known than where it begins."""
+    return VehicleAnnouncement(
+        stamp=0,
+        source=source,
+        mass=0.0,
+        max_thrust=0.0,
+        control_rate=0.0,
+        position=position,
+        orientation=orientation,
+    )
+
+
+def read_image(path: Path, stamp: int, source: str, frame_id: str) -> Image:
+    """Read a colour or grey picture.
+
+    Raises:
+        ReplayError: It is none.
+    """
+    pixels = _pixels(path)
+    if pixels.dtype == np.uint16:
+        raise ReplayError(f"{path}: expected a picture of 8 bits, found one of 16")
+    if pixels.ndim == 3:
+        code = cv2.COLOR_BGRA2RGB if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
+        pixels = cv2.cvtColor(pixels, code)
+    encoding = "rgb8" if pixels.ndim == 3 else "mono8"
+    return Image(stamp=stamp, source=source, frame_id=frame_id, encoding=encoding, data=pixels)
+
+
+def read_depth(path: Path, stamp: int, source: str, frame_id: str, factor: float) -> DepthImage:
+    """Read a depth picture of 16 bits.
+
+    Args:
+        path: The file.
+        stamp: Of the event (ns).
+        source: Of the event.
+        frame_id: Of the event.
+        factor: Steps per metre; a step of 0 is none, and becomes ``inf``.
+
+    Raises:
+        ReplayError: It is none.
+    """
+    steps = _pixels(path)
+    if steps.dtype != np.uint16 or steps.ndim != 2:
+        raise ReplayError(
+            f"{path}: expected a depth picture of 16 bits, found {steps.dtype} {steps.shape}"
+        )
+    metres = steps.astype(np.float32) / np.float32(factor)
+    metres[steps == 0] = np.inf
+    return DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=metres)
+
+
+def in_order(streams: Iterable[Iterable[Event]]) -> Iterator[Timed]:
+    """Merge streams of events, each in order of stamps, which are the times too.
+
+    Of events of one stamp, the earlier stream's come first.
+    """
+    merged = heapq.merge(*streams, key=lambda event: event.stamp)
+    return (Timed(event.stamp, event) for event in merged)
+
+
+def _pixels(path: Path) -> npt.NDArray[Any]:
+    try:
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error) as error:
+        raise ReplayError(f"{path}: expected a picture, found: {error}") from None
+    if pixels is None:
+        raise ReplayError(f"{path}: expected a picture, found something else")
+    return pixels

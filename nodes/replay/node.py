@@ -1,0 +1,206 @@
+"""A recording in the place of the simulator: the same announcements, events, stamps and sources."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+
+import msgspec
+
+from events import Announcement, Event, Odometry, VehicleAnnouncement
+from nodes.replay.ahead import ReadAhead
+from nodes.replay.choice import Choice
+from nodes.replay.formats import open_reader
+from nodes.replay.reader import Reader, ReplayError
+from nodes.replay.settings import ReplayConfig
+from runtime import Node, Output
+
+SECOND = 1_000_000_000
+
+_SLICE = SECOND // 10
+"""In real time, how long a sleep may keep `seek` waiting (ns)."""
+
+
+class Replay(Node[ReplayConfig]):
+    """Says what was recorded, when it was said, on either clock.
+
+    ::
+
+        [[nodes]]
+        name = "replay"
+        type = "nodes.replay:Replay"
+        file = "runs/record/recording.mcap"
+
+    The run ends with the recording. `pause`, `resume` and `seek` are for the loop's thread.
+    """
+
+    events = Output(Event)
+
+    def __init__(self) -> None:
+        self._reader: Reader | None = None
+        self._ahead: ReadAhead | None = None
+        self._announcements: list[Announcement] = []
+        self._shift = 0
+        """The run's clock less the recording's time (ns)."""
+        self._paused_at: int | None = None
+        self._resumed = asyncio.Event()
+        self._target: int | None = None
+        self._told = 0
+        self.sent = 0
+
+    async def on_startup(self) -> None:
+        """Open the recording.
+
+        Raises:
+            FatalError: It cannot be read.
+            MissingDependencyError: A library is not installed.
+        """
+        try:
+            await self.offload(self._open)
+        except ReplayError as error:
+            self.log.fatal("%s", error)
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce what was announced."""
+        return self._announcements
+
+    async def run(self) -> None:
+        """Say it all, from start to end, and again if that is wanted."""
+        assert self._reader is not None
+        begin = round(self.config.start * SECOND)
+        end = round(self.config.end * SECOND) or None
+        position, self._shift = begin, self.clock.now() - begin
+        while True:
+            last = await self._play(position, end)
+            if last is None and not self.sent and self._target is None:
+                self.log.fatal("%s", self._nothing())
+            last = position if last is None else last
+            over = end or self._reader.end() or last + round(self.config.linger * SECOND)
+            await self._sleep_until(max(over, last))
+            if self._target is not None:
+                position, self._target = self._target, None
+            elif self.config.loop:
+                position = begin
+            else:
+                break
+            self._shift = self.clock.now() - position
+        self._tell_trouble()
+        if named := ", ".join(sorted(self._choice.unmatched)):
+            self.log.warning("only, skip: nothing in the recording is of %s", named)
+        self.stop("the recording ended")
+
+    async def on_shutdown(self) -> None:
+        """Close the recording."""
+        await self._close_ahead()
+        self._tell_trouble()
+        if self._reader is not None:
+            await self.offload(self._reader.close)
+
+    # For a monitor.
+
+    def pause(self) -> None:
+        """Say nothing until `resume`; the clock goes on."""
+        if self._paused_at is None:
+            self._paused_at = self.clock.now()
+            self._resumed.clear()
+
+    def resume(self) -> None:
+        """Go on where `pause` came."""
+        if self._paused_at is not None:
+            self._shift += self.clock.now() - self._paused_at
+            self._paused_at = None
+            self._resumed.set()
+
+    def seek(self, seconds: float) -> None:
+        """Go on at another time of the recording; stamps stay on the run's clock."""
+        self._target = max(round(seconds * SECOND), 0)
+
+    @property
+    def position(self) -> float:
+        """Return which time of the recording it is, seconds."""
+        now = self.clock.now() if self._paused_at is None else self._paused_at
+        return (now - self._shift) / SECOND
+
+    async def _play(self, start: int, end: int | None) -> int | None:
+        """Say what was said from one time to another; return the last time, if anything came."""
+        assert self._reader is not None
+        await self._close_ahead()
+        events = self._reader.events(start, end, self._choice)
+        self._ahead = ahead = ReadAhead(events, self.config.memory)
+        send, now = self.events.send, self.clock.now
+        last = None
+        try:
+            while (batch := await self.offload(ahead.take)) is not None:
+                for last, event in batch:
+                    if last + self._shift > now() or self._paused_at is not None:
+                        await self._sleep_until(last)
+                    if self._target is not None:
+                        return last
+                    if shift := self._shift:
+                        event = msgspec.structs.replace(event, stamp=event.stamp + shift)
+                        if event.stamp < 0:  # of before the start
+                            continue
+                    self.sent += 1
+                    send(event)
+        except ReplayError as error:
+            self.log.fatal("%s", error)
+        return last
+
+    async def _sleep_until(self, time: int) -> None:
+        """Wait for a time of the recording; come back early if `seek` was called."""
+        real = self.clock.kind == "real"
+        while self._target is None:
+            if self._paused_at is not None:
+                await self._resumed.wait()
+                continue
+            now, due = self.clock.now(), time + self._shift
+            if due <= now:
+                return
+            await self.clock.sleep_until(min(due, now + _SLICE) if real else due)
+
+    def _open(self) -> None:
+        config = self.config
+        self._reader = reader = open_reader(config, self.name)
+        announced = reader.announcements()
+        self._choice = Choice(config.only, config.skip, announced)
+        self._announcements = [each for each in announced if self._choice.announced(each)]
+        if config.start:
+            self._announcements = [self._standing(reader, each) for each in self._announcements]
+
+    def _standing(self, reader: Reader, announcement: Announcement) -> Announcement:
+        """Return a vehicle's announcement with the pose that it has at the start."""
+        if not isinstance(announcement, VehicleAnnouncement):
+            return announcement
+
+        def wants(kind: type[Event], source: str) -> bool:
+            return issubclass(kind, Odometry) and source == announcement.source
+
+        found = reader.events(round(self.config.start * SECOND), None, wants)
+        event = next((each.event for each in found), None)
+        if not isinstance(event, Odometry):
+            return announcement
+        return msgspec.structs.replace(
+            announcement, position=event.position, orientation=event.orientation
+        )
+
+    def _nothing(self) -> str:
+        config, named = self.config, ", ".join(sorted(self._choice.unmatched))
+        return (
+            f"{config.file}: expected events that are wanted, found none"
+            + (f" from {config.start:g} s on" if config.start else "")
+            + (f" to {config.end:g} s" if config.end else "")
+            + (f" of {named}" if named else "")
+            + "".join(f"; {each}" for each in (self._reader.trouble if self._reader else []))
+        )
+
+    def _tell_trouble(self) -> None:
+        if self._reader is None:
+            return
+        for each in self._reader.trouble[self._told :]:
+            self.log.warning("%s: %s", self.config.file, each)
+        self._told = len(self._reader.trouble)
+
+    async def _close_ahead(self) -> None:
+        if self._ahead is not None:
+            ahead, self._ahead = self._ahead, None
+            await self.offload(ahead.close)

@@ -1,0 +1,116 @@
+"""Recordings that `nodes.mcap_recorder` made: events come back as they were."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+
+from events import Announcement, CameraAnnouncement, Event
+from nodes.mcap_recorder import native
+from nodes.mcap_recorder.arrays import arrays
+from nodes.mcap_recorder.disk import RecordingError
+from nodes.mcap_recorder.mcap_file import Record, contents, read
+from nodes.mcap_recorder.topics import HOLDERS
+from nodes.replay.reader import Reader, ReplayError, Timed, Wants
+from nodes.ros2_bridge.plan import FrameNames
+from nodes.ros2_bridge.typestore import TypeStore
+from runtime.errors import WireError
+from runtime.wire import event_type
+
+_LOOK = 64
+"""Messages within which a recording of ours has one of its own kind."""
+
+
+class Recorded(Reader):
+    """Reads a recording of ours, torn ones too.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ReplayError: It is no MCAP file.
+        MissingDependencyError: mcap or rosbags is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+        self._store = TypeStore()
+        self._frames = FrameNames()
+        try:
+            self._contents = contents(path)
+        except RecordingError as error:
+            raise ReplayError(str(error)) from None
+        self._announcements = tuple(self._read_announcements())
+        for announcement in self._announcements:
+            if isinstance(announcement, CameraAnnouncement):
+                self._frames.add(announcement)
+
+    def announcements(self) -> Sequence[Announcement]:
+        """Return what its nodes announced."""
+        return self._announcements
+
+    def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
+        """Yield its events, equal to what was recorded."""
+        holder: Record | None = None
+        for record in read(self._path, start, end, self._complain):
+            if record.type in HOLDERS:
+                holder = record
+            kind = record.metadata.get("kind")
+            if kind is None or record.metadata.get("announcement"):
+                continue
+            try:
+                if wants(event_type(kind), record.metadata.get("source", "")):
+                    yield Timed(record.time, self._event(record, holder))
+            except (WireError, ValueError) as error:
+                self._complain(f"{record.topic}: {error}")
+
+    def end(self) -> int | None:
+        """Return when the recorder ended."""
+        said = self._contents.metadata.get("visnav", {}).get("end", "")
+        return int(said) if said.isdigit() else self._contents.end
+
+    def _event(self, record: Record, holder: Record | None) -> Event:
+        lacking = native.lacking(record.data)
+        if not lacking:
+            return native.event(record.data)
+        if holder is None or holder.sequence != record.sequence:
+            raise ValueError(f"expected a message with the arrays of event {record.sequence}")
+        # All events with arrays and a message have a frame.
+        frame = native.fields(record.data).get("frame_id", "map")
+        axes = self._frames.axes(frame)
+        found = arrays(self._store, holder.data, holder.type, lacking, axes)
+        return native.event(record.data, found)
+
+    def _read_announcements(self) -> Iterator[Announcement]:
+        """Yield the announcements, which come before all events."""
+        for record in read(self._path):
+            if record.metadata.get("announcement"):
+                try:
+                    event = native.event(record.data)
+                except WireError as error:
+                    self._complain(f"{record.topic}: {error}")
+                    continue
+                if isinstance(event, Announcement):
+                    yield event
+            elif "kind" in record.metadata:
+                return
+
+    def _complain(self, what: str) -> None:
+        if what not in self.trouble:
+            self.trouble.append(what)
+
+
+def is_ours(path: Path) -> bool:
+    """Tell whether a file is a recording of ours, though another tool may have written it anew.
+
+    Raises:
+        ReplayError: It is no MCAP file.
+    """
+    try:
+        if contents(path).ours:
+            return True
+        return any("kind" in record.metadata for record in islice(read(path), _LOOK))
+    except RecordingError as error:
+        raise ReplayError(str(error)) from None

@@ -1,0 +1,253 @@
+"""Bags of ROS that others made: their messages as events, in our frames (`ros2_bridge.incoming`).
+
+Messages with a header keep its stamp; the time of receipt is when they are said. Where the two
+are of different clocks (a simulator's and the recording machine's), each counts from its own first.
+Cameras sit where ``/tf_static`` puts their optical frames in ``base_link``; one that it does not
+know looks ahead from the body's origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PoseEstimate,
+)
+from nodes.mcap_recorder.arrays import decoded
+from nodes.replay.bag_topics import chosen
+from nodes.replay.folders import standing
+from nodes.replay.mounting import Mountings
+from nodes.replay.reader import Reader, ReplayError, Timed, Wants
+from nodes.replay.settings import Topic, Use
+from nodes.ros2_bridge.calibration import camera_announcement
+from nodes.ros2_bridge.incoming import READERS, Reading, estimate
+from nodes.ros2_bridge.stamps import Stamps
+from nodes.ros2_bridge.typestore import Bag
+
+_SAME_CLOCK = 60 * 1_000_000_000
+"""Nanoseconds between stamp and receipt above which they are of different clocks."""
+
+_EVENTS: dict[Use, type[Event]] = {
+    "image": Image,
+    "depth": DepthImage,
+    "imu": Imu,
+    "odometry": Odometry,
+    "truth": Odometry,
+    "estimate": PoseEstimate,
+}
+
+_LATER = 1 << 62
+
+
+class RosBag(Reader):
+    """Reads a bag.
+
+    Args:
+        path: A folder, or an MCAP or SQLite file.
+        topics: What to read; if empty, what its types and names tell.
+        vehicle: Source of the true poses.
+
+    Raises:
+        ReplayError: It cannot be read, or a topic is not there.
+    """
+
+    def __init__(self, path: Path, topics: tuple[Topic, ...], vehicle: str) -> None:
+        super().__init__()
+        self._path = path
+        self._vehicle = vehicle
+        try:
+            self._bag = Bag(path)
+        except ValueError as error:
+            raise ReplayError(str(error)) from None
+        try:
+            found = self._bag.topics()
+            self._topics = chosen(found, topics, vehicle)
+            self._firsts = self._first_messages()
+            self._times, self._stamps = self._origins()
+            self._announcements = list(self._announced(found))
+        except (ReplayError, ValueError) as error:
+            self._bag.close()
+            raise ReplayError(f"{path}: {error}") from None
+
+    def announcements(self) -> Sequence[Announcement]:
+        """Return the vehicle where it begins, cameras, IMUs and estimators."""
+        return self._announcements
+
+    def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
+        """Yield what the topics' messages become; one that makes no sense is left out."""
+        names = [
+            name
+            for name, topic in self._topics.items()
+            if topic.use != "camera" and wants(_EVENTS[topic.use], topic.source)
+        ]
+        stop = None if end is None else end + self._times
+        try:
+            for name, type_, time, message in self._bag.messages(names, start + self._times, stop):
+                try:
+                    event = self._event(self._topics[name], type_, message)
+                except (ValueError, TypeError, ArithmeticError) as error:
+                    self._complain(f"{name}: {error}")
+                    continue
+                yield Timed(time - self._times, event)
+        except ValueError as error:
+            raise ReplayError(str(error)) from None
+
+    def close(self) -> None:
+        """Close the bag."""
+        self._bag.close()
+
+    def _event(self, topic: Topic, type_: str, message: Any) -> Event:
+        reading = Reading(
+            source=topic.source, now=_LATER, stamps=self._stamps, frame_id=topic.frame_id
+        )
+        if topic.use == "truth" or topic.use == "odometry":
+            return self._truth(topic, type_, message, reading)
+        if type_ == "sensor_msgs/msg/CompressedImage":
+            return _compressed(topic.use, message, reading)
+        event = READERS[type_, topic.use](message, reading)
+        assert event is not None
+        return event
+
+    def _truth(self, topic: Topic, type_: str, message: Any, reading: Reading) -> Odometry:
+        """Read a true pose; it is in ``map`` unless the settings say otherwise."""
+        reading = msgspec.structs.replace(reading, frame_id=topic.frame_id or "map")
+        if type_ == "nav_msgs/msg/Odometry":
+            event = READERS[type_, "odometry"](message, reading)
+            assert isinstance(event, Odometry)
+            return msgspec.structs.replace(event, child_frame_id="base_link")
+        if type_ == "geometry_msgs/msg/TransformStamped":
+            message = _AsPose(message)
+        pose = estimate(message, reading)
+        assert isinstance(pose, PoseEstimate)
+        return Odometry(
+            stamp=pose.stamp,
+            source=pose.source,
+            frame_id=pose.frame_id,
+            position=pose.position,
+            orientation=pose.orientation,
+            linear_velocity=(0.0, 0.0, 0.0),  # nobody says
+            angular_velocity=(0.0, 0.0, 0.0),
+        )
+
+    def _first_messages(self) -> dict[str, tuple[str, int, Any]]:
+        """Return type, time of receipt and content of each topic's first message."""
+        found: dict[str, tuple[str, int, Any]] = {}
+        for name in self._topics:
+            for _, type_, time, message in self._bag.messages([name]):
+                found[name] = type_, time, message
+                break
+        if not found:
+            raise ReplayError(f"expected messages on {', '.join(self._topics)}, found none")
+        return found
+
+    def _origins(self) -> tuple[int, Stamps]:
+        """Return the time of receipt that is 0 from now on, and how stamps are told."""
+        times, stamps = [], []
+        for _, time, message in self._firsts.values():
+            times.append(time)
+            stamp = message.header.stamp
+            stamps.append(int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec))
+        if all(abs(t - s) < _SAME_CLOCK for t, s in zip(times, stamps, strict=True)):
+            origin = min(*times, *stamps)
+            return origin, Stamps(origin)
+        return min(times), Stamps(min(stamps))
+
+    def _announced(self, found: dict[str, tuple[str, int]]) -> Iterator[Announcement]:
+        for name, topic in self._topics.items():
+            if topic.use in {"odometry", "truth"} and name in self._firsts:
+                type_, _, message = self._firsts[name]
+                event = self._event(topic, type_, message)
+                assert isinstance(event, Odometry)
+                yield standing(topic.source, event.position, event.orientation)
+        yield from self._cameras(found)
+        for name, topic in self._topics.items():
+            if topic.use == "imu" and name in self._firsts:
+                header = self._firsts[name][2].header
+                yield ImuAnnouncement(
+                    stamp=0,
+                    source=topic.source,
+                    rate=self._rate(found[name][1]),
+                    frame_id=topic.frame_id or header.frame_id or "base_link",
+                    gyroscope_noise_density=0.0,  # messages do not say
+                    gyroscope_random_walk=0.0,
+                    accelerometer_noise_density=0.0,
+                    accelerometer_random_walk=0.0,
+                )
+            elif topic.use == "estimate":
+                yield EstimatorAnnouncement(
+                    stamp=0, source=topic.source, method=f"ROS: {topic.topic}"
+                )
+
+    def _cameras(self, found: dict[str, tuple[str, int]]) -> Iterator[CameraAnnouncement]:
+        mountings = Mountings(
+            message
+            for _, type_, _, message in self._bag.messages(["/tf_static"])
+            if type_ == "tf2_msgs/msg/TFMessage"
+        )
+        images: dict[str, list[str]] = {}
+        rates: dict[str, float] = {}
+        for name, topic in self._topics.items():
+            if topic.use in {"image", "depth"} and name in self._firsts:
+                type_, _, message = self._firsts[name]
+                kind = "depth"
+                if topic.use == "image":
+                    event = self._event(topic, type_, message)
+                    assert isinstance(event, Image)
+                    kind = "rgb" if event.encoding == "rgb8" else "grey"
+                images.setdefault(topic.source, []).append(kind)
+                rates[topic.source] = self._rate(found[name][1])
+        for name, topic in self._topics.items():
+            if topic.use == "camera" and name in self._firsts and topic.source in images:
+                kinds = tuple(images.pop(topic.source))
+                message = self._firsts[name][2]
+                camera = camera_announcement(message, topic.source, kinds, topic.frame_id)
+                camera = msgspec.structs.replace(camera, rate=rates[topic.source])
+                mounting = mountings.of(message.header.frame_id)
+                if mounting is not None:
+                    place, turn = mounting
+                    camera = msgspec.structs.replace(camera, position=place, orientation=turn)
+                yield camera
+        for source in images:
+            self._complain(f"{source}: expected a camera_info, found none: it is not announced")
+
+    def _rate(self, count: int) -> float:
+        seconds = (self._bag.end - self._bag.start) / 1e9
+        return max(count - 1, 1) / seconds if seconds > 0 else 1.0
+
+    def _complain(self, what: str) -> None:
+        if what not in self.trouble:
+            self.trouble.append(what)
+
+
+class _AsPose:
+    """A TransformStamped with the fields of a PoseStamped."""
+
+    def __init__(self, message: Any) -> None:
+        self.header = message.header
+        self.pose = self
+        self.position = message.transform.translation
+        self.orientation = message.transform.rotation
+
+
+def _compressed(use: Use, message: Any, reading: Reading) -> Event:
+    stamp, frame_id = reading.stamp(message.header), reading.frame(message.header, "")
+    pixels = decoded(message)
+    if use == "depth":
+        return DepthImage(stamp=stamp, source=reading.source, frame_id=frame_id, data=pixels)
+    encoding = "rgb8" if pixels.ndim == 3 else "mono8"
+    return Image(
+        stamp=stamp, source=reading.source, frame_id=frame_id, encoding=encoding, data=pixels
+    )

@@ -1,0 +1,90 @@
+"""What the file says of a replay."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from runtime import Duration, NodeConfig
+
+Use = Literal["image", "depth", "imu", "odometry", "truth", "estimate", "camera"]
+
+
+class Topic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A topic of a ROS bag, and what its messages become.
+
+    Attributes:
+        topic: Its name.
+        use: ``as`` in the file. ``image`` (from Image or CompressedImage), ``depth``, ``camera``
+            (CameraInfo: a camera is announced), ``imu``, ``odometry`` and ``truth`` (Odometry,
+            PoseStamped or TransformStamped: the vehicle's true pose), ``estimate``.
+        source: Of the events; if empty, the node's name, and for a camera the topic's namespace.
+        frame_id: If set, the frame that events name, whatever the messages say.
+    """
+
+    topic: str
+    use: Use = msgspec.field(name="as")
+    source: str = ""
+    frame_id: str = ""
+
+
+class Pinhole(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Intrinsics of a camera, for data sets that do not come with them.
+
+    Attributes:
+        fx: Pixels.
+        fy: Pixels.
+        cx: Pixels.
+        cy: Pixels.
+        distortion: plumb_bob: k1, k2, p1, p2, k3.
+    """
+
+    fx: Annotated[float, msgspec.Meta(gt=0)]
+    fy: Annotated[float, msgspec.Meta(gt=0)]
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class ReplayConfig(NodeConfig):
+    """Settings of a replay.
+
+    Attributes:
+        file: A recording of `nodes.mcap_recorder` (torn ones too), a ROS 2 bag (a folder, or an
+            MCAP or SQLite file), or the folder of a data set in the layout of EuRoC or TUM RGB-D.
+        start: Where to begin. The run's clock is 0 there, and stamps count from there.
+        end: Where to end, on the recording's own time; 0 for its end.
+        linger: How long the run goes on after the last event, for what others have to say of it.
+            A recording that says when it ended, or an `end`, ends just then.
+        loop: Begin again at the end. The clock goes on, and stamps with it.
+        only: Types (``Image``, ``Odometry``) and sources (``drone``, with all below it); an event
+            must be of one of the types and from one of the sources, so far as any are named.
+            ``["Event"]`` is everything. If empty: what sensors and the vehicle said, and the
+            true poses; not what pilots, estimators and evaluations said.
+        skip: Types and sources that are left out.
+        memory: Bytes that may be read ahead.
+        topics: What is read of a ROS bag, and as what.
+        vehicle: Source of a data set's true poses; its cameras are below it. If empty, the
+            node's name.
+        camera: Intrinsics of a data set in TUM's layout. If not given, those of its camera.yaml,
+            or else the 525 pixels that its authors recommend.
+        depth_factor: Steps of its depth pictures per metre.
+    """
+
+    file: str
+    start: Duration = Duration(0)  # immutable
+    end: Duration = Duration(0)
+    linger: Duration = Duration(0.5)
+    loop: bool = False
+    only: tuple[str, ...] = ()
+    skip: tuple[str, ...] = ()
+    memory: Annotated[int, msgspec.Meta(ge=1 << 20)] = 128 << 20
+    topics: tuple[Topic, ...] = ()
+    vehicle: str = ""
+    camera: Pinhole | None = None
+    depth_factor: Annotated[float, msgspec.Meta(gt=0)] = 5000.0
+
+    def __post_init__(self) -> None:
+        if self.end and self.end <= self.start:
+            raise ValueError(f"end: expected a time after start, {self.start:g} s")

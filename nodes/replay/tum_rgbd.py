@@ -1,0 +1,220 @@
+"""Data sets in the layout of TUM's RGB-D benchmark, as published, and as `nodes.dataset` writes it.
+
+J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and
+cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. The world's z points up; it is turned to
+NED by half a turn about x. A depth picture is taken with the colour picture nearest to it, within
+20 ms as their associate.py does it, and gets its stamp, so that estimators find pairs.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    CameraInfo,
+    DepthImage,
+    Event,
+    Image,
+    Odometry,
+    PoseStamped,
+    Quaternion,
+    Vector3,
+)
+from nodes.replay.euroc import read_sensor
+from nodes.replay.folders import (
+    in_order,
+    read_depth,
+    read_image,
+    rotation_to_ned,
+    standing,
+    vector_to_ned,
+)
+from nodes.replay.reader import Reader, ReplayError, Timed, Wants
+from nodes.replay.settings import Pinhole
+from nodes.ros2_bridge.calibration import OPTICAL_IN_BODY
+from nodes.ros2_bridge.frames import conjugate, multiply
+from nodes.trajectory.table import read_rows
+
+FARTHEST = 20_000_000
+"""Nanoseconds between a depth picture and its colour picture."""
+
+RECOMMENDED = Pinhole(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
+"""What the data set's authors recommend for all three of their cameras' registered depth."""
+
+_Rows = list[tuple[int, Path]]
+
+
+class TumRgbd(Reader):
+    """Reads colour, depth and the camera's true poses.
+
+    The camera sits in the body's origin and looks ahead, so that the body's pose (FRD) is known
+    where the camera's is.
+
+    Args:
+        folder: The one with rgb.txt in it.
+        vehicle: Source of the truth; the camera is below it.
+        camera: Intrinsics; if `None`, those of camera.yaml, or else the recommended ones.
+        depth_factor: Steps per metre.
+
+    Raises:
+        ReplayError: Something in it is not as published.
+    """
+
+    def __init__(
+        self, folder: Path, vehicle: str, camera: Pinhole | None, depth_factor: float
+    ) -> None:
+        super().__init__()
+        self._folder = folder
+        self._vehicle = vehicle
+        self._source = f"{vehicle}/camera"
+        self._frame_id = f"{self._source}_optical"
+        try:
+            self._rgb = self._index("rgb.txt")
+            depth = self._index("depth.txt") if (folder / "depth.txt").is_file() else []
+            self._truth = self._poses()
+        except ReplayError:
+            raise
+        except ValueError as error:
+            raise ReplayError(str(error)) from None
+        self._depth = self._paired(depth)
+        calibration = folder / "camera.yaml"
+        self._factor = depth_factor
+        rate = _rate(self._rgb)
+        if calibration.is_file():
+            sensor = read_sensor(calibration)
+            self._factor = sensor.number("depth_factor", depth_factor)
+            rate = sensor.number("rate_hz", rate)
+            if camera is None:
+                k1, k2, p1, p2, k3 = sensor.list("distortion", 5)
+                camera = Pinhole(
+                    fx=sensor.number("fx"),
+                    fy=sensor.number("fy"),
+                    cx=sensor.number("cx"),
+                    cy=sensor.number("cy"),
+                    distortion=(k1, k2, p1, p2, k3),
+                )
+        self._origin = min([self._rgb[0][0], *(row[0] for row in self._truth[:1])])
+        self._announcements = self._announced(camera or RECOMMENDED, rate)
+
+    def announcements(self) -> Sequence[Announcement]:
+        """Return the body where it begins, and the camera."""
+        return self._announcements
+
+    def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
+        """Yield truth (as the camera's pose and as the body's), depth and colour."""
+
+        def inside(stamp: int) -> bool:
+            time = stamp - self._origin
+            return start <= time and (end is None or time < end)
+
+        streams: list[Iterator[Event]] = []
+        truth = [row for row in self._truth if inside(row[0])]
+        if wants(Odometry, self._vehicle):
+            streams.append(self._moved(*row) for row in truth)
+        if wants(PoseStamped, self._source):
+            streams.append(self._placed(*row) for row in truth)
+        if wants(DepthImage, self._source):
+            streams.append(self._depths([row for row in self._depth if inside(row[0])]))
+        if wants(Image, self._source):
+            streams.append(self._images([row for row in self._rgb if inside(row[0])]))
+        return in_order(streams)
+
+    def _images(self, rows: _Rows) -> Iterator[Event]:
+        for stamp, path in rows:
+            yield read_image(path, stamp - self._origin, self._source, self._frame_id)
+
+    def _depths(self, rows: _Rows) -> Iterator[Event]:
+        for stamp, path in rows:
+            time = stamp - self._origin
+            yield read_depth(path, time, self._source, self._frame_id, self._factor)
+
+    def _moved(self, stamp: int, position: Vector3, optical: Quaternion) -> Odometry:
+        """Return the truth; the data set has no velocities, so they are 0."""
+        return Odometry(
+            stamp=stamp - self._origin,
+            source=self._vehicle,
+            position=position,
+            orientation=multiply(optical, conjugate(OPTICAL_IN_BODY)),
+            linear_velocity=(0.0, 0.0, 0.0),
+            angular_velocity=(0.0, 0.0, 0.0),
+        )
+
+    def _placed(self, stamp: int, position: Vector3, optical: Quaternion) -> PoseStamped:
+        return PoseStamped(
+            stamp=stamp - self._origin,
+            source=self._source,
+            position=position,
+            orientation=optical,
+        )
+
+    def _paired(self, depth: _Rows) -> _Rows:
+        """Give each depth picture the stamp of its colour picture; those without are left out."""
+        stamps = [stamp for stamp, _ in self._rgb]
+        taken: dict[int, tuple[int, Path]] = {}
+        for stamp, path in depth:
+            at = bisect.bisect_left(stamps, stamp)
+            near = min(stamps[max(at - 1, 0) : at + 1], key=lambda each: abs(each - stamp))
+            distance = abs(near - stamp)
+            if distance <= FARTHEST and (near not in taken or distance < taken[near][0]):
+                taken[near] = distance, path
+        if left_out := len(depth) - len(taken):
+            self.trouble.append(f"{left_out} depth pictures have no colour picture near them")
+        return sorted((stamp, path) for stamp, (_, path) in taken.items())
+
+    def _announced(self, camera: Pinhole, rate: float) -> list[Announcement]:
+        first = read_image(self._rgb[0][1], 0, self._source, self._frame_id)
+        height, width = first.data.shape[:2]
+        images = ("rgb" if first.encoding == "rgb8" else "grey",)
+        announced: list[Announcement] = [
+            CameraAnnouncement(
+                stamp=0,
+                source=self._source,
+                images=(*images, "depth") if self._depth else images,
+                info=CameraInfo(
+                    width=width,
+                    height=height,
+                    fx=camera.fx,
+                    fy=camera.fy,
+                    cx=camera.cx,
+                    cy=camera.cy,
+                    distortion=camera.distortion,
+                ),
+                rate=rate,
+                latency=0.0,
+                frame_id=self._frame_id,
+                parent_frame_id="base_link",
+                position=(0.0, 0.0, 0.0),
+                orientation=OPTICAL_IN_BODY,
+            )
+        ]
+        if self._truth:
+            begin = self._rgb[0][0]
+            row = next((row for row in self._truth if row[0] >= begin), self._truth[0])
+            moved = self._moved(*row)
+            announced.insert(0, standing(self._vehicle, moved.position, moved.orientation))
+        return announced
+
+    def _index(self, name: str) -> _Rows:
+        rows = read_rows(self._folder / name, None, (2,), "timestamp filename")
+        return sorted((row.seconds(), self._folder / row.fields[1]) for row in rows)
+
+    def _poses(self) -> list[tuple[int, Vector3, Quaternion]]:
+        path = self._folder / "groundtruth.txt"
+        if not path.is_file():
+            return []
+        found = []
+        for row in read_rows(path, None, (8,), "timestamp tx ty tz qx qy qz qw"):
+            x, y, z, qx, qy, qz, qw = row.numbers(1, 8)
+            pose = vector_to_ned((x, y, z)), rotation_to_ned((qw, qx, qy, qz))
+            found.append((row.seconds(), *pose))
+        return sorted(found)
+
+
+def _rate(rows: _Rows) -> float:
+    if len(rows) < 2:
+        return 30.0
+    return (len(rows) - 1) * 1e9 / (rows[-1][0] - rows[0][0])

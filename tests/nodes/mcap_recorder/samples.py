@@ -1,0 +1,171 @@
+"""One event of each kind that a recording treats in a way of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from events import (
+    Armed,
+    CameraAnnouncement,
+    CameraInfo,
+    DepthImage,
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    LaserScan3D,
+    Odometry,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    Range,
+    Score,
+    SegmentationImage,
+    TrackedFeatures,
+    TransformStamped,
+    VehicleAnnouncement,
+)
+from runtime.wire import pack
+
+CAMERA = "drone/front"
+OPTICAL = "drone/front_optical"
+TURNED = (0.5, -0.5, 0.5, -0.5)
+
+
+class Found(Event):
+    """An event that only a test knows."""
+
+    number: int
+    where: dict[str, float]
+
+
+def announcements() -> list[Event]:
+    return [
+        VehicleAnnouncement(
+            stamp=0,
+            source="drone",
+            mass=1.2,
+            max_thrust=26.0,
+            control_rate=400.0,
+            position=(1.0, 2.0, -0.1),
+            orientation=(1.0, 0.0, 0.0, 0.0),
+        ),
+        CameraAnnouncement(
+            stamp=0,
+            source=CAMERA,
+            images=("rgb", "depth", "segmentation"),
+            info=CameraInfo(width=5, height=4, fx=5.0, fy=5.5, cx=2.0, cy=1.5),
+            rate=10.0,
+            latency=0.04,
+            frame_id=OPTICAL,
+            parent_frame_id="base_link",
+            position=(0.15, 0.0, 0.0),
+            orientation=(0.5, 0.5, 0.5, 0.5),
+        ),
+        ImuAnnouncement(
+            stamp=0,
+            source="drone/imu",
+            rate=200.0,
+            frame_id="base_link",
+            gyroscope_noise_density=1e-4,
+            gyroscope_random_walk=1e-5,
+            accelerometer_noise_density=2e-3,
+            accelerometer_random_walk=3e-3,
+        ),
+        EstimatorAnnouncement(stamp=0, source="odometry", method="test"),
+    ]
+
+
+def image(stamp: int, source: str = CAMERA, *, grey: bool = False) -> Image:
+    """Return a picture that is another at every stamp."""
+    shape = (4, 5) if grey else (4, 5, 3)
+    data = np.random.default_rng(stamp).integers(0, 255, shape, np.uint8)
+    encoding = "mono8" if grey else "rgb8"
+    return Image(stamp=stamp, source=source, frame_id=OPTICAL, encoding=encoding, data=data)
+
+
+def depth(stamp: int) -> DepthImage:
+    data = np.linspace(0.5, 70.0, 20, dtype=np.float32).reshape(4, 5)
+    data[0, :3] = [np.inf, np.nan, -0.0]
+    return DepthImage(stamp=stamp, source=CAMERA, frame_id=OPTICAL, data=data)
+
+
+def imu(stamp: int) -> Imu:
+    rates, force = (0.1, -0.2, 1e-17), (0.3, -0.0, -9.81)
+    return Imu(stamp=stamp, source="drone/imu", angular_velocity=rates, linear_acceleration=force)
+
+
+def odometry(stamp: int) -> Odometry:
+    return Odometry(
+        stamp=stamp,
+        source="drone",
+        position=(1.0 / 3.0, 2.0, -3.0),
+        orientation=TURNED,
+        linear_velocity=(0.5, 0.0, -1.0),
+        angular_velocity=(0.0, 0.1, 0.0),
+    )
+
+
+def cloud(stamp: int, source: str, count: int, *, colours: bool) -> PointCloud:
+    rng = np.random.default_rng(stamp + count)
+    points = rng.normal(size=(count, 3)).astype(np.float32)
+    points[:1] = [np.nan, -0.0, np.inf]
+    colors = rng.integers(0, 255, (count if colours else 0, 3), np.uint8)
+    return PointCloud(stamp=stamp, source=source, points=points, colors=colors)
+
+
+def said(stamp: int) -> list[Event]:
+    """Return one of everything."""
+    return [
+        imu(stamp),
+        odometry(stamp),
+        PoseStamped(stamp=stamp, source=CAMERA, position=(1.0, 2.0, 3.0), orientation=TURNED),
+        image(stamp),
+        image(stamp, f"{CAMERA}/grey", grey=True),
+        depth(stamp),
+        SegmentationImage(
+            stamp=stamp,
+            source=CAMERA,
+            frame_id=OPTICAL,
+            data=np.arange(-1, 19, dtype=np.int32).reshape(4, 5),
+        ),
+        cloud(stamp, "map", 7, colours=True),
+        cloud(stamp, "map/plain", 3, colours=False),
+        cloud(stamp, "map/none", 0, colours=True),
+        LaserScan3D(
+            stamp=stamp, source="drone/lidar", frame_id="l", points=np.ones((2, 3), np.float32)
+        ),
+        TrackedFeatures(
+            stamp=stamp,
+            source="odometry",
+            frame_id=OPTICAL,
+            points=np.ones((3, 2), np.float32),
+            inliers=np.array([True, False, True]),
+        ),
+        PoseEstimate(
+            stamp=stamp,
+            source="odometry",
+            position=(0.1, 0.2, 0.3),
+            orientation=TURNED,
+            covariance=tuple(float(n) for n in range(36)),
+        ),
+        TransformStamped(
+            stamp=stamp,
+            source="drone",
+            frame_id="base_link",
+            child_frame_id="mast",
+            translation=(0.0, 0.0, -0.2),
+            rotation=(1.0, 0.0, 0.0, 0.0),
+            static=True,
+        ),
+        Range(stamp=stamp, source="drone/down", range=1.0, min_range=0.1, max_range=9.0),
+        Score(stamp=stamp, source="judge", subject="odometry", metric="ate", value=0.5, unit="m"),
+        Armed(stamp=stamp, source="drone"),
+        Found(stamp=stamp, source="test", number=2**60, where={"x": 0.1}),
+    ]
+
+
+def same(found: Event, expected: Event) -> bool:
+    """Tell whether two events are equal to the byte, arrays included."""
+    return pack(found).frame() == pack(expected).frame()

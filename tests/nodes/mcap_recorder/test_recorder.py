@@ -1,0 +1,173 @@
+"""The recorder in a run: everything is in the file, whatever ends the run."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from events import Event, Image
+from nodes.mcap_recorder import McapRecorder, McapRecorderConfig, pipe
+from nodes.mcap_recorder.backlog import Backlog
+from nodes.mcap_recorder.disk import RecordingError
+from nodes.mcap_recorder.mcap_file import McapWriter, contents, read
+from nodes.mcap_recorder.order import Order
+from nodes.mcap_recorder.process import Process
+from nodes.mcap_recorder.recording import Recording
+from nodes.replay.recorded import Recorded
+from runtime import Tick, every
+from runtime.errors import FatalError
+from runtime.testing import NodeResult, run_node, run_nodes, spec
+from runtime.wire import pack
+from tests.nodes.mcap_recorder.samples import announcements, imu, said, same
+
+SECOND = 1_000_000_000
+
+
+def record(events: list[Event], out: Path | None, **config: Any) -> NodeResult:
+    return run_node(
+        McapRecorder, inputs=events, config=config, duration=3.0, name="recorder", out=out
+    )
+
+
+def big(stamp: int) -> Image:
+    data = np.random.default_rng(stamp).integers(0, 255, (300, 300, 3), np.uint8)
+    return Image(stamp=stamp, source="drone/front", frame_id="f", data=data)
+
+
+def test_a_run_is_recorded_to_its_end(tmp_path: Path) -> None:
+    """All that was said is there, when it was said; so is the time at which the run ended."""
+    (tmp_path / "config.toml").write_text("[run]\n")
+    events = [*announcements(), *said(SECOND), *said(2 * SECOND)]
+    result = record(events, tmp_path)
+    assert result.drops["recorder.events"].dropped == 0
+    path = tmp_path / "recording.mcap"
+    reader = Recorded(path)
+    found = list(reader.events(0, None, lambda _, __: True))
+    assert all(same(*pair) for pair in zip(reader.announcements(), events[:4], strict=True))
+    assert all(same(a.event, b) for a, b in zip(found, events[4:], strict=True))
+    assert [each.time for each in found] == [event.stamp for event in events[4:]]
+    assert reader.end() == 3 * SECOND
+    assert contents(path).metadata["visnav"]["events"] == str(len(events))
+
+
+@pytest.mark.slow
+def test_simulated_time_waits_for_a_slow_disk(tmp_path: Path) -> None:
+    """With next to no memory nothing is lost: pictures come no faster than they are written."""
+    events: list[Event] = [big(n * 10_000_000) for n in range(12)]
+    result = record(events, tmp_path, memory=1 << 19, images="png")
+    assert result.drops["recorder.events"].dropped == 0
+    assert result.seconds == 3.0
+    found = Recorded(tmp_path / "recording.mcap").events(0, None, lambda _, __: True)
+    assert [each.event.stamp for each in found] == [event.stamp for event in events]
+
+
+def test_a_full_disk_ends_the_run_in_order(tmp_path: Path) -> None:
+    """The error names the file; what is not in it is counted."""
+    (tmp_path / "recording.mcap").symlink_to("/dev/full")
+    with pytest.raises(FatalError, match=r"recording\.mcap cannot be written: No space left"):
+        record([imu(0)], tmp_path)
+
+
+def test_what_a_failed_chunk_had_is_not_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor what comes after it: the process stops reading."""
+    order = Order(
+        path=str(tmp_path / "a.mcap"), config=McapRecorderConfig(), attachment="", niceness=0,
+        cores=(),
+    )  # fmt: skip
+    process = Process(order)
+
+    def fail(_: McapWriter) -> None:
+        raise RecordingError("full")
+
+    monkeypatch.setattr(McapWriter, "end_chunk", fail)
+    there, here = os.pipe()
+    for stamp in (0, SECOND, 2 * SECOND):
+        pipe.write_all(here, pipe.pieces(stamp, pack(imu(stamp)), pipe.EVENT))
+    os.close(here)
+    answer = process.run(there)
+    os.close(there)
+    assert (answer.what, answer.text, answer.written) == ("error", "full", 0)
+
+
+@pytest.mark.slow
+def test_a_recorder_that_is_restarted_keeps_what_it_had(tmp_path: Path) -> None:
+    """It goes on in a file of its own; both know the announcements."""
+    again = spec(Failing, "recorder", on_error="restart")
+    events = [*announcements(), imu(0), imu(SECOND), imu(2 * SECOND)]
+    run_nodes([again], inputs=events, duration=3.0, out=tmp_path)
+    stamps = {}
+    for path in sorted(tmp_path.glob("*.mcap")):
+        reader = Recorded(path)
+        assert len(reader.announcements()) == 4
+        found = reader.events(0, None, lambda _, __: True)
+        stamps[path.name] = [each.event.stamp for each in found]
+    assert stamps == {"recording-2.mcap": [2 * SECOND], "recording.mcap": [0, SECOND]}
+
+
+class Failing(McapRecorder):
+    """Fails once, at 1.2 s."""
+
+    failed = False
+
+    @every(hz=5)
+    def fail(self, tick: Tick) -> None:
+        if tick.index == 6 and not type(self).failed:
+            type(self).failed = True
+            raise ValueError("a test's own")
+
+
+def test_without_a_folder_nothing_is_recorded() -> None:
+    """A run that writes no files needs none of it."""
+    assert record([imu(0)], None).reason == "duration"
+
+
+def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> None:
+    """The run hears of it, and simulated time does not wait for what will not come."""
+    path, failures = tmp_path / "a.mcap", list[RecordingError]()
+    config = McapRecorderConfig(chunk_size=1 << 16)
+    order = Order(path=str(path), config=config, attachment="", niceness=0, cores=())
+    backlog = Backlog(1 << 18, "wait")
+    recording = Recording(order, backlog, failures.append, lambda _: None)
+    recording.start()
+    backlog.put(1, big(1))
+    while path.stat().st_size < 200_000:
+        time.sleep(0.01)  # for another process
+    os.kill(recording._child.pid, signal.SIGKILL)
+    recording._child.wait()
+    for stamp in range(2, 9):
+        backlog.put(stamp, big(stamp))
+    backlog.wait_for_room()
+    recording.close(9)
+    assert "the process that writes it ended with -9" in str(failures)
+    assert recording.unwritten >= 6
+    trouble: list[str] = []
+    assert {each.time for each in read(path, damaged=trouble.append)} == {1}
+    assert trouble == ["the end is missing: the file was not closed"]
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_leaves_a_whole_file(tmp_path: Path) -> None:
+    """To the process that writes, that is the end of its input; it closes the file."""
+    path = tmp_path / "a.mcap"
+    order = Order(path=str(path), config=McapRecorderConfig(), attachment="", niceness=0, cores=())
+    backlog = Backlog(1 << 18, "wait")
+    recording = Recording(order, backlog, lambda _: None, lambda _: None)
+    recording.start()
+    for event in said(5):
+        backlog.put(5, event)
+    while backlog.bytes:
+        time.sleep(0.01)  # for the thread that hands over
+    assert recording._child.stdin is not None
+    recording._child.stdin.close()  # as the end of this process would
+    recording._child.wait()
+    assert contents(path).complete
+    assert len([r for r in read(path) if "kind" in r.metadata]) == len(said(5))
+    recording.close(5)

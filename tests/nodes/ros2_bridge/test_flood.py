@@ -1,0 +1,54 @@
+"""A flood from another process: each message is heard, or counted as refused or dropped."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bench.flooder import TWIST
+from nodes.ros2_bridge.keys import Topic, data_key
+from tests.nodes.ros2_bridge import said
+from tests.nodes.ros2_bridge.network import bridged_run
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(150)]
+
+MORE = """
+[[nodes.subscriptions]]
+topic = "/cmd_vel"
+type = "geometry_msgs/msg/Twist"
+as = "velocity"
+rate = {rate}
+"""
+
+
+@pytest.mark.parametrize("rate", [100.0, 100_000.0])
+def test_what_was_sent_is_what_was_heard_and_what_was_dropped(rate: float, tmp_path: Path) -> None:
+    """At a rate that refuses most, and at one that lets all wait."""
+    key = data_key(0, Topic(name="/cmd_vel", type=TWIST, hash=said.store().hash(TWIST)))
+    with bridged_run(tmp_path, enough=9, more=MORE.format(rate=rate)) as (run, port):
+        command = [sys.executable, "-m", "bench.flooder", str(port), key, "10000", "1", "4"]
+        flooder = subprocess.run(
+            command, input="go\nend\n", capture_output=True, text=True, timeout=60, check=True
+        )
+        windows = [json.loads(line) for line in flooder.stdout.splitlines()[1:]]
+        sent = [count for _, _, count in windows]
+        time.sleep(1.0)  # what is on its way arrives
+        run.send_signal(signal.SIGINT)
+        output, _ = run.communicate(timeout=30)
+        assert run.returncode == 0, output
+    assert sent[0] == sent[2] == 0
+    assert min(sent[1], sent[3]) > 3000  # 10,000, or what this machine can do
+    (log,) = tmp_path.rglob("log.txt")
+    found = re.search(r"(\d+) heard, (\d+) refused or dropped", log.read_text())
+    assert found is not None
+    heard, refused = map(int, found.groups())
+    assert heard + refused == sum(sent)
+    if rate < 1000:
+        assert 200 <= heard <= 500
