@@ -1,0 +1,268 @@
+"""Topics by source, and which message an event becomes.
+
+Pictures and clouds are put from threads beside the loop, one of each kind at a time; the rest takes
+some microseconds and is put at once. A frame ``world``, z up, is above ``map``, for viewers that
+have no other up.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PlannedPose,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    PositionSetpoint,
+    Quaternion,
+    Score,
+    TrackedFeatures,
+    Vector3,
+    VehicleAnnouncement,
+)
+from nodes.estimation import pose_matrix, pose_tuples
+from nodes.evaluation.live import RecentTruth
+from nodes.foxglove_server.messages import IMU_SCHEMA, SCORE_SCHEMA, Messages
+from nodes.foxglove_server.scene import ESTIMATES, PLAN, TRUTH, Colour, Trail
+from nodes.foxglove_server.server import Server
+from nodes.foxglove_server.settings import FoxgloveConfig
+
+_MAP_IN_WORLD: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
+"""North, east, down in east, north, up."""
+
+
+class Publishing:
+    """Turns events into messages.
+
+    Args:
+        server: Where to.
+        config: The node's settings.
+    """
+
+    def __init__(self, server: Server, config: FoxgloveConfig) -> None:
+        self._server = server
+        self._config = config
+        self._make = Messages(server.types)
+        self._cameras: dict[str, CameraAnnouncement] = {}  # by source
+        self._frames: dict[str, str] = {}  # sources of pictures, by optical frame
+        self._bodies: dict[str, str] = {}  # frames, by vehicle
+        self._estimators: dict[str, str] = {}  # parent frames, by source
+        self._truth = RecentTruth()
+        self._trails: dict[str, Trail] = {}
+        self._drawn: list[Any] = []
+        self._static: list[Any] = []
+        self._planned_by: type[Event] | None = None
+        for topic, kind in (
+            ("/tf", "FrameTransforms"),
+            ("/tf_static", "FrameTransforms"),
+            ("/scene", "SceneUpdate"),
+            ("/log", "Log"),
+        ):
+            server.declare(topic, kind)
+        self._fix(0, "world", "map", (0.0, 0.0, 0.0), _MAP_IN_WORLD)
+        server.latch("/scene", self._whole_scene, 0)
+
+    # Before the first event.
+
+    def announced(self, announcement: Announcement) -> None:
+        """Declare the topics for what will be said."""
+        topic = _topic(announcement.source)
+        match announcement:
+            case VehicleAnnouncement():
+                self._vehicle(announcement.source, "base_link")
+            case ImuAnnouncement():
+                self._server.declare_json(topic, IMU_SCHEMA)
+            case EstimatorAnnouncement():
+                self._server.declare(f"{topic}/pose", "PoseInFrame")
+            case CameraAnnouncement():
+                self._camera(announcement)
+
+    def _camera(self, camera: CameraAnnouncement) -> None:
+        server, topic = self._server, _topic(camera.source)
+        self._cameras[camera.source] = camera
+        self._frames[camera.frame_id] = camera.source
+        calibration = self._make.calibration(camera)
+        server.declare(f"{topic}/camera_info", "CameraCalibration")
+        server.latch(f"{topic}/camera_info", lambda: calibration, camera.stamp)
+        for kind in camera.images if self._config.picture_rate else ():
+            if kind == "grey" and "rgb" in camera.images:
+                server.declare(*self._picture(f"{camera.source}/grey"))
+            elif kind in ("rgb", "grey"):
+                server.declare(*self._picture(camera.source))
+            elif kind == "depth" and self._config.depth:
+                server.declare(f"{topic}/depth", "RawImage")
+        if (parent := camera.parent_frame_id) != "map":
+            self._fix(camera.stamp, parent, camera.frame_id, camera.position, camera.orientation)
+
+    # Beside the loop.
+
+    def image(self, event: Image) -> None:
+        """Put a picture."""
+        self._frames.setdefault(event.frame_id, event.source)
+        topic, type_ = self._picture(event.source)
+        self._server.declare(topic, type_)
+        if self._server.wanted(topic):
+            quality = self._config.jpeg_quality
+            make = self._make
+            message = make.compressed(event, quality) if quality else make.image(event)
+            self._server.log(topic, message, event.stamp)
+
+    def depth(self, event: DepthImage) -> None:
+        """Put a depth image."""
+        topic = f"{_topic(event.source)}/depth"
+        self._server.declare(topic, "RawImage")
+        if self._server.wanted(topic):
+            self._server.log(topic, self._make.depth(event), event.stamp)
+
+    def features(self, event: TrackedFeatures) -> None:
+        """Put what an estimator followed in a picture."""
+        if (camera := self._frames.get(event.frame_id)) is None:
+            return
+        topic = f"{_topic(camera)}/features{_topic(event.source)}"
+        self._server.declare(topic, "ImageAnnotations")
+        if self._server.wanted(topic):
+            self._server.log(topic, self._make.features(event), event.stamp)
+
+    def cloud(self, event: PointCloud) -> None:
+        """Put a cloud; the newest is for those, too, who look later."""
+        topic = f"{_topic(event.source)}/cloud"
+        self._server.declare(topic, "PointCloud")
+        message = self._make.cloud(event)
+        self._server.latch(topic, lambda: message, event.stamp)
+
+    # At once.
+
+    def odometry(self, event: Odometry) -> None:
+        """Put where a vehicle truly is, as a message and as a transform."""
+        stamp, source = event.stamp, event.source
+        body = self._vehicle(source, event.child_frame_id)
+        self._server.log(f"{_topic(source)}/odometry", self._make.odometry(event, body), stamp)
+        self._move(stamp, event.frame_id, body, event.position, event.orientation)
+        if source == next(iter(self._bodies)):
+            self._truth.add(stamp, event.position, event.orientation)
+        self._extend(f"truth/{source}", event.frame_id, TRUTH, stamp, event.position)
+
+    def estimate(self, event: PoseEstimate) -> None:
+        """Put an estimate, and the frame it places: ``<estimator>/<body>``.
+
+        Estimates that are not in ``map`` begin at the true pose of their time.
+        """
+        stamp, source = event.stamp, event.source
+        topic = f"{_topic(source)}/pose"
+        self._server.declare(topic, "PoseInFrame")
+        parent = self._estimators.get(source)
+        if parent is None:
+            parent = self._estimators[source] = self._parent_of(event)
+        self._server.log(topic, self._make.pose(event, parent), stamp)
+        body = f"{source}/{event.child_frame_id}"
+        self._move(stamp, parent, body, event.position, event.orientation)
+        colour = ESTIMATES[list(self._estimators).index(source) % len(ESTIMATES)]
+        self._extend(f"estimate/{source}", parent, colour, stamp, event.position)
+
+    def planned(self, event: PlannedPose | PositionSetpoint) -> None:
+        """Draw where a vehicle is meant to be; set-points only if nobody tells the plan itself."""
+        if self._planned_by is not PlannedPose:
+            self._planned_by = type(event)
+        if isinstance(event, self._planned_by):
+            self._extend("plan", "map", PLAN, event.stamp, event.position)
+
+    def placed(self, event: PoseStamped) -> None:
+        """Put where a free camera is."""
+        camera = self._cameras.get(event.source)
+        if camera is not None and camera.parent_frame_id == "map":
+            pose = event.position, event.orientation
+            self._move(event.stamp, event.frame_id, camera.frame_id, *pose)
+
+    def imu(self, event: Imu) -> None:
+        """Put a measurement."""
+        topic = _topic(event.source)
+        self._server.declare_json(topic, IMU_SCHEMA)
+        self._server.log(topic, self._make.imu(event), event.stamp)
+
+    def score(self, event: Score) -> None:
+        """Put a score."""
+        topic = f"/scores{_topic(event.subject)}/{event.metric}"
+        self._server.declare_json(topic, SCORE_SCHEMA)
+        self._server.log(topic, self._make.score(event), event.stamp)
+
+    def happened(self, event: Event) -> None:
+        """Put an event that is worth a word."""
+        self._server.log("/log", self._make.log(event), event.stamp)
+
+    # What they share.
+
+    def _vehicle(self, source: str, frame_id: str) -> str:
+        """Return a vehicle's frame: the first has its own, others have their name before it."""
+        if (known := self._bodies.get(source)) is not None:
+            return known
+        body = self._bodies[source] = f"{source}/{frame_id}" if self._bodies else frame_id
+        self._server.declare(f"{_topic(source)}/odometry", "Odometry")
+        self._drawn.append(self._make.vehicle(source, body))
+        self._server.latch("/scene", self._whole_scene, 0)
+        return body
+
+    def _parent_of(self, event: PoseEstimate) -> str:
+        """Return the frame that an estimator works in, laid on the truth if it is its own."""
+        if event.frame_id == "map":
+            return "map"
+        frame_id = f"{event.source}/{event.frame_id}"
+        if (truth := self._truth.at(event.stamp)) is not None:
+            said = pose_matrix(event.position, event.orientation)
+            laid = pose_tuples(pose_matrix(*truth) @ np.linalg.inv(said))
+            self._fix(event.stamp, "map", frame_id, *laid)
+        return frame_id
+
+    def _fix(self, stamp: int, parent: str, child: str, at: Vector3, turned: Quaternion) -> None:
+        """Put a transform that holds from now on."""
+        self._static.append(self._make.transform(stamp, parent, child, at, turned))
+        message = self._make.transforms(*self._static)
+        self._server.latch("/tf_static", lambda: message, stamp)
+
+    def _move(self, stamp: int, parent: str, child: str, at: Vector3, turned: Quaternion) -> None:
+        """Put a transform that holds for now."""
+        if self._server.wanted("/tf"):
+            placed = self._make.transform(stamp, parent, child, at, turned)
+            self._server.log("/tf", self._make.transforms(placed), stamp)
+
+    def _extend(self, name: str, frame_id: str, colour: Colour, stamp: int, at: Vector3) -> None:
+        """Draw on at a path."""
+        trail = self._trails.get(name)
+        if trail is None:
+            thickness = 0.04 if name.startswith("truth") else 0.02
+            trail = self._trails[name] = Trail(name, frame_id, colour, thickness)
+        if (piece := trail.add(stamp, at)) is not None and self._server.wanted("/scene"):
+            self._server.log("/scene", self._make.scene(self._make.line(trail, *piece)), stamp)
+
+    def _whole_scene(self) -> Any:
+        """Return all that is drawn, for those who begin to look; in any thread."""
+        lines = [
+            self._make.line(trail, name, piece)
+            for trail in list(self._trails.values())
+            for name, piece in trail.pieces()
+        ]
+        return self._make.scene(*list(self._drawn), *lines)
+
+    def _picture(self, source: str) -> tuple[str, str]:
+        """Return the topic of pictures, and its type.
+
+        A camera with both ``rgb`` and ``grey`` sends the grey ones as ``<source>/grey``.
+        """
+        type_ = "CompressedImage" if self._config.jpeg_quality else "RawImage"
+        extra = source.endswith("/grey") and source.removesuffix("/grey") in self._cameras
+        return _topic(source) if extra else f"{_topic(source)}/image", type_
+
+
+def _topic(source: str) -> str:
+    return f"/{source.strip('/')}"

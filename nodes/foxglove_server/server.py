@@ -1,0 +1,117 @@
+"""The library and its server: the only module that imports foxglove, and not before it is asked to.
+
+The server has threads of its own. To make and log a small message takes about 4 µs where nobody
+looks, and 30 µs where somebody does (most of it to wake such a thread): done on the loop.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from nodes.foxglove_server.settings import FoxgloveConfig
+from runtime.errors import MissingDependencyError, VisnavError
+
+Make = Callable[[], Any]
+"""Returns a message."""
+
+
+class Server:
+    """A WebSocket server (``foxglove.sdk.v1``) and its topics.
+
+    Args:
+        config: Where to listen.
+        name: As viewers show it.
+
+    Raises:
+        MissingDependencyError: foxglove is not installed.
+        VisnavError: It cannot listen there.
+    """
+
+    def __init__(self, config: FoxgloveConfig, name: str) -> None:
+        try:
+            import foxglove
+            import foxglove.channels
+            import foxglove.messages
+            import foxglove.websocket
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"the server needs foxglove ({error}): pip install 'visnav-runtime[foxglove]'"
+            ) from error
+        self.types: Any = foxglove.messages
+        self._channel, self._typed = foxglove.Channel, foxglove.channels
+        self._context = foxglove.Context()
+        self._channels: dict[str, Any] = {}
+        self._latched: dict[str, tuple[Make, int]] = {}
+        self._lock = threading.Lock()
+        listener: Any = _Listener(self._subscribed)
+        try:
+            self._server = foxglove.start_server(
+                name=name,
+                host=config.host,
+                port=config.port,
+                capabilities=[foxglove.websocket.Capability.Time],
+                server_listener=listener,
+                message_backlog_size=config.backlog,
+                context=self._context,
+            )
+        except Exception as error:  # the library's own type is not public
+            raise VisnavError(
+                f"expected to listen on {config.host}:{config.port}, found: {error}"
+            ) from error
+        self.address = f"ws://{config.host}:{self._server.port}"
+
+    def declare(self, topic: str, kind: str) -> None:
+        """Declare a topic of one of Foxglove's own types: ``CompressedImage``."""
+        if topic not in self._channels:
+            channel = getattr(self._typed, f"{kind}Channel")
+            self._channels[topic] = channel(topic, context=self._context)
+
+    def declare_json(self, topic: str, schema: Mapping[str, Any]) -> None:
+        """Declare a topic of objects that a JSON schema describes."""
+        if topic not in self._channels:
+            self._channels[topic] = self._channel(topic, schema=dict(schema), context=self._context)
+
+    def wanted(self, topic: str) -> bool:
+        """Tell whether anybody looks at a topic."""
+        return bool(self._channels[topic].has_sinks())
+
+    def log(self, topic: str, message: Any, stamp: int) -> None:
+        """Send a message to those who look; in any thread."""
+        self._channels[topic].log(message, log_time=stamp)
+
+    def latch(self, topic: str, make: Make, stamp: int) -> None:
+        """Send what `make` returns now, and to whoever looks at the topic from now on."""
+        with self._lock:
+            self._latched[topic] = make, stamp
+        if self.wanted(topic):
+            self.log(topic, make(), stamp)
+
+    def tell_time(self, now: int) -> None:
+        """Tell the run's time (ns)."""
+        self._server.broadcast_time(now)
+
+    def close(self) -> None:
+        """End the server; may take a moment."""
+        self._server.stop()
+
+    def _subscribed(self, topic: str) -> None:
+        with self._lock:
+            make, stamp = self._latched.get(topic, (None, 0))
+        if make is not None:
+            self.log(topic, make(), stamp)
+
+
+class _Listener:
+    """Hears, in the server's threads, who subscribes to what."""
+
+    def __init__(self, subscribed: Callable[[str], None]) -> None:
+        self._subscribed = subscribed
+
+    def on_subscribe(self, _: Any, channel: Any) -> None:
+        """Hear of a subscription."""
+        self._subscribed(channel.topic)
+
+    def on_unsubscribe(self, _: Any, channel: Any) -> None:
+        """Hear of the end of one."""

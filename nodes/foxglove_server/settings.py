@@ -1,0 +1,33 @@
+"""What the file says of the server."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from runtime import NodeConfig
+
+
+class FoxgloveConfig(NodeConfig):
+    """Settings of the server.
+
+    Attributes:
+        host: Where it listens. Whoever reaches it sees all; hence this machine only, unless said
+            otherwise.
+        port: The same; 0: any that is free (the log tells it).
+        picture_rate: Pictures a second of each camera, on the run's clock; of a set (colours,
+            depth) all or none. 0: no pictures.
+        jpeg_quality: 1 to 100; 0: pictures as they are.
+        depth: Whether to show depth images, in millimetres.
+        time_rate: How often a second the run's time is told.
+        backlog: Messages that wait for a viewer that is slow; the oldest is dropped.
+    """
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 8765
+    picture_rate: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 15.0
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=0, le=100)] = 80
+    depth: bool = True
+    time_rate: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 50.0
+    backlog: Annotated[int, msgspec.Meta(ge=1)] = 1024

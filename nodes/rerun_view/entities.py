@@ -1,0 +1,81 @@
+"""Where things stand in Rerun's tree of entities, which is also its tree of frames.
+
+map                        the world: x north, y east, z down
+map/<vehicle>              a vehicle's body, where it truly is
+map/<vehicle>/<camera>     one of its cameras (optical frame), with its pictures below
+map/cameras/<camera>       a free camera
+map/truth/<vehicle>        the path it has truly flown
+map/plan                   the path it was meant to fly
+map/estimates/<estimator>  the frame an estimator works in; its path and newest pose below
+pictures/<camera>          pictures of a camera that nobody announced
+map/clouds/<node>          clouds; map/seen/<camera>: points of depth images
+imu, scores, log           plots and text
+"""
+
+from __future__ import annotations
+
+import re
+
+from events import CameraAnnouncement
+
+WORLD = "map"
+PLAN = "map/plan"
+LOG = "log"
+
+
+def path(*names: str) -> str:
+    """Return an entity's path; slashes of sources divide it, what Rerun cannot read is escaped."""
+    parts = [part for name in names for part in name.split("/") if part]
+    return "/".join(re.sub(r"([^\w.-])", r"\\\1", part) for part in parts)
+
+
+def body(vehicle: str) -> str:
+    """Return where a vehicle's body is."""
+    return path(WORLD, vehicle)
+
+
+def truth(vehicle: str) -> str:
+    """Return where a vehicle's true path is."""
+    return path(WORLD, "truth", vehicle)
+
+
+def estimate(estimator: str) -> str:
+    """Return where an estimator's own frame is."""
+    return path(WORLD, "estimates", estimator)
+
+
+def estimated_path(estimator: str) -> str:
+    """Return where an estimator's path is."""
+    return f"{estimate(estimator)}/path"
+
+
+def seen(camera: str) -> str:
+    """Return where the points are that a camera saw."""
+    return path(WORLD, "seen", camera)
+
+
+def cloud(source: str) -> str:
+    """Return where a node's clouds are."""
+    return path(WORLD, "clouds", source)
+
+
+def scores(subject: str, metric: str) -> str:
+    """Return where a plot of errors is."""
+    return path("scores", metric, subject)
+
+
+def imu(source: str, what: str) -> str:
+    """Return where a plot of measurements is."""
+    return path("imu", what, source)
+
+
+def pictures(source: str) -> str:
+    """Return where the pictures are of a camera of which nothing else is known."""
+    return path("pictures", source)
+
+
+def camera(announced: CameraAnnouncement) -> str:
+    """Return where a camera is: below its vehicle, or free in the world."""
+    if announced.parent_frame_id == "map":
+        return path(WORLD, "cameras", announced.source)
+    return path(WORLD, announced.source)

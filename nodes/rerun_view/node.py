@@ -1,0 +1,164 @@
+"""The view as a node: what it hears, how much of that it keeps, and when it passes it on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from events import (
+    Announcement,
+    DepthImage,
+    Event,
+    Image,
+    Imu,
+    Odometry,
+    PlannedPose,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    PositionSetpoint,
+    Score,
+    SegmentationImage,
+    TrackedFeatures,
+    TrackingEvent,
+    VehicleEvent,
+)
+from nodes.rerun_view.pictures import Thinning
+from nodes.rerun_view.recorder import Recorder
+from nodes.rerun_view.recording import Numbered
+from nodes.rerun_view.settings import RerunConfig
+from runtime import Node, Stream, on
+
+_PICTURES, _ROWS = 256, 16384
+"""What waits to be passed on: pictures and clouds, and the rest. In lockstep time waits for the
+recorder, and nothing ever has to be dropped; in real time the oldest is, and counted."""
+
+_PACK = 2048
+"""Events that are passed on at once, at most."""
+
+
+class RerunView(Node[RerunConfig]):
+    """Shows a run in Rerun, or writes what Rerun can open.
+
+    ::
+
+        [[nodes]]
+        name = "view"
+        type = "nodes.rerun_view:RerunView"
+
+    The world, vehicles, cameras with their pictures, paths, estimates, clouds, errors and IMU have
+    their places in a layout that needs no arranging. First in the file, it also hears what others
+    say as they end, such as the cloud of a mapping.
+    """
+
+    def __init__(self) -> None:
+        self._announcements: list[Announcement] = []
+        self._heard = 0
+        self._passed = 0
+        self._recorder: Any = None
+        self._begun = False
+        self._thinning = Thinning(self.config.picture_rate)
+        self._pictures: Stream[Numbered[Event]] = Stream(
+            f"{self.name}.pictures", _PICTURES, "drop_oldest"
+        )
+        self._rows: Stream[Numbered[Event]] = Stream(f"{self.name}.rows", _ROWS, "drop_oldest")
+
+    async def on_startup(self) -> None:
+        """Start the process that logs."""
+        config, file = self.config, None
+        if config.mode == "save":
+            if self.out is None:
+                self.log.warning("the run writes no files, so there is nothing to view")
+                return
+            file = self.out / config.file
+            self.out.mkdir(parents=True, exist_ok=True)
+        name = self.name if self.out is None else self.out.name
+        self._recorder = await self.worker(Recorder, config, name, file)
+        if page := await self._recorder.call_for(0.0, Recorder.page):
+            self.log.info("open %s", page)
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Note what there will be."""
+        self._announcements.append(announcement)
+
+    @on(Image, DepthImage, SegmentationImage)
+    def pictured(self, event: Image | DepthImage | SegmentationImage) -> None:
+        """Keep some pictures."""
+        self._heard += 1
+        kind = type(event).__name__
+        if self._thinning.picture(kind, event.source, event.frame_id, event.stamp):
+            self._pictures.offer((self._heard, event))
+
+    @on(TrackedFeatures)
+    def followed(self, event: TrackedFeatures) -> None:
+        """Keep the features of those pictures."""
+        self._heard += 1
+        if self._thinning.belongs(event.frame_id, event.stamp):
+            self._pictures.offer((self._heard, event))
+
+    @on(PointCloud)
+    def mapped(self, event: PointCloud) -> None:
+        """Keep clouds."""
+        self._heard += 1
+        self._pictures.offer((self._heard, event))
+
+    @on(
+        Odometry,
+        PoseStamped,
+        PoseEstimate,
+        PlannedPose,
+        PositionSetpoint,
+        Imu,
+        Score,
+        TrackingEvent,
+        VehicleEvent,
+    )
+    def said(self, event: Event) -> None:
+        """Keep what is small."""
+        self._heard += 1
+        self._rows.offer((self._heard, event))
+
+    async def run(self) -> None:
+        """Pass on what has come, again and again.
+
+        In lockstep the run goes on for one period while a batch is logged.
+        """
+        if self._recorder is None:
+            return
+        await self._begin()
+        period = 1.0 / self.config.rate
+        while True:
+            batch = self._take()
+            if batch:
+                await self._recorder.call_for(period, Recorder.log, batch)
+            else:
+                await self.clock.sleep(period)
+
+    async def on_shutdown(self) -> None:
+        """Pass on the rest, and close the file."""
+        if self._recorder is None:
+            return
+        await self._begin()
+        while batch := self._take():
+            await self._recorder.call_for(0.0, Recorder.log, batch)
+        if trouble := await self._recorder.call_for(0.0, Recorder.close):
+            self.log.warning("the viewer went away before the end: %s", trouble)
+        dropped = self._pictures.dropped + self._rows.dropped
+        if dropped:
+            self.log.warning("%d of %d events dropped: the view was too slow", dropped, self._heard)
+        if self.config.mode == "save" and self.out is not None:
+            self.log.info("%s: rerun opens it", self.out / self.config.file)
+
+    async def _begin(self) -> None:
+        if not self._begun:
+            self._begun = True
+            await self._recorder.call_for(0.0, Recorder.begin, self._announcements)
+
+    def _take(self) -> list[Numbered[Event]]:
+        """Return what waits, in the order in which it was heard."""
+        batch = [
+            stream.receive_nowait()
+            for stream in (self._pictures, self._rows)
+            for _ in range(min(stream.statistics().buffered, _PACK))
+        ]
+        batch.sort(key=lambda each: each[0])
+        return batch

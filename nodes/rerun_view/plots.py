@@ -1,0 +1,86 @@
+"""Numbers over time, and what happened, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from events import Event, Imu, Score, TrackingLost
+from nodes.rerun_view import entities
+from nodes.rerun_view.recording import Colour, Numbered, Recording
+
+_AXES = [(230, 80, 70), (90, 200, 90), (90, 140, 255)]
+"""Colours of x, y, z."""
+
+_MEASURED = ("angular_velocity", "linear_acceleration")
+
+_HANDY = {"rad": ("°", 180.0 / np.pi), "s": ("ms", 1000.0)}
+"""By unit of a score: what is plotted instead, and how many of it make one."""
+
+PLOTS = {
+    "position error (m)": "+ /scores/position_error/**",
+    "rotation error (°)": "+ /scores/rotation_error/**",
+    "angular velocity (rad/s)": "+ /imu/angular_velocity/**",
+    "specific force (m/s²)": "+ /imu/linear_acceleration/**",
+}
+"""Which plots have a place in the layout, by title, and what they show."""
+
+_TITLED = ("position_error", "rotation_error")
+"""Metrics whose plots have the unit in their title."""
+
+
+class Plots:
+    """Writes curves and words.
+
+    Args:
+        recording: Where to.
+        colours: Of what is scored, by source.
+    """
+
+    def __init__(self, recording: Recording, colours: Mapping[str, Colour]) -> None:
+        self._to = recording
+        self._colours = colours
+        self._known: set[str] = set()
+
+    def imu(self, source: str) -> None:
+        """Prepare the curves of an IMU."""
+        for what in _MEASURED:
+            self._style(entities.imu(source, what), colors=_AXES, names=["x", "y", "z"])
+
+    def measurements(self, source: str, events: Sequence[Numbered[Imu]]) -> None:
+        """Put measurements of one IMU."""
+        self.imu(source)
+        for what in _MEASURED:
+            rows = np.array([getattr(event, what) for _, event in events])
+            columns = self._to.rr.Scalars.columns(scalars=rows)
+            self._to.columns(entities.imu(source, what), events, columns)
+
+    def scores(self, events: Sequence[Numbered[Score]]) -> None:
+        """Put scores, of any subject and metric."""
+        apart: dict[tuple[str, str, str], list[Numbered[Score]]] = {}
+        for number, event in events:
+            key = event.subject, event.metric, event.unit
+            apart.setdefault(key, []).append((number, event))
+        for (subject, metric, unit), found in apart.items():
+            entity = entities.scores(subject, metric)
+            shown, factor = _HANDY.get(unit, (unit, 1.0))
+            style = {"colors": [self._colours[subject]]} if subject in self._colours else {}
+            name = subject if metric in _TITLED else f"{subject} ({shown})"
+            self._style(entity, names=[name], **style)
+            values = np.array([event.value for _, event in found]) * factor
+            self._to.columns(entity, found, self._to.rr.Scalars.columns(scalars=values))
+
+    def happened(self, event: Event) -> None:
+        """Put an event that is worth a word."""
+        text = f"{event.source}: {type(event).__name__}"
+        if more := getattr(event, "reason", "") or getattr(event, "other", ""):
+            text += f" ({more})"
+        lost = isinstance(event, TrackingLost)
+        self._to.put(entities.LOG, self._to.rr.TextLog(text, level="WARN" if lost else "INFO"))
+
+    def _style(self, entity: str, **style: Any) -> None:
+        if entity not in self._known:
+            self._known.add(entity)
+            self._to.static(entity, self._to.rr.SeriesLines(**style))

@@ -1,0 +1,214 @@
+"""Events to Rerun. For a worker's process, because the library holds Python's lock for long.
+
+    recorder = await self.worker(Recorder, config, name, file)
+    await recorder.call(Recorder.begin, announcements)
+    await recorder.call(Recorder.log, batch)
+
+Time is told twice: ``run``, an event's stamp, and ``event``, the order in which they were heard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PlannedPose,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    PositionSetpoint,
+    Score,
+    SegmentationImage,
+    TrackedFeatures,
+    TrackingEvent,
+    VehicleAnnouncement,
+    VehicleEvent,
+)
+from nodes.rerun_view.layout import Contents, Eye, layout
+from nodes.rerun_view.plots import PLOTS, Plots
+from nodes.rerun_view.recording import Numbered, Recording
+from nodes.rerun_view.sdk import Viewer, load
+from nodes.rerun_view.settings import RerunConfig
+from nodes.rerun_view.world import World
+
+_GATHERED = 500
+"""Events that are written into a file together."""
+
+_FLUSH = 20.0
+"""Real seconds that the end waits for a viewer that does not take what is logged."""
+
+
+class Recorder:
+    """One recording.
+
+    Args:
+        config: The node's settings.
+        name: Of the run, as the viewer lists it.
+        file: To write, in mode ``save``.
+
+    Raises:
+        MissingDependencyError: rerun is not installed, or there is no screen for its window.
+        VisnavError: A port cannot be had.
+    """
+
+    def __init__(self, config: RerunConfig, name: str, file: Path | None) -> None:
+        self._config = config
+        library = load()
+        self._rrb = library.blueprint
+        self._stream = library.log.RecordingStream("visnav")
+        self._viewer: Viewer | None = None
+        if config.mode == "save":
+            self._stream.save(file)
+        else:
+            self._viewer = Viewer(config)
+            self._stream.connect_grpc(self._viewer.data)
+        self._stream.send_recording_name(name)
+        recording = Recording(library.log, self._stream)
+        self._recording = recording
+        self._world = World(recording, config)
+        self._plots = Plots(recording, self._world.colours)
+        self._plotted: set[str] = set()
+        self._shown: tuple[int, ...] = ()
+        self._closed = False
+        self._waiting: list[Numbered[Event]] = []
+
+    def page(self) -> str:
+        """Return the address of the page that shows the run; empty if there is none."""
+        return "" if self._viewer is None else self._viewer.page
+
+    def begin(self, announcements: Iterable[Announcement]) -> None:
+        """Put what holds for the whole run."""
+        for each in announcements:
+            match each:
+                case VehicleAnnouncement():
+                    self._world.vehicle(each.source)
+                case EstimatorAnnouncement():
+                    self._world.estimator(each.source)
+                    self._plotted.add("scores")
+                case ImuAnnouncement():
+                    self._plots.imu(each.source)
+                    self._plotted.add("imu")
+                case CameraAnnouncement():
+                    self._world.camera(each)
+        self._show()
+
+    def log(self, batch: Sequence[Numbered[Event]]) -> None:
+        """Put events, in the order in which they were heard.
+
+        What goes into a file is gathered first: each entity's rows have a head of their own.
+        """
+        self._waiting += batch
+        if self._viewer is None and len(self._waiting) < _GATHERED:
+            return
+        batch, self._waiting = self._waiting, []
+        self._log(batch)
+
+    def _log(self, batch: Sequence[Numbered[Event]]) -> None:
+        together: dict[tuple[type[Event], str], list[Any]] = {}
+        for number, event in batch:
+            kind = next((kind for kind in _IN_COLUMNS if isinstance(event, kind)), None)
+            if kind is not None:
+                together.setdefault((kind, event.source), []).append((number, event))
+        for kind in _IN_COLUMNS:  # the truth first: estimates are held against it
+            for (found, source), events in together.items():
+                if found is kind:
+                    self._put_columns(kind, source, events)
+        for number, event in batch:
+            self._recording.at(number, event.stamp)
+            self._put(number, event)
+        self._show()
+
+    def close(self) -> str:
+        """Write the rest, and end; return what went wrong with a viewer, or nothing.
+
+        Raises:
+            RuntimeError: The file could not be written.
+        """
+        if self._closed:
+            return ""
+        self._closed, trouble = True, ""
+        self._log(self._waiting)
+        self._world.finish()
+        self._show(self._eye())
+        try:
+            self._stream.flush(timeout_sec=_FLUSH)
+        except RuntimeError as error:  # a window that was closed, or a page that stands still
+            if self._viewer is None:
+                raise
+            trouble = self._viewer.last_words() or str(error)
+        self._stream.disconnect()
+        if self._viewer is not None:
+            self._viewer.close()
+        return trouble
+
+    def _put_columns(self, kind: type[Event], source: str, events: list[Any]) -> None:
+        if kind is Odometry:
+            self._world.moved(source, events)
+        elif kind is PoseEstimate:
+            self._world.estimated(source, events)
+        elif kind is Imu:
+            self._plots.measurements(source, events)
+            self._plotted.add("imu")
+        else:
+            self._plots.scores(events)
+            self._plotted.add("scores")
+
+    def _put(self, number: int, event: Event) -> None:
+        world = self._world
+        match event:
+            case Image():
+                world.image(event)
+            case DepthImage():
+                world.depth(event)
+            case SegmentationImage():
+                world.segmentation(event)
+            case TrackedFeatures():
+                world.features(event)
+            case PoseStamped():
+                world.placed(event)
+            case PointCloud():
+                world.cloud(event)
+            case PlannedPose() | PositionSetpoint():
+                world.planned(number, event)
+            case TrackingEvent() | VehicleEvent():
+                self._plots.happened(event)
+
+    def _show(self, eye: Eye | None = None) -> None:
+        """Send the layout if there is something new to show."""
+        pictures = self._world.pictures
+        found = (
+            len(self._world.trails),
+            len(self._plotted),
+            *(len(kinds) for kinds in pictures.values()),
+        )
+        if found == self._shown and eye is None:
+            return
+        self._shown = found
+        plots = {t: what for t, what in PLOTS.items() if what.split("/")[1] in self._plotted}
+        contents = Contents(trails=self._world.trails, cameras=pictures, plots=plots, eye=eye)
+        self._stream.send_blueprint(layout(self._rrb, contents))
+
+    def _eye(self) -> Eye | None:
+        """Return an eye that sees all of the flight from above, from south-west."""
+        low, high = self._world.bounds
+        if self._config.mode != "save" or not np.isfinite(low).all():
+            return None
+        centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 5.0)
+        x, y, z = centre.tolist()
+        return (x - 0.7 * size, y - 0.4 * size, z - 0.9 * size), (x, y, z)
+
+
+_IN_COLUMNS: tuple[type[Event], ...] = (Odometry, PoseEstimate, Imu, Score)

@@ -1,0 +1,287 @@
+"""What stands in the world: vehicles, paths, estimates, cameras with what they see, clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from events import (
+    CameraAnnouncement,
+    CameraInfo,
+    DepthImage,
+    Image,
+    Odometry,
+    PlannedPose,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    PositionSetpoint,
+    SegmentationImage,
+    TrackedFeatures,
+    Vector3,
+)
+from nodes.estimation import pose_matrix, pose_tuples
+from nodes.evaluation.live import RecentTruth
+from nodes.rerun_view import entities
+from nodes.rerun_view.paths import Path
+from nodes.rerun_view.pictures import CENTIMETRES, Points, Surroundings, depth_png, jpeg
+from nodes.rerun_view.recording import Colour, Numbered, Recording
+from nodes.rerun_view.settings import RerunConfig
+
+_TRUTH, _PLAN = (80, 220, 120), (140, 140, 150)
+_INLIER, _OUTLIER = (90, 240, 120), (240, 80, 70)
+_ESTIMATES = [(255, 160, 20), (90, 170, 255), (230, 110, 230), (250, 230, 80), (120, 230, 230)]
+
+_THICK, _THIN = 0.02, 0.01
+"""Metres: radii of paths."""
+
+
+class World:
+    """Writes what has a place.
+
+    Args:
+        recording: Where to.
+        config: The node's settings.
+    """
+
+    def __init__(self, recording: Recording, config: RerunConfig) -> None:
+        self._to = recording
+        self._rr = recording.rr
+        self._config = config
+        self._truth: dict[str, RecentTruth] = {}
+        self._cameras: dict[str, CameraAnnouncement] = {}  # by source
+        self._frames: dict[str, str] = {}  # entities of cameras, by optical frame
+        self._surroundings: dict[str, Surroundings] = {}  # by source
+        self._anchored: set[str] = set()
+        self._paths: dict[str, tuple[Path, Colour, float]] = {}
+        self._latest: dict[str, tuple[int, int]] = {}
+        self._planned_by: type | None = None
+        self.colours: dict[str, Colour] = {}
+        """Of estimators, by source."""
+        self.pictures: dict[str, list[str]] = {}
+        """Kinds of pictures there are, by camera's entity."""
+        self.trails: list[str] = []
+        """Entities of which all that was logged is to be shown."""
+        self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
+        """Where vehicles have been: lowest and highest coordinates, metres in ``map``."""
+        recording.static(entities.WORLD, self._rr.ViewCoordinates.FRD)
+
+    # What there is.
+
+    def vehicle(self, source: str) -> None:
+        """Prepare a vehicle: a body with four rotors, and its axes."""
+        if source in self._truth:
+            return
+        self._truth[source] = RecentTruth()
+        entity = entities.body(source)
+        rotors = [(x, y, -0.03) for x in (-0.14, 0.14) for y in (-0.14, 0.14)]
+        self._to.static(
+            f"{entity}/shape",
+            self._rr.Boxes3D(
+                centers=[(0, 0, 0), (0.09, 0, 0), *rotors],
+                half_sizes=[(0.1, 0.06, 0.035), (0.03, 0.03, 0.02), *[(0.09, 0.09, 0.006)] * 4],
+                colors=[(200, 200, 210), (230, 80, 70), *[(90, 95, 110)] * 4],
+                fill_mode="solid",
+            ),
+        )
+        self._to.static(entity, self._rr.TransformAxes3D(0.4))
+        self._path(entities.truth(source), _TRUTH, _THICK)
+
+    def estimator(self, source: str) -> None:
+        """Prepare an estimator's path, and give it a colour."""
+        if source in self.colours:
+            return
+        self.colours[source] = _ESTIMATES[len(self.colours) % len(_ESTIMATES)]
+        self._path(entities.estimated_path(source), self.colours[source], _THIN)
+
+    def camera(self, announced: CameraAnnouncement) -> None:
+        """Prepare a camera: where it sits, and how it sees."""
+        config, info = self._config, announced.info
+        self._cameras[announced.source] = announced
+        entity = self._frames[announced.frame_id] = entities.camera(announced)
+        kinds = [kind for kind in announced.images if config.depth or kind != "depth"]
+        self.pictures[entity] = kinds if config.picture_rate else []
+        if announced.parent_frame_id != "map":
+            self._to.static(entity, self._transform(announced.position, announced.orientation))
+        for kind in announced.images:
+            self._pinhole(f"{entity}/{kind}", info, config.depth_stride if kind == "depth" else 1)
+        if "depth" in announced.images and config.points_rate and config.picture_rate:
+            self._surroundings[announced.source] = Surroundings(
+                info,
+                config.points_rate,
+                config.points_stride,
+                config.points_reach,
+                config.points_above,
+            )
+            self.trails.append(entities.seen(announced.source))
+
+    # What moves.
+
+    def moved(self, source: str, events: Sequence[Numbered[Odometry]]) -> None:
+        """Put true poses of one vehicle."""
+        self.vehicle(source)
+        truth = self._truth[source]
+        for number, event in events:
+            truth.add(event.stamp, event.position, event.orientation)
+            self._extend(entities.truth(source), number, event.stamp, event.position)
+        positions = np.array([event.position for _, event in events])
+        self.bounds[0] = np.minimum(self.bounds[0], positions.min(axis=0))
+        self.bounds[1] = np.maximum(self.bounds[1], positions.max(axis=0))
+        self._poses(entities.body(source), events)
+
+    def estimated(self, source: str, events: Sequence[Numbered[PoseEstimate]]) -> None:
+        """Put estimates of one estimator.
+
+        Those that are not in ``map`` begin at the true pose of their time, as evaluation lays them.
+        """
+        self.estimator(source)
+        first = events[0][1]
+        if source not in self._anchored:
+            self._anchored.add(source)
+            if first.frame_id != "map" and (truth := self._true_pose(first.stamp)) is not None:
+                laid = truth @ np.linalg.inv(pose_matrix(first.position, first.orientation))
+                self._to.static(entities.estimate(source), self._transform(*pose_tuples(laid)))
+            self._to.static(f"{entities.estimate(source)}/body", self._rr.TransformAxes3D(0.3))
+        for number, event in events:
+            self._extend(entities.estimated_path(source), number, event.stamp, event.position)
+        self._poses(f"{entities.estimate(source)}/body", events)
+
+    def planned(self, number: int, event: PlannedPose | PositionSetpoint) -> None:
+        """Put where a vehicle is meant to be; set-points only if nobody tells the plan itself."""
+        if self._planned_by is not PlannedPose:
+            self._planned_by = type(event)
+        if isinstance(event, self._planned_by):
+            self._path(entities.PLAN, _PLAN, _THIN)
+            self._extend(entities.PLAN, number, event.stamp, event.position)
+
+    def placed(self, event: PoseStamped) -> None:
+        """Put where a free camera is; that of a vehicle's camera serves its depth images."""
+        camera = self._cameras.get(event.source)
+        if camera is not None and camera.parent_frame_id == "map":
+            pose = self._transform(event.position, event.orientation)
+            self._to.put(entities.camera(camera), pose)
+        self._surround(event)
+
+    # What is seen.
+
+    def image(self, event: Image) -> None:
+        """Put a picture."""
+        quality = self._config.jpeg_quality
+        picture = (
+            self._rr.EncodedImage(contents=jpeg(event.data, quality), media_type="image/jpeg")
+            if quality
+            else self._rr.Image(event.data)
+        )
+        self._to.put(self._place(event, "grey" if event.data.ndim == 2 else "rgb"), picture)
+        self._surround(event)
+
+    def depth(self, event: DepthImage) -> None:
+        """Put a depth image."""
+        if (config := self._config).depth:
+            picture = self._rr.EncodedDepthImage(
+                depth_png(event.data[:: config.depth_stride, :: config.depth_stride]),
+                media_type="image/png",
+                meter=CENTIMETRES,
+                colormap="turbo",
+                depth_range=(0.0, config.points_reach * CENTIMETRES),
+            )
+            self._to.put(self._place(event, "depth"), picture)
+        self._surround(event)
+
+    def segmentation(self, event: SegmentationImage) -> None:
+        """Put which objects are seen; nothing is object 0."""
+        classes = np.clip(event.data + 1, 0, 65535).astype(np.uint16)
+        self._to.put(self._place(event, "segmentation"), self._rr.SegmentationImage(classes))
+
+    def features(self, event: TrackedFeatures) -> None:
+        """Put what an estimator followed in a picture."""
+        if (camera := self._frames.get(event.frame_id)) is not None:
+            colours = np.where(event.inliers[:, None], _INLIER, _OUTLIER).astype(np.uint8)
+            centres = event.points + 0.5  # Rerun's pixels have their centres at halves
+            points = self._rr.Points2D(centres, colors=colours, radii=2.0)
+            entity = entities.path("features", event.source)
+            kind = "rgb" if "rgb" in self.pictures[camera] else "grey"
+            self._to.put(f"{camera}/{kind}/{entity}", points)
+
+    def cloud(self, event: PointCloud) -> None:
+        """Put a cloud, in the world or in its camera."""
+        entity = entities.cloud(event.source)
+        if (camera := self._frames.get(event.frame_id)) is not None:
+            entity = f"{camera}/{entities.path('cloud', event.source)}"
+        colours = event.colors if len(event.colors) else None
+        self._to.put(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
+
+    def finish(self) -> None:
+        """Put what is left of the paths."""
+        for entity, (path, _, _) in self._paths.items():
+            if (rest := path.rest()) is not None:
+                self._strip(entity, *self._latest[entity], rest)
+
+    def _place(self, event: Image | DepthImage | SegmentationImage, kind: str) -> str:
+        """Return where a picture belongs: to its camera, or by itself if nobody announced that."""
+        camera = self._frames.setdefault(event.frame_id, entities.pictures(event.source))
+        if kind not in (kinds := self.pictures.setdefault(camera, [])):
+            kinds.append(kind)
+        return f"{camera}/{kind}"
+
+    def _surround(self, event: Image | DepthImage | PoseStamped) -> None:
+        if (found := self._surroundings.get(event.source)) is None:
+            return
+        if (seen := found.take(event)) is not None:
+            self._points(entities.seen(event.source), seen)
+
+    def _pinhole(self, entity: str, info: CameraInfo, stride: int) -> None:
+        """Put how a picture of every n-th pixel was taken; Rerun's centres are at halves."""
+        matrix = info.matrix()
+        matrix[:2] /= stride
+        matrix[:2, 2] += 0.5
+        self._to.static(
+            entity,
+            self._rr.Pinhole(
+                image_from_camera=matrix,
+                resolution=(-(-info.width // stride), -(-info.height // stride)),
+                camera_xyz=self._rr.ViewCoordinates.RDF,
+                image_plane_distance=0.5,
+                color=(200, 200, 210),
+            ),
+        )
+
+    def _points(self, entity: str, seen: Points) -> None:
+        points = self._rr.Points3D(seen.points, colors=seen.colours, radii=0.02)
+        self._to.put(entity, points)
+
+    def _true_pose(self, stamp: int) -> npt.NDArray[np.float64] | None:
+        found = [pose for each in self._truth.values() if (pose := each.at(stamp)) is not None]
+        return pose_matrix(*found[0]) if found else None
+
+    def _poses(
+        self, entity: str, events: Sequence[Numbered[Odometry]] | Sequence[Numbered[PoseEstimate]]
+    ) -> None:
+        columns = self._rr.Transform3D.columns(
+            translation=np.array([event.position for _, event in events]),
+            quaternion=np.array(
+                [(*event.orientation[1:], event.orientation[0]) for _, event in events]
+            ),
+        )
+        self._to.columns(entity, events, columns)
+
+    def _transform(self, position: Vector3, orientation: tuple[float, ...]) -> object:
+        w, x, y, z = orientation
+        return self._rr.Transform3D(translation=position, quaternion=(x, y, z, w))
+
+    def _path(self, entity: str, colour: Colour, radius: float) -> None:
+        if entity not in self._paths:
+            self._paths[entity] = Path(), colour, radius
+            self.trails.append(entity)
+
+    def _extend(self, entity: str, number: int, stamp: int, position: Vector3) -> None:
+        self._latest[entity] = number, stamp
+        if (piece := self._paths[entity][0].add(stamp, position)) is not None:
+            self._strip(entity, number, stamp, piece)
+
+    def _strip(self, entity: str, number: int, stamp: int, piece: list[Vector3]) -> None:
+        _, colour, radius = self._paths[entity]
+        self._to.at(number, stamp)
+        self._to.put(entity, self._rr.LineStrips3D([piece], colors=[colour], radii=[radius]))

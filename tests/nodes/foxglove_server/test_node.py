@@ -1,0 +1,104 @@
+"""The server as a node: on simulated time, and as a user would start it."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from events import Event
+from nodes.foxglove_server import FoxgloveServer
+from nodes.foxglove_server.server import Server
+from nodes.foxglove_server.settings import FoxgloveConfig
+from runtime.errors import ConfigError, FatalError, MissingDependencyError
+from runtime.testing import run_node
+from tests.nodes.foxglove_server.client import Viewer, fields
+from tests.nodes.rerun_view.said import CAMERA, ESTIMATOR, MS, VEHICLE, image, imu, odometry
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_it_runs_where_nobody_looks(caplog: pytest.LogCaptureFixture) -> None:
+    inputs: list[Event] = [VEHICLE, CAMERA, ESTIMATOR]
+    inputs += [e for i in range(20) for e in (odometry(i * MS), imu(i * MS), image(i * MS))]
+    with caplog.at_level("INFO"):
+        result = run_node(FoxgloveServer, inputs=inputs, config={"port": 0}, duration=0.1)
+    assert result.ticks["node.tell_time"].calls == 5
+    assert any("open ws://127.0.0.1:" in record.getMessage() for record in caplog.records)
+
+
+def test_a_port_that_is_taken_ends_the_run_with_a_reason() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(FatalError, match=f"expected to listen on 127.0.0.1:{port}"):
+            run_node(FoxgloveServer, config={"port": port})
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [({"port": 70_000}, "port"), ({"picture_rate": -1}, "picture_rate"), ({"size": 1}, "size")],
+)
+def test_settings_that_are_wrong_say_where(config: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        run_node(FoxgloveServer, config=config)
+
+
+def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'visnav-runtime\[foxglove\]'"):
+        Server(FoxgloveConfig(), "test")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_a_viewer_comes_and_goes_while_the_example_flies(tmp_path: Path) -> None:
+    """Pictures and poses come at their rates; a viewer that is cut off leaves the run alone."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    process = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "runtime", "run", "examples/foxglove.toml"),
+            *("--out", str(tmp_path), "--set", f"foxglove.port={port}"),
+        ],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        viewer = _connect(f"ws://127.0.0.1:{port}")
+        topics = "/drone/camera/image", "/tf_static", "/drone/odometry"
+        viewer.subscribe(*topics)
+        end = time.monotonic() + 60.0
+        while len(viewer.messages[topics[0]]) < 20 and time.monotonic() < end:
+            viewer.take()
+        assert len(viewer.messages[topics[0]]) >= 20
+        assert len(viewer.messages[topics[2]]) > len(viewer.messages[topics[0]])
+        assert len(fields(viewer.next("/tf_static"))[1]) == 2
+        viewer.connection.socket.shutdown(socket.SHUT_RDWR)
+        viewer.close()
+        with _connect(f"ws://127.0.0.1:{port}") as another:
+            another.subscribe("/drone/camera/image")
+            another.next("/drone/camera/image")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30.0) in (0, 1)  # 1: so early the verdict may be anything
+    finally:
+        process.kill()
+        process.wait()
+    assert "Callback failed" not in (tmp_path / "log.txt").read_text()
+
+
+def _connect(address: str) -> Viewer:
+    end = time.monotonic() + 60.0
+    while True:
+        try:
+            return Viewer(address)
+        except OSError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.05)  # for a process, which has a clock of its own
