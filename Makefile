@@ -58,8 +58,10 @@ bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (abou
 bench-quick: $(READY)  ## Run the quick benchmarks (under two minutes).
 	$(BIN)/python -m runtime bench all --quick --out runs/bench-quick
 
-pictures: demo  ## Make the README's pictures anew.
+pictures: demo  ## Make the README's pictures anew (needs Chromium for two of them; minutes).
 	$(BIN)/python tools/readme_pictures.py
+	$(BIN)/python -m runtime run examples/rerun.toml
+	$(BIN)/python tools/view_picture.py runs/rerun/flight.rrd docs/rerun.png
 
 clean:  ## Remove the environment, results and caches.
 	rm -rf $(VENV) runs sweeps .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

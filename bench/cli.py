@@ -127,6 +127,44 @@ def lockstep(
     _finish(lockstep_table(rows), json, rows)
 
 
+@app.command()
+def bridge(
+    json: Json = None,
+    samples: Annotated[
+        int, typer.Option(min=100, help="Round trips with small events; a quarter with pictures.")
+    ] = 2000,
+    repeats: Annotated[int, typer.Option(min=30, help="Pictures encoded for ROS.")] = 300,
+) -> None:
+    """Measure what crosses between two processes beside raw Zenoh, and ROS pictures' encoding."""
+    from bench.bridge import measure
+    from bench.ros_images import measure as measure_ros
+    from bench.tables import bridge_table, ros_images_table
+
+    with _status() as say:
+        rows = measure(samples, say)
+        say("pictures for ROS")
+        ros = measure_ros(repeats)
+    _finish(bridge_table(rows), None, rows)
+    _finish(ros_images_table(ros), json, [*rows, *ros])
+
+
+@app.command()
+def flood(
+    json: Json = None,
+    windows: Annotated[
+        int, typer.Option(min=4, help="Of a second each, every other flooded.")
+    ] = 30,
+    rate: Annotated[float, typer.Option(min=1, help="Messages a second of a flood.")] = 10_000.0,
+) -> None:
+    """Measure how late a 400 Hz tick is while ROS 2 messages flood in."""
+    from bench.flood import measure
+    from bench.tables import flood_table
+
+    with _status() as say:
+        rows = measure(windows=windows, rate=rate, progress=say)
+    _finish(flood_table(rows), json, rows)
+
+
 @app.command("all")
 def everything(
     out: Annotated[Path, typer.Option(help="Folder for results.json and plots.")],

@@ -9,10 +9,13 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from bench.bridge import BridgeRow
     from bench.compare import Change
     from bench.driver import Row
+    from bench.flood import FloodRow
     from bench.idle import IdleRow
     from bench.lockstep import LockstepRow
+    from bench.ros_images import RosImageRow
     from bench.stall import StallRow
     from bench.throughput import ThroughputRow
 
@@ -101,6 +104,64 @@ def lockstep_table(rows: Sequence[LockstepRow]) -> Table:
     for row in rows:
         share = "" if row.share is None else f"{row.share:.0%}"
         table.add_row(row.case, f"{row.speed:.1f}", share)
+    return table
+
+
+def bridge_table(rows: Sequence[BridgeRow]) -> Table:
+    """Return what a run in two processes adds to Zenoh."""
+    table = _table(
+        "between two processes: median round trip (µs), events a second",
+        *("event", "bytes", "ours", "zenoh", "ratio", "p99", "zenoh's", "per second", "zenoh's"),
+    )
+    for row in rows:
+        table.add_row(
+            row.case,
+            f"{row.bytes:,}",
+            number(row.ours_us),
+            number(row.zenoh_us),
+            f"{row.ratio:.2f}",
+            number(row.ours_p99_us),
+            number(row.zenoh_p99_us),
+            f"{row.ours_per_second:,.0f}",
+            f"{row.zenoh_per_second:,.0f}",
+        )
+    return table
+
+
+def ros_images_table(rows: Sequence[RosImageRow]) -> Table:
+    """Return what encoding pictures for ROS costs."""
+    table = _table(
+        "encoding for ROS 2 (µs)", "picture", "bytes", "ours", "rosbags", "ratio", "p99", "rosbags'"
+    )
+    for row in rows:
+        table.add_row(
+            row.case,
+            f"{row.bytes:,}",
+            number(row.ours_us),
+            number(row.rosbags_us),
+            f"{row.ratio:.2f}",
+            number(row.ours_p99_us),
+            number(row.rosbags_p99_us),
+        )
+    return table
+
+
+def flood_table(rows: Sequence[FloodRow]) -> Table:
+    """Return lateness with and without a flood."""
+    table = _table(
+        "lateness of a 400 Hz tick (µs), and its ratio to the quiet second before",
+        *("window", "messages per second", "p50", "p99", "max", "ratio of p50", "of p99"),
+    )
+    for row in rows:
+        table.add_row(
+            row.case,
+            f"{row.messages_per_second:,.0f}",
+            f"{row.late_p50_us:.0f}",
+            f"{row.late_p99_us:.0f}",
+            f"{row.late_max_us:.0f}",
+            f"{row.ratio_p50:.2f}",
+            f"{row.ratio_p99:.2f}",
+        )
     return table
 
 

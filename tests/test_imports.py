@@ -17,7 +17,17 @@ MAY_IMPORT = {
     "nodes": {"events", "runtime", "nodes"},
     "bench": {"events", "runtime", "sims", "nodes", "bench"},
 }
-BRIDGES = {"glfw", "OpenGL", "zenoh", "rerun", "mcap", "pyorbslam3", "rosbags"}
+BRIDGES = {
+    "glfw",
+    "OpenGL",
+    "zenoh",
+    "rerun",
+    "foxglove",
+    "mcap",
+    "pyorbslam3",
+    "rosbags",
+    "textual",
+}
 PURE = {"asyncio", "socket", "threading"}
 """What no event imports."""
 

@@ -21,12 +21,15 @@ def folder() -> Path:
     """Return the folder of the sockets, made if missing.
 
     Raises:
-        CommandError: Others than its user may get at it.
+        CommandError: It cannot be made, or others than its user may get at it.
     """
     base = os.environ.get("XDG_RUNTIME_DIR")
     path = Path(base) / "visnav" if base else Path(tempfile.gettempdir()) / f"visnav-{os.getuid()}"
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    found = path.lstat()
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = path.lstat()
+    except OSError as error:
+        raise CommandError(f"{path}: expected a folder for sockets: {error.strerror}") from None
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
         raise CommandError(
             f"{path}: expected a folder that only its user may enter, found mode "
@@ -42,6 +45,8 @@ def socket_of(run: str) -> Path:
         CommandError: The folder is no good.
     """
     place, end = folder(), f"-{os.getpid()}.sock"
+    for other in place.glob("*.sock"):  # what killed runs have left goes at the next occasion
+        _answers(other)
     name = re.sub(r"[^\w.-]", "_", run)
     room = _LONGEST - len(os.fsencode(place)) - 1 - len(end)
     short = os.fsencode(name)[: max(room, 1)].decode(errors="ignore")

@@ -26,7 +26,8 @@ from runtime.monitor.snapshot import (
     TickState,
 )
 from runtime.monitor.timekeeping import CommandError, Timekeeper
-from runtime.node import senders, streams
+from runtime.monitor.window import Sample, Window
+from runtime.node import NodeConfig, senders, streams
 from runtime.parameters import settings
 from runtime.schedule import SECOND
 from runtime.summary import count_drops
@@ -48,51 +49,50 @@ class Observer:
         self._records = records
         self._keeper = Timekeeper(supervisor.clock)
         self._meter: Meter | None = None
-        self._counts: Counter[str] = Counter()
+        self._window = Window(self._sample())
+        self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}
+        """Of each node, and how they were shown: they seldom change."""
         self._number = 0
-        self._real = time.perf_counter()
-        self._run = 0
 
     def begin(self) -> None:
         """Begin to measure: somebody looks."""
         if self._meter is None:
             self._meter = Meter(self._supervisor.clock)
             self._supervisor.probes.attach(self._meter)
-            self._real, self._run = time.perf_counter(), self._supervisor.clock.now()
+            self._window = Window(self._sample())
 
     def end(self) -> None:
         """Measure no more: nobody looks."""
         if self._meter is not None:
             self._supervisor.probes.detach(self._meter)
             self._meter = None
+            self._window = Window(self._sample())
 
     # Seeing.
 
     def take(self) -> Snapshot:
-        """Return what there is to see since the last time."""
+        """Return what there is to see now, and of the last second or so."""
         supervisor = self._supervisor
-        real, now = time.perf_counter(), supervisor.clock.now()
-        interval, passed = max(real - self._real, 1e-9), (now - self._run) / SECOND
-        self._real, self._run = real, now
         self._number += 1
-        meter = self._meter or Meter(supervisor.clock)
-        snapshot = Snapshot(
+        sample = self._sample()
+        self._window.add(sample)
+        now = sample.run
+        return Snapshot(
             run=self._config.run.name,
             pid=os.getpid(),
             number=self._number,
-            interval=interval,
             ended=supervisor.reason,
             clock=ClockState(
                 kind=supervisor.clock.kind,
                 now=now / SECOND,
                 duration=float(self._config.run.duration),
-                speed=passed / interval,
+                speed=self._window.run / self._window.real,
                 asked=self._keeper.asked,
                 paused=self._keeper.paused,
                 fixed=self._keeper.fixed(),
             ),
-            nodes=[self._node(life, meter, interval) for life in supervisor._lives.values()],
-            outputs=self._outputs(meter, now, passed),
+            nodes=[self._node(life) for life in supervisor._lives.values()],
+            outputs=self._outputs(sample),
             inputs=[
                 InputState(
                     name=stream.name,
@@ -120,22 +120,42 @@ class Observer:
             ],
             log=self._records.lines(),
         )
-        meter.reset()
-        return snapshot
 
-    def _node(self, life: Life, meter: Meter, interval: float) -> NodeState:
-        steps = meter.nodes.get(life.spec.name)
+    def _sample(self) -> Sample:
+        """Return what has been added up since the last time."""
+        sent: Counter[str] = Counter()
+        for node in self._supervisor.ever:
+            for sender in senders(node).values():
+                sent[sender.name] += sender.sent().total()
+        meter = self._meter
+        return Sample(
+            time.perf_counter(),
+            self._supervisor.clock.now(),
+            sent,
+            {} if meter is None else {name: sum_.take() for name, sum_ in meter.nodes.items()},
+            {} if meter is None else {name: sum_.take() for name, sum_ in meter.outputs.items()},
+        )
+
+    def _node(self, life: Life) -> NodeState:
+        steps, real = self._window.node(life.spec.name), self._window.real
         return NodeState(
             name=life.spec.name,
             type=life.spec.type_name,
             condition=self._condition(life),
             failures=life.failures,
-            share=steps.busy / 1e9 / interval if steps else 0.0,
-            steps=steps.count / interval if steps else 0.0,
-            longest_ms=steps.longest / 1e6 if steps else 0.0,
+            share=steps.total / 1e9 / real,
+            steps=steps.times / real,
+            longest_ms=steps.longest / 1e6,
             calls=sum(worker.outstanding() for worker in life.workers),
-            settings=settings(life.node.config if life.node else life.spec.config),
+            settings=self._shown(life),
         )
+
+    def _shown(self, life: Life) -> dict[str, str]:
+        config = life.node.config if life.node else life.spec.config
+        known = self._settings.get(life.spec.name)
+        if known is None or known[0] is not config:
+            known = self._settings[life.spec.name] = config, settings(config)
+        return known[1]
 
     def _condition(self, life: Life) -> NodeCondition:
         if life.recovering:
@@ -148,27 +168,25 @@ class Observer:
             return "starting"
         return "running" if self._supervisor._running else "ready"
 
-    def _outputs(self, meter: Meter, now: int, passed: float) -> list[OutputState]:
-        counts: Counter[str] = Counter()
-        events: dict[str, str] = {}
-        for node in self._supervisor.ever:
-            for sender in senders(node).values():
-                counts[sender.name] += sender.sent().total()
-                events[sender.name] = sender.event.__name__
-        before, self._counts = self._counts, counts
+    def _outputs(self, sample: Sample) -> list[OutputState]:
+        events = {
+            sender.name: sender.event.__name__
+            for node in self._supervisor.ever
+            for sender in senders(node).values()
+        }
+        last = self._meter.outputs if self._meter is not None else {}
         found = []
         for name, event in events.items():
-            flow = meter.outputs.get(name)
-            recent = flow if flow is not None and flow.count else None
+            flow = self._window.output(name)
             found.append(
                 OutputState(
                     name=name,
                     event=event,
-                    count=counts[name],
-                    rate=(counts[name] - before[name]) / passed if passed > 0 else 0.0,
-                    age=(now - flow.last) / SECOND if flow is not None else None,
-                    latency_ms=recent.total / recent.count / 1e6 if recent else None,
-                    latency_max_ms=recent.longest / 1e6 if recent else None,
+                    count=sample.sent[name],
+                    rate=self._window.rate(name),
+                    age=(sample.run - last[name].last) / SECOND if name in last else None,
+                    latency_ms=flow.total / flow.times / 1e6 if flow.times else None,
+                    latency_max_ms=flow.longest / 1e6 if flow.times else None,
                 )
             )
         return found

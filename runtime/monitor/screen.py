@@ -141,7 +141,7 @@ class Screen(App[str]):
         for line in snapshot.log:
             if line.number > self._shown:
                 self._shown = line.number
-                log.write(_log_line(line))
+                log.write(_log_line(line), expand=True)
 
     def _fill(self, name: str, snapshot: Snapshot) -> None:
         """Write a table's rows over those that stand there, so that the cursor stays."""

@@ -20,7 +20,7 @@ class ClockState(_Data, frozen=True):
         kind: ``lockstep`` or ``real``.
         now: Seconds since the first update.
         duration: Seconds at which the run ends; 0 for no limit.
-        speed: Seconds of the clock per real second since the last snapshot.
+        speed: Seconds of the clock per real second over the last second or so.
         asked: The speed that was asked for; `None`: as fast as it can.
         paused: Whether it stands.
         fixed: Why it can be neither paused nor set; empty if it can.
@@ -36,7 +36,7 @@ class ClockState(_Data, frozen=True):
 
 
 class NodeState(_Data, frozen=True):
-    """One node; times are real, since the last snapshot.
+    """One node; times are real, over the last second or so.
 
     Attributes:
         name: Its name.
@@ -62,7 +62,7 @@ class NodeState(_Data, frozen=True):
 
 
 class OutputState(_Data, frozen=True):
-    """One output; seconds are the run's clock's, since the last snapshot.
+    """One output; seconds are the run's clock's, over the last second or so (a real one).
 
     Attributes:
         name: ``node.port``.
@@ -138,7 +138,6 @@ class Snapshot(_Data, frozen=True, tag="snapshot"):
         run: Its name.
         pid: Of its process.
         number: Counts snapshots.
-        interval: Real seconds since the last one.
         ended: Why the run ends or has ended; empty while it goes on.
         clock: The run's clock.
         nodes: In the order of the file.
@@ -152,7 +151,6 @@ class Snapshot(_Data, frozen=True, tag="snapshot"):
     run: str
     pid: int
     number: int
-    interval: float
     ended: str
     clock: ClockState
     nodes: list[NodeState]

@@ -122,6 +122,7 @@ class Page:
         text = _template().render(
             nonce=nonce,
             token=self.token,
+            first=None if self._last is None else msgspec.json.decode(self._last),
             stacks=[
                 {
                     name: [(title, is_number(name, n)) for n, title in enumerate(COLUMNS[name])]

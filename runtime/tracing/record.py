@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import concurrent.futures
 import contextlib
 import functools
+import sys
 import threading
 import time
 from collections import deque
@@ -15,6 +15,8 @@ from typing import Any
 
 from events import Event
 from runtime.clock import Clock
+from runtime.errors import ConfigError
+from runtime.node import Node
 from runtime.probes import Call
 from runtime.realtime import RealClock
 from runtime.sender import Sender, Tap
@@ -22,8 +24,8 @@ from runtime.supervisor import Supervisor
 from runtime.tracing.spool import CHUNK, Pace, Spool
 from runtime.tracing.write import write_trace
 
-OUTSIDE = "?"
-"""The node of what was offloaded by nobody's task."""
+OUTSIDE = "runtime"
+"""Who offloaded what no node did."""
 
 
 class Recorder:
@@ -136,7 +138,7 @@ class NotingExecutor(concurrent.futures.Executor):
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> concurrent.futures.Future[Any]:
         """Have a function called in a thread."""
-        submitted, node = time.perf_counter_ns(), _current_node()
+        submitted, node = time.perf_counter_ns(), _asker()
         inner = fn.func if isinstance(fn, functools.partial) else fn
         name = getattr(inner, "__qualname__", type(inner).__name__)
 
@@ -163,8 +165,16 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
         supervisor: Of the run; nothing has been sent yet.
         path: Of the trace; compressed if it ends with ``.gz``.
         name: Of the run.
+
+    Raises:
+        ConfigError: There can be no such file.
     """
-    spool = Spool(path.with_name(path.name + ".part"))
+    try:
+        spool = Spool(path.with_name(path.name + ".part"))
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: expected a place for a trace, found: {error.strerror}"
+        ) from None
     recorder = Recorder(supervisor.clock, spool)
     supervisor.probes.attach(recorder)
     supervisor.executor = NotingExecutor(supervisor.executor, recorder.beside.append)
@@ -177,10 +187,7 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
         write_trace(spool, path, name=name, clock=supervisor.clock.kind, nodes=order)
 
 
-def _current_node() -> str:
-    """Return whose task runs, by its name."""
-    try:
-        task = asyncio.current_task()
-    except RuntimeError:  # another thread's
-        return OUTSIDE
-    return OUTSIDE if task is None else task.get_name()
+def _asker() -> str:
+    """Return the node whose `offload` called `submit`, which called this."""
+    caller = sys._getframe(2).f_locals.get("self")
+    return caller.name if isinstance(caller, Node) else OUTSIDE

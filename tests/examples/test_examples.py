@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from runtime.config import load
+from tests.runtime.peers.samples import free_port
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
@@ -36,9 +37,9 @@ def test_is_a_right_file(path: Path) -> None:
 
 def test_a_node_of_ones_own_scores_each_image(tmp_path: Path) -> None:
     """`brightness` scores what its camera sees, at the rate of the camera."""
-    summary = run("brightness", tmp_path, "run.duration=2s")
-    assert summary["events"]["Image"] == 20
-    assert summary["events"]["Score"] == 20
+    summary = run("brightness", tmp_path, "run.duration=1s", "drone.camera_processes=1")
+    assert summary["events"]["Image"] == 10
+    assert summary["events"]["Score"] == 10
 
 
 @pytest.mark.slow
@@ -125,3 +126,55 @@ def test_orb_slam3_takes_the_place_of_odometry(tmp_path: Path) -> None:
     summary = run("orb_slam3", tmp_path / "out", *settings, "evaluation.report=false")
     assert summary["not_deterministic"] == ["odometry"]
     assert summary["verdict"]["estimators"]["odometry"]["lost_seconds"] == 0.0
+
+
+@pytest.mark.slow
+def test_rerun_leaves_a_recording(tmp_path: Path) -> None:
+    """`rerun` writes a file with the whole flight in it."""
+    run("rerun", tmp_path, "run.duration=4s", "evaluation.report=false")
+    assert (tmp_path / "flight.rrd").stat().st_size > 500_000
+
+
+@pytest.mark.slow
+def test_foxglove_runs_where_nobody_looks(tmp_path: Path) -> None:
+    """`foxglove` flies on without a viewer."""
+    changes = "run.duration=4s", "foxglove.port=0", "evaluation.report=false"
+    summary = run("foxglove", tmp_path, *changes)
+    assert summary["events"]["Odometry"] > 300
+
+
+@pytest.mark.slow
+def test_a_recording_takes_the_simulators_place(tmp_path: Path) -> None:
+    """`replay` gives the estimates that `record` gave in flight, to the byte."""
+    run("record", tmp_path / "live", "run.duration=4s", "evaluation.report=false")
+    file = f"replay.file={tmp_path / 'live' / 'recording.mcap'}"
+    summary = run("replay", tmp_path / "again", file, "evaluation.report=false")
+    assert summary["reason"] == "the recording ended"
+    name = "trajectories/odometry.tum"
+    assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_two_machines_start_in_either_order(tmp_path: Path, clock: str, first: int) -> None:
+    """`two_machines` runs as two processes, whichever comes first, as it does in one."""
+    changes = ["run.duration=4s", f"run.clock={clock}", f"network.meet=tcp/127.0.0.1:{free_port()}"]
+    settings = [word for change in changes for word in ("--set", change)]
+    command = [sys.executable, "-m", "runtime", "run", "examples/two_machines.toml", "--quiet"]
+    groups = ["drone,tour", "odometry,evaluation"]
+    started = []
+    for only in groups if first == 0 else reversed(groups):
+        out = ["--only", only, "--out", str(tmp_path / only)]
+        process = subprocess.Popen(
+            [*command, *settings, *out], cwd=ROOT, stderr=subprocess.PIPE, text=True
+        )
+        started.append(process)
+    for process in started:
+        _, said = process.communicate(timeout=50)
+        assert process.returncode == 0, said
+    one, other = (json.loads((tmp_path / only / "summary.json").read_text()) for only in groups)
+    assert one["digest"] == other["digest"]
+    assert one["events"]["PoseEstimate"] > 30
+    if clock == "lockstep":
+        assert one["digest"] == run("two_machines", tmp_path / "alone", *changes)["digest"]

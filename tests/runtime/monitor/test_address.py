@@ -31,6 +31,15 @@ def test_the_folder_is_its_users_alone(sockets: Path) -> None:
         folder()
 
 
+def test_a_folder_that_cannot_be_is_a_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "file"))
+    with pytest.raises(VisnavError, match="visnav: expected a folder for sockets: Not a directory"):
+        runs()
+
+
 def test_a_run_has_an_address_however_long_its_name(sockets: Path) -> None:
     assert socket_of("a b").name == f"a_b-{os.getpid()}.sock"
     assert len(os.fsencode(socket_of("é" * 200))) <= 100

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
+import pty
 import re
 import shutil
 import signal
+import struct
 import subprocess
+import sys
+import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runtime.samples_cli import command, config_file, start, summary
+from tests.runtime.samples_cli import ROOT, command, config_file, start, summary
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
 LOOP = """
@@ -84,6 +91,33 @@ def test_the_page_shows_a_run_in_a_browser(tmp_path: Path, sockets: Path) -> Non
     assert re.search(r"<h1[^>]*>sample   [3-5]\.\d+ of 5 s", shown)
     assert re.search(r"<td[^>]*>drone.images</td><td[^>]*>Image</td><td[^>]*>\d+</td>", shown)
     assert 'value="pilot.gain=1.0"' in shown
+
+
+@pytest.mark.slow
+def test_the_screen_and_the_run_share_a_terminal(tmp_path: Path, sockets: Path) -> None:
+    path = config_file(tmp_path, run="speed = 1.0", settings=LOOP)
+    terminal, inside = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 140, 0, 0))
+    shown = b""
+    with subprocess.Popen(
+        [sys.executable, "-m", "runtime", "run", str(path), "--top"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=inside,
+        stdout=inside,
+        stderr=inside,
+        start_new_session=True,
+    ) as process:
+        os.close(inside)
+        with contextlib.suppress(OSError):  # how a terminal says that nobody is there any more
+            while piece := os.read(terminal, 65536):
+                shown += piece
+                if b"drone.images" in shown and b"10.0" in shown:
+                    os.write(terminal, b"x")  # twice at least, and no harm in more
+    os.close(terminal)
+    assert process.returncode == 0
+    assert b"ended by: stopped by hand" in shown
+    assert summary(tmp_path / "runs" / "sample")["reason"] == "stopped by hand"
 
 
 @pytest.mark.slow

@@ -1,0 +1,188 @@
+"""How late a 400 Hz controller gets under a flood of messages from ROS 2.
+
+A multirotor hovers on the real clock, controlled at 400 Hz, with the bridge beside it, which has
+subscribed to velocities. Another process sends 10,000 of them a second in every other window of
+a second. Each flooded window is compared with the quiet one just before it, and the median of all
+such pairs is told: whatever else the machine does falls on both alike, and on few pairs much.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from bench.flooder import TWIST
+from events import Takeoff
+from nodes.ros2_bridge.keys import Topic, data_key
+from nodes.ros2_bridge.typestore import TypeStore
+from runtime import Node, Output, Tick, every
+from runtime.config import parse
+from runtime.execute import execute
+
+RATE = 10_000.0
+WINDOW = 1.0
+"""Seconds."""
+EDGE_NS = 30_000_000
+"""At either end of a window, ticks are left out for so long: what was sent may be under way."""
+
+
+class FloodRow(msgspec.Struct, frozen=True, kw_only=True):
+    """Windows of one kind.
+
+    Attributes:
+        case: ``quiet`` or ``flood``.
+        ticks: How many were measured.
+        messages_per_second: That came.
+        late_p50_us: Median lateness of the 400 Hz tick, microseconds.
+        late_p99_us: Median of the windows' 99th percentiles.
+        late_max_us: Maximum of all.
+        ratio_p50: Median of the pairs' ratios of medians, to the quiet window's.
+        ratio_p99: The same of the 99th percentiles.
+    """
+
+    case: str
+    ticks: int
+    messages_per_second: float
+    late_p50_us: float
+    late_p99_us: float
+    late_max_us: float
+    ratio_p50: float
+    ratio_p99: float
+
+
+_late: list[tuple[int, int]] = []
+"""When a tick came (monotonic clock) and how late, ns."""
+
+
+class Probe(Node):
+    """Measures how late a 400 Hz tick comes, and sends the vehicle up."""
+
+    orders = Output(Takeoff)
+
+    async def run(self) -> None:
+        """Take off."""
+        self.orders.send(Takeoff(stamp=self.clock.now(), source=self.name))
+
+    @every(hz=400)
+    def tick(self, tick: Tick) -> None:
+        """Note how late it is."""
+        _late.append((time.monotonic_ns(), tick.late))
+
+
+def measure(
+    *,
+    windows: int = 30,
+    rate: float = RATE,
+    progress: Callable[[str], None] = lambda _: None,
+) -> list[FloodRow]:
+    """Measure quiet windows and flooded ones, in turns.
+
+    Args:
+        windows: Of both kinds together.
+        rate: Messages a second of a flood.
+        progress: Told what is being measured.
+    """
+    progress(f"{windows} windows of {WINDOW:g} s, every other with {rate:g} messages a second")
+    _late.clear()
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    found: list[tuple[int, int, int]] = []
+    with _flooder(port, rate, windows, found):
+        execute(parse(_settings(port, windows * WINDOW + 8.0), "bench flood"))
+    quiet, flood = found[0::2], found[1::2]
+    return [_row("quiet", quiet, quiet), _row("flood", flood, quiet)]
+
+
+@contextlib.contextmanager
+def _flooder(
+    port: int, rate: float, windows: int, found: list[tuple[int, int, int]]
+) -> Iterator[None]:
+    """Run the flood beside the block; `found` gets begin, end and number sent of each window."""
+    type_hash = TypeStore().hash(TWIST)
+    key = data_key(0, Topic(name="/cmd_vel", type=TWIST, hash=type_hash))
+    words = [str(port), key, str(rate), str(WINDOW), str(windows)]
+    command = [sys.executable, "-m", "bench.flooder", *words]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        reading = threading.Thread(target=_read, args=(process, found), daemon=True)
+        reading.start()
+        try:
+            yield
+        finally:
+            process.kill()
+            reading.join()
+
+
+def _read(process: subprocess.Popen[str], found: list[tuple[int, int, int]]) -> None:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line == "ready\n":
+            time.sleep(1.0)  # for the vehicle to have taken off
+            process.stdin.write("go\n")
+            process.stdin.flush()
+        else:
+            found.append(tuple(json.loads(line)))
+
+
+def _settings(port: int, seconds: float) -> dict[str, Any]:
+    subscription = {"topic": "/cmd_vel", "type": TWIST, "as": "velocity"}
+    return {
+        "run": {"clock": "real", "duration": seconds, "log": "error"},
+        "nodes": [
+            {"name": "probe", "type": f"{__name__}:Probe"},
+            {"name": "drone", "type": "sims.multirotor.node:Multirotor"},
+            {
+                "name": "ros2",
+                "type": "nodes.ros2_bridge:Ros2Bridge",
+                "connect": [],
+                "listen": [f"tcp/127.0.0.1:{port}"],
+                "subscriptions": [subscription],
+            },
+        ],
+    }
+
+
+def _row(
+    case: str, windows: list[tuple[int, int, int]], quiet: list[tuple[int, int, int]]
+) -> FloodRow:
+    lates = [_lateness(window) for window in windows]
+    befores = [_lateness(window) for window in quiet]
+    p50, p99 = ([float(np.percentile(late, q)) for late in lates] for q in (50, 99))
+    ratios = [
+        np.percentile(late, [50, 99]) / np.percentile(before, [50, 99])
+        for late, before in zip(lates, befores, strict=False)
+    ]
+    ratio_p50, ratio_p99 = np.median(ratios, axis=0).tolist()
+    seconds = sum(end - begin for begin, end, _ in windows) / 1e9
+    return FloodRow(
+        case=case,
+        ticks=sum(map(len, lates)),
+        messages_per_second=sum(sent for *_, sent in windows) / seconds,
+        late_p50_us=float(np.median(p50)),
+        late_p99_us=float(np.median(p99)),
+        late_max_us=float(max(late.max() for late in lates)),
+        ratio_p50=ratio_p50,
+        ratio_p99=ratio_p99,
+    )
+
+
+def _lateness(window: tuple[int, int, int]) -> npt.NDArray[np.float64]:
+    """Return how late the ticks of a window were, microseconds."""
+    begin, end, _ = window
+    ticks = np.array(_late, np.int64)
+    inside = (ticks[:, 0] > begin + EDGE_NS) & (ticks[:, 0] < end - EDGE_NS)
+    return np.asarray(ticks[inside, 1] / 1e3)

@@ -1,0 +1,98 @@
+"""Make the pictures of the monitor: docs/monitor.png and docs/web.png.
+
+Starts examples/closed_loop.toml at real speed, looks at it in both ways, and ends it. Needs
+Chromium, which draws them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+SIZE = (150, 44)
+"""Columns and lines of the terminal."""
+FLYING = 8.0
+"""Seconds of the run after which there is something to see."""
+
+
+def main() -> None:
+    """Make both pictures."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        sys.exit("expected chromium, found none")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_RUNTIME_DIR"] = folder
+        command = [
+            sys.executable, "-m", "runtime", "run", "examples/closed_loop.toml", "--quiet",
+            "--set", "run.speed=1", "--set", "run.stall=0", "--out", f"{folder}/run",
+        ]  # fmt: skip
+        with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as run:  # noqa: S603
+            try:
+                asyncio.run(_look(Path(folder), browser))
+            finally:
+                run.terminate()
+
+
+async def _look(folder: Path, browser: str) -> None:
+    from runtime.monitor.address import runs
+    from runtime.monitor.client import Client
+    from runtime.monitor.command import Set
+    from runtime.monitor.screen import Screen
+
+    deadline = time.monotonic() + 60
+    while not (found := runs()):
+        if time.monotonic() > deadline:
+            sys.exit("expected the run to begin within a minute")
+        await asyncio.sleep(0.2)
+    path = found["closed_loop"]
+    client = await Client.connect(path)
+    screen = Screen(client)
+    async with screen.run_test(size=SIZE) as pilot:
+        while screen.snapshot is None or screen.snapshot.clock.now < FLYING:
+            await pilot.pause(0.2)
+        await client.ask(Set(text="pilot.gain=0.8"))
+        await pilot.pause(1.0)
+        svg = screen.export_screenshot(title="python -m runtime top")
+    svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)  # of a server elsewhere
+    (folder / "screen.svg").write_text(svg, encoding="utf-8")
+    width, height = (round(float(n)) for n in re.findall(r'viewBox="0 0 (\S+) (\S+)"', svg)[0])
+    _draw(browser, f"file://{folder}/screen.svg", DOCS / "monitor.png", width, height)
+    web = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "runtime", "web", str(path), "--port", "0",
+        cwd=ROOT, stdout=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    assert web.stdout is not None
+    url = (await web.stdout.readline()).decode().split()[-1]
+    await asyncio.sleep(2.0)  # there should be something to show at once
+    await asyncio.to_thread(_draw, browser, url, DOCS / "web.png", 1280, 640)
+    web.terminate()
+    await web.wait()
+
+
+def _draw(browser: str, url: str, picture: Path, width: int, height: int) -> None:
+    subprocess.run(  # noqa: S603  # found on the path, and told all it does
+        [
+            browser, "--headless", "--no-sandbox", "--hide-scrollbars", "--timeout=6000",
+            f"--window-size={width},{height}", f"--screenshot={picture}", url,
+        ],
+        check=True, capture_output=True, timeout=60,
+        preexec_fn=_stand_back,
+    )  # fmt: skip
+    print(f"{picture}: {picture.stat().st_size / 1e3:.0f} kB")
+
+
+def _stand_back() -> None:
+    os.nice(19)  # or the browser would slow down what it shows
+
+
+if __name__ == "__main__":
+    main()
