@@ -62,6 +62,7 @@ pictures: demo  ## Make the README's pictures anew (needs Chromium for two of th
 	$(BIN)/python tools/readme_pictures.py
 	$(BIN)/python -m runtime run examples/rerun.toml
 	$(BIN)/python tools/view_picture.py runs/rerun/flight.rrd docs/rerun.png
+	$(BIN)/python tools/monitor_pictures.py
 
 clean:  ## Remove the environment, results and caches.
 	rm -rf $(VENV) runs sweeps .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -3,14 +3,16 @@
 Read in this order: `node` (what an author writes), `ports` and `bundles` (what it declares),
 `sender`, `streams` and `links` (how an event gets from one node to another), `steps` (why that is
 quick), `schedule`, `clock`, `lockstep` and `realtime` (time), `worker` and `shared` (slow work),
-`graph`, `supervisor`, `execute` and `summary` (a run), `config` (the file). `testing` is for tests
-of nodes.
+`graph`, `supervisor`, `execute` and `summary` (a run), `config` (the file), `wire` and `peers` (a
+run in several processes). `parameters` and `changing` (settings that change in a run), `probes`,
+`tracing` and `monitor` (looking on) can wait. `testing` is for tests of nodes.
 """
 
 from runtime.bundles import Bundle
 from runtime.clock import Clock
 from runtime.errors import RefusedError, VisnavError
 from runtime.node import Node, NodeConfig
+from runtime.parameters import Changeable
 from runtime.ports import Input, Output, every, on
 from runtime.schedule import Tick
 from runtime.streams import Stream
@@ -19,6 +21,7 @@ from runtime.worker import Worker
 
 __all__ = [
     "Bundle",
+    "Changeable",
     "Clock",
     "Duration",
     "Input",

@@ -13,6 +13,7 @@
     │   ├── ChannelClosedError you (or the end of the run) closed it
     │   ├── ChannelBusyError   two coroutines wait on one input
     │   └── AmbiguousSourceError  an input that matches stamps hears two sources
+    ├── CommandError           a run cannot do what its monitor asked it to
     ├── PeerError              another process of the run is missing, gone, or of another mind
     ├── WireError              bytes from elsewhere that are no event, or an event that cannot leave
     └── WorkerError
@@ -87,6 +88,10 @@ class ChannelBusyError(ChannelError):
 
 class AmbiguousSourceError(ChannelError):
     """Two sources send events for one field of a bundle; the file must name one."""
+
+
+class CommandError(VisnavError):
+    """A run cannot do what it was asked; the message says why."""
 
 
 class PeerError(VisnavError):

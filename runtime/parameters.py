@@ -81,7 +81,7 @@ def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
     for field in _fields(type_):
         key = f"{before}{field.encode_name}"
         inner = _struct_in(field.type)
-        if _is_marked(field.type):
+        if is_marked(field.type):
             found.append(key)
         elif inner is not None:
             found += changeable(inner, f"{key}." if inner is field.type else f"{key}.*.")
@@ -155,7 +155,7 @@ def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
         field = next((f for f in _fields(struct) if f.encode_name == name), None)
         if field is None:  # the name of an entry of a list
             continue
-        if _is_marked(field.type):
+        if is_marked(field.type):
             return True
         struct = _struct_in(field.type)
     return False
@@ -166,7 +166,8 @@ def _fields(type_: type[msgspec.Struct]) -> tuple[msgspec.structs.FieldInfo, ...
     return msgspec.structs.fields(type_)
 
 
-def _is_marked(type_: Any) -> bool:
+def is_marked(type_: Any) -> bool:
+    """Tell whether a setting of this type can change in a run."""
     marks = type_.__metadata__ if get_origin(type_) is Annotated else ()
     return any(isinstance(m, msgspec.Meta) and (m.extra or {}).get(_MARK) for m in marks)
 
@@ -188,7 +189,7 @@ def settings(config: NodeConfig) -> dict[str, str]:
             struct = _struct_in(field.type)
             if inner is None:
                 continue
-            if _is_marked(field.type):
+            if is_marked(field.type):
                 found[key] = toml(inner)
             elif isinstance(inner, dict) and struct is not None:
                 walk(struct, inner, f"{key}.")

@@ -29,7 +29,7 @@ SHORTER = {
 }
 """What is added to a command so that it takes a second."""
 
-ELSEWHERE = ("--only", "examples/replay.toml")
+ELSEWHERE = ("--only", "examples/replay.toml", "--trace", "trace trace")
 """Commands that need another one beside or before them; tests/examples runs both."""
 
 MISSED = 1

@@ -62,11 +62,15 @@ def _add_settings(tree: Tree, config: type[Any]) -> None:
     import msgspec
     from rich.markup import escape
 
+    from runtime.parameters import is_marked
+
     for field in msgspec.structs.fields(config):
         inner = _struct(field.type)
         default = "required" if field.required else "" if inner else f"= {_default(field)}"
-        line = f"setting {field.encode_name}: {_type_name(field.type)} {default}"
-        branch = tree.add(escape(line.rstrip()))
+        line = f"setting {field.encode_name}: {_type_name(field.type)} {default}".rstrip()
+        if is_marked(field.type):
+            line += "  (can change in a run)"
+        branch = tree.add(escape(line))
         if inner is not None:
             _add_settings(branch, inner)
 

@@ -34,8 +34,8 @@ def web(
 
 
 async def _serve(path: Path, port: int, token: str | None, leave: bool) -> None:
+    from runtime.errors import CommandError
     from runtime.monitor.client import Client
-    from runtime.monitor.timekeeping import CommandError
     from runtime.monitor.web import serve
 
     try:

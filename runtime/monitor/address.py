@@ -10,8 +10,7 @@ import stat
 import tempfile
 from pathlib import Path
 
-from runtime.errors import suggest
-from runtime.monitor.timekeeping import CommandError
+from runtime.errors import CommandError, suggest
 
 _LONGEST = 100
 """Bytes of a Unix socket's path at most (108 on Linux, 104 elsewhere)."""

@@ -8,6 +8,7 @@ import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+from runtime.errors import CommandError
 from runtime.monitor.command import (
     LONGEST_LINE,
     UNREADABLE,
@@ -19,7 +20,6 @@ from runtime.monitor.command import (
     encode,
 )
 from runtime.monitor.snapshot import Snapshot
-from runtime.monitor.timekeeping import CommandError
 
 PATIENCE = 10.0
 """Real seconds that a run gets to answer a command."""

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from runtime.config import Config
-from runtime.errors import suggest
+from runtime.errors import CommandError, suggest
 from runtime.life import Life
 from runtime.monitor.command import Command, Pause, Restart, Resume, Set, Speed, Step, Stop
 from runtime.monitor.meter import Meter
@@ -25,7 +25,7 @@ from runtime.monitor.snapshot import (
     Snapshot,
     TickState,
 )
-from runtime.monitor.timekeeping import CommandError, Timekeeper
+from runtime.monitor.timekeeping import Timekeeper
 from runtime.monitor.window import Sample, Window
 from runtime.node import NodeConfig, senders, streams
 from runtime.parameters import settings

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from runtime.errors import VisnavError
+from runtime.errors import CommandError, VisnavError
 from runtime.monitor.address import socket_of
 from runtime.monitor.command import (
     LONGEST_LINE,
@@ -29,7 +29,6 @@ from runtime.monitor.command import (
     encode,
 )
 from runtime.monitor.observer import Observer, told
-from runtime.monitor.timekeeping import CommandError
 
 R = TypeVar("R")
 

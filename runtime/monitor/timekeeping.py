@@ -6,13 +6,9 @@ In real time none of this is possible: sensors and vehicles do not wait.
 from __future__ import annotations
 
 from runtime.clock import Clock
-from runtime.errors import VisnavError
+from runtime.errors import CommandError
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.schedule import SECOND
-
-
-class CommandError(VisnavError):
-    """A run cannot do what it was asked; the message says why."""
 
 
 class Timekeeper:

@@ -15,7 +15,10 @@ from tests.runtime.samples_cli import config_file, start, summary
 
 pytestmark = pytest.mark.timeout(30)
 CLOCKS = ["lockstep", "real"]
-PACED = {"lockstep": "clock = 'lockstep'\nspeed = 1.0", "real": "clock = 'real'"}
+PACED = {
+    "lockstep": "clock = 'lockstep'\nspeed = 1.0\nstall = 0",
+    "real": "clock = 'real'\nstall = 0",
+}
 
 
 @contextmanager

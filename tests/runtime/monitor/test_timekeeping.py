@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 import pytest
 
+from runtime.errors import CommandError
 from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.monitor.timekeeping import CommandError, Timekeeper
+from runtime.monitor.timekeeping import Timekeeper
 
 MS = 1_000_000
 
