@@ -63,6 +63,7 @@ def test_client_hands_events_to_nodes_in_order_until_one_handles_them(client: Sy
     ]
 
 
+@pytest.mark.slow
 def test_program_is_compiled_once(
     client: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

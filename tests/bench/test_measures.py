@@ -55,6 +55,7 @@ def test_lockstep_is_compared_with_a_bare_loop() -> None:
     assert 0 < run.share < 1
 
 
+@pytest.mark.slow
 def test_idling_is_measured_over_the_ticks() -> None:
     """A second of 100 Hz is a hundred ticks, and takes some of a core but not all of it."""
     row = idle.measure(1.0)
@@ -62,6 +63,7 @@ def test_idling_is_measured_over_the_ticks() -> None:
     assert 0 < row.cpu_percent < 100
 
 
+@pytest.mark.slow
 def test_throughput_covers_handlers_streams_and_workers() -> None:
     """Each way through has a row; only pictures have bytes."""
     rows = throughput.measure(bursts=3)

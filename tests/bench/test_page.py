@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from bench.driver import Row
 from bench.idle import IdleRow
@@ -98,6 +99,7 @@ def test_the_pictures_on_the_page_exist(tmp_path: Path) -> None:
     assert all((tmp_path / link).stat().st_size > 5_000 for link in links)
 
 
+@pytest.mark.slow
 def test_each_picture_stands_once_under_its_own_case(tmp_path: Path) -> None:
     """``large`` and ``large-shared`` begin alike, and yet do not share their pictures."""
     measured = results()

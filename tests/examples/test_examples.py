@@ -35,6 +35,7 @@ def test_is_a_right_file(path: Path) -> None:
     assert load(path).nodes
 
 
+@pytest.mark.slow
 def test_a_node_of_ones_own_scores_each_image(tmp_path: Path) -> None:
     """`brightness` scores what its camera sees, at the rate of the camera."""
     summary = run("brightness", tmp_path, "run.duration=1s", "drone.camera_processes=1")

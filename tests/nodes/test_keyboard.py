@@ -124,6 +124,7 @@ def test_pictures_are_shown_right_side_up_and_in_their_colours(
     assert eventually(shown), {place: display.pixels()[place] for place in expected}
 
 
+@pytest.mark.slow
 def test_grey_pictures_of_odd_width_are_shown(begin: Begin, display: Display) -> None:
     """A grey picture whose rows are no multiple of four bytes is grey and not sheared."""
     begin(PAINTER | {"encoding": "mono8", "width": 161, "height": 121})
@@ -137,6 +138,7 @@ def test_grey_pictures_of_odd_width_are_shown(begin: Begin, display: Display) ->
     assert eventually(shown), np.unique(display.pixels()[:480, :640].reshape(-1, 3), axis=0)
 
 
+@pytest.mark.slow
 def test_a_picture_that_cannot_be_shown_is_an_error(display: Display) -> None:
     """Four channels end the run with what was expected and found."""
     with Run(display, "four channels", PAINTER | {"encoding": "rgba8"}) as run:
@@ -145,6 +147,7 @@ def test_a_picture_that_cannot_be_shown_is_an_error(display: Display) -> None:
     assert "found uint8 of shape (80, 160, 4)" in error
 
 
+@pytest.mark.slow
 def test_letters_are_those_of_the_layout(begin: Begin, display: Display) -> None:
     """On a German keyboard z is the key marked z, and ü goes by its place."""
     display.call("setxkbmap", "de")
@@ -169,6 +172,7 @@ def test_closing_the_window_ends_the_run(begin: Begin, display: Display) -> None
     display.call("xdotool", "keyup", "w")
 
 
+@pytest.mark.slow
 def test_a_node_may_keep_the_window_open(begin: Begin, display: Display) -> None:
     """Where WindowClosed is handled, window and run go on, and each click is told."""
     run = begin(STUBBORN)
@@ -179,6 +183,7 @@ def test_a_node_may_keep_the_window_open(begin: Begin, display: Display) -> None
     run.wait_for("KeyReleased", key="w")
 
 
+@pytest.mark.slow
 def test_keys_are_released_when_the_window_dies(begin: Begin, display: Display) -> None:
     """A window whose process is killed leaves no key held, and the others run on."""
     run = begin(on_error="drop")
@@ -191,6 +196,7 @@ def test_keys_are_released_when_the_window_dies(begin: Begin, display: Display) 
     assert run.wait_for("ended")["reason"] == "SIGTERM"
 
 
+@pytest.mark.slow
 def test_pictures_of_two_cameras_are_warned_of_once(
     display: Display, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

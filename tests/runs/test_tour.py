@@ -67,6 +67,7 @@ def test_a_short_flight_leaves_everything(tmp_path: Path) -> None:
     assert [(c["source"], c["rate"]) for c in cameras] == [("drone/camera", 30.0)]
 
 
+@pytest.mark.slow
 def test_pictures_depth_pose_and_imu_share_their_stamps() -> None:
     config = load(CONFIG, [*SHORT, "run.duration=1s", "camera.rate=25"])
     nodes = (*config.nodes[:1], spec(Witness, "witness"))
@@ -106,6 +107,7 @@ def test_another_seed_or_number_of_renderers(tmp_path: Path) -> None:
     assert fly(tmp_path, "slow", *settings, "camera.latency=80ms") != one
 
 
+@pytest.mark.slow
 def test_the_tour_flies_round_the_hall_and_lands(tmp_path: Path) -> None:
     """Without cameras a minute's flight takes seconds."""
     fly(tmp_path, "out", "drone.cameras=[]")

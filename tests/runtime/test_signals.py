@@ -41,7 +41,11 @@ def ends(process: subprocess.Popen[str]) -> tuple[int, str]:
 
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize(
-    ("number", "reason"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")]
+    ("number", "reason"),
+    [
+        (signal.SIGINT, "Ctrl-C"),
+        pytest.param(signal.SIGTERM, "SIGTERM", marks=pytest.mark.slow),
+    ],
 )
 def test_a_signal_ends_a_run_in_order(
     clock: str, number: signal.Signals, reason: str, tmp_path: Path

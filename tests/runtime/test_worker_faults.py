@@ -54,7 +54,10 @@ def _new_garden() -> None:
 FATES = [
     ("die", "lockstep", WorkerDiedError, "worker g.Plant: ended with exit code 7; .*\ngoodbye"),
     ("die", "real", WorkerDiedError, "worker g.Plant: ended with exit code 7; .*\ngoodbye"),
-    ("hang", "lockstep", WorkerTimeoutError, "worker g.Plant: no answer in 1.5 s"),
+    pytest.param(
+        *("hang", "lockstep", WorkerTimeoutError, "worker g.Plant: no answer in 1.5 s"),
+        marks=pytest.mark.slow,
+    ),
     ("idle", "real", WorkerDiedError, "worker g.Plant: killed by signal 9; it said nothing"),
 ]
 

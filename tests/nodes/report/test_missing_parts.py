@@ -124,7 +124,7 @@ def test_estimators_that_said_nothing_are_named(tmp_path: Path) -> None:
     assert "mute: no curves: it left no poses" in run.missing
 
 
-@pytest.mark.parametrize("kind", ["hover", "diverged"])
+@pytest.mark.parametrize("kind", ["hover", pytest.param("diverged", marks=pytest.mark.slow)])
 def test_odd_flights_are_drawn(tmp_path: Path, kind: str) -> None:
     """Warnings, such as those of matplotlib about empty axes, are errors here."""
     truth = walk(2)

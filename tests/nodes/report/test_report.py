@@ -166,6 +166,7 @@ def test_every_picture_is_one_and_shows_something(run: Path, page: Page) -> None
     assert page.markup.count("<img") == len(pictures) + 1  # and flight.png
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
     again = tmp_path / run.name
     shutil.copytree(run, again)

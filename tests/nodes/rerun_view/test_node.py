@@ -46,6 +46,7 @@ def flight(seconds: float) -> list[Event]:
     return events
 
 
+@pytest.mark.slow
 def test_in_lockstep_all_is_recorded_and_as_many_pictures_as_asked_for(tmp_path: Path) -> None:
     inputs = [VEHICLE, CAMERA, ESTIMATOR, *flight(1.9)]
     run_node(RerunView, inputs=inputs, config={"picture_rate": 4}, duration=1.9, out=tmp_path)

@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
+import pytest
 from textual.pilot import Pilot
 from textual.widgets import DataTable, Input, Static
 
@@ -71,6 +72,7 @@ async def test_keys_ask_the_run() -> None:
         assert stand.asked == [Resume()]
 
 
+@pytest.mark.slow
 async def test_a_parameter_is_asked_for_below() -> None:
     stand = Stand(snapshot())
     async with shown(stand) as (screen, pilot):

@@ -96,7 +96,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         process.communicate()
 
 
-@pytest.mark.parametrize("clock", ["lockstep", "real"])
+@pytest.mark.parametrize("clock", ["lockstep", pytest.param("real", marks=pytest.mark.slow)])
 def test_a_killed_process_ends_the_run_which_says_who_it_was(rig: Rig, clock: str) -> None:
     rig.write(clock=clock, on_error="stop")
     there, here = rig.start("one,other", "there"), rig.start("asker", "here")
@@ -149,7 +149,7 @@ def test_a_process_that_comes_back_takes_part_again(rig: Rig, clock: str, lost: 
     assert summary.sim_seconds >= 8
 
 
-@pytest.mark.parametrize("clock", ["lockstep", "real"])
+@pytest.mark.parametrize("clock", [pytest.param("lockstep", marks=pytest.mark.slow), "real"])
 def test_ctrl_c_in_one_process_ends_all_in_order(rig: Rig, clock: str) -> None:
     rig.write(clock=clock, on_error="stop")
     there, here = rig.start("one,other", "there"), rig.start("asker", "here")

@@ -21,8 +21,8 @@ THREE: tuple[tuple[str, str, dict[str, Any]], ...] = (
     "onlys",
     [
         ("asker", "one,other"),
-        ("one,other", "asker"),
-        ("asker,other", "one"),
+        pytest.param(("one,other", "asker"), marks=pytest.mark.slow),
+        pytest.param(("asker,other", "one"), marks=pytest.mark.slow),
         ("other", "one", "asker"),
     ],
     ids=str,

@@ -20,6 +20,7 @@ pytestmark = pytest.mark.timeout(60)
 BESIDE = f"from {Judge.__module__} import Judge\n\n\nclass Own(Judge):\n    pass\n"
 
 
+@pytest.mark.slow
 def test_equal_sweeps_have_equal_tables_also_with_nodes_beside_the_file(tmp_path: Path) -> None:
     (tmp_path / "own_judge.py").write_text(BESIDE, encoding="utf-8")
     config = judge_file(tmp_path, "limit = 6.5", type_="own_judge:Own")
@@ -38,6 +39,7 @@ def test_equal_sweeps_have_equal_tables_also_with_nodes_beside_the_file(tmp_path
     assert tables[0] == tables[1]
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_is_a_row_and_the_sweep_goes_on(tmp_path: Path) -> None:
     config = judge_file(tmp_path)
     options = ["--vary", "judge.fail=true,false", "--jobs", "1", "--out", "out"]

@@ -14,7 +14,7 @@ import pytest
 
 from sims.cameras import CameraRenderer, Frame, camera_info, pose_to_qpos
 from sims.frames import from_euler, rotate
-from sims.worlds import TOURS, WORLDS
+from sims.worlds import TOURS
 from tests.sims.cameras.scenes import ALL, CAMERAS, Scene, scene
 
 Array = npt.NDArray[np.float64]
@@ -22,7 +22,7 @@ LOOKS = np.array([1, 0, 0, 0, 0, 0], np.uint8)
 SOLIDS = np.array([0, 0, 0, 1, 0, 0], np.uint8)
 
 
-@pytest.fixture(params=sorted(WORLDS), scope="module")
+@pytest.fixture(params=["hall", pytest.param("yard", marks=pytest.mark.slow)], scope="module")
 def world(request: pytest.FixtureRequest) -> Iterator[tuple[Scene, CameraRenderer, str]]:
     built = scene(request.param)
     renderer = CameraRenderer(built.packed, CAMERAS, built.prefix, seed=0)

@@ -65,6 +65,7 @@ def test_same_state_same_bits(renderer: CameraRenderer) -> None:
     assert digest(renderer.render(7, QPOS, NAMES)) == first
 
 
+@pytest.mark.slow
 def test_same_bits_in_other_processes(renderer: CameraRenderer) -> None:
     """Two spawned processes draw, and add noise, exactly as this one does."""
     built = scene("hall")

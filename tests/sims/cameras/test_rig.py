@@ -109,6 +109,7 @@ def test_loss_and_jitter_do_not_depend_on_each_other() -> None:
         assert (delay is None) == (delay_of(prompt, 1, stamp) is None)
 
 
+@pytest.mark.slow
 def test_jitter_delays_and_keeps_the_order(world: str) -> None:
     """Each picture comes at its own time, or with the one before it if that is later; and the
     same whether one process renders quickly or two slowly."""
@@ -131,6 +132,7 @@ def test_jitter_delays_and_keeps_the_order(world: str) -> None:
         np.testing.assert_array_equal(one.data, other.data)
 
 
+@pytest.mark.slow
 def test_a_lost_exposure_gives_nothing(world: str, caplog: pytest.LogCaptureFixture) -> None:
     """Neither image nor depth nor pose; the others come in time; and the log says how many."""
     caplog.set_level(logging.INFO, "visnav.free")
@@ -180,12 +182,14 @@ def vehicle(world: str) -> NodeResult:
     return run_node(Multirotor, inputs=[climb], config=config, duration=3.0)
 
 
+@pytest.mark.slow
 def test_a_free_camera_smears_while_it_moves(free: NodeResult) -> None:
     """With a velocity, and not when it is put elsewhere at once."""
     found = [stamp // (100 * MS) for stamp, is_smeared in smeared(free).items() if is_smeared]
     assert found == [5, 6, 7, 8, 9]
 
 
+@pytest.mark.slow
 def test_a_trajectory_smears(world: str, tmp_path: Path) -> None:
     file = tmp_path / "turn.tum"
     file.write_text("0 0 0 -1 0 0 0 1\n0.3 0 0 -1 0 0 0 1\n0.6 0 0 -1 0 0 0.3826834 0.9238795\n")

@@ -14,7 +14,7 @@ import pytest
 
 from sims.cameras import CameraRenderer, model_to_bytes, pose_to_qpos
 from sims.frames import from_euler
-from sims.worlds import CLEARANCE, TOURS, WORLDS, load_world, tour_length
+from sims.worlds import CLEARANCE, TOURS, load_world, tour_length
 from tests.sims.cameras.scenes import CAMERAS, fresh, scene
 
 REACH = {"hall": (7.0, 5.0), "yard": (12.0, 12.0)}
@@ -47,7 +47,7 @@ class Probe:
         )
 
 
-@pytest.fixture(params=sorted(WORLDS), scope="module")
+@pytest.fixture(params=["hall", pytest.param("yard", marks=pytest.mark.slow)], scope="module")
 def probe(request: pytest.FixtureRequest) -> tuple[str, Probe]:
     return request.param, Probe(request.param)
 
@@ -125,7 +125,7 @@ def test_a_ball_comes_to_rest_on_the_floor_and_steps_are_cheap(probe: tuple[str,
     assert cost < 20e-6  # measured 3 to 5 µs; the rest is for a busy machine
 
 
-@pytest.mark.parametrize("name", sorted(WORLDS))
+@pytest.mark.parametrize("name", ["hall", pytest.param("yard", marks=pytest.mark.slow)])
 def test_sizes_are_modest(name: str) -> None:
     """The model with all its textures stays below 40 MB, and compiles at once."""
     world = fresh(name)
@@ -160,6 +160,7 @@ def views(name: str, measure: Probe) -> Iterator[tuple[tuple[float, float, float
                     yield place, math.radians(90.0 * quarter + 31.0 * (number % 5))
 
 
+@pytest.mark.slow
 def test_there_are_corners_everywhere(probe: tuple[str, Probe]) -> None:
     """95 % of views have 200 good corners, in 12 of 16 parts of the picture."""
     name, measure = probe
