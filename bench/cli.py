@@ -149,6 +149,22 @@ def bridge(
 
 
 @app.command()
+def recording(
+    json: Json = None,
+    seconds: Annotated[float, typer.Option(min=3.0, help="Length of each run.")] = 6.0,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each kind, in turns.")] = 5,
+    rate: Annotated[float, typer.Option(min=1.0, help="Hertz of the camera.")] = 30.0,
+) -> None:
+    """Measure how late a 400 Hz tick is while a run is recorded, and while it is not."""
+    from bench.recording import measure
+    from bench.tables import recording_table
+
+    with _status() as say:
+        rows = measure(seconds=seconds, repeats=repeats, rate=rate, progress=say)
+    _finish(recording_table(rows), json, rows)
+
+
+@app.command()
 def flood(
     json: Json = None,
     windows: Annotated[

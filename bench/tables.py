@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from bench.flood import FloodRow
     from bench.idle import IdleRow
     from bench.lockstep import LockstepRow
+    from bench.recording import RecordingRow
     from bench.ros_images import RosImageRow
     from bench.stall import StallRow
     from bench.throughput import ThroughputRow
@@ -161,6 +162,26 @@ def flood_table(rows: Sequence[FloodRow]) -> Table:
             f"{row.late_max_us:.0f}",
             f"{row.ratio_p50:.2f}",
             f"{row.ratio_p99:.2f}",
+        )
+    return table
+
+
+def recording_table(rows: Sequence[RecordingRow]) -> Table:
+    """Return lateness with and without a recorder."""
+    table = _table(
+        "lateness of a 400 Hz tick (µs), and the pairs' ratio of p99",
+        *("run", "p50", "p99", "max", "ratio", "frames", "MB", "dropped"),
+    )
+    for row in rows:
+        table.add_row(
+            row.case,
+            f"{row.late_p50_us:.0f}",
+            f"{row.late_p99_us:.0f}",
+            f"{row.late_max_us:.0f}",
+            f"{row.ratio_p99:.2f}",
+            f"{row.frames}",
+            f"{row.megabytes:.0f}",
+            f"{row.dropped}",
         )
     return table
 
