@@ -66,6 +66,7 @@ class Recording:
         self.unwritten = 0
         """Events that are not in the file."""
         self._handed = 0
+        self._cores = order.cores
         self._failed = failed
         self._complain = complain
         self._closing = threading.Event()
@@ -116,6 +117,7 @@ class Recording:
     # The thread that feeds.
 
     def _feed(self) -> None:
+        self._stay_with_the_loop()
         try:
             self._hand_over()
             pipe.write_all(self._file, [pipe.end(self._end)])
@@ -129,6 +131,15 @@ class Recording:
         while not self._closing.wait(_PAUSE):
             self._let_go()
         self._let_go()
+
+    def _stay_with_the_loop(self) -> None:
+        """Keep this thread off the busy cores: there it might wait for its turn with Python's lock.
+
+        Then the loop would wait for that, too.
+        """
+        if self._cores and hasattr(os, "sched_setaffinity"):
+            if spare := os.sched_getaffinity(0) - {*self._cores}:
+                os.sched_setaffinity(0, spare)
 
     def _hand_over(self) -> None:
         parts: list[Buffer] = []
