@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Awaitable
 from typing import Any
 
 from runtime.clock import Clock
 from runtime.config import NodeSpec
-from runtime.errors import NodeError, VisnavError
+from runtime.errors import NodeError, NodeTimeoutError, VisnavError
+from runtime.limits import real_time_limit
 from runtime.links import Link
-from runtime.node import Node
+from runtime.node import Node, streams
 from runtime.schedule import Ticker
 from runtime.worker import Worker
 
@@ -39,10 +41,50 @@ class Life:
             for port, config in self.spec.links.items()
         }
 
-    def close_links(self) -> None:
-        """Let nothing that is on its way arrive any more."""
+    async def end(self, limit: float) -> list[NodeError]:
+        """End ticks, tasks, node and workers; whatever goes wrong, the other steps follow.
+
+        Args:
+            limit: Real seconds that a step may take.
+
+        Returns:
+            What went wrong; it is logged.
+        """
+        node, wrong = self.node, []
+        for ticker in self.tickers:
+            ticker.stopped = True
+        self.tickers.clear()
+        for task in self.tasks:
+            task.cancel()
+        if self.tasks:
+            wrong += await self._within(limit, "its tasks", asyncio.wait(self.tasks))
+        if node is not None and self.started:
+            wrong += await self._within(limit, "on_shutdown", node.on_shutdown())
+        for worker in self.workers:
+            await asyncio.to_thread(worker.close)
+        self.workers.clear()
+        self.started = False
         for link in self.links.values():
             link.close()
+        if node is not None:
+            for stream in streams(node).values():
+                stream.close()
+        return wrong
+
+    async def _within(self, limit: float, what: str, ending: Awaitable[Any]) -> list[NodeError]:
+        """Await a step of the end, and return what went wrong."""
+        name = self.spec.name
+        try:
+            async with real_time_limit(limit):
+                await ending
+        except TimeoutError:
+            late = NodeTimeoutError(name, f"expected {what} to end within {limit:g} s")
+            log.error("%s", late)
+            return [late]
+        except Exception as error:
+            log.error("%s: %s: %s", name, what, error, exc_info=error)
+            return [wrap(name, error)]
+        return []
 
 
 def log_error(error: NodeError, *, last: bool) -> None:

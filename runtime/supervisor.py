@@ -18,7 +18,7 @@ import functools
 import inspect
 import logging
 import time
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,7 @@ from runtime.errors import FatalError, NodeError, NodeTimeoutError, PeerError, R
 from runtime.life import Life, log_error, wrap
 from runtime.limits import real_time_limit
 from runtime.links import Link
-from runtime.node import Node, make_node, streams
+from runtime.node import Node, make_node
 from runtime.probes import Probes
 from runtime.schedule import Once, Tick, Ticker
 from runtime.sender import Deliver, Listener, Tap
@@ -437,40 +437,6 @@ class Supervisor:
     async def _retire(self, life: Life) -> None:
         """End one node, unless that is done: it hears nothing afterwards."""
         async with life.ending:
-            await self._end_node(life)
-
-    async def _end_node(self, life: Life) -> None:
-        """End a node's ticks, tasks and workers."""
-        node = life.node
-        for ticker in life.tickers:
-            ticker.stopped = True
-        life.tickers.clear()
-        for task in life.tasks:
-            task.cancel()
-        if life.tasks:
-            await self._within_limit(life, "its tasks", asyncio.wait(life.tasks))
-        if node is not None and life.started:
-            await self._within_limit(life, "on_shutdown", node.on_shutdown())
-        for worker in life.workers:
-            await asyncio.to_thread(worker.close)
-        life.workers.clear()
-        life.started = False
-        life.close_links()
-        if node is not None:
-            for stream in streams(node).values():
-                stream.close()
-        self._connect()
-
-    async def _within_limit(self, life: Life, what: str, ending: Awaitable[Any]) -> None:
-        """Await a step of a node's end; whatever goes wrong, the other steps follow."""
-        limit, name = self._config.run.shutdown_limit, life.spec.name
-        try:
-            async with real_time_limit(limit):
-                await ending
-        except TimeoutError:
-            late = NodeTimeoutError(name, f"expected {what} to end within {limit:g} s")
-            self.error = self.error or late
-            log.error("%s", late)
-        except Exception as error:
-            self.error = self.error or wrap(name, error)
-            log.error("%s: %s: %s", name, what, error, exc_info=error)
+            for error in await life.end(self._config.run.shutdown_limit):
+                self.error = self.error or error
+            self._connect()

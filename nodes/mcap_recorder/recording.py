@@ -137,9 +137,10 @@ class Recording:
 
         Then the loop would wait for that, too.
         """
-        if self._cores and hasattr(os, "sched_setaffinity"):
-            if spare := os.sched_getaffinity(0) - {*self._cores}:
-                os.sched_setaffinity(0, spare)
+        if not (self._cores and hasattr(os, "sched_setaffinity")):
+            return
+        if spare := os.sched_getaffinity(0) - {*self._cores}:
+            os.sched_setaffinity(0, spare)
 
     def _hand_over(self) -> None:
         parts: list[Buffer] = []
