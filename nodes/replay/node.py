@@ -31,7 +31,8 @@ class Replay(Node[ReplayConfig]):
         type = "nodes.replay:Replay"
         file = "runs/record/recording.mcap"
 
-    The run ends with the recording. `pause`, `resume` and `seek` are for the loop's thread.
+    The run ends with the recording. While it goes on, ``python -m runtime set replay.paused=true``
+    and ``replay.position=12s`` do what `pause` and `seek` do; these are for the loop's thread.
     """
 
     events = Output(Event)
@@ -47,6 +48,8 @@ class Replay(Node[ReplayConfig]):
         self._target: int | None = None
         self._told = 0
         self.sent = 0
+        if self.config.paused:
+            self.pause()
 
     async def on_startup(self) -> None:
         """Open the recording.
@@ -96,7 +99,12 @@ class Replay(Node[ReplayConfig]):
         if self._reader is not None:
             await self.offload(self._reader.close)
 
-    # For a monitor.
+    def on_change(self, before: ReplayConfig) -> None:
+        """Pause, go on, or go elsewhere."""
+        if self.config.paused != before.paused:
+            (self.pause if self.config.paused else self.resume)()
+        if self.config.position != before.position:
+            self.seek(self.config.position)
 
     def pause(self) -> None:
         """Say nothing until `resume`; the clock goes on."""

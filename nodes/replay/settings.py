@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from runtime import Duration, NodeConfig
+from runtime import Changeable, Duration, NodeConfig
 
 Use = Literal["image", "depth", "imu", "odometry", "truth", "estimate", "camera"]
 
@@ -58,6 +58,8 @@ class ReplayConfig(NodeConfig):
         linger: How long the run goes on after the last event, for what others have to say of it.
             A recording that says when it ended, or an `end`, ends just then.
         loop: Begin again at the end. The clock goes on, and stamps with it.
+        paused: Say nothing; can change in a run. The clock goes on, and what follows comes later.
+        position: Where to go on, on the recording's own time, whenever it is set in a run.
         only: Types (``Image``, ``Odometry``) and sources (``drone``, with all below it); an event
             must be of one of the types and from one of the sources, so far as any are named.
             ``["Event"]`` is everything. If empty: what sensors and the vehicle said, and the
@@ -77,6 +79,8 @@ class ReplayConfig(NodeConfig):
     end: Duration = Duration(0)
     linger: Duration = Duration(0.5)
     loop: bool = False
+    paused: Changeable[bool] = False
+    position: Changeable[Duration] = Duration(0)
     only: tuple[str, ...] = ()
     skip: tuple[str, ...] = ()
     memory: Annotated[int, msgspec.Meta(ge=1 << 20)] = 128 << 20

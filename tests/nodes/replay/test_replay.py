@@ -113,6 +113,35 @@ class Pausing(Witness):
         self.drone.resume()
 
 
+class Setting(Pausing):
+    """Does the same by settings, as one does from outside."""
+
+    def act(self) -> None:
+        if len([e for _, e in self.heard if isinstance(e, Imu)]) == 2 and not self.acted:
+            type(self).acted = True
+            self.drone = _replay_of(self)
+            self.set("paused=true")
+            self.start(self.resume())
+
+    async def resume(self) -> None:
+        await self.clock.sleep(0.1)
+        self.set("paused=false")
+
+    def set(self, text: str) -> None:
+        host: Any = self._host
+        host.changing.set(f"{self.drone.name}.{text}")
+
+
+class Going(Setting):
+    """Goes back at the last measurement, by a setting."""
+
+    def act(self) -> None:
+        if len([e for _, e in self.heard if isinstance(e, Imu)]) == 3 and not self.acted:
+            type(self).acted = True
+            self.drone = _replay_of(self)
+            self.set('position="30ms"')
+
+
 class Seeking(Witness):
     """Goes back at the last measurement, once."""
 
@@ -143,10 +172,18 @@ def test_a_pause_makes_all_that_follows_later(path: Path) -> None:
     assert len(Pausing.heard) == len(flight(sets.FRAMES)) - 2
 
 
-def test_seeking_goes_on_elsewhere_at_once(path: Path) -> None:
+def test_a_pause_can_be_set_from_outside(path: Path) -> None:
+    """As a setting that changes in the run."""
+    replay(path, Setting)
+    times = [time for time, e in Setting.heard if isinstance(e, Imu)]
+    assert times == [0, 30 * MS, 160 * MS]
+
+
+@pytest.mark.parametrize("witness", [Seeking, Going])
+def test_seeking_goes_on_elsewhere_at_once(path: Path, witness: type[Witness]) -> None:
     """What is read ahead is thrown away; time goes on."""
-    result = replay(path, Seeking)
-    times = [time for time, e in Seeking.heard if isinstance(e, Imu)]
+    result = replay(path, witness)
+    times = [time for time, e in witness.heard if isinstance(e, Imu)]
     assert times == [0, 30 * MS, 60 * MS, 60 * MS, 90 * MS]
     assert result.reason == "the recording ended"
 

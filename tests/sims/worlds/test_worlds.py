@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
+import tomllib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,6 +20,7 @@ from sims.frames import from_euler
 from sims.worlds import CLEARANCE, TOURS, load_world, tour_length
 from tests.sims.cameras.scenes import CAMERAS, fresh, scene
 
+ROOT = Path(__file__).parents[3]
 REACH = {"hall": (7.0, 5.0), "yard": (12.0, 12.0)}
 """How far from the middle views are tried, metres north and east."""
 
@@ -61,6 +65,19 @@ def test_the_tour_is_clear(probe: tuple[str, Probe]) -> None:
         for share in np.linspace(0.0, 1.0, count):
             place = tuple((start + (end - start) * share).tolist())
             assert measure.distance(place, 2.0) >= CLEARANCE + 0.001, place
+
+
+def test_the_examples_fly_clear(probe: tuple[str, Probe]) -> None:
+    """No example's path touches anything, or comes so near that a gust would."""
+    name, measure = probe
+    for file in sorted((ROOT / "examples").glob("*.toml")):
+        nodes = tomllib.loads(file.read_text(encoding="utf-8"))["nodes"]
+        world = next((n.get("world", "hall") for n in nodes if n["type"].startswith("sims.")), "")
+        paths = [np.array(n["waypoints"]) for n in nodes if "waypoints" in n and world == name]
+        for start, end in itertools.chain(*(itertools.pairwise(path) for path in paths)):
+            for share in np.linspace(0.0, 1.0, math.ceil(np.linalg.norm(end - start) / 0.3)):
+                place = tuple((start + (end - start) * share).tolist())
+                assert measure.distance(place, 2.0) >= 0.5, (file.name, place)
 
 
 def test_the_tour_is_a_tour(probe: tuple[str, Probe]) -> None:
