@@ -3,6 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+CORE := $(VENV)/.core
 READY := $(VENV)/.ready
 
 # Tests start hundreds of processes, which begin sooner if modules stay compiled.
@@ -17,16 +18,20 @@ help:  ## List the targets.
 setup: $(READY)  ## Make a virtual environment with all that is needed (the others do it too).
 
 # MuJoCo renders through EGL; where its libraries are missing, install them if we may.
-$(READY): pyproject.toml
+$(CORE): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "expected Python 3.11 or later, found $$($(PYTHON) --version): set PYTHON="; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet -e '.[dev]'
+	$(BIN)/python -m pip install --quiet -e .
 	@sh tools/system_packages.sh gl $(BIN)/python
 	@touch $@
 
-demo: $(READY)  ## Fly the standard tour, judge visual odometry on it, and report in runs/tour.
+$(READY): $(CORE)
+	$(BIN)/python -m pip install --quiet -e '.[dev]'
+	@touch $@
+
+demo: $(CORE)  ## Fly the standard tour, judge visual odometry on it, and report in runs/tour.
 	$(BIN)/python -m runtime run config.toml
 
 test: $(READY)  ## Run the quick tests.
@@ -61,7 +66,7 @@ bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (abou
 bench-quick: $(READY)  ## Run the quick benchmarks (under two minutes).
 	$(BIN)/python -m runtime bench all --quick --out runs/bench-quick
 
-pictures: demo  ## Make the README's pictures anew (needs Chromium for two of them; minutes).
+pictures: demo $(READY)  ## Make the README's pictures anew (needs Chromium for two of them; minutes).
 	$(BIN)/python tools/readme_pictures.py
 	$(BIN)/python -m runtime run examples/rerun.toml
 	$(BIN)/python tools/view_picture.py runs/rerun/flight.rrd docs/rerun.png

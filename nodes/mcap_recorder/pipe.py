@@ -23,6 +23,10 @@ EVENT, ANNOUNCEMENT, END = 0, 1, 2
 
 _HEAD = struct.Struct("<qIB")
 _LENGTH = struct.Struct("<I")
+_PART = 1 << 16
+"""Bytes written at once: the kernel does not let go of the core meanwhile, and the loop may need
+it."""
+
 _MOST = 512
 """Buffers of a call of writev(2), which takes 1024."""
 
@@ -62,13 +66,23 @@ def write_all(file: int, buffers: Sequence[Buffer]) -> None:
     Raises:
         OSError: Nobody reads any more.
     """
-    views = [memoryview(buffer).cast("B") for buffer in buffers]
+    views = [part for buffer in buffers for part in _parts(memoryview(buffer).cast("B"))]
     while views:
-        written = os.writev(file, views[:_MOST])
+        written = os.writev(file, views[:1] if len(views[0]) == _PART else _some(views))
         while views and written >= len(views[0]):
             written -= len(views.pop(0))
         if written:
             views[0] = views[0][written:]
+
+
+def _parts(view: memoryview) -> list[memoryview]:
+    return [view[at : at + _PART] for at in range(0, len(view), _PART)]
+
+
+def _some(views: list[memoryview]) -> list[memoryview]:
+    """Return the views before the next large part."""
+    large = (n for n, view in enumerate(views[:_MOST]) if len(view) == _PART)
+    return views[: next(large, _MOST)]
 
 
 def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator[Piece]:
