@@ -41,6 +41,8 @@ def page(results: Results, pictures: Mapping[str, Sequence[str]], folder: str) -
     """Return the whole page as Markdown; the pictures of each case are in `folder`."""
     parts = [CAVEATS, "\n".join(_goals(results)), "\n".join(_stall(results))]
     parts += ["\n".join(_lockstep(results)), "\n".join(_throughput(results))]
+    if results.bridge:
+        parts.append("\n".join(_beside(results)))
     for case, title in (
         ("small", "Small message"),
         ("large", "Large message (4.67 MB), copied"),
@@ -105,6 +107,15 @@ def _goals(results: Results) -> Iterator[str]:
     yield f"| {lateness} | no camera | | {ratio:.2f} | ≤ 1.25 |"
     percent = results.idle.cpu_percent
     yield f"| processor time of a 100 Hz timer | one core | | {percent:.2f} % | ≤ 1 % |"
+    for b in results.bridge:
+        mark = "≤ 2" if b.bytes < 1000 else "≤ 1.3"
+        yield f"| {b.case} to another process and back | Zenoh | 2 | {b.ratio:.2f} | {mark} |"
+    for recorded in results.recording[1:]:
+        late = f"{lateness.partition(',')[0]}, {recorded.case}"
+        yield f"| {late} | no recorder | | {recorded.ratio_p99:.2f} | ≤ 1.25 |"
+    for flooded in results.flood[1:]:
+        late = f"{lateness.partition(',')[0]}, {flooded.messages_per_second:,.0f} messages a second"
+        yield f"| {late} | quiet | | {flooded.ratio_p99:.2f} | ≤ 1.5 |"
     yield ""
 
 
@@ -143,6 +154,44 @@ def _throughput(results: Results) -> Iterator[str]:
         yield (
             f"| {r.case} | {r.batch} | {number(r.per_event_us)} "
             f"| {r.events_per_second:,.0f} | {size} |"
+        )
+    yield ""
+
+
+def _beside(results: Results) -> Iterator[str]:
+    yield "## Between processes, and beside the loop\n"
+    yield "Each of these tables is a run of its own, whose sides were measured in turns.\n"
+    yield "A run in two processes on one machine, beside bare Zenoh sessions in the same two:\n"
+    yield "| event | bytes | round trip µs | Zenoh's | ratio | a second | Zenoh's |"
+    yield "|---|--:|--:|--:|--:|--:|--:|"
+    for b in results.bridge:
+        yield (
+            f"| {b.case} | {b.bytes:,} | {number(b.ours_us)} | {number(b.zenoh_us)} "
+            f"| {b.ratio:.2f} | {b.ours_per_second:,.0f} | {b.zenoh_per_second:,.0f} |"
+        )
+    yield "\nA picture as a message of ROS 2, by the bridge and by rosbags' `serialize_cdr`:\n"
+    yield "| picture | bytes | µs | rosbags' | ratio |"
+    yield "|---|--:|--:|--:|--:|"
+    for i in results.ros_images:
+        yield (
+            f"| {i.case} | {i.bytes:,} | {number(i.ours_us)} | {number(i.rosbags_us)} "
+            f"| {i.ratio:.2f} |"
+        )
+    yield "\nLateness of a 400 Hz tick while a run with 512×512 RGB-D at 30 Hz is recorded:\n"
+    yield "| run | late p50 µs | p99 µs | max µs | pairs' ratio of p99 | MB | dropped |"
+    yield "|---|--:|--:|--:|--:|--:|--:|"
+    for r in results.recording:
+        yield (
+            f"| {r.case} | {r.late_p50_us:.0f} | {r.late_p99_us:.0f} | {r.late_max_us:.0f} "
+            f"| {r.ratio_p99:.2f} | {r.megabytes:.0f} | {r.dropped} |"
+        )
+    yield "\nThe same while messages of ROS 2 come from another process:\n"
+    yield "| window | messages a second | late p50 µs | p99 µs | pairs' ratio of p99 |"
+    yield "|---|--:|--:|--:|--:|"
+    for f in results.flood:
+        yield (
+            f"| {f.case} | {f.messages_per_second:,.0f} | {f.late_p50_us:.0f} "
+            f"| {f.late_p99_us:.0f} | {f.ratio_p99:.2f} |"
         )
     yield ""
 

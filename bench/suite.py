@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
-from bench import idle, lockstep, stall, throughput
+from bench import bridge, flood, idle, lockstep, recording, ros_images, stall, throughput
 from bench.driver import Outcome, Row, measure_all
 from bench.page import page
 from bench.plots import plot_boxes, plot_scaling
@@ -26,6 +27,10 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
     throughput: list[throughput.ThroughputRow]
     idle: idle.IdleRow
     lockstep: list[lockstep.LockstepRow]
+    bridge: list[bridge.BridgeRow] = []
+    ros_images: list[ros_images.RosImageRow] = []
+    recording: list[recording.RecordingRow] = []
+    flood: list[flood.FloodRow] = []
     missing: dict[str, str]
     versions: dict[str, str]
 
@@ -79,11 +84,24 @@ def run(
         throughput=through,
         idle=idling,
         lockstep=lockstep.measure(repeats=2 if quick else 5, progress=progress),
+        **beside(quick=quick, progress=progress),
         missing={k: v for outcome in outcomes for k, v in outcome.missing.items()},
         versions={k: v for outcome in outcomes for k, v in outcome.versions.items()},
     )
     write(results, out, page_path)
     return results
+
+
+def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> dict[str, Any]:
+    """Measure what goes on between processes and beside the loop, by field of `Results`."""
+    return {
+        "bridge": bridge.measure(200 if quick else 2000, progress),
+        "ros_images": ros_images.measure(50 if quick else 300),
+        "recording": recording.measure(
+            seconds=3.0 if quick else 5.0, repeats=1 if quick else 9, progress=progress
+        ),
+        "flood": flood.measure(windows=4 if quick else 30, progress=progress),
+    }
 
 
 def write(results: Results, out: Path, page_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from bench.bridge import BridgeRow
 from bench.driver import Row
 from bench.idle import IdleRow
 from bench.lockstep import LockstepRow
@@ -71,6 +72,20 @@ def results() -> Results:
         ],
         idle=IdleRow(hz=100, seconds=10, ticks=1000, cpu_percent=0.8),
         lockstep=[LockstepRow(case="run", speed=100, share=0.2)],
+        bridge=[
+            BridgeRow(
+                case="small event",
+                bytes=64,
+                samples=100,
+                ours_us=180,
+                zenoh_us=100,
+                ratio=1.8,
+                ours_p99_us=300,
+                zenoh_p99_us=200,
+                ours_per_second=2e4,
+                zenoh_per_second=1e4,
+            )
+        ],
         missing={"trio channels": "not installed"},
         versions={"pyee": "pyee 13"},
     )
@@ -111,3 +126,11 @@ def test_each_picture_stands_once_under_its_own_case(tmp_path: Path) -> None:
     assert len(links) == len(set(links)) == 9
     shared = next(n for n, line in enumerate(lines) if line.startswith("## Large message, by"))
     assert not any("large-shared" in line for line in lines[:shared] if line.startswith("!["))
+
+
+def test_what_crosses_to_another_process_is_held_against_zenoh(tmp_path: Path) -> None:
+    """As a ratio with its mark, and as a table."""
+    write(results(), tmp_path, tmp_path / "RESULTS.md")
+    text = (tmp_path / "RESULTS.md").read_text(encoding="utf-8")
+    assert "| small event to another process and back | Zenoh | 2 | 1.80 | ≤ 2 |" in text
+    assert "| small event | 64 | 180 | 100 | 1.80 | 20,000 | 10,000 |" in text
