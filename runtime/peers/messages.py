@@ -174,7 +174,7 @@ class Standing(Message, frozen=True):
     sent: tuple[int, ...]
 
 
-Any_ = (
+AnyMessage = (
     Hello
     | Announced
     | Hearing
@@ -195,10 +195,10 @@ Ordered = Said | Stop | Retired
 """In lockstep these are taken in at one's turn, in the order of their serial numbers."""
 
 encode = msgspec.msgpack.Encoder().encode
-_decoder: msgspec.msgpack.Decoder[Any_] = msgspec.msgpack.Decoder(Any_)
+_decoder: msgspec.msgpack.Decoder[AnyMessage] = msgspec.msgpack.Decoder(AnyMessage)
 
 
-def decode(data: bytes) -> Any_:
+def decode(data: bytes) -> AnyMessage:
     """Read a message.
 
     Raises:

@@ -22,7 +22,7 @@ from runtime.peers.member import Member
 from runtime.peers.messages import (
     Ack,
     Announced,
-    Any_,
+    AnyMessage,
     Begin,
     Call,
     Hearing,
@@ -88,7 +88,7 @@ class Peers:
         self._loop: LockstepLoop | None = None
         self._turns: Turns | None = None
         self._announced = Announced({})
-        self._early: list[tuple[Member, Any_, Event | None]] = []
+        self._early: list[tuple[Member, AnyMessage, Event | None]] = []
         self._begun = self._ending = False
         self._origin = 0
         self._retired: set[str] = set()
@@ -234,7 +234,7 @@ class Peers:
 
     # What the roster tells.
 
-    def heard(self, member: Member, message: Any_, event: Event | None) -> None:
+    def heard(self, member: Member, message: AnyMessage, event: Event | None) -> None:
         """Take in a message of another process.
 
         Raises:

@@ -24,7 +24,7 @@ from runtime.errors import PeerError, VisnavError, WireError
 from runtime.limits import real_time_limit
 from runtime.peers.meeting import check_fits, missing, name_of, say_missing
 from runtime.peers.member import Member
-from runtime.peers.messages import Ack, Any_, Hello, Ping, Pong, Said, decode
+from runtime.peers.messages import Ack, AnyMessage, Hello, Ping, Pong, Said, decode
 from runtime.peers.session import Session
 from runtime.wire import unpack
 
@@ -40,7 +40,7 @@ GREET_EVERY = 0.2
 class Told(Protocol):
     """Who is told of what happens, on the loop."""
 
-    def heard(self, member: Member, message: Any_, event: Event | None) -> None:
+    def heard(self, member: Member, message: AnyMessage, event: Event | None) -> None:
         """Take in a message of a process of the run.
 
         Raises:
@@ -250,7 +250,7 @@ class Roster:
 
     # On the loop.
 
-    def _take(self, member: Member, message: Any_, event: Event | None) -> None:
+    def _take(self, member: Member, message: AnyMessage, event: Event | None) -> None:
         try:
             if isinstance(message, Hello):
                 self._meet(member, message)
