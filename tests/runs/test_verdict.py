@@ -14,11 +14,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 CONFIG = ROOT / "config.toml"
 
 
-def fly(folder: Path, config: Path, *settings: str, code: int = 0) -> dict[str, Any]:
-    """Run a file and return its summary."""
+def fly(folder: Path, config: Path, *settings: str, code: int | None = 0) -> dict[str, Any]:
+    """Run a file and return its summary; `code` is that of its end, or `None` for 0 or 1."""
     changes = [word for setting in settings for word in ("--set", setting)]
     done = command("run", config, "-q", "--out", "out", *changes, folder=folder, limit=280)
-    assert done.returncode == code, done.stderr
+    assert done.returncode in ({0, 1} if code is None else {code}), done.stderr
     found: dict[str, Any] = json.loads((folder / "out" / "summary.json").read_text())
     return found
 
@@ -46,7 +46,7 @@ def test_a_scene_too_heavy_for_the_machine_gives_the_same_estimates(tmp_path: Pa
     for render_time in ("0s", "2s"):
         folder = tmp_path / render_time
         folder.mkdir()
-        summary = fly(folder, CONFIG, *short, f"camera.render_time={render_time}", code=1)
+        summary = fly(folder, CONFIG, *short, f"camera.render_time={render_time}", code=None)
         found.append((summary["digest"], summary["verdict"]))
         assert summary["verdict"]["estimators"]["odometry"]["estimates"] == 25
     assert found[0] == found[1]
