@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Iterable
 from typing import Any
 
-from runtime.clock import Clock
+from events import Announcement
 from runtime.config import NodeSpec
-from runtime.errors import NodeError, NodeTimeoutError, VisnavError
+from runtime.errors import NodeError, NodeTimeoutError, RefusedError, VisnavError
 from runtime.limits import real_time_limit
 from runtime.links import Link
-from runtime.node import Node, streams
+from runtime.node import Host, Node, make_node, streams
 from runtime.schedule import Ticker
 from runtime.worker import Worker
 
@@ -34,12 +34,66 @@ class Life:
         self.recovering = False
         self.ending = asyncio.Lock()
 
-    def make_links(self, clock: Clock, seed: int) -> None:
-        """Make the links that the file puts before the node's ports."""
-        self.links = {
-            port: Link(f"{self.spec.name}.{port}", config, clock, seed)
-            for port, config in self.spec.links.items()
-        }
+    async def begin(self, host: Host, limit: float) -> None:
+        """Make the node and the links before its ports, and start it up.
+
+        Args:
+            host: What the run does for it.
+            limit: Real seconds that `on_startup` may take.
+
+        Raises:
+            NodeError: Something went wrong in it.
+        """
+        spec = self.spec
+        try:
+            self.node = make_node(spec.node, spec.name, spec.config, host, spec.inputs)
+            self.links = {
+                port: Link(f"{spec.name}.{port}", config, host.clock, host.seed)
+                for port, config in spec.links.items()
+            }
+            async with real_time_limit(limit):
+                await self.node.on_startup()
+            self.started = True
+        except NodeError:
+            raise
+        except TimeoutError:
+            expected = f"expected on_startup to end within {limit:g} s"
+            raise NodeTimeoutError(spec.name, f"{expected}, found it still running") from None
+        except Exception as error:
+            raise wrap(spec.name, error) from error
+
+    def announced(self) -> list[Announcement]:
+        """Return what the node announces.
+
+        Raises:
+            NodeError: Something went wrong in it.
+        """
+        assert self.node is not None
+        try:
+            return list(self.node.announce())
+        except NodeError:
+            raise
+        except Exception as error:
+            raise wrap(self.spec.name, error) from error
+
+    def hear(self, announcements: Iterable[Announcement]) -> None:
+        """Let the node hear all announcements.
+
+        Raises:
+            NodeError: Something went wrong in it; a `RefusedError` if it cannot work with one.
+        """
+        assert self.node is not None
+        name = self.spec.name
+        for announcement in announcements:
+            try:
+                self.node.on_announcement(announcement)
+            except ValueError as error:
+                what = f"cannot work with {announcement.source}: {error}"
+                raise RefusedError(name, what) from error
+            except NodeError:
+                raise
+            except Exception as error:
+                raise wrap(name, error) from error
 
     async def end(self, limit: float) -> list[NodeError]:
         """End ticks, tasks, node and workers; whatever goes wrong, the other steps follow.

@@ -133,7 +133,7 @@ class Probes:
                 self.on_task(name, task)
             for worker in life.workers:
                 self.on_worker(worker)
-        self._supervisor._connect()
+        self._supervisor.connect()
 
     def _request(self, process: _Process, message: Any) -> Future[Any]:
         answer = _Process.request(process, message)

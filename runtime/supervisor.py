@@ -30,11 +30,10 @@ from runtime import graph
 from runtime.changing import Changing
 from runtime.clock import Clock
 from runtime.config import Config
-from runtime.errors import FatalError, NodeError, NodeTimeoutError, PeerError, RefusedError
+from runtime.errors import FatalError, NodeError, PeerError
 from runtime.life import Life, log_error, wrap
-from runtime.limits import real_time_limit
 from runtime.links import Link
-from runtime.node import Node, make_node
+from runtime.node import Node
 from runtime.probes import Probes
 from runtime.schedule import Once, Tick, Ticker
 from runtime.sender import Deliver, Listener, Tap
@@ -241,13 +240,13 @@ class Supervisor:
                 await self._start_up(life)
                 if self._ended.is_set():  # it stopped the run and did not wait for anything after
                     return
-            said = {name: self._announced(life) for name, life in self._lives.items()}
+            said = {name: life.announced() for name, life in self._lives.items()}
             mine = list(chain(*said.values()))
             self.announcements += await self.peers.announce(said) if self.peers else mine
             for life in self._lives.values():
-                self._hear(life)
+                life.hear(self.announcements)
             if self.peers is not None:
-                self._connect()  # so that each knows what the others hear
+                self.connect()  # so that each knows what the others hear
                 await self.peers.begin()
         except PeerError as error:
             log.error("%s", error, extra={"told": True})
@@ -260,7 +259,7 @@ class Supervisor:
         for announcement in mine:
             for tap in self._taps:
                 tap(None, announcement)
-        self._connect()
+        self.connect()
         self._running = True
         self.first_update = time.monotonic()
         if self.peers is None:
@@ -276,48 +275,16 @@ class Supervisor:
             self.peers.begun()
 
     async def _start_up(self, life: Life) -> None:
-        spec = life.spec
+        limit = self._config.run.startup_limit
         try:
-            life.node = node = make_node(spec.node, spec.name, spec.config, self, spec.inputs)
-            self.ever.append(node)
-            life.make_links(self.clock, self.seed)
+            await life.begin(self, limit)
+        finally:
+            if life.node is not None and life.node not in self.ever:
+                self.ever.append(life.node)
             self.links |= {link.name: link for link in life.links.values()}
-            async with real_time_limit(self._config.run.startup_limit):
-                await node.on_startup()
-            life.started = True
-        except NodeError:
-            raise
-        except TimeoutError:
-            limit = f"expected on_startup to end within {self._config.run.startup_limit:g} s"
-            raise NodeTimeoutError(spec.name, f"{limit}, found it still running") from None
-        except Exception as error:
-            raise wrap(spec.name, error) from error
 
-    def _announced(self, life: Life) -> list[Announcement]:
-        assert life.node is not None
-        try:
-            return list(life.node.announce())
-        except NodeError:
-            raise
-        except Exception as error:
-            raise wrap(life.spec.name, error) from error
-
-    def _hear(self, life: Life) -> None:
-        """Let a node hear all announcements, and turn a refusal into an error."""
-        assert life.node is not None
-        for announcement in self.announcements:
-            try:
-                life.node.on_announcement(announcement)
-            except ValueError as error:
-                raise RefusedError(
-                    life.spec.name, f"cannot work with {announcement.source}: {error}"
-                ) from error
-            except NodeError:
-                raise
-            except Exception as error:
-                raise wrap(life.spec.name, error) from error
-
-    def _connect(self) -> None:
+    def connect(self) -> None:
+        """Freeze who hears whom; anew whenever a node or another process comes or goes."""
         nodes = [life.node for life in self._lives.values() if life.node and life.started]
         sources = {node.name: node.sources for node in nodes}
         links = {life.spec.name: life.links for life in self._lives.values()}
@@ -332,10 +299,6 @@ class Supervisor:
             self.peers.connect(heard, self._listener_failed)
         self.changing.connect(heard, self._taps, self._listener_failed)
         self.probes.on_connected(nodes, [self.changing.sender])
-
-    def connect(self) -> None:
-        """Freeze anew who hears whom: another process has come, or gone."""
-        self._connect()
 
     def _begin_node(self, life: Life) -> None:
         node = life.node
@@ -401,7 +364,7 @@ class Supervisor:
             await self.clock.sleep(pause)
             try:
                 await self._start_up(life)
-                self._hear(life)
+                life.hear(self.announcements)
             except NodeError as error:
                 if isinstance(error, FatalError):
                     self.stop(f"{life.spec.name} failed", error)
@@ -410,7 +373,7 @@ class Supervisor:
                 await asyncio.shield(self._group.create_task(self._retire(life)))
                 continue
             life.recovering = False
-            self._connect()
+            self.connect()
             self._begin_node(life)
             return
 
@@ -424,7 +387,7 @@ class Supervisor:
         if self._recoveries:
             await asyncio.wait(self._recoveries)
         if not self._running:  # what has started may still send farewells to what has, too
-            self._connect()
+            self.connect()
         for name, life in reversed(self._lives.items()):
             if self.peers is not None:
                 await self.peers.turn_to_end(name)
@@ -439,4 +402,4 @@ class Supervisor:
         async with life.ending:
             for error in await life.end(self._config.run.shutdown_limit):
                 self.error = self.error or error
-            self._connect()
+            self.connect()

@@ -53,7 +53,6 @@ class RerunView(Node[RerunConfig]):
     def __init__(self) -> None:
         self._announcements: list[Announcement] = []
         self._heard = 0
-        self._passed = 0
         self._recorder: Any = None
         self._begun = False
         self._thinning = Thinning(self.config.picture_rate)

@@ -23,7 +23,6 @@ class Member:
         number: Its number among the processes of the run, or -1 if it is none of them.
         hello: Who it says it is.
         unfit: Whether it runs another file, or nodes that run elsewhere.
-        gone: Whether it is not there any more.
         offset: Of its monotonic clock.
         announced: What its nodes announced.
         ready: Whether its nodes can begin.
@@ -38,7 +37,6 @@ class Member:
         self.number = -1
         self.hello: Hello | None = None
         self.unfit = False
-        self.gone = False
         self.offset = Offset()
         self.announced: Announced | None = None
         self.ready = False

@@ -104,36 +104,32 @@ class Session:
 
 
 def _configuration(network: NetworkConfig) -> zenoh.Config:
-    """Return the configuration of a peer that listens at the meeting place or finds it."""
+    """Return a peer's configuration: the file's, or one that finds or makes the meeting place."""
+    settings: dict[str, Any] = {"transport/link/tx/lease": round(float(network.lease) * 1000)}
     if network.zenoh:
         if not Path(network.zenoh).is_file():
             raise PeerError(f"network.zenoh: expected a file, found none at {network.zenoh}")
         configuration = zenoh.Config.from_file(network.zenoh)
     else:
         configuration = zenoh.Config()
-        configuration.insert_json5("mode", '"peer"')
-        configuration.insert_json5("scouting/multicast/enabled", "false")
-    milliseconds = round(float(network.lease) * 1000)
-    anywhere = "127.0.0.1:0" if re.search(r"/(127\.|localhost)", network.meet) else "0.0.0.0:0"
-    settings: dict[str, Any] = {
-        # The first process on that host takes the address, and the others connect to it; each
-        # tells the rest where else it listens.
-        "listen/endpoints": [network.meet, f"tcp/{anywhere}"],
-        "listen/exit_on_failure": False,
-        "listen/timeout_ms": 0,
-        "connect/endpoints": [network.meet],
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
-        "connect/retry": {
-            "period_init_ms": 100,
-            "period_max_ms": 400,
-            "period_increase_factor": 2,
-        },
-    }
-    if not network.zenoh:
-        settings["transport/link/tx/lease"] = milliseconds
-    else:  # the file says where to listen and to connect
-        settings = {"transport/link/tx/lease": milliseconds}
+        here = re.search(r"/(127\.|localhost)", network.meet)
+        settings |= {
+            "mode": "peer",
+            "scouting/multicast/enabled": False,
+            # The first process on that host takes the address, and the others connect to it; each
+            # tells the rest where else it listens.
+            "listen/endpoints": [network.meet, "tcp/127.0.0.1:0" if here else "tcp/0.0.0.0:0"],
+            "listen/exit_on_failure": False,
+            "listen/timeout_ms": 0,
+            "connect/endpoints": [network.meet],
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "connect/retry": {
+                "period_init_ms": 100,
+                "period_max_ms": 400,
+                "period_increase_factor": 2,
+            },
+        }
     for key, value in settings.items():
         configuration.insert_json5(key, json.dumps(value))
     return configuration
