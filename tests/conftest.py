@@ -14,4 +14,5 @@ os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
 # A deadline is real time, of which a busy machine may take any amount.
 settings.register_profile("without deadlines", deadline=None)
+settings.register_profile("thorough", deadline=None, max_examples=2000)  # --hypothesis-profile=…
 settings.load_profile("without deadlines")

@@ -44,10 +44,11 @@ def test_in_lockstep_the_digest_is_that_of_one_process(onlys: tuple[str, ...]) -
 
 def test_in_real_time_everything_crosses_too() -> None:
     config = settings(*THREE, clock="real", duration=0.6)
-    for summary in apart(config, "asker", "one,other"):
-        assert summary.outputs["asker.questions"] == pytest.approx(31, abs=3)
-        assert summary.outputs["one.answers"] > 20
-        assert summary.outputs["other.answers"] > 10
+    one, other = apart(config, "asker", "one,other")
+    assert one.outputs == other.outputs
+    for output in ("asker.questions", "asker.pictures", "one.answers", "other.answers"):
+        assert one.outputs[output] > 0  # how many is up to the machine
+    for summary in (one, other):
         trips = [each.round_trip_ms for each in summary.processes]
         assert trips.count(None) < len(trips) or summary.processes[0].clock_offset_ms is None
 
