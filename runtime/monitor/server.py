@@ -93,7 +93,7 @@ class Server:
         await self._end.wait()
         publishing.cancel()
         server.close()
-        for writer in self._watching:
+        for writer in list(self._watching):  # some may leave meanwhile
             writer.write(self._last)
             with contextlib.suppress(OSError, TimeoutError):
                 await asyncio.wait_for(writer.drain(), 1.0)

@@ -53,7 +53,7 @@ class Line:
         self._events = 0
         self._under_way = 0
         self._writing = False
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._closed = False
         self._thread = threading.Thread(target=self._write, name=f"to {name}", daemon=True)
@@ -111,7 +111,8 @@ class Line:
     def _put_now(self, message: Message, packed: Packed | None) -> None:
         head = encode(message)
         frame = b"" if packed is None else packed.frame()
-        self._under_way += len(head) + len(frame)
+        with self._lock:
+            self._under_way += len(head) + len(frame)
         try:
             self._put(head, frame)
         except VisnavError as error:

@@ -30,6 +30,7 @@ class Member:
         told: What it was told that nodes here hear.
         arrived: Bytes that came from it and that it has not been told of.
         parted: What it had to say of the run, as JSON.
+        has_ours: Whether it has what we had to say of the run.
     """
 
     def __init__(self, id_: str, put: Put, failed: Callable[[VisnavError], None]) -> None:
@@ -44,6 +45,7 @@ class Member:
         self.told: tuple[Wanted, ...] | None = None
         self.arrived = 0
         self.parted: bytes | None = None
+        self.has_ours = False
         self.line = Line(id_, put, failed)
 
     @property

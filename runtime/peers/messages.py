@@ -124,6 +124,13 @@ class Parted(Message, frozen=True):
     part: bytes
 
 
+class Farewell(Message, frozen=True):
+    """I have what you had to say of the run: leave when you like.
+
+    That a process goes is told before its last messages may have arrived.
+    """
+
+
 class Turn(Message, frozen=True):
     """It is your turn in lockstep.
 
@@ -186,6 +193,7 @@ AnyMessage = (
     | Stop
     | Retired
     | Parted
+    | Farewell
     | Turn
     | Ack
     | Call

@@ -25,6 +25,7 @@ from runtime.peers.messages import (
     AnyMessage,
     Begin,
     Call,
+    Farewell,
     Hearing,
     Hello,
     Message,
@@ -93,6 +94,7 @@ class Peers:
         self._origin = 0
         self._retired: set[str] = set()
         self._left_out: set[str] = set()
+        self._parted: dict[int, Member] = {}
 
     # Before the run.
 
@@ -209,14 +211,14 @@ class Peers:
         try:
             async with real_time_limit(PARTING):
                 await roster.until(
-                    lambda: all(m.parted is not None for m in roster.present()), despite=True
+                    lambda: all(m.parted and m.has_ours for m in roster.present()), despite=True
                 )
         except TimeoutError:
             silent = [name_of(m.nodes) for m in roster.present() if m.parted is None]
             log.warning("no summary of %s", "; ".join(silent))
         parts = {roster.me: mine}
         processes = {roster.me: ProcessSummary(list(roster.here), roster.hello.place)}
-        for member in roster.present():
+        for member in [*self._parted.values(), *roster.present()]:
             processes[member.number] = member.summary()
             if member.parted is not None:
                 parts[member.number] = msgspec.json.decode(member.parted, type=Summary)
@@ -249,6 +251,10 @@ class Peers:
                     member.line.send(self._announced)
             case Parted():
                 member.parted = message.part
+                self._parted[member.number] = member
+                member.line.send(Farewell())
+            case Farewell():
+                member.has_ours = True
             case Begin():
                 member.begin = message
             case Ready():

@@ -158,3 +158,26 @@ def test_a_monitor_that_fails_leaves_the_run_alone(monkeypatch: pytest.MonkeyPat
             assert ask(find(None), Set(text="pilot.gain=2")) == "gain = 2.0"
 
     assert served(outside).supervisor.reason == "seen enough"
+
+
+def test_who_leaves_while_the_end_is_told_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    left = []
+
+    async def leave(writer: asyncio.StreamWriter) -> None:
+        left.append(writer)
+        writer.transport.abort()
+        for _ in range(20):
+            await asyncio.sleep(0)  # the task that listened to it notices
+
+    def outside() -> None:
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(str(find(None)))
+            connection.sendall(b'{"type":"watch"}\n')
+            assert ask(find(None), Set(text="pilot.gain=2")) == "gain = 2.0"
+            monkeypatch.setattr(asyncio.StreamWriter, "drain", leave)
+            stays.append(connection.dup())
+
+    stays: list[socket.socket] = []
+    assert served(outside).supervisor.reason == "seen enough"
+    stays.pop().close()
+    assert left

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import pytest
 
 from runtime.errors import PeerError
 from runtime.execute import execute
+from runtime.peers.line import Line
+from runtime.peers.messages import Message, Parted
 from tests.runtime.peers.samples import Process, apart, settings
 
 THREE: tuple[tuple[str, str, dict[str, Any]], ...] = (
@@ -51,6 +54,26 @@ def test_in_real_time_everything_crosses_too() -> None:
     for summary in (one, other):
         trips = [each.round_trip_ms for each in summary.processes]
         assert trips.count(None) < len(trips) or summary.processes[0].clock_offset_ms is None
+
+
+def test_nobody_leaves_before_all_have_heard_what_it_had_to_say(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Zenoh may tell that a process has gone before it delivers that one's last words."""
+    send, late = Line.send, list[threading.Timer]()
+
+    def send_late(line: Line, message: Message, *args: Any) -> None:
+        if isinstance(message, Parted) and not late:
+            late.append(threading.Timer(0.2, send, (line, message)))
+            late[0].start()
+        else:
+            send(line, message, *args)
+
+    monkeypatch.setattr(Line, "send", send_late)
+    one, other = apart(settings(*THREE, duration=0.1), "asker", "one,other")
+    assert late
+    assert one.outputs == other.outputs
+    assert len(one.processes) == len(other.processes) == 2
 
 
 def test_handled_ends_the_delivery_in_its_own_process_only() -> None:
