@@ -79,12 +79,15 @@ class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
             listens there; the others connect to it. By default on this machine only.
         zenoh: A Zenoh configuration file, which then says where to listen and connect instead:
             for TLS, access control, a router.
+        shared: Whether large events to a process on this machine pass through memory that both
+            see.
         lease: A process that is silent for so long is gone.
         wait: How long to wait for the others at the start.
     """
 
     meet: str = "tcp/127.0.0.1:7450"
     zenoh: str = ""
+    shared: bool = True
     lease: Duration = Duration(0.8)  # immutable
     wait: Duration = Duration(60)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import ctypes
+import fcntl
 import mmap
 import os
 import pickle
@@ -25,6 +26,9 @@ from typing import Any
 INLINE = 4096
 """Buffers smaller than this (bytes) travel inside the message."""
 
+MAPPED = 1 << 24
+"""Length to which a file grows at first (bytes); from there on it doubles."""
+
 LIMIT = 1 << 30
 """A file never grows beyond this (bytes); what does not fit travels inside the message."""
 
@@ -32,7 +36,9 @@ LIMIT = 1 << 30
 def anonymous_file() -> int:
     """Return the descriptor of a new nameless file in memory (on disk where there is none)."""
     if sys.platform == "linux":
-        return os.memfd_create("visnav", 0)
+        fd = os.memfd_create("visnav", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+        return fd
     with tempfile.TemporaryFile() as file:
         return os.dup(file.fileno())
 
@@ -42,10 +48,12 @@ class Arena:
 
     Args:
         fd: The file.
+        limit: Bytes to which it may grow.
     """
 
-    def __init__(self, fd: int) -> None:
+    def __init__(self, fd: int, limit: int = LIMIT) -> None:
         self._fd = fd
+        self._limit = limit
         self._size = 0
         self._map: mmap.mmap | None = None
         self._blocks: dict[int, int] = {}  # offset: size
@@ -53,15 +61,24 @@ class Arena:
 
     def put(self, data: memoryview) -> int | None:
         """Copy `data` (contiguous bytes) into a block and return its offset; `None` if full."""
-        fitting = [o for o in self._free if data.nbytes <= self._blocks[o] <= 2 * data.nbytes]
-        if fitting:
-            offset = min(fitting, key=self._blocks.__getitem__)
-            self._free.remove(offset)
-        elif (offset := self._grow(data.nbytes)) < 0:
-            return None
-        assert self._map is not None
-        self._map[offset : offset + data.nbytes] = data
+        offset = self.reserve(data.nbytes)
+        if offset is not None:
+            self.view(offset, data.nbytes)[:] = data
         return offset
+
+    def reserve(self, size: int) -> int | None:
+        """Take a block of at least `size` bytes and return its offset; `None` if full."""
+        fitting = [o for o in self._free if size <= self._blocks[o] <= 2 * size]
+        if not fitting:
+            return self._grow(size)
+        offset = min(fitting, key=self._blocks.__getitem__)
+        self._free.remove(offset)
+        return offset
+
+    def view(self, offset: int, size: int) -> memoryview:
+        """Return the memory of a block, to be written."""
+        assert self._map is not None
+        return memoryview(self._map)[offset : offset + size]
 
     def free(self, offset: int) -> None:
         """Let a block be used again."""
@@ -71,14 +88,17 @@ class Arena:
         """Close the file."""
         os.close(self._fd)
 
-    def _grow(self, size: int) -> int:
+    def _grow(self, size: int) -> int | None:
         offset = self._size
         size = -(-size // mmap.PAGESIZE) * mmap.PAGESIZE
-        if offset + size > LIMIT:
-            return -1
+        if offset + size > self._limit:
+            return None
+        if self._map is None or offset + size > len(self._map):
+            # Pages cost nothing before they are used, but a new map of them does on both sides.
+            length = min(max(2 * (offset + size), MAPPED), self._limit)
+            os.ftruncate(self._fd, length)
+            self._map = mmap.mmap(self._fd, length)
         self._size += size
-        os.ftruncate(self._fd, self._size)
-        self._map = mmap.mmap(self._fd, self._size)
         self._blocks[offset] = size
         return offset
 

@@ -43,6 +43,14 @@ class Packed(msgspec.Struct, frozen=True):
     offsets: tuple[int, ...]
     size: int
 
+    def write(self, into: memoryview) -> None:
+        """Write the frame into `size` bytes; the interpreter runs on while arrays are copied."""
+        begin = _LENGTH.size + len(self.head)
+        into[:begin] = _LENGTH.pack(len(self.head)) + self.head
+        whole = np.frombuffer(into, np.uint8)
+        for array, offset in zip(self.arrays, self.offsets, strict=True):
+            whole[offset : offset + array.nbytes] = array.reshape(-1).view(np.uint8)
+
     def frame(self) -> bytes:
         """Return the frame: the one copy there is of the arrays."""
         parts: list[Buffer] = [_LENGTH.pack(len(self.head)), self.head]

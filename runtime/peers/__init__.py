@@ -2,6 +2,7 @@
 
     messages   what processes say to each other
     session    how it gets there: Zenoh, in this module only
+    memory     what large events pass through between processes of one machine
     line       a thread that writes to one process, so that the loop never waits for a network
     meeting    who is there: nodes, equal files, and what is missing
     offsets    how far another machine's clock is from ours

@@ -2,7 +2,8 @@
 
 Zenoh waits where the network is slow, and the loop must not. A small message goes out on the spot
 as long as little is under way, by what the other process says has arrived; then Zenoh has room for
-it. All others are written by a thread, in order.
+it. So does a picture if the other process sees memory of ours, where it is put: its message is
+small. All others are written by a thread, in order.
 """
 
 from __future__ import annotations
@@ -12,8 +13,11 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
+import msgspec
+
 from events import Event
 from runtime.errors import ChannelFullError, VisnavError
+from runtime.peers.memory import Outgoing
 from runtime.peers.messages import Message, encode
 from runtime.wire import Packed, pack
 
@@ -24,6 +28,9 @@ BOUND = 1024
 
 SMALL = 8192
 """Bytes of a message that the loop may write itself: copying them takes a microsecond."""
+
+AT_ONCE = 1 << 20
+"""Bytes of an event that the loop may put into common memory: copying them takes 0.1 ms."""
 
 UNDER_WAY = 32768
 """Bytes that may be under way for that: Zenoh's queue holds four times as many."""
@@ -40,12 +47,14 @@ class Line:
     Attributes:
         replaced: Events that a newer one of the same output took the place of.
         peak: Most messages that ever waited.
+        memory: That the other process sees, once it has said so.
     """
 
     def __init__(self, name: str, put: Put, failed: Callable[[VisnavError], None]) -> None:
         self.name = name
         self.replaced = 0
         self.peak = 0
+        self.memory: Outgoing | None = None
         self._put = put
         self._failed = failed
         self._queue: deque[_Waiting] = deque()
@@ -79,8 +88,8 @@ class Line:
             if before is not None:
                 before.packed = packed
                 self.replaced += 1
-            elif self._goes_at_once(packed):
-                self._put_now(message, packed)
+            elif self._idle() and (parts := self._in_bytes(message, packed, now=True)):
+                self._put_now(*parts)
             else:
                 self._wait(_Waiting(message, packed, skip))
 
@@ -103,14 +112,22 @@ class Line:
             self._closed = True
             self._wake.put(None)
 
-    def _goes_at_once(self, packed: Packed | None) -> bool:
-        small = packed is None or packed.size <= SMALL
-        idle = not (self._queue or self._writing)
-        return small and idle and self._under_way < UNDER_WAY
+    def _idle(self) -> bool:
+        return not (self._queue or self._writing) and self._under_way < UNDER_WAY
 
-    def _put_now(self, message: Message, packed: Packed | None) -> None:
-        head = encode(message)
-        frame = b"" if packed is None else packed.frame()
+    def _in_bytes(
+        self, message: Message, packed: Packed | None, *, now: bool
+    ) -> tuple[bytes, bytes] | None:
+        """Return a message and its payload; `None` if making them takes too long to do it now."""
+        if packed is None or packed.size <= SMALL:
+            return encode(message), b"" if packed is None else packed.frame()
+        if self.memory is not None and not (now and packed.size > AT_ONCE):
+            place = self.memory.put(packed)
+            if place is not None:
+                return encode(msgspec.structs.replace(message, place=place)), b""
+        return None if now else (encode(message), packed.frame())
+
+    def _put_now(self, head: bytes, frame: bytes) -> None:
         with self._lock:
             self._under_way += len(head) + len(frame)
         try:
@@ -145,7 +162,9 @@ class Line:
                 self._skippable.pop(waiting.skip, None)
                 if waiting.packed is not None:
                     self._events -= 1
-            self._put_now(waiting.message, waiting.packed)
+            parts = self._in_bytes(waiting.message, waiting.packed, now=False)
+            assert parts is not None
+            self._put_now(*parts)
             self._writing = False
             if self._closed:
                 self._wake.put(None)  # look again whether anything is left

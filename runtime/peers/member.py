@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from runtime.errors import VisnavError
+from events import Event
+from runtime.errors import VisnavError, WireError
 from runtime.peers.line import Line, Put
-from runtime.peers.messages import Announced, Begin, Hello, Wanted
+from runtime.peers.memory import Incoming, Outgoing
+from runtime.peers.messages import Ack, Announced, Begin, Hello, Said, Wanted
 from runtime.peers.offsets import Offset
 from runtime.summary import ProcessSummary
+from runtime.wire import unpack
+
+ACK_EVERY = 8192
+"""Bytes after which the other end is told that they have arrived."""
+
+FREE_EVERY = 4
+"""Frames in its memory that are read no more after which it is told so."""
 
 
 class Member:
@@ -28,8 +37,9 @@ class Member:
         ready: Whether its nodes can begin.
         begin: When the first update is, if it has said so.
         told: What it was told that nodes here hear.
-        arrived: Bytes that came from it and that it has not been told of.
         parted: What it had to say of the run, as JSON.
+        outgoing: Memory that was offered to it.
+        incoming: Memory of its own that we see.
         has_ours: Whether it has what we had to say of the run.
     """
 
@@ -43,10 +53,39 @@ class Member:
         self.ready = False
         self.begin: Begin | None = None
         self.told: tuple[Wanted, ...] | None = None
-        self.arrived = 0
+        self._arrived = 0
         self.parted: bytes | None = None
+        self.outgoing: Outgoing | None = None
+        self.incoming: Incoming | None = None
         self.has_ours = False
         self.line = Line(id_, put, failed)
+
+    def event(self, said: Said, payload: bytes) -> Event:
+        """Return the event that it said.
+
+        Raises:
+            WireError: There is none.
+        """
+        if said.place is None:
+            return unpack(payload)
+        if self.incoming is None:
+            raise WireError("expected an event as a payload, found its place in unknown memory")
+        return unpack(self.incoming.frame(*said.place))
+
+    def acknowledge(self, count: int) -> None:
+        """Take in that so many bytes came, and tell it once in a while."""
+        self._arrived += count
+        unread = 0 if self.incoming is None else self.incoming.unread
+        if self._arrived >= ACK_EVERY or unread >= FREE_EVERY:
+            freed = () if self.incoming is None else self.incoming.freed()
+            self.line.send(Ack(self._arrived, freed))
+            self._arrived = 0
+
+    def acknowledged(self, ack: Ack) -> None:
+        """Take in what it has got, and what it reads no more."""
+        self.line.arrived(ack.arrived)
+        if self.outgoing is not None:
+            self.outgoing.freed(ack.freed)
 
     @property
     def nodes(self) -> tuple[str, ...]:

@@ -96,11 +96,36 @@ class Begin(Message, frozen=True):
     now: int = 0
 
 
+class Memory(Message, frozen=True):
+    """Memory into which I can put what is large for you, if you see it.
+
+    Attributes:
+        machine: Where it is.
+        path: To its file.
+        key: What stands at its beginning.
+    """
+
+    machine: str
+    path: str
+    key: bytes
+
+
+class Mapped(Message, frozen=True):
+    """I see your memory."""
+
+
 class Said(Message, frozen=True):
-    """An event of an output (``node.port``); its frame is the payload."""
+    """An event of an output (``node.port``).
+
+    Attributes:
+        output: Whose.
+        serial: Its place among the ordered messages.
+        place: Where its frame stands in my memory, and its size; `None`: it is the payload.
+    """
 
     output: str
     serial: int = 0
+    place: tuple[int, int] | None = None
 
 
 class Stop(Message, frozen=True):
@@ -152,9 +177,10 @@ class Turn(Message, frozen=True):
 
 
 class Ack(Message, frozen=True):
-    """So many bytes have arrived."""
+    """So many bytes have arrived, and these places in your memory are read no more."""
 
     arrived: int
+    freed: tuple[int, ...] = ()
 
 
 class Call(Message, frozen=True):
@@ -181,26 +207,13 @@ class Standing(Message, frozen=True):
     sent: tuple[int, ...]
 
 
-AnyMessage = (
-    Hello
-    | Announced
-    | Hearing
-    | Ping
-    | Pong
-    | Ready
-    | Begin
-    | Said
-    | Stop
-    | Retired
-    | Parted
-    | Farewell
-    | Turn
-    | Ack
-    | Call
-    | Standing
-)
 Ordered = Said | Stop | Retired
 """In lockstep these are taken in at one's turn, in the order of their serial numbers."""
+
+OfTheRun = (
+    Announced | Hearing | Ready | Begin | Ordered | Parted | Farewell | Turn | Call | Standing
+)
+AnyMessage = Hello | Ping | Pong | Ack | Memory | Mapped | OfTheRun
 
 encode = msgspec.msgpack.Encoder().encode
 _decoder: msgspec.msgpack.Decoder[AnyMessage] = msgspec.msgpack.Decoder(AnyMessage)

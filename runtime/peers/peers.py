@@ -20,19 +20,16 @@ from runtime.peers.crossing import Crossing, hearing
 from runtime.peers.meeting import name_of
 from runtime.peers.member import Member
 from runtime.peers.messages import (
-    Ack,
     Announced,
-    AnyMessage,
     Begin,
     Call,
     Farewell,
     Hearing,
-    Hello,
     Message,
+    OfTheRun,
     Ordered,
     Parted,
     Ping,
-    Pong,
     Ready,
     Retired,
     Said,
@@ -89,7 +86,7 @@ class Peers:
         self._loop: LockstepLoop | None = None
         self._turns: Turns | None = None
         self._announced = Announced({})
-        self._early: list[tuple[Member, AnyMessage, Event | None]] = []
+        self._early: list[tuple[Member, OfTheRun, Event | None]] = []
         self._begun = self._ending = False
         self._origin = 0
         self._retired: set[str] = set()
@@ -236,7 +233,7 @@ class Peers:
 
     # What the roster tells.
 
-    def heard(self, member: Member, message: AnyMessage, event: Event | None) -> None:
+    def heard(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         """Take in a message of another process.
 
         Raises:
@@ -267,7 +264,7 @@ class Peers:
                     self._run.connect()
             case Stop() if not self._begun:
                 self._do(member.number, message, None)
-            case Hello() | Hearing() | Ping() | Pong() | Ack():
+            case Hearing():
                 pass
             case _ if not self._begun:
                 self._early.append((member, message, event))
@@ -275,7 +272,7 @@ class Peers:
                 self._turns.take(member.number, message, event)
             case Said() | Stop() | Retired():
                 self._do(member.number, message, event)
-            case Turn() | Call() | Standing():
+            case Turn() | Call() | Standing() if not self._ending:
                 raise WireError("expected the run to be in lockstep there, too")
 
     def lost(self, member: Member) -> None:

@@ -24,14 +24,21 @@ from runtime.errors import PeerError, VisnavError, WireError
 from runtime.limits import real_time_limit
 from runtime.peers.meeting import check_fits, missing, name_of, say_missing
 from runtime.peers.member import Member
-from runtime.peers.messages import Ack, AnyMessage, Hello, Ping, Pong, Said, decode
+from runtime.peers.memory import Incoming, Outgoing
+from runtime.peers.messages import (
+    Ack,
+    Hello,
+    Mapped,
+    Memory,
+    OfTheRun,
+    Ping,
+    Pong,
+    Said,
+    decode,
+)
 from runtime.peers.session import Session
-from runtime.wire import unpack
 
 log = logging.getLogger("visnav.runtime")
-
-ACK_EVERY = 8192
-"""Bytes after which the other end is told that they have arrived."""
 
 GREET_EVERY = 0.2
 """Seconds between two greetings of a process that has not answered."""
@@ -40,7 +47,7 @@ GREET_EVERY = 0.2
 class Told(Protocol):
     """Who is told of what happens, on the loop."""
 
-    def heard(self, member: Member, message: AnyMessage, event: Event | None) -> None:
+    def heard(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         """Take in a message of a process of the run.
 
         Raises:
@@ -200,24 +207,28 @@ class Roster:
         member = self._member(sender)
         try:
             message = decode(head)
-            event = unpack(payload) if isinstance(message, Said) else None
+            event = member.event(message, payload) if isinstance(message, Said) else None
         except WireError as error:
             log.warning("from %s: %s", member.place, error)
             return
         if isinstance(message, Ack):
-            member.line.arrived(message.arrived)
+            member.acknowledged(message)
             return
-        member.arrived += len(head) + len(payload)
-        if member.arrived >= ACK_EVERY:
-            member.line.send(Ack(member.arrived))
-            member.arrived = 0
-        if isinstance(message, Ping):  # answered here: a detour by the loop would take time
-            member.line.send(Pong(message.sent, received))
-        elif isinstance(message, Pong):
-            member.offset.add(message.sent, message.here, received)
-            self._soon(self.notify)
-        else:
-            self._soon(self._take, member, message, event)
+        match message:
+            case Ping():  # answered here: a detour by the loop would take time
+                member.line.send(Pong(message.sent, received))
+            case Pong():
+                member.offset.add(message.sent, message.here, received)
+                self._soon(self.notify)
+            case Memory():
+                member.incoming = Incoming.found(message) if self._network.shared else None
+                if member.incoming is not None:
+                    member.line.send(Mapped())
+            case Mapped():
+                member.line.memory = member.outgoing
+            case _:
+                self._soon(self._take, member, message, event)
+        member.acknowledge(len(head) + len(payload))
 
     def _see(self, other: str, here: bool) -> None:
         self._soon(self._came if here else self._went, self._member(other))
@@ -250,7 +261,7 @@ class Roster:
 
     # On the loop.
 
-    def _take(self, member: Member, message: AnyMessage, event: Event | None) -> None:
+    def _take(self, member: Member, message: Hello | OfTheRun, event: Event | None) -> None:
         try:
             if isinstance(message, Hello):
                 self._meet(member, message)
@@ -276,6 +287,9 @@ class Roster:
             else:
                 self.fail(error)
             return
+        if self._network.shared and member.outgoing is None:
+            member.outgoing = Outgoing()
+            member.line.send(member.outgoing.offer())
         if self._numbers:
             number = self._numbers.get(hello.nodes, -1)
             member.unfit = number < 0 or self._numbered.get(number, member) is not member

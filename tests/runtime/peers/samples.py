@@ -125,12 +125,16 @@ def free_port() -> int:
 
 
 def settings(
-    *nodes: tuple[str, str, dict[str, Any]], meet: str = "", wait: float = 20, **run: Any
+    *nodes: tuple[str, str, dict[str, Any]],
+    meet: str = "",
+    wait: float = 20,
+    shared: bool = True,
+    **run: Any,
 ) -> Config:
     """Return a configuration of nodes of this module: name, class, settings."""
     table = {
         "run": {"name": "apart", "duration": 1.0} | run,
-        "network": {"meet": meet or f"tcp/127.0.0.1:{free_port()}", "wait": wait},
+        "network": {"meet": meet or f"tcp/127.0.0.1:{free_port()}", "wait": wait, "shared": shared},
         "nodes": [{"name": name, "type": f"{__name__}:{cls}", **rest} for name, cls, rest in nodes],
     }
     return parse(table, "test.toml")
