@@ -34,24 +34,24 @@ class RealClock(Clock):
     Args:
         loop: The loop to wake.
         speed: Seconds of this clock per real second.
+
+    Attributes:
+        speed: The same.
     """
 
     kind: Literal["real"] = "real"
 
     def __init__(self, loop: asyncio.AbstractEventLoop, speed: float = 1.0) -> None:
-        self._speed = speed
-        self._origin: int | None = None
+        self.speed = speed
+        self._pace: _Pace | None = None
         make = TimerFd if sys.platform == "linux" else LoopAlarm
         self._alarm: Alarm = make(loop, self._ring)
         self.schedule = Schedule()
         self.schedule.on_sooner = self._set_alarm
 
     def now(self) -> int:
-        """Return nanoseconds since the first update; 0 before it."""
-        if self._origin is None:
-            return 0
-        elapsed = max(time.monotonic_ns() - self._origin, 0)
-        return elapsed if self._speed == 1.0 else int(elapsed * self._speed)
+        """Return nanoseconds since the first update; 0 before it. In any thread."""
+        return 0 if self._pace is None else self._pace.at(time.monotonic_ns())
 
     def start(self) -> None:
         """Let time run, from 0."""
@@ -59,8 +59,17 @@ class RealClock(Clock):
 
     def start_at(self, origin: int) -> None:
         """Let time run, from 0 at a time of `time.monotonic_ns`."""
-        self._origin = origin
+        self._pace = _Pace(origin, 0, self.speed)
         self._ring()
+
+    def steer(self, factor: float) -> None:
+        """Let time run a little quicker or slower than its speed from here on, without a jump."""
+        now = time.monotonic_ns()
+        then = 0 if self._pace is None else self._pace.at(now)
+        self._pace = _Pace(now, then, self.speed * factor)
+        due = self.schedule.next_due()
+        if due is not None:
+            self._set_alarm(due)
 
     async def beside(self, work: concurrent.futures.Future[R], latency: int = 0) -> R:
         """Await work done elsewhere; its result comes no earlier than `latency` ns from now."""
@@ -72,8 +81,8 @@ class RealClock(Clock):
 
     async def sleep_until(self, stamp: int) -> None:
         """Wait until a time (ns) of this clock; before the first update, that long in real time."""
-        if self._origin is None:
-            await asyncio.sleep(stamp / self._speed / SECOND)
+        if self._pace is None:
+            await asyncio.sleep(stamp / self.speed / SECOND)
         else:
             await super().sleep_until(stamp)
 
@@ -92,8 +101,26 @@ class RealClock(Clock):
                 self._set_alarm(due)
 
     def _set_alarm(self, due: int) -> None:
-        if self._origin is not None:
-            self._alarm.set(self._origin + math.ceil(due / self._speed))
+        if self._pace is not None:
+            self._alarm.set(self._pace.when(due))
+
+
+class _Pace:
+    """How time of the run goes with that of `time.monotonic_ns`: linearly, from a point on."""
+
+    __slots__ = ("_rate", "_since", "_then")
+
+    def __init__(self, since: int, then: int, rate: float) -> None:
+        self._since = since
+        self._then = then
+        self._rate = rate
+
+    def at(self, now: int) -> int:
+        elapsed = max(now - self._since, 0)
+        return self._then + (elapsed if self._rate == 1.0 else int(elapsed * self._rate))
+
+    def when(self, due: int) -> int:
+        return self._since + math.ceil((due - self._then) / self._rate)
 
 
 class TimerFd:

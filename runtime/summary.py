@@ -70,6 +70,7 @@ class ProcessSummary(msgspec.Struct, frozen=True):
         place: Host and process number.
         clock_offset_ms: Its monotonic clock, less that of the process whose summary this is.
         round_trip_ms: Of the quickest question and answer; the offset is off by half of it at most.
+        clock_drift_ppm: How much quicker its clock is, in millionths, if ours follows it.
         waited: Most messages that waited for the network on their way there.
         replaced: Events that newer ones replaced on their way there.
     """
@@ -78,6 +79,7 @@ class ProcessSummary(msgspec.Struct, frozen=True):
     place: str
     clock_offset_ms: float | None = None
     round_trip_ms: float | None = None
+    clock_drift_ppm: float | None = None
     waited: int = 0
     replaced: int = 0
 

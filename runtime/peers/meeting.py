@@ -5,9 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from runtime.config import Config, to_builtins
 from runtime.errors import PeerError
 from runtime.explain import show
 from runtime.peers.messages import Hello
+
+
+def what_all_share(config: Config) -> dict[str, Any]:
+    """Return a file without what each process may have its own way: the network, and its log."""
+    table: dict[str, Any] = to_builtins(config)
+    return {
+        **{key: value for key, value in table.items() if key != "network"},
+        "run": {key: value for key, value in table["run"].items() if key not in {"log", "stall"}},
+    }
 
 
 def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ from runtime.errors import VisnavError, WireError
 from runtime.peers.line import Line, Put
 from runtime.peers.memory import Incoming, Outgoing
 from runtime.peers.messages import Ack, Announced, Begin, Hello, Said, Wanted
-from runtime.peers.offsets import Offset
+from runtime.peers.offsets import Exchanges
 from runtime.summary import ProcessSummary
 from runtime.wire import unpack
 
@@ -32,7 +32,8 @@ class Member:
         number: Its number among the processes of the run, or -1 if it is none of them.
         hello: Who it says it is.
         unfit: Whether it runs another file, or nodes that run elsewhere.
-        offset: Of its monotonic clock.
+        exchanges: Of the time.
+        drift_ppm: How much quicker that clock is than ours, in millionths, if we follow it.
         announced: What its nodes announced.
         ready: Whether its nodes can begin.
         begin: When the first update is, if it has said so.
@@ -48,7 +49,8 @@ class Member:
         self.number = -1
         self.hello: Hello | None = None
         self.unfit = False
-        self.offset = Offset()
+        self.exchanges = Exchanges()
+        self.drift_ppm: float | None = None
         self.announced: Announced | None = None
         self.ready = False
         self.begin: Begin | None = None
@@ -99,12 +101,13 @@ class Member:
 
     def summary(self) -> ProcessSummary:
         """Return what the run's summary says of it."""
-        trip = self.offset.round_trip
+        best = self.exchanges.best()
         return ProcessSummary(
             nodes=list(self.nodes),
             place=self.place,
-            clock_offset_ms=None if trip is None else self.offset.ns / 1e6,
-            round_trip_ms=None if trip is None else trip / 1e6,
+            clock_offset_ms=None if best is None else best.offset / 1e6,
+            round_trip_ms=None if best is None else best.round_trip / 1e6,
+            clock_drift_ppm=self.drift_ppm,
             waited=self.line.peak,
             replaced=self.line.replaced,
         )

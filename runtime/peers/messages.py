@@ -23,7 +23,7 @@ class Hello(Message, frozen=True):
 
     Attributes:
         nodes: That run here.
-        config: The whole file, with its defaults.
+        config: The file, with its defaults, but for what may differ from process to process.
         place: Host and process number, for messages to people.
         began: When the process began, in seconds since 1970: of two with one node, the later is
             wrong here.
@@ -68,16 +68,27 @@ class Hearing(Message, frozen=True):
 
 
 class Ping(Message, frozen=True):
-    """Ask what time it is there."""
+    """Ask what time it is there.
+
+    Attributes:
+        sent: My monotonic clock, in nanoseconds.
+    """
 
     sent: int
 
 
 class Pong(Message, frozen=True):
-    """My monotonic clock, in nanoseconds, and that of the ping."""
+    """An answer.
+
+    Attributes:
+        sent: As in the ping.
+        here: My monotonic clock, in nanoseconds.
+        now: My clock of the run.
+    """
 
     sent: int
     here: int
+    now: int
 
 
 class Ready(Message, frozen=True):

@@ -1,4 +1,4 @@
-"""How far the monotonic clock of another machine is from ours.
+"""How far the clocks of another process are from ours.
 
 Cristian's algorithm: a reply that took little time, there and back, cannot have been read off far
 from the middle of it. (F. Cristian, Probabilistic clock synchronization, 1989.)
@@ -6,24 +6,43 @@ from the middle of it. (F. Cristian, Probabilistic clock synchronization, 1989.)
 
 from __future__ import annotations
 
+import collections
+from typing import NamedTuple
 
-class Offset:
-    """The best of some exchanges with one process.
+KEPT = 20
+"""Exchanges that are remembered."""
+
+
+class Exchange(NamedTuple):
+    """What one question and its answer said, in nanoseconds.
 
     Attributes:
-        ns: What to add to our clock to get theirs.
-        round_trip: Nanoseconds of the exchange that says so; half of it is how far off `ns` may be.
+        round_trip: What they took; half of it is how far off the others may be.
+        offset: What to add to our monotonic clock to get theirs.
+        late: How much less than theirs our clock of the run shows.
+    """
+
+    round_trip: int
+    offset: int
+    late: int
+
+
+class Exchanges:
+    """The latest exchanges with one process; the quickest of them counts.
+
+    Attributes:
+        count: How many there were in all.
     """
 
     def __init__(self) -> None:
-        self.ns = 0
-        self.round_trip: int | None = None
-        self.exchanges = 0
+        self.count = 0
+        self._latest: collections.deque[Exchange] = collections.deque(maxlen=KEPT)
 
-    def add(self, sent: int, there: int, received: int) -> None:
-        """Take in an exchange: our time, theirs, and ours again."""
-        self.exchanges += 1
-        round_trip = received - sent
-        if self.round_trip is None or round_trip < self.round_trip:
-            self.round_trip = round_trip
-            self.ns = there - (sent + received) // 2
+    def add(self, exchange: Exchange) -> None:
+        """Take one in; in any thread."""
+        self._latest.append(exchange)
+        self.count += 1
+
+    def best(self, latest: int = KEPT) -> Exchange | None:
+        """Return the quickest of the latest exchanges, if there were any."""
+        return min(list(self._latest)[-latest:], default=None)

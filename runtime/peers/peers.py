@@ -8,15 +8,13 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Protocol
 
-import msgspec
-
 from events import Announcement, Event
 from runtime.clock import Clock
 from runtime.config import Config
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
-from runtime.limits import real_time_limit
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.peers.crossing import Crossing, hearing
+from runtime.peers.following import Following, compare
 from runtime.peers.meeting import name_of
 from runtime.peers.member import Member
 from runtime.peers.messages import (
@@ -29,7 +27,6 @@ from runtime.peers.messages import (
     OfTheRun,
     Ordered,
     Parted,
-    Ping,
     Ready,
     Retired,
     Said,
@@ -37,24 +34,19 @@ from runtime.peers.messages import (
     Stop,
     Turn,
 )
+from runtime.peers.parting import part
 from runtime.peers.roster import Roster
 from runtime.peers.turns import Turns
 from runtime.realtime import RealClock
 from runtime.sender import Listener
 from runtime.steps import Fault
-from runtime.summary import ProcessSummary, Summary, merged
+from runtime.summary import Summary
 from runtime.wire import pack, unpack
 
 log = logging.getLogger("visnav.runtime")
 
 LEAD = 50_000_000
 """Nanoseconds between the word to begin and the first update: it must reach everybody before."""
-
-EXCHANGES = 20
-"""Of the time with another process: the quickest counts."""
-
-PARTING = 5.0
-"""Seconds that a process has, in the end, to tell what there was."""
 
 
 class Run(Protocol):
@@ -88,10 +80,11 @@ class Peers:
         self._announced = Announced({})
         self._early: list[tuple[Member, OfTheRun, Event | None]] = []
         self._begun = self._ending = False
-        self._origin = 0
         self._retired: set[str] = set()
         self._left_out: set[str] = set()
         self._parted: dict[int, Member] = {}
+        self._following: Following | None = None
+        self._followed = -1
 
     # Before the run.
 
@@ -133,24 +126,28 @@ class Peers:
         roster = self._roster
         reference = self._reference()
         if reference is not None and self._turns is None:
-            for _ in range(EXCHANGES):
-                count = reference.offset.exchanges
-                reference.line.send(Ping(time.monotonic_ns()))
-                await roster.until(lambda n=count: reference.offset.exchanges > n)  # type: ignore[misc]
+            await compare(reference, roster.until)
         self._tell(Ready())
         if reference is None:
             await roster.until(lambda: all(m.ready for m in roster.present()))
-            self._origin = time.monotonic_ns() + LEAD
-            self._tell(Begin(self._origin))
+            origin = time.monotonic_ns() + LEAD
+            self._tell(Begin(origin))
         else:
             await roster.until(lambda: reference.begin is not None)
             assert reference.begin is not None
-            self._origin = reference.begin.origin - reference.offset.ns
+            best = reference.exchanges.best()
+            origin = reference.begin.origin - (best.offset if best else 0)
             if self._loop is not None:
                 self._loop.move(reference.begin.now, self._loop.orders())
         if isinstance(self._clock, RealClock):
-            await asyncio.sleep(max(self._origin - time.monotonic_ns(), 0) / 1e9)
-            self._clock.start_at(self._origin)
+            await asyncio.sleep(max(origin - time.monotonic_ns(), 0) / 1e9)
+            self._clock.start_at(origin)
+            self._follow(reference)
+
+    def _follow(self, member: Member | None) -> None:
+        if member is not None and isinstance(self._clock, RealClock):
+            self._followed = member.number
+            self._following = Following(self._clock, member)
 
     def begun(self) -> None:
         """Let what the others say arrive: the nodes here have begun."""
@@ -203,29 +200,13 @@ class Peers:
 
     async def part(self, mine: Summary) -> Summary:
         """Exchange what each process has to say of the run; return all of it together."""
-        roster = self._roster
-        self._tell(Parted(msgspec.json.encode(mine)))
-        try:
-            async with real_time_limit(PARTING):
-                await roster.until(
-                    lambda: all(m.parted and m.has_ours for m in roster.present()), despite=True
-                )
-        except TimeoutError:
-            silent = [name_of(m.nodes) for m in roster.present() if m.parted is None]
-            log.warning("no summary of %s", "; ".join(silent))
-        parts = {roster.me: mine}
-        processes = {roster.me: ProcessSummary(list(roster.here), roster.hello.place)}
-        for member in [*self._parted.values(), *roster.present()]:
-            processes[member.number] = member.summary()
-            if member.parted is not None:
-                parts[member.number] = msgspec.json.decode(member.parted, type=Summary)
-        return merged(
-            [part for _, part in sorted(parts.items())], [p for _, p in sorted(processes.items())]
-        )
+        return await part(self._roster, self._parted, mine)
 
     async def close(self) -> None:
         """Say the last words, and leave."""
         self._ending = True
+        if self._following is not None:
+            self._following.stop()
         self._turns = None
         if self._loop is not None:
             self._loop.gate = None
@@ -287,6 +268,8 @@ class Peers:
         if self._ending or not lost:
             self._gather()
             return
+        if self._following is not None and self._following.member is member:
+            self._following.go_on_alone()
         if self._crossing is not None:
             self._crossing.wants(member.number, ())
         rules = {spec.on_error for spec in self._config.nodes if spec.name in lost}
@@ -309,6 +292,13 @@ class Peers:
         """Go on with a process that the network had parted from us."""
         log.warning("%s: found again, at %s", name_of(member.nodes), member.place)
         self._take_back(member)
+        if member.number == self._followed:
+            self._follow(member)
+
+    def now(self, ago: int = 0) -> int:
+        """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
+        speed = self._clock.speed if isinstance(self._clock, RealClock) else 0
+        return self._clock.now() - round(ago * speed)
 
     def unsent(self, member: Member, error: VisnavError) -> None:
         """Say what could not be sent; that a process has gone is noticed elsewhere."""
@@ -335,7 +325,9 @@ class Peers:
     def _welcome(self, member: Member) -> None:
         """Let a process that was gone take part again."""
         log.warning("%s: back, at %s", name_of(member.nodes), member.place)
-        member.line.send(Begin(self._origin, 0 if self._loop is None else self._loop.now))
+        now = self._clock.now()
+        real = now / self._clock.speed if isinstance(self._clock, RealClock) else 0
+        member.line.send(Begin(time.monotonic_ns() - round(real), now))
         self._take_back(member)
 
     def _take_back(self, member: Member) -> None:

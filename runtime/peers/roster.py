@@ -19,10 +19,10 @@ from typing import Any, Protocol
 import msgspec
 
 from events import Event
-from runtime.config import Config, to_builtins
+from runtime.config import Config
 from runtime.errors import PeerError, VisnavError, WireError
 from runtime.limits import real_time_limit
-from runtime.peers.meeting import check_fits, missing, name_of, say_missing
+from runtime.peers.meeting import check_fits, missing, name_of, say_missing, what_all_share
 from runtime.peers.member import Member
 from runtime.peers.memory import Incoming, Outgoing
 from runtime.peers.messages import (
@@ -36,6 +36,7 @@ from runtime.peers.messages import (
     Said,
     decode,
 )
+from runtime.peers.offsets import Exchange
 from runtime.peers.session import Session
 
 log = logging.getLogger("visnav.runtime")
@@ -59,6 +60,9 @@ class Told(Protocol):
 
     def found_again(self, member: Member) -> None:
         """Go on with a process that went on without us, too."""
+
+    def now(self, ago: int = 0) -> int:
+        """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
 
     def unsent(self, member: Member, error: VisnavError) -> None:
         """Deal with what could not be sent to a process."""
@@ -88,7 +92,7 @@ class Roster:
         self.count = 0
         self.hello = Hello(
             nodes=self.here,
-            config=to_builtins(config),
+            config=what_all_share(config),
             place=f"{socket.gethostname()}, process {os.getpid()}",
             began=time.time(),
         )
@@ -216,9 +220,12 @@ class Roster:
             return
         match message:
             case Ping():  # answered here: a detour by the loop would take time
-                member.line.send(Pong(message.sent, received))
+                member.line.send(Pong(message.sent, received, self._told.now()))
             case Pong():
-                member.offset.add(message.sent, message.here, received)
+                half = (received - message.sent) // 2
+                offset = message.here - message.sent - half
+                late = message.now - self._told.now(ago=half)
+                member.exchanges.add(Exchange(received - message.sent, offset, late))
                 self._soon(self.notify)
             case Memory():
                 member.incoming = Incoming.found(message) if self._network.shared else None

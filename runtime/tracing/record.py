@@ -111,7 +111,7 @@ class Recorder:
     def close(self) -> None:
         """Hand over what is left, while the run's clock still goes."""
         if isinstance(self._clock, RealClock):
-            real, run, speed = time.perf_counter_ns(), self._clock.now(), self._clock._speed
+            real, run, speed = time.perf_counter_ns(), self._clock.now(), self._clock.speed
             self._spool.pace = Pace(round(real - run / speed), speed)
         self._flush()
 

@@ -59,8 +59,10 @@ class Rig:
             FILE.format(clock=clock, on_error=on_error, duration=duration, meet=meet)
         )
 
-    def start(self, only: str, out: str, where: str = "") -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "runtime", "run", str(self.file), "--quiet"]
+    def start(
+        self, only: str, out: str, where: str = "", python: tuple[str, ...] = ("-m", "runtime")
+    ) -> subprocess.Popen[str]:
+        command = [sys.executable, *python, "run", str(self.file), "--quiet"]
         command = [*where.split(), *command]
         options = ["--only", only, "--out", str(self.folder / out), "--log", "debug"]
         process = subprocess.Popen(

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from runtime.errors import PeerError
-from runtime.peers.meeting import check_fits, missing, say_missing
+from runtime.peers.meeting import check_fits, missing, say_missing, what_all_share
 from runtime.peers.messages import Hello
 from tests.runtime.peers.samples import Process, settings
 
@@ -65,3 +65,11 @@ def test_another_file_is_refused_and_the_right_one_still_welcome() -> None:
     assert "found nodes[1].takes = 0.005 there, 0.5 here" in str(refused.error)
     Process(right, "one").ended()
     assert first.ended().outputs["one.answers"] > 0
+
+
+def test_how_each_process_gets_there_and_what_it_logs_may_differ() -> None:
+    """Through a tunnel, say, or with other certificates."""
+    here = settings(*TWO, log="debug", stall=0, shared=False)
+    there = settings(*TWO, meet="tcp/10.0.0.1:4711", wait=1.0)
+    assert what_all_share(here) == what_all_share(there)
+    assert what_all_share(here) != what_all_share(settings(*TWO, seed=1))
