@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ class WorldError(VisnavError, ValueError):
 def load_world(name_or_path: str | Path, seed: int = 0) -> mujoco.MjSpec:
     """Return a world, ready for vehicles and cameras to be added.
 
+    What MuJoCo warns of from then on goes to the log.
+
     Args:
         name_or_path: A name in `WORLDS`, or the path of an MJCF file (what ends in ``.xml``,
             contains a slash, or is a `Path`).
@@ -33,6 +36,8 @@ def load_world(name_or_path: str | Path, seed: int = 0) -> mujoco.MjSpec:
     Raises:
         WorldError: No such name or file, or the file is no MJCF that compiles.
     """
+    # Else they would go to a file of MuJoCo's in whatever folder the run was started.
+    mujoco.set_mju_user_warning(logging.getLogger("visnav.mujoco").warning)
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.lower().endswith(".xml")
     if is_path:

@@ -196,3 +196,22 @@ def test_there_are_corners_everywhere(probe: tuple[str, Probe]) -> None:
     renderer.close()
     assert len(good) > 100
     assert np.mean(good) >= 0.95
+
+
+def test_what_mujoco_warns_of_goes_to_the_log_and_to_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    file = tmp_path / "world.xml"
+    file.write_text(
+        """<mujoco><worldbody><body><joint name="j" type="slide"/><geom size=".1"/></body>
+        </worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
+    )
+    model = load_world(file).compile()
+    data = mujoco.MjData(model)
+    data.ctrl[0] = float("nan")
+    mujoco.mj_step(model, data)
+    assert "CTRL at ACTUATOR 0" in caplog.text
+    assert not list(here.iterdir())
