@@ -23,13 +23,14 @@ import math
 import re
 import sys
 import tomllib
+import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
-from runtime.errors import ConfigError, suggest
+from runtime.errors import ConfigError, VisnavError, suggest
 from runtime.explain import explain, show
 from runtime.links import LinkConfig
 from runtime.node import Node, NodeConfig
@@ -221,6 +222,14 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
         ) from None
     except ImportError as error:
         raise ConfigError(f"{where}: {module_name} cannot be imported: {error}") from error
+    except VisnavError:
+        raise
+    except Exception as error:  # whatever a module of the user's does
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        place = "" if isinstance(error, SyntaxError) else f" ({last.filename}, line {last.lineno})"
+        raise ConfigError(
+            f"{where}: {module_name} cannot be imported: {type(error).__name__}: {error}{place}"
+        ) from error
     known = {
         name: value
         for name, value in vars(module).items()

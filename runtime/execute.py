@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import gc
 import logging
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Collection, Iterator
@@ -59,6 +61,7 @@ def execute(
     handlers = list(handlers or [])
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
+        _clear(out)
         (out / "config.toml").write_text(tomli_w.dumps(to_builtins(config)), encoding="utf-8")
         handlers.append(file_handler(out / "log.txt"))
     loop = make_loop(config.run)
@@ -72,6 +75,15 @@ def execute(
     if error is not None:
         raise error
     return summary
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier run has left, lest it pass for this one's; recordings stay."""
+    if (out / "config.toml").is_file():
+        for name in ("summary.json", "report.html"):
+            (out / name).unlink(missing_ok=True)
+        for name in ("evaluation", "trajectories", "frames", "plots"):
+            shutil.rmtree(out / name, ignore_errors=True)
 
 
 def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
@@ -109,7 +121,9 @@ async def _run(
     if log_events:
         taps.append(_log_event)
     supervisor = Supervisor(config, clock, taps, out, only)
-    watchdog = Watchdog(loop, config.run.stall, _report_stall)
+    # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
+    level = logging.DEBUG if config.run.clock == "lockstep" else logging.WARNING
+    watchdog = Watchdog(loop, config.run.stall, functools.partial(_report_stall, level))
     with (
         logging_to(handlers, config.run.log, clock.now),
         _signals_stop(supervisor, loop),
@@ -168,8 +182,10 @@ def _no_long_collections() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _report_stall(stall: Stall) -> None:
-    log.warning("the loop stood for %.0f ms: %s, %s", stall.seconds * 1e3, stall.node, stall.line)
+def _report_stall(level: int, stall: Stall) -> None:
+    log.log(
+        level, "the loop stood for %.0f ms: %s, %s", stall.seconds * 1e3, stall.node, stall.line
+    )
 
 
 def _log_event(sender: Sender[Any] | None, event: Event) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -29,6 +29,7 @@ from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import file_name, write_results
 from nodes.trajectory import PoseRows
 from nodes.trajectory.formats import tum_row
+from nodes.trajectory.growing import GrowingFile
 from runtime import Duration, Node, NodeConfig, Output, on
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -76,7 +77,7 @@ class Evaluation(Node[EvaluationConfig]):
         self._records: dict[str, EstimatorRecord] = {}
         self._live: dict[str, LiveErrors] = {}
         self._album = Album(self.config.pictures)
-        self._files: dict[str, IO[str]] = {}
+        self._files: dict[str, GrowingFile] = {}
         self._closed = False
 
     def on_announcement(self, announcement: Announcement) -> None:
@@ -138,7 +139,7 @@ class Evaluation(Node[EvaluationConfig]):
         self._closed = True  # what comes from now on is judged, too, but too late for the files
         for file in self._files.values():
             file.close()
-        if not self._records:
+        if not self._records and self.clock.now() > 0:
             self.log.warning("no estimator has announced itself or said anything")
         judgements, verdict = await self.offload(self._finish)
         for name, judgement in judgements.items():
@@ -198,8 +199,8 @@ class Evaluation(Node[EvaluationConfig]):
             folder = self.out / "trajectories"
             folder.mkdir(exist_ok=True)
             path = folder / f"{file_name(name)}.tum"
-            file = self._files[name] = path.open("w", encoding="ascii")
-        file.write(tum_row(event.stamp, event.position, event.orientation))
+            file = self._files[name] = GrowingFile(self, path)
+        file.add(tum_row(event.stamp, event.position, event.orientation))
 
     def _say(self, event: PoseEstimate, metric: str, value: float, unit: str) -> None:
         self.scores.send(

@@ -144,10 +144,11 @@ def report(summary: Summary, folder: Path) -> None:
         digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
     if summary.verdict is not None:
         _judge(console, summary.verdict)
+    page = ": open report.html" if (folder / "report.html").is_file() else ""
     console.print(
         f"{summary.sim_seconds:.1f} s on the {summary.clock} clock in "
         f"{summary.wall_seconds:.1f} s ({speed:.1f} × real time), ended by: {summary.reason}\n"
-        f"digest {digest}   results in [bold]{folder}[/bold]",
+        f"digest {digest}   results in [bold]{folder}[/bold]{page}",
         highlight=False,
     )
 

@@ -161,6 +161,21 @@ def test_a_module_that_needs_another_says_which(tmp_path: Path) -> None:
     assert "wrong_node cannot be imported: cannot import name" in text
 
 
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("x = 1\nprint(y)\n", "NameError: name 'y' is not defined ({file}, line 2)"),
+        ("def f(:\n", "SyntaxError: invalid syntax (broken_SyntaxError.py, line 1)"),
+    ],
+)
+def test_a_module_that_fails_says_where(tmp_path: Path, code: str, expected: str) -> None:
+    name = f"broken_{expected.partition(':')[0]}"
+    file = tmp_path / f"{name}.py"
+    file.write_text(code)
+    text = message(tmp_path, f'[[nodes]]\nname = "m"\ntype = "{name}:Mine"')
+    assert f"{name} cannot be imported: {expected.format(file=file)}" in text
+
+
 @pytest.mark.parametrize("name", ["", "  ", "a/b", "../x", ".hidden"])
 def test_a_run_is_named_as_a_folder_can_be(name: str) -> None:
     """The name of the run becomes a folder, and nothing beyond it."""
