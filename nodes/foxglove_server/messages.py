@@ -125,8 +125,8 @@ class Messages:
         steps = np.where((steps >= 0) & (steps <= 65535), steps, 0.0).round()
         return self._raw(event, steps.astype("<u2"), "16UC1")
 
-    def cloud(self, event: PointCloud) -> Any:
-        """Return a PointCloud."""
+    def cloud(self, event: PointCloud, frame_id: str) -> Any:
+        """Return a PointCloud; `frame_id` is what its frame is called."""
         rows = np.zeros(len(event.points), np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)]))
         rows["xyz"] = event.points
         rows["rgba"] = 255
@@ -138,7 +138,7 @@ class Messages:
         fields += [(name, 12 + i, numbers.Uint8) for i, name in enumerate(colours)]
         return self._m.PointCloud(
             timestamp=self._time(event.stamp),
-            frame_id=event.frame_id,
+            frame_id=frame_id,
             pose=self._pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
             point_stride=rows.itemsize,
             fields=[field(name=name, offset=at, type=kind) for name, at, kind in fields],

@@ -59,6 +59,7 @@ class Publishing:
         self._frames: dict[str, str] = {}  # sources of pictures, by optical frame
         self._bodies: dict[str, str] = {}  # frames, by vehicle
         self._estimators: dict[str, str] = {}  # parent frames, by source
+        self._renamed: dict[str, str] = {}  # the same by what the estimators call them
         self._truth = RecentTruth()
         self._trails: dict[str, Trail] = {}
         self._drawn: list[Any] = []
@@ -139,7 +140,7 @@ class Publishing:
         """Put a cloud; the newest is for those, too, who look later."""
         topic = f"{_topic(event.source)}/cloud"
         self._server.declare(topic, "PointCloud")
-        message = self._make.cloud(event)
+        message = self._make.cloud(event, self._renamed.get(event.frame_id, event.frame_id))
         self._server.latch(topic, lambda: message, event.stamp)
 
     # At once.
@@ -218,6 +219,7 @@ class Publishing:
         if event.frame_id == "map":
             return "map"
         frame_id = f"{event.source}/{event.frame_id}"
+        self._renamed.setdefault(event.frame_id, frame_id)
         if (truth := self._truth.at(event.stamp)) is not None:
             said = pose_matrix(event.position, event.orientation)
             laid = pose_tuples(pose_matrix(*truth) @ np.linalg.inv(said))

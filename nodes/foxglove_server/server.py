@@ -16,6 +16,9 @@ from runtime.errors import MissingDependencyError, VisnavError
 Make = Callable[[], Any]
 """Returns a message."""
 
+_PATIENCE = 2.0
+"""Real seconds that viewers have to go."""
+
 
 class Server:
     """A WebSocket server (``foxglove.sdk.v1``) and its topics.
@@ -58,9 +61,10 @@ class Server:
             )
         except Exception as error:  # the library's own type is not public
             raise VisnavError(
-                f"expected to listen on {config.host}:{config.port}, found: {error}"
+                f"port: expected to listen on {config.host}:{config.port}, found: {error}"
             ) from error
-        self.address = f"ws://{config.host}:{self._server.port}"
+        host = f"[{config.host}]" if ":" in config.host else config.host
+        self.address = f"ws://{host}:{self._server.port}"
 
     def declare(self, topic: str, kind: str) -> None:
         """Declare a topic of one of Foxglove's own types: ``CompressedImage``."""
@@ -93,8 +97,14 @@ class Server:
         self._server.broadcast_time(now)
 
     def close(self) -> None:
-        """End the server; may take a moment."""
-        self._server.stop()
+        """End the server; may take a moment.
+
+        The library waits without end for whoever has connected and never said a word, such as a
+        browser that connects in advance: we do not.
+        """
+        stopping = threading.Thread(target=self._server.stop, name="foxglove stops", daemon=True)
+        stopping.start()
+        stopping.join(_PATIENCE)
 
     def _subscribed(self, topic: str) -> None:
         with self._lock:

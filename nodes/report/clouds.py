@@ -29,6 +29,8 @@ _AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(42.0)
 """Of the oblique view: from the south-west, and from above."""
 _TALLEST, _TITLE = 6.0, 0.55
 """Inches of a view at most, and of what stands above and below it."""
+_THINNEST = 0.15
+"""Of a view's longer side: its shorter one at least."""
 _DETAIL = 3.6
 """Metres across of the detail."""
 
@@ -97,18 +99,26 @@ def _views(cloud: Shown) -> list[View]:
     within = ((points >= low) & (points <= high)).all(axis=1)
     inside = points[within]
     east, north, up = np.eye(3)
-    top = View("from above", np.eye(3), low[:2], high[:2], ("east (m)", "north (m)"))
+    top = View("from above", np.eye(3), *_frame(low[:2], high[:2]), ("east (m)", "north (m)"))
     right = np.cos(_AZIMUTH) * east - np.sin(_AZIMUTH) * north
     away = np.sin(_AZIMUTH) * east + np.cos(_AZIMUTH) * north
     upward = np.sin(_ELEVATION) * away + np.cos(_ELEVATION) * up
     oblique = np.stack([right, upward, np.cross(right, upward)])
     seen = inside @ oblique.T
-    whole = View("obliquely", oblique, seen[:, :2].min(axis=0), seen[:, :2].max(axis=0))
+    corners = _frame(seen[:, :2].min(axis=0), seen[:, :2].max(axis=0))
+    whole = View("obliquely", oblique, *corners)
     place = _busiest(inside, cloud.colors[some][within])
     middle = oblique[:2] @ place
     half = np.array([_DETAIL / 2, _DETAIL / 2 * 0.8])
     detail = View("a detail", oblique, middle - half, middle + half)
     return [top, whole, detail]
+
+
+def _frame(low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Return the corners of a view, of which no side is all too thin: a cloud may be one point."""
+    middle, half = (low + high) / 2, (high - low) / 2
+    half = np.maximum(half, max(_THINNEST * float(half.max()), 0.05))
+    return middle - half, middle + half
 
 
 def _busiest(points: Floats, colors: npt.NDArray[np.uint8]) -> Floats:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 
 from nodes.evaluation.judging import Errors
 from nodes.evaluation.record import Interval, seconds
@@ -59,8 +60,14 @@ class _Reader:
     def run(self) -> Run:
         facts = self._try("summary.json", _facts, "the run did not end in an orderly way")
         verdict = self._try("evaluation/verdict.json", _verdict, "nothing was evaluated to the end")
-        if verdict is None and facts is not None:
-            verdict = facts.verdict
+        if facts is not None:
+            if verdict is not None and verdict.estimators and facts.verdict is None:
+                self.missing.append(
+                    "evaluation/verdict.json is of an earlier run: by its summary, nobody was "
+                    "judged in this one. Trajectories and pictures may be that one's, too"
+                )
+                verdict = None
+            verdict = verdict or facts.verdict
         config = self._try("config.toml", _text, "the settings are not known")
         log = self._try("log.txt", _text, "what was logged is not known")
         truth = self._truth()
@@ -167,6 +174,8 @@ def _errors(path: Path) -> Errors:
         errors = read_errors(path)
     if not len(errors.stamps):
         raise ValueError("expected rows of errors, found none")
+    if not (np.isfinite(errors.position).all() and np.isfinite(errors.rotation).all()):
+        raise ValueError("expected finite errors, found others")
     return errors
 
 

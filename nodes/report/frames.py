@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from nodes.report.contents import Run
 from nodes.report.style import DPI, WIDTH, Picture, label, save, sheet
@@ -34,15 +35,30 @@ def draw_frames(run: Run, folder: Path) -> list[Picture]:
     return pictures
 
 
+def read_picture(path: Path) -> npt.NDArray[Any]:
+    """Read a picture: red, green, blue, shape (h, w, 3).
+
+    Raises:
+        OSError: It cannot be read.
+        ValueError: It is none.
+    """
+    data = np.fromfile(path, np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
+    if picture is None:
+        raise ValueError(f"expected a JPEG or PNG, found {data[:8].tobytes()!r}")
+    return picture
+
+
 def _sheet(run: Run, paths: list[Path], out: Path) -> bool:
     """Draw a sheet; `False` if there was nothing to draw."""
     columns = min(_COLUMNS, len(paths))
     width = (round(WIDTH * DPI) - _GAP * (_COLUMNS - 1)) // _COLUMNS
     shown = []
     for path in paths:
-        picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB)
-        if picture is None:
-            run.missing.append(f"frames/{path.name} cannot be read: expected a JPEG")
+        try:
+            picture = read_picture(path)
+        except (OSError, ValueError) as error:
+            run.missing.append(f"frames/{path.name} cannot be read: {error}")
             continue
         height = max(round(picture.shape[0] * width / picture.shape[1]), 1)
         small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
@@ -67,6 +83,6 @@ def _sheet(run: Run, paths: list[Path], out: Path) -> bool:
 def _caption(run: Run, path: Path) -> str:
     """Return the time of a picture, from the stamp at the end of its name."""
     stamp = path.stem.rpartition("_")[2]
-    if not stamp.isdigit():
+    if not stamp.isdecimal():
         return label(path.stem)
     return f"{(int(stamp) - run.start) / 1e9:.2f} s"

@@ -15,7 +15,7 @@ from nodes.report.clouds import draw_clouds
 from nodes.report.contents import Run
 from nodes.report.curves import draw_distributions, draw_errors, draw_latency, draw_relative
 from nodes.report.folder import read_run
-from nodes.report.frames import draw_frames
+from nodes.report.frames import draw_frames, read_picture
 from nodes.report.paths import draw_paths
 from nodes.report.style import Picture, drawing
 
@@ -80,7 +80,7 @@ def render(run: Run, curves: list[Picture], frames: list[Picture], clouds: list[
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    left = [Picture(path, *_LEFT[path.name]) for path in run.pictures]
+    left = [Picture(path, *_LEFT[path.name]) for path in run.pictures if _can_be_read(run, path)]
     return environment.get_template("page.html.jinja").render(
         run=run,
         main=tables.figures(run, main=True),
@@ -94,6 +94,16 @@ def render(run: Run, curves: list[Picture], frames: list[Picture], clouds: list[
         left=[_embedded(p) for p in left],
         verdicts=[_verdict(run, e.name, e.figures, e.color) for e in run.estimators],
     )
+
+
+def _can_be_read(run: Run, path: Path) -> bool:
+    """Tell whether a file that another node left is a picture; `Run.missing` says if not."""
+    try:
+        read_picture(path)
+    except (OSError, ValueError) as error:
+        run.missing.append(f"{path.name} cannot be read: {error}")
+        return False
+    return True
 
 
 def _embedded(picture: Picture) -> dict[str, str]:

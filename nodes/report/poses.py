@@ -21,6 +21,9 @@ SECOND = 1_000_000_000
 GAP = SECOND // 2
 """Silence that counts as lost, beside the estimator's latency."""
 
+_FARTHEST = 1e12
+"""Metres: an estimate that has burst goes beyond all that can be squared, or drawn."""
+
 
 def read_poses(path: Path) -> Trajectory:
     """Read a TUM file that may end in the middle of a line, as that of a killed run does.
@@ -37,6 +40,8 @@ def read_poses(path: Path) -> Trajectory:
     rows = np.loadtxt(lines, ndmin=2)
     if rows.shape[1] != 8:
         raise ValueError(f"expected 8 numbers a row, found {rows.shape[1]}")
+    if (far := np.abs(rows[:, 1:4]).max()) > _FARTHEST:
+        raise ValueError(f"expected positions within {_FARTHEST:g} m, found {far:g} m")
     # Whole seconds apart, as those of a calendar leave a float no nanoseconds.
     halves = [line.split(None, 1)[0].partition(".") for line in lines]
     stamps = np.array([int(s) * SECOND + int(f"{f:0<9}"[:9]) for s, _, f in halves], np.int64)

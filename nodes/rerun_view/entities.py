@@ -9,12 +9,14 @@ map/plan                   the path it was meant to fly
 map/estimates/<estimator>  the frame an estimator works in; its path and newest pose below
 pictures/<camera>          pictures of a camera that nobody announced
 map/clouds/<node>          clouds; map/seen/<camera>: points of depth images
+…/cloud/<node>             clouds in the frame of a body, a camera or an estimator
 imu, scores, log           plots and text
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from events import CameraAnnouncement
 
@@ -74,8 +76,13 @@ def pictures(source: str) -> str:
     return path("pictures", source)
 
 
-def camera(announced: CameraAnnouncement) -> str:
-    """Return where a camera is: below its vehicle, or free in the world."""
+def camera(announced: CameraAnnouncement, vehicles: Sequence[str]) -> str:
+    """Return where a camera is: below its vehicle, or free in the world.
+
+    One whose source does not begin with its vehicle's is taken to be the first vehicle's.
+    """
+    source = announced.source
     if announced.parent_frame_id == "map":
-        return path(WORLD, "cameras", announced.source)
-    return path(WORLD, announced.source)
+        return path(WORLD, "cameras", source)
+    known = any(source.startswith(f"{vehicle}/") for vehicle in vehicles)
+    return path(WORLD, *([] if known else vehicles[:1]), source)

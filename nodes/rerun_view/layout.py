@@ -65,11 +65,16 @@ def _world(rrb: Any, contents: Contents) -> Any:
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=(0, 0, -1)
         )
-    # Pictures of depth in the world would be clouds of their own, and features would float.
-    kinds = ("depth", "segmentation", "rgb/features", "grey/features")
-    hidden = [f"- /{camera}/{kind}/**" for camera in contents.cameras for kind in kinds]
+    # Pictures of depth in the world would be clouds of their own, and features would float. But a
+    # camera that has nothing else is shown by its depth.
+    hidden = [
+        f"- /{camera}/{kind}/**"
+        for camera, there in contents.cameras.items()
+        for kind in ("depth", "segmentation", "rgb/features", "grey/features")
+        if kind != "depth" or there != ["depth"]
+    ]
     return rrb.Spatial3DView(
-        name="world",
+        name="world: true path green, planned path grey, estimates as in the plots",
         origin=f"/{entities.WORLD}",
         contents=["+ $origin/**", *hidden],
         overrides={trail: [so_far] for trail in contents.trails},

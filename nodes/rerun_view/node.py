@@ -140,8 +140,9 @@ class RerunView(Node[RerunConfig]):
         while batch := self._take():
             await self._recorder.call_for(0.0, Recorder.log, batch)
         if trouble := await self._recorder.call_for(0.0, Recorder.close):
-            self.log.warning("the viewer went away before the end: %s", trouble)
+            self.log.warning("the viewer has not got everything: %s", trouble)
         dropped = self._pictures.dropped + self._rows.dropped
+        dropped += await self._recorder.call_for(0.0, Recorder.left_out)
         if dropped:
             self.log.warning("%d of %d events dropped: the view was too slow", dropped, self._heard)
         if self.config.mode == "save" and self.out is not None:

@@ -47,8 +47,12 @@ from nodes.rerun_view.world import World
 _GATHERED = 500
 """Events that are written into a file together."""
 
-_FLUSH = 20.0
-"""Real seconds that the end waits for a viewer that does not take what is logged."""
+_PATIENCE = 3.0
+"""Real seconds that a viewer has to take what was logged. If it takes longer, all that comes is
+left out until it has: the library would first fill hundreds of megabytes, and then stand still."""
+
+_GLANCE = 0.01
+"""Real seconds to see whether it has, by then."""
 
 
 class Recorder:
@@ -83,6 +87,8 @@ class Recorder:
         self._plotted: set[str] = set()
         self._shown: tuple[int, ...] = ()
         self._closed = False
+        self._behind = False
+        self._left_out = 0
         self._waiting: list[Numbered[Event]] = []
 
     def page(self) -> str:
@@ -91,7 +97,8 @@ class Recorder:
 
     def begin(self, announcements: Iterable[Announcement]) -> None:
         """Put what holds for the whole run."""
-        for each in announcements:
+        vehicles_first = sorted(announcements, key=lambda a: not isinstance(a, VehicleAnnouncement))
+        for each in vehicles_first:
             match each:
                 case VehicleAnnouncement():
                     self._world.vehicle(each.source)
@@ -110,6 +117,9 @@ class Recorder:
 
         What goes into a file is gathered first: each entity's rows have a head of their own.
         """
+        if self._viewer is not None and not self._taken():
+            self._left_out += len(batch)
+            return
         self._waiting += batch
         if self._viewer is None and len(self._waiting) < _GATHERED:
             return
@@ -131,6 +141,10 @@ class Recorder:
             self._put(number, event)
         self._show()
 
+    def left_out(self) -> int:
+        """Return how many events were not logged because a viewer stood still or had gone."""
+        return self._left_out
+
     def close(self) -> str:
         """Write the rest, and end; return what went wrong with a viewer, or nothing.
 
@@ -139,20 +153,31 @@ class Recorder:
         """
         if self._closed:
             return ""
-        self._closed, trouble = True, ""
+        self._closed = True
         self._log(self._waiting)
         self._world.finish()
         self._show(self._eye())
-        try:
-            self._stream.flush(timeout_sec=_FLUSH)
-        except RuntimeError as error:  # a window that was closed, or a page that stands still
-            if self._viewer is None:
-                raise
-            trouble = self._viewer.last_words() or str(error)
-        self._stream.disconnect()
-        if self._viewer is not None:
-            self._viewer.close()
+        if self._viewer is None:
+            self._stream.flush()
+            self._stream.disconnect()
+            return ""
+        trouble = ""
+        if self._taken():
+            self._stream.disconnect()
+        else:  # a window that was closed, or a viewer that stands still: it would wait for that
+            trouble = self._viewer.last_words() or "it took nothing any more"
+        self._viewer.close()
         return trouble
+
+    def _taken(self) -> bool:
+        """Tell whether a viewer has taken what was logged; wait for that, but only once."""
+        try:
+            self._stream.flush(timeout_sec=_GLANCE if self._behind else _PATIENCE)
+        except RuntimeError:
+            self._behind = True
+        else:
+            self._behind = False
+        return not self._behind
 
     def _put_columns(self, kind: type[Event], source: str, events: list[Any]) -> None:
         if kind is Odometry:
@@ -208,7 +233,7 @@ class Recorder:
             return None
         centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 5.0)
         x, y, z = centre.tolist()
-        return (x - 0.7 * size, y - 0.4 * size, z - 0.9 * size), (x, y, z)
+        return (x - 0.8 * size, y - 0.45 * size, z - size), (x, y, z)
 
 
 _IN_COLUMNS: tuple[type[Event], ...] = (Odometry, PoseEstimate, Imu, Score)

@@ -93,12 +93,13 @@ class Viewer:
         self._web = config.mode == "serve"
         if not self._web:
             check_display()
-        ports = (config.port, config.web_port) if self._web else (config.port,)
-        for port in ports:
-            _check_free(config.host, port)
-        self.data = f"rerun+http://{config.host}:{config.port}/proxy"
-        query = urllib.parse.urlencode({"url": self.data})
-        self.page = f"http://{config.host}:{config.web_port}?{query}" if self._web else ""
+        ports = {"port": config.port} | ({"web_port": config.web_port} if self._web else {})
+        for setting, port in ports.items():
+            _check_free(setting, config.host, port)
+        host = f"[{config.host}]" if ":" in config.host else config.host
+        self.data = f"rerun+http://{host}:{config.port}/proxy"
+        query = urllib.parse.urlencode({"url": self.data}, safe=":/[]")
+        self.page = f"http://{host}:{config.web_port}?{query}" if self._web else ""
         more = ["--expect-data-soon"]
         if self._web:
             more = ["--serve-web", "--web-viewer-port", str(config.web_port)]
@@ -114,7 +115,7 @@ class Viewer:
             preexec_fn=(lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)) if self._web else None,
         )
         try:
-            for port in ports:
+            for port in ports.values():
                 self._wait(config.host, port)
         except VisnavError:
             self._end()
@@ -163,7 +164,7 @@ def program() -> str:
     return str(Path(found.submodule_search_locations[0]) / "rerun")
 
 
-def _check_free(host: str, port: int) -> None:
+def _check_free(setting: str, host: str, port: int) -> None:
     """Refuse a port that another program has, to which we would otherwise talk."""
     try:
         family = socket.getaddrinfo(host, port)[0][0]
@@ -171,4 +172,6 @@ def _check_free(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
     except OSError as error:
-        raise VisnavError(f"expected a free port {host}:{port}, found: {error}") from error
+        raise VisnavError(
+            f"{setting}: expected a free port {host}:{port}, found: {error}"
+        ) from error

@@ -53,6 +53,7 @@ class World:
         self._truth: dict[str, RecentTruth] = {}
         self._cameras: dict[str, CameraAnnouncement] = {}  # by source
         self._frames: dict[str, str] = {}  # entities of cameras, by optical frame
+        self._others: dict[str, str] = {}  # entities of bodies and of estimators' own, by frame
         self._surroundings: dict[str, Surroundings] = {}  # by source
         self._anchored: set[str] = set()
         self._paths: dict[str, tuple[Path, Colour, float]] = {}
@@ -100,7 +101,7 @@ class World:
         """Prepare a camera: where it sits, and how it sees."""
         config, info = self._config, announced.info
         self._cameras[announced.source] = announced
-        entity = self._frames[announced.frame_id] = entities.camera(announced)
+        entity = self._frames[announced.frame_id] = entities.camera(announced, list(self._truth))
         kinds = [kind for kind in announced.images if config.depth or kind != "depth"]
         self.pictures[entity] = kinds if config.picture_rate else []
         if announced.parent_frame_id != "map":
@@ -122,6 +123,7 @@ class World:
     def moved(self, source: str, events: Sequence[Numbered[Odometry]]) -> None:
         """Put true poses of one vehicle."""
         self.vehicle(source)
+        self._others.setdefault(events[0][1].child_frame_id, entities.body(source))
         truth = self._truth[source]
         for number, event in events:
             truth.add(event.stamp, event.position, event.orientation)
@@ -140,6 +142,8 @@ class World:
         first = events[0][1]
         if source not in self._anchored:
             self._anchored.add(source)
+            if first.frame_id != "map":
+                self._others.setdefault(first.frame_id, entities.estimate(source))
             if first.frame_id != "map" and (truth := self._true_pose(first.stamp)) is not None:
                 laid = truth @ np.linalg.inv(pose_matrix(first.position, first.orientation))
                 self._to.static(entities.estimate(source), self._transform(*pose_tuples(laid)))
@@ -161,7 +165,7 @@ class World:
         camera = self._cameras.get(event.source)
         if camera is not None and camera.parent_frame_id == "map":
             pose = self._transform(event.position, event.orientation)
-            self._to.put(entities.camera(camera), pose)
+            self._to.put(self._frames[camera.frame_id], pose)
         self._surround(event)
 
     # What is seen.
@@ -206,10 +210,11 @@ class World:
             self._to.put(f"{camera}/{kind}/{entity}", points)
 
     def cloud(self, event: PointCloud) -> None:
-        """Put a cloud, in the world or in its camera."""
+        """Put a cloud, in the world or below what its frame belongs to."""
         entity = entities.cloud(event.source)
-        if (camera := self._frames.get(event.frame_id)) is not None:
-            entity = f"{camera}/{entities.path('cloud', event.source)}"
+        for frames in (self._others, self._frames):
+            if (owner := frames.get(event.frame_id)) is not None:
+                entity = f"{owner}/{entities.path('cloud', event.source)}"
         colours = event.colors if len(event.colors) else None
         self._to.put(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
 

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,19 @@ def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'visnav-runtime\[foxglove\]'"):
         Server(FoxgloveConfig(), "test")
+
+
+def test_who_connects_and_says_nothing_does_not_hold_up_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("nodes.foxglove_server.server._PATIENCE", 0.1)
+    server = Server(FoxgloveConfig(port=0), "test")
+    port = int(server.address.rpartition(":")[2])
+    with socket.create_connection(("127.0.0.1", port)):
+        ending = threading.Thread(target=server.close, daemon=True)
+        ending.start()
+        ending.join(30.0)
+        assert not ending.is_alive()
 
 
 @pytest.mark.slow

@@ -148,6 +148,11 @@ def test_estimates_in_a_frame_of_their_own_begin_at_the_truth(
     laid = fields(fields(viewer.next("/tf_static"))[1][-1])
     assert (laid[2], laid[3]) == ([b"map"], [b"vo/odom"])
     assert doubles(laid[4][0], 3) == [1.0, 2.0, -3.0]
+    none, colours = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    cloud = PointCloud(stamp=0, source="mapping", frame_id="odom", points=none, colors=colours)
+    stage.publishing.cloud(cloud)
+    viewer.subscribe("/mapping/cloud")
+    assert fields(viewer.next("/mapping/cloud"))[2] == [b"vo/odom"]
 
 
 def test_pictures_are_what_the_camera_saw(server: Server, viewer: Viewer) -> None:

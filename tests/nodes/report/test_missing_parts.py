@@ -12,6 +12,7 @@ from nodes.evaluation.judging import Thresholds
 from nodes.evaluation.record import EstimatorRecord
 from nodes.report import write_report
 from nodes.report.folder import read_run
+from nodes.report.style import Floats
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row, write_tum
 from tests.nodes.report.folders import SECOND, evaluated, ply, recorded, summary, walk
@@ -78,6 +79,10 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
     ply(tmp_path / "clouds" / "empty.ply", walk(1).positions[:0])
     (tmp_path / "frames").mkdir()
     (tmp_path / "frames" / "vo_000.jpg").write_text("none")
+    (tmp_path / "frames" / "vo_001.jpg").touch()
+    (tmp_path / "frames" / "vo_002.jpg").mkdir()
+    (tmp_path / "flight.png").write_text("none")
+    (tmp_path / "pictures.png").touch()
     page = Page(write_report(tmp_path))
     for name in (
         "summary.json cannot be read",
@@ -88,10 +93,36 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
         "clouds/vo.ply cannot be read: expected a PLY file",
         "clouds/empty.ply cannot be drawn: it has no points",
         "frames/vo_000.jpg cannot be read: expected a JPEG",
+        "frames/vo_001.jpg cannot be read: expected a JPEG",
+        "frames/vo_002.jpg cannot be read: [Errno 21]",
+        "flight.png cannot be read: expected a JPEG or PNG, found b'none'",
+        "pictures.png cannot be read: expected a JPEG or PNG, found b''",
     ):
         assert name in page.text
     names = {p.name for p in (tmp_path / "plots").iterdir()}
     assert names == {"trajectories.png", "relative.png"}
+
+
+def test_the_verdict_of_an_earlier_run_does_not_pass_for_this_one_s(tmp_path: Path) -> None:
+    """A run that ends at once leaves in its folder what the one before had left there."""
+    truth = walk(2)
+    evaluated(tmp_path, truth, {"vo": recorded(truth)}, Thresholds())
+    assert read_run(tmp_path).verdict is not None
+    summary(tmp_path, None)
+    run = read_run(tmp_path)
+    assert run.verdict is None
+    assert any("verdict.json is of an earlier run" in text for text in run.missing)
+
+
+def test_an_estimate_that_has_burst_is_named(tmp_path: Path) -> None:
+    truth = walk(2)
+    evaluated(tmp_path, truth, {"vo": recorded(truth)}, Thresholds())
+    (tmp_path / "evaluation" / "vo.aligned.tum").write_text("0.1 1e300 0 0 0 0 0 1\n")
+    (tmp_path / "evaluation" / "vo.csv").write_text("stamp_ns\n100,200,inf,0\n")
+    missing = read_run(tmp_path).missing
+    burst = "expected positions within 1e+12 m, found 1e+300 m"
+    assert f"evaluation/vo.aligned.tum cannot be read: {burst}" in missing
+    assert "evaluation/vo.csv cannot be read: expected finite errors, found others" in missing
 
 
 def test_lost_intervals_of_a_file_win_over_gaps(tmp_path: Path) -> None:
@@ -138,6 +169,18 @@ def test_odd_flights_are_drawn(tmp_path: Path, kind: str) -> None:
         write_tum(tmp_path / "evaluation" / "vo.aligned.tum", truth.take(slice(0, 1)))
     page = Page(write_report(tmp_path))
     assert "Trajectories" in page.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("points", [np.zeros((1, 3)), np.linspace((0, 0, 0), (0, 0, -9), 50)])
+def test_clouds_without_breadth_are_drawn(tmp_path: Path, points: Floats) -> None:
+    """One point, and a pole."""
+    (tmp_path / "log.txt").touch()
+    (tmp_path / "clouds").mkdir()
+    ply(tmp_path / "clouds" / "vo.ply", points)
+    page = Page(write_report(tmp_path))
+    assert "cannot be" not in page.text
+    assert (tmp_path / "plots" / "clouds_1.png").exists()
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:

@@ -184,7 +184,7 @@ def test_hostile_names_are_shown_as_they_are(tmp_path: Path) -> None:
     figures = {"passed": False, "failed": ["<b>bold</b>"], "method": "<i>m</i>", "<u>": "<s>"}
     shown["estimators"][name] = figures
     (tmp_path / "evaluation" / "verdict.json").write_bytes(msgspec.json.encode(shown))
-    summary(tmp_path, None, name="<h6>", reason="<marquee>", error="<blink>")
+    summary(tmp_path, shown, name="<h6>", reason="<marquee>", error="<blink>")
     (tmp_path / "config.toml").write_text("</pre><h5>")
     (tmp_path / "log.txt").write_text("    1.000000 ERROR    a: </pre><h4>\n")
     page = Page(write_report(tmp_path))

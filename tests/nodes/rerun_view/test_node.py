@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 
 from events import Event
@@ -91,8 +93,10 @@ def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.Mo
 def test_a_port_that_is_taken_is_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(VisnavError, match=f"expected a free port 127.0.0.1:{port}"):
+        with pytest.raises(VisnavError, match=f"^port: expected a free port 127.0.0.1:{port}"):
             sdk.Viewer(RerunConfig(mode="serve", port=port))
+        with pytest.raises(VisnavError, match=f"^web_port: expected a free port 127.0.0.1:{port}"):
+            sdk.Viewer(RerunConfig(mode="serve", port=free_port(), web_port=port))
 
 
 def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,6 +131,36 @@ def test_a_viewer_that_goes_away_is_survived() -> None:
     recorder._viewer._process.wait()
     recorder.log([(i, odometry(i * MS)) for i in range(1, 100)])
     assert recorder.close() == "exit code -9"
+
+
+@pytest.mark.slow
+def test_a_viewer_that_stands_still_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it does not take is left out and counted; once it goes on, so does the view."""
+    monkeypatch.setattr("nodes.rerun_view.recorder._PATIENCE", 0.3)
+    config = RerunConfig(mode="serve", port=free_port(), web_port=free_port(), jpeg_quality=0)
+    noise = np.random.default_rng(0).integers(0, 255, (1000, 1000, 3), np.uint8)
+    recorder = Recorder(config, "test", None)
+    recorder.begin([VEHICLE, CAMERA])
+    assert recorder._viewer is not None
+    viewer = recorder._viewer._process
+    large: Event = msgspec.structs.replace(image(0), data=noise)
+    viewer.send_signal(signal.SIGSTOP)
+    for i in range(20):
+        recorder.log([(i, large)])
+    left_out = recorder.left_out()
+    assert left_out >= 10  # the rest lies in the buffers between the two
+    viewer.send_signal(signal.SIGCONT)
+    end = time.monotonic() + 30.0
+    while not recorder._taken() and time.monotonic() < end:
+        pass  # it waits for the viewer, a process, which has a clock of its own
+    recorder.log([(20, large)])
+    assert recorder.left_out() == left_out
+    viewer.send_signal(signal.SIGSTOP)
+    for i in range(20):
+        recorder.log([(i, large)])
+    began = time.monotonic()
+    assert recorder.close() == "it took nothing any more"
+    assert time.monotonic() - began < 9.0  # a node has 10 s for its end
 
 
 @pytest.mark.slow

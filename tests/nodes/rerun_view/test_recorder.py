@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from events import Event, PositionSetpoint, TrackingLost
+from events import Event, PointCloud, PositionSetpoint, TrackingLost
 from nodes.rerun_view.recorder import Recorder
 from nodes.rerun_view.settings import RerunConfig
 from tests.nodes.rerun_view.said import (
@@ -72,6 +72,33 @@ def test_a_camera_sits_on_its_vehicle_and_sees_as_announced(tmp_path: Path) -> N
         matrix = found.values(f"{entity}/{kind}", "Pinhole:image_from_camera").reshape(3, 3).T
         expected = [[4 / stride, 0, 3.5 / stride + 0.5], [0, 4 / stride, 2.5 / stride + 0.5]]
         assert matrix[:2] == pytest.approx(np.array(expected))
+
+
+def test_a_camera_of_another_name_sits_on_the_vehicle_all_the_same(tmp_path: Path) -> None:
+    recorder = Recorder(RerunConfig(), "test", tmp_path / "flight.rrd")
+    recorder.begin([msgspec.structs.replace(CAMERA, source="front"), VEHICLE])
+    recorder.close()
+    entity = "map/drone/front"
+    found = Recorded(tmp_path / "flight.rrd").values(entity, TRANSLATION).ravel()
+    assert found == pytest.approx([0.1, 0.2, 0.3])
+
+
+def test_a_cloud_lies_in_its_frame(tmp_path: Path) -> None:
+    """A map from poses in an estimator's own frame goes where that frame was laid."""
+    points = np.ones((2, 3), np.float32)
+    none = np.zeros((0, 3), np.uint8)
+    clouds: list[Event] = [
+        PointCloud(stamp=MS, source="map", frame_id=frame_id, points=points, colors=none)
+        for frame_id in ("map", "odom", "base_link", "drone/camera_optical")
+    ]
+    found = record(tmp_path, [odometry(0), estimate(0, (0.0, 0.0, 0.0), "odom")], clouds)
+    places = {entity for entity in found.entities if "cloud" in entity}
+    assert places == {
+        "map/clouds/map",
+        "map/estimates/vo/cloud/map",
+        "map/drone/cloud/map",
+        "map/drone/camera/cloud/map",
+    }
 
 
 def test_a_path_is_logged_once_in_pieces(tmp_path: Path) -> None:
