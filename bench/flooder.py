@@ -2,7 +2,8 @@
 
 ``python -m bench.flooder PORT KEY RATE SECONDS WINDOWS`` connects, says ``ready``, waits for a
 line on its standard input, and then prints a line for each window: when it began and ended
-(monotonic clock, ns) and how many messages it sent. Nothing is dropped on this side.
+(monotonic clock, ns) and how many messages it sent. Nothing is dropped on this side. Another line
+of input then ends it; a number in it is the size of a last message, that of no twist.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ def main(port: int, key: str, rate: float, seconds: float, windows: int) -> None
                         sent += 1
                 time.sleep(BURST)
             print(json.dumps([begin, time.monotonic_ns(), sent]), flush=True)
-        session.put(f"{key}/end", b"")
-        sys.stdin.readline()
+        if size := sys.stdin.readline().strip():
+            publisher.put(bytes(int(size)))
 
 
 if __name__ == "__main__":

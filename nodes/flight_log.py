@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import IO, Annotated
+from typing import Annotated
 
 import cv2
 import msgspec
@@ -10,6 +10,7 @@ import numpy as np
 
 from events import Collision, Image, Odometry
 from nodes.pictures import Row, Thumbnail, draw_contact_sheet, draw_flight
+from nodes.trajectory.growing import GrowingFile
 from runtime import Duration, Node, NodeConfig, on
 
 Count = Annotated[int, msgspec.Meta(ge=1, le=100)]
@@ -47,10 +48,10 @@ class FlightLog(Node[FlightLogConfig]):
         self._collisions: list[Collision] = []
         self._interval = round(self.config.interval * 1e9)
         self._next_picture: dict[str, int] = {}  # by camera
-        self._file: IO[str] | None = None
+        self._file: GrowingFile | None = None
         if self.out is not None:
-            self._file = (self.out / self.config.trajectory).open("w", encoding="ascii")
-            self._file.write("# timestamp[s] x y z[m, NED] qx qy qz qw (FRD to NED)\n")
+            head = "# timestamp[s] x y z[m, NED] qx qy qz qw (FRD to NED)\n"
+            self._file = GrowingFile(self, self.out / self.config.trajectory, head)
 
     @on(Odometry)
     def moved(self, event: Odometry) -> None:
@@ -61,7 +62,7 @@ class FlightLog(Node[FlightLogConfig]):
             # TUM's format (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): xyzw.
             seconds, rest = divmod(event.stamp, 1_000_000_000)
             pose = f"{x:.9f} {y:.9f} {z:.9f} {qx:.9f} {qy:.9f} {qz:.9f} {qw:.9f}"
-            self._file.write(f"{seconds}.{rest:09d} {pose}\n")
+            self._file.add(f"{seconds}.{rest:09d} {pose}\n")
 
     @on(Image)
     def saw(self, event: Image) -> None:

@@ -136,8 +136,10 @@ class Life:
             log.error("%s", late)
             return [late]
         except Exception as error:
-            log.error("%s: %s: %s", name, what, error, exc_info=error)
-            return [wrap(name, error)]
+            wrapped = wrap(name, error)
+            trace = None if isinstance(error, VisnavError) else error
+            log.error("%s (%s)", wrapped, what, exc_info=trace)
+            return [wrapped]
         return []
 
 
@@ -155,6 +157,7 @@ def log_error(error: NodeError, *, last: bool) -> None:
 def wrap(name: str, error: Exception) -> NodeError:
     """Return a node's exception as an error that names the node."""
     ours = isinstance(error, VisnavError)  # says all there is to say; others need their type
-    wrapped = NodeError(name, str(error) if ours else f"{type(error).__name__}: {error}")
+    text = str(error).removeprefix(f"{name}: ") if ours else f"{type(error).__name__}: {error}"
+    wrapped = NodeError(name, text)
     wrapped.__cause__ = error
     return wrapped

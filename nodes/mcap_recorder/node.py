@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from pathlib import Path
 
@@ -16,6 +17,9 @@ from runtime import Input, Node
 
 _WAITING = 1 << 16
 """Events that may come while simulated time waits: more than are ever said at one moment."""
+
+_PATIENCE = 8.0
+"""Real seconds that the run's end may take; `run.shutdown_limit` is 10 unless changed."""
 
 
 class McapRecorder(Node[McapRecorderConfig]):
@@ -37,6 +41,9 @@ class McapRecorder(Node[McapRecorderConfig]):
         self._recording: Recording | None = None
         self._backlog = Backlog(self.config.memory, self.config.when_full)
         self._failed: asyncio.Future[RecordingError] | None = None
+        self._ended_run = False
+        self._unfinished: int | None = None
+        """When the run ended (ns), while its end is yet to be written."""
         self._warned_at = 1
         self._waits = 0
         self._waited = 0.0
@@ -62,6 +69,7 @@ class McapRecorder(Node[McapRecorderConfig]):
             self.log.fatal("%s", error)
         assert self._recording is not None
         self._recording.start()
+        self.after_run(self._finish)
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Record what will be provided."""
@@ -83,7 +91,7 @@ class McapRecorder(Node[McapRecorderConfig]):
                 await self._wait()
 
     async def on_shutdown(self) -> None:
-        """Write what still waits, and the index.
+        """Write what still waits, and the index; what takes longer is done after the run.
 
         Raises:
             FatalError: The disk is full, or the like.
@@ -93,33 +101,61 @@ class McapRecorder(Node[McapRecorderConfig]):
             return
         while self.events.statistics().buffered:
             backlog.put(self.clock.now(), self.events.receive_nowait())
-        await self.offload(recording.close, self.clock.now())
+        self._unfinished = self.clock.now()
+        if not await self.offload(recording.close, self._unfinished, _PATIENCE):
+            waits = backlog.bytes / 1e6
+            self.log.warning("%.1f MB are yet to be written: that goes on after the run", waits)
+            return
+        self._unfinished = None
+        self._tell(recording)
+        if recording.error is not None and not self._ended_run:
+            self.log.fatal("%s", recording.error)
+
+    def _finish(self, _: Path) -> None:
+        """Give a slow disk the time that it needs, when the run is over and nobody waits for it.
+
+        Raises:
+            RecordingError: The disk is full, or the like.
+        """
+        recording = self._recording
+        if recording is None or self._unfinished is None:
+            return
+        recording.close(self._unfinished)
+        if recording.error is not None:
+            raise recording.error
+
+    def _tell(self, recording: Recording) -> None:
+        """Log, and count, what came of it."""
+        backlog, result = self._backlog, recording.result
         lost = backlog.dropped + recording.unwritten
         self.events.dropped += lost
-        result = recording.result
-        self.log.info(
-            "%s: %d events, %.1f MB; at most %.1f MB waited%s",
-            recording.path,
-            result.written,
-            result.size / 1e6,
-            backlog.peak / 1e6,
-            f", and simulated time {self._waits} times for the disk, {self._waited:.1f} s in all"
-            if self._waits
-            else "",
-        )
+        if result.what != "gone":  # it would have said how many there are
+            waits = f"{self._waits} times for the disk, {self._waited:.1f} s in all"
+            self.log.info(
+                "%s: %d events, %.1f MB; at most %.1f MB waited%s",
+                recording.path,
+                result.written,
+                result.size / 1e6,
+                backlog.peak / 1e6,
+                f", and simulated time {waits}" if self._waits else "",
+            )
         if lost:
-            self.log.warning("%d events are not in the recording", lost)
-        if recording.error is not None and self._failed is not None and not self._failed.done():
-            self.log.fatal("%s", recording.error)
+            self.log.warning(
+                "%d events are not in the recording%s",
+                lost,
+                ", nor is what its process had yet to write" if result.what == "gone" else "",
+            )
 
     def _open(self, loop: asyncio.AbstractEventLoop) -> Recording:
         assert self.out is not None
 
         def complain(what: str) -> None:
-            loop.call_soon_threadsafe(self.log.warning, "%s", what)
+            with contextlib.suppress(RuntimeError):  # the run is over
+                loop.call_soon_threadsafe(self.log.warning, "%s", what)
 
         def failed(error: RecordingError) -> None:
-            loop.call_soon_threadsafe(self._fail, error)
+            with contextlib.suppress(RuntimeError):  # the run is over, and `_finish` tells
+                loop.call_soon_threadsafe(self._fail, error)
 
         order = Order(
             path=str(self._path(self.out)),
@@ -146,7 +182,9 @@ class McapRecorder(Node[McapRecorderConfig]):
     async def _watch(self) -> None:
         """End the run when nothing can be recorded any more."""
         assert self._failed is not None
-        self.log.fatal("%s", await self._failed)
+        error = await self._failed
+        self._ended_run = True
+        self.log.fatal("%s", error)
 
     async def _wait(self) -> None:
         """Have simulated time wait until there is room."""

@@ -31,7 +31,8 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
     """A line of what the process says.
 
     Attributes:
-        what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``.
+        what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``;
+            ``gone`` stands for a process that ended without a word.
         text: For messages.
         written: Events in the file.
         size: Bytes of the file.

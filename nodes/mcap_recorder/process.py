@@ -64,6 +64,7 @@ class Process:
                 if piece.what == pipe.END:
                     break
                 self._write(piece)
+            self._end_chunk()
             facts = {"end": str(last), "events": str(self._written)}
             self._writer.close({"visnav": facts})
         except RecordingError as error:
@@ -119,7 +120,8 @@ def say(answer: Answer) -> None:
 
 def main(order: str) -> None:
     """Do what is asked, and tell what came of it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the run's business
+    for each in (signal.SIGINT, signal.SIGHUP):  # the terminal is the run's business
+        signal.signal(each, signal.SIG_IGN)
     wanted = msgspec.json.decode(order, type=Order)
     os.nice(wanted.niceness)
     if wanted.cores:

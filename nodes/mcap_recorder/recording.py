@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 
 import msgspec
@@ -100,19 +101,25 @@ class Recording:
         self._listener.start()
         self._feeder.start()
 
-    def close(self, end: int) -> None:
-        """Hand over what still waits, and return when the file is closed. Not on a loop.
+    def close(self, end: int, patience: float | None = None) -> bool:
+        """Have what still waits written, and tell whether the file is closed. Not on a loop.
 
         Args:
             end: Time of the run's clock (ns) at which it ends.
+            patience: Real seconds to wait at most, after which it may be called again; if `None`,
+                as long as the disk takes.
         """
         self._end = end
         self._closing.set()
-        self._feeder.join()
-        self._listener.join()
+        until = None if patience is None else time.monotonic() + patience
+        for thread in (self._feeder, self._listener):
+            thread.join(None if until is None else max(until - time.monotonic(), 0.0))
+            if thread.is_alive():
+                return False
         self._child.wait()
         if self.result.what in {"done", "error"}:  # one that was killed did not count
             self.unwritten += self._handed - self.result.written
+        return True
 
     # The thread that feeds.
 
@@ -207,7 +214,7 @@ class Recording:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._child.wait(1.0)
             code = self._child.returncode
-            return Answer("error", f"{self.path}: the process that writes it ended with {code}")
+            return Answer("gone", f"{self.path}: the process that writes it ended with {code}")
 
 
 def spare_cores() -> tuple[int, ...]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
-from nodes.mcap_recorder.disk import RecordingError
-from nodes.mcap_recorder.mcap_file import contents, recover
+from nodes.mcap_recorder import records
+from nodes.mcap_recorder.disk import RecordingError, is_being_written, unwritable
+from nodes.mcap_recorder.mcap_file import contents
 
 
 class Recovery(msgspec.Struct, frozen=True):
@@ -32,20 +36,26 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
     Args:
         path: The torn file.
         out: The whole one; if `None`, it takes the place of the torn one when it is complete, and
-            the torn one is gone: all that could be read of it is in the new one.
+            the torn one is gone: all that could be read of it is in the new one. A file that has
+            its index is left alone then, for what is damaged in it may yet be of use.
 
     Raises:
-        RecordingError: The file is no MCAP file, nothing can be read of it, or the other cannot
-            be written.
+        RecordingError: The file is no MCAP file or is being written, nothing can be read of it, or
+            the other cannot be written.
     """
     found = contents(path)
+    with records.open_file(path) as file:
+        if is_being_written(file):
+            raise RecordingError(f"{path}: expected a file that is done, found one being written")
     if found.complete and out is None:
-        return Recovery(path, 0, [], mended=False)
+        trouble: list[str] = []
+        messages = sum(isinstance(r, records.Message) for r in _all_of(path, trouble))
+        return Recovery(path, messages, trouble, mended=False)
     if out is not None and out.exists():
         raise RecordingError(f"{out}: expected the name of a new file, found one that is there")
     place = out or path.with_name(f"{path.name}.mended")
     try:
-        messages, trouble = recover(path, place)
+        messages, trouble = _write_anew(path, place)
         if not messages:
             raise RecordingError(f"{path}: expected messages, found none that can be read")
     except BaseException:
@@ -54,3 +64,56 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
     if out is None:
         place.replace(path)
     return Recovery(out or path, messages, trouble, mended=True)
+
+
+def _all_of(path: Path, trouble: list[str]) -> Iterator[Any]:
+    return records.records(path, 0, None, trouble.append, everything=True)
+
+
+def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
+    """Write all that can be read of a file to another, complete and with an index.
+
+    Returns:
+        How many messages there were, and what could not be read.
+    """
+    trouble: list[str] = []
+    messages = 0
+    with records.open_file(path) as torn:
+        header = records.header_of(torn)
+    try:
+        with out.open("wb") as file:
+            writer = records.writer(
+                file,
+                compression="zstd",
+                chunk_size=4 << 20,
+                profile=header.profile,
+                library=header.library,
+            )
+            schemas: dict[int, int] = {0: 0}
+            channels: dict[int, int] = {}
+            for record in _all_of(path, trouble):
+                match record:
+                    case records.Schema():
+                        if record.id not in schemas:
+                            schema = record.name, record.encoding, record.data
+                            schemas[record.id] = writer.register_schema(*schema)
+                    case records.Channel(topic=topic, message_encoding=how, metadata=metadata):
+                        if record.id not in channels:
+                            schema_id = schemas.get(record.schema_id, 0)  # a damaged chunk's
+                            number = writer.register_channel(topic, how, schema_id, metadata)
+                            channels[record.id] = number
+                    case records.Metadata():
+                        writer.add_metadata(record.name, record.metadata)
+                    case records.Attachment(create_time=made, log_time=time):
+                        file_ = record.name, record.media_type, record.data
+                        writer.add_attachment(made, time, *file_)
+                    case records.Message(log_time=time, publish_time=published):
+                        number = channels[record.channel_id]
+                        writer.add_message(number, time, record.data, published, record.sequence)
+                        messages += 1
+            writer.finish()  # type: ignore[no-untyped-call]
+            file.flush()
+            os.fsync(file.fileno())  # it may take the place of the only other one there is
+    except OSError as error:
+        raise unwritable(out, error) from error
+    return messages, trouble

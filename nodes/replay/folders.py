@@ -101,7 +101,8 @@ def in_order(streams: Iterable[Iterable[Event]]) -> Iterator[Timed]:
 
 def _pixels(path: Path) -> npt.NDArray[Any]:
     try:
-        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+        code = np.fromfile(path, np.uint8)
+        pixels = cv2.imdecode(code, cv2.IMREAD_UNCHANGED) if code.size else None
     except (OSError, cv2.error) as error:
         raise ReplayError(f"{path}: expected a picture, found: {error}") from None
     if pixels is None:

@@ -47,6 +47,7 @@ class Replay(Node[ReplayConfig]):
         self._resumed = asyncio.Event()
         self._target: int | None = None
         self._told = 0
+        self._told_left_out = 0
         self.sent = 0
         if self.config.paused:
             self.pause()
@@ -79,10 +80,15 @@ class Replay(Node[ReplayConfig]):
                 self.log.fatal("%s", self._nothing())
             last = position if last is None else last
             over = end or self._reader.end() or last + round(self.config.linger * SECOND)
-            await self._sleep_until(max(over, last))
+            over = max(over, last)
+            await self._sleep_until(over)
             if self._target is not None:
                 position, self._target = self._target, None
             elif self.config.loop:
+                if over <= begin:
+                    self.log.fatal(
+                        "loop: expected a recording that takes some time, found one moment"
+                    )
                 position = begin
             else:
                 break
@@ -125,7 +131,9 @@ class Replay(Node[ReplayConfig]):
 
     @property
     def position(self) -> float:
-        """Return which time of the recording it is, seconds."""
+        """Return which time of the recording it is, or will be on resuming, seconds."""
+        if self._target is not None:
+            return self._target / SECOND
         now = self.clock.now() if self._paused_at is None else self._paused_at
         return (now - self._shift) / SECOND
 
@@ -207,6 +215,11 @@ class Replay(Node[ReplayConfig]):
         for each in self._reader.trouble[self._told :]:
             self.log.warning("%s: %s", self.config.file, each)
         self._told = len(self._reader.trouble)
+        if (left_out := self._reader.left_out - self._told_left_out) > 0:
+            self.log.warning(
+                "%s: %d events cannot be read, and are left out", self.config.file, left_out
+            )
+            self._told_left_out += left_out
 
     async def _close_ahead(self) -> None:
         if self._ahead is not None:

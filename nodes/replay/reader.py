@@ -12,6 +12,9 @@ from typing import NamedTuple, Protocol
 
 from events import Announcement, Event
 
+MOST_TROUBLE = 20
+"""Different complaints about a recording that are kept."""
+
 
 class ReplayError(ValueError):
     """A recording cannot be read; the message names the file and says what is wrong."""
@@ -36,10 +39,12 @@ class Reader(ABC):
 
     Attributes:
         trouble: What could not be read so far, in words.
+        left_out: How many events could not be read.
     """
 
     def __init__(self) -> None:
         self.trouble: list[str] = []
+        self.left_out = 0
 
     @abstractmethod
     def announcements(self) -> Sequence[Announcement]:
@@ -68,6 +73,12 @@ class Reader(ABC):
     def end(self) -> int | None:
         """Return when it ends (ns), if it says so; else it ends with its last event."""
         return None
+
+    def complain(self, what: str) -> None:
+        """Note what cannot be read; of more than anyone would look at, only that there is more."""
+        if what in self.trouble or len(self.trouble) > MOST_TROUBLE:
+            return
+        self.trouble.append(what if len(self.trouble) < MOST_TROUBLE else "and more of that kind")
 
     def close(self) -> None:  # noqa: B027  # most hold nothing
         """Let go of what it holds."""

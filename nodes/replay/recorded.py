@@ -54,7 +54,7 @@ class Recorded(Reader):
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
         """Yield its events, equal to what was recorded."""
         holder: Record | None = None
-        for record in read(self._path, start, end, self._complain):
+        for record in read(self._path, start, end, self.complain):
             if record.type in HOLDERS:
                 holder = record
             kind = record.metadata.get("kind")
@@ -64,12 +64,13 @@ class Recorded(Reader):
                 if wants(event_type(kind), record.metadata.get("source", "")):
                     yield Timed(record.time, self._event(record, holder))
             except (WireError, ValueError) as error:
-                self._complain(f"{record.topic}: {error}")
+                self.left_out += 1
+                self.complain(f"{record.topic}: {error}")
 
     def end(self) -> int | None:
-        """Return when the recorder ended."""
+        """Return when the recorder ended; `None` if it could not say so."""
         said = self._contents.metadata.get("visnav", {}).get("end", "")
-        return int(said) if said.isdigit() else self._contents.end
+        return int(said) if said.isdigit() else None
 
     def _event(self, record: Record, holder: Record | None) -> Event:
         lacking = native.lacking(record.data)
@@ -90,16 +91,12 @@ class Recorded(Reader):
                 try:
                     event = native.event(record.data)
                 except WireError as error:
-                    self._complain(f"{record.topic}: {error}")
+                    self.complain(f"{record.topic}: {error}")
                     continue
                 if isinstance(event, Announcement):
                     yield event
             elif "kind" in record.metadata:
                 return
-
-    def _complain(self, what: str) -> None:
-        if what not in self.trouble:
-            self.trouble.append(what)
 
 
 def is_ours(path: Path) -> bool:

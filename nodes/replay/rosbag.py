@@ -1,6 +1,7 @@
 """Bags of ROS that others made: their messages as events, in our frames (`ros2_bridge.incoming`).
 
-Messages with a header keep its stamp; the time of receipt is when they are said. Where the two
+Messages with a header keep its stamp, unless that is zero; the time of receipt is when they are
+said. Where the two
 are of different clocks (a simulator's and the recording machine's), each counts from its own first.
 Cameras sit where ``/tf_static`` puts their optical frames in ``base_link``; one that it does not
 know looks ahead from the body's origin.
@@ -8,6 +9,7 @@ know looks ahead from the body's origin.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +38,7 @@ from nodes.ros2_bridge.calibration import camera_announcement
 from nodes.ros2_bridge.incoming import READERS, Reading, estimate
 from nodes.ros2_bridge.stamps import Stamps
 from nodes.ros2_bridge.typestore import Bag
+from runtime.errors import VisnavError
 
 _SAME_CLOCK = 60 * 1_000_000_000
 """Nanoseconds between stamp and receipt above which they are of different clocks."""
@@ -50,6 +53,7 @@ _EVENTS: dict[Use, type[Event]] = {
 }
 
 _LATER = 1 << 62
+"""Stands for the stamp of a message that has none."""
 
 
 class RosBag(Reader):
@@ -68,19 +72,18 @@ class RosBag(Reader):
         super().__init__()
         self._path = path
         self._vehicle = vehicle
-        try:
+        with _readable(path):
             self._bag = Bag(path)
-        except ValueError as error:
-            raise ReplayError(str(error)) from None
         try:
-            found = self._bag.topics()
-            self._topics = chosen(found, topics, vehicle)
-            self._firsts = self._first_messages()
-            self._times, self._stamps = self._origins()
-            self._announcements = list(self._announced(found))
-        except (ReplayError, ValueError) as error:
+            with _readable(path):
+                found = self._bag.topics()
+                self._topics = chosen(found, topics, vehicle)
+                self._firsts = self._first_messages()
+                self._times, self._stamps = self._origins()
+                self._announcements = list(self._announced(found))
+        except ReplayError:
             self._bag.close()
-            raise ReplayError(f"{path}: {error}") from None
+            raise
 
     def announcements(self) -> Sequence[Announcement]:
         """Return the vehicle where it begins, cameras, IMUs and estimators."""
@@ -94,22 +97,31 @@ class RosBag(Reader):
             if topic.use != "camera" and wants(_EVENTS[topic.use], topic.source)
         ]
         stop = None if end is None else end + self._times
-        try:
+        wrong: set[str] = set()
+        with _readable(self._path):
             for name, type_, time, message in self._bag.messages(names, start + self._times, stop):
                 try:
                     event = self._event(self._topics[name], type_, message)
-                except (ValueError, TypeError, ArithmeticError) as error:
-                    self._complain(f"{name}: {error}")
+                except (ValueError, TypeError, ArithmeticError, AttributeError) as error:
+                    self.left_out += 1
+                    if name not in wrong:  # one example of each topic is enough
+                        wrong.add(name)
+                        self.complain(f"{name}: {error}")
                     continue
+                if event.stamp == _LATER:
+                    event = msgspec.structs.replace(event, stamp=time - self._times)
                 yield Timed(time - self._times, event)
-        except ValueError as error:
-            raise ReplayError(str(error)) from None
 
     def close(self) -> None:
         """Close the bag."""
         self._bag.close()
 
     def _event(self, topic: Topic, type_: str, message: Any) -> Event:
+        if 0 < (at := _stamp(message)) < self._stamps.offset:
+            early = (self._stamps.offset - at) / 1e9
+            raise ValueError(
+                f"expected no stamp before the first, found one {early:.3f} s before it"
+            )
         reading = Reading(
             source=topic.source, now=_LATER, stamps=self._stamps, frame_id=topic.frame_id
         )
@@ -155,13 +167,12 @@ class RosBag(Reader):
 
     def _origins(self) -> tuple[int, Stamps]:
         """Return the time of receipt that is 0 from now on, and how stamps are told."""
-        times, stamps = [], []
-        for _, time, message in self._firsts.values():
-            times.append(time)
-            stamp = message.header.stamp
-            stamps.append(int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec))
-        if all(abs(t - s) < _SAME_CLOCK for t, s in zip(times, stamps, strict=True)):
-            origin = min(*times, *stamps)
+        times = [time for _, time, _ in self._firsts.values()]
+        found = ((time, _stamp(message)) for _, time, message in self._firsts.values())
+        stamped = [(time, at) for time, at in found if at]
+        stamps = [at for _, at in stamped]
+        if all(abs(time - at) < _SAME_CLOCK for time, at in stamped):
+            origin = min(times + stamps)
             return origin, Stamps(origin)
         return min(times), Stamps(min(stamps))
 
@@ -221,15 +232,31 @@ class RosBag(Reader):
                     camera = msgspec.structs.replace(camera, position=place, orientation=turn)
                 yield camera
         for source in images:
-            self._complain(f"{source}: expected a camera_info, found none: it is not announced")
+            self.complain(f"{source}: expected a camera_info, found none: it is not announced")
 
     def _rate(self, count: int) -> float:
         seconds = (self._bag.end - self._bag.start) / 1e9
         return max(count - 1, 1) / seconds if seconds > 0 else 1.0
 
-    def _complain(self, what: str) -> None:
-        if what not in self.trouble:
-            self.trouble.append(what)
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Make of whatever a damaged bag raises, in rosbags and below it, an error with its name."""
+    try:
+        yield
+    except VisnavError:
+        raise
+    except Exception as error:
+        what = " ".join(str(error).split()) or type(error).__name__
+        if not isinstance(error, ReplayError | ValueError):
+            what = f"expected a readable bag, found: {what}"
+        raise ReplayError(what if str(path) in what else f"{path}: {what}") from error
+
+
+def _stamp(message: Any) -> int:
+    """Return a header's stamp (ns); 0 if it has none."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 class _AsPose:

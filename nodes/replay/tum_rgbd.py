@@ -215,6 +215,5 @@ class TumRgbd(Reader):
 
 
 def _rate(rows: _Rows) -> float:
-    if len(rows) < 2:
-        return 30.0
-    return (len(rows) - 1) * 1e9 / (rows[-1][0] - rows[0][0])
+    lasts = rows[-1][0] - rows[0][0]
+    return (len(rows) - 1) * 1e9 / lasts if lasts else 30.0

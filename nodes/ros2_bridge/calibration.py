@@ -48,15 +48,26 @@ def camera_info(message: Any) -> CameraInfo:
     fx, skew, cx, _, fy, cy, *_ = (float(value) for value in message.k)
     coefficients = tuple(float(value) for value in message.d)
     sizes = 1 <= message.width <= 16384 and 1 <= message.height <= 16384
-    if not (sizes and fx > 0.0 and fy > 0.0 and skew == 0.0 and isfinite(fx + fy + cx + cy)):
+    finite = isfinite(fx + fy + cx + cy + sum(coefficients))
+    if not (sizes and fx > 0.0 and fy > 0.0 and skew == 0.0 and finite):
         raise ValueError(
             f"expected a calibrated camera, found {message.width} x {message.height} pixels "
-            f"with K = {message.k.tolist()}"
+            f"with K = {message.k.tolist()} and D = {list(coefficients[:8])}"
+        )
+    part = message.roi.width not in {0, message.width} or message.roi.height not in {
+        0,
+        message.height,
+    }
+    if part or message.binning_x > 1 or message.binning_y > 1:
+        raise ValueError(
+            "expected a calibration of whole pictures, found binning of "
+            f"{message.binning_x} x {message.binning_y} and a region of interest of "
+            f"{message.roi.width} x {message.roi.height} pixels"
         )
     plain = not any(coefficients)
     if not (plain or (message.distortion_model == "plumb_bob" and len(coefficients) == 5)):
         raise ValueError(
-            f"expected plumb_bob with 5 coefficients, found {message.distortion_model!r} "
+            f"expected plumb_bob with 5 coefficients, found {message.distortion_model!r:.80} "
             f"with {len(coefficients)}"
         )
     return CameraInfo(

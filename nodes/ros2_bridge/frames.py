@@ -36,6 +36,13 @@ OPTICAL_IN_LINK: Quaternion = (0.5, -0.5, 0.5, -0.5)
 """Rotation from a camera's optical frame to its FLU body (REP 103's suffix ``_optical``)."""
 
 
+def axes_of(frame_id: str) -> Axes:
+    """Return how the axes of a frame lie by its name: ours, or ROS's (REP 103's suffix)."""
+    if frame_id == "map":
+        return "world"
+    return "optical" if frame_id.endswith(("_optical", "_optical_frame")) else "body"
+
+
 def turn_vector(axes: Axes, vector: Vector3) -> Vector3:
     """Take a vector in such a frame to the other side's axes."""
     x, y, z = vector

@@ -7,7 +7,7 @@ import importlib
 from events import Event
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.incoming import READERS, Reader, Reading
-from nodes.ros2_bridge.keys import Topic, ros_name, topic_name
+from nodes.ros2_bridge.keys import Qos, Topic, ros_name, topic_name
 from nodes.ros2_bridge.settings import Ros2BridgeConfig, Subscription
 from nodes.ros2_bridge.stamps import Stamps
 from nodes.ros2_bridge.typestore import MessageError, TypeStore
@@ -37,12 +37,7 @@ class Hearing:
     ) -> None:
         self.subscription = subscription
         name = topic_name(config.namespace, subscription.topic)
-        self.topic = Topic(
-            name=name,
-            type=subscription.type,
-            hash=store.hash(subscription.type),
-            qos=subscription.qos,
-        )
+        self.topic = topic(store, name, subscription.type, subscription.qos)
         self.source = subscription.source or f"{node}/{ros_name(subscription.topic)}"
         self.heard = 0
         self._store = store
@@ -78,6 +73,18 @@ class Hearing:
             return None
         self.heard += 1
         return event
+
+
+def topic(store: TypeStore, name: str, type_: str, qos: Qos) -> Topic:
+    """Return a topic as the file has it.
+
+    Raises:
+        ValueError: The type is not known.
+    """
+    try:
+        return Topic(name=name, type=type_, hash=store.hash(type_), qos=qos)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 def _reader(subscription: Subscription) -> Reader:

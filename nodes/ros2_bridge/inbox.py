@@ -33,7 +33,7 @@ class Inbox:
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
-        deliver: Callable[[bytes], None],
+        deliver: Callable[[bytes], object],
         *,
         depth: int,
         rate: float,

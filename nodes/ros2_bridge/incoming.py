@@ -1,7 +1,8 @@
 """ROS messages to events, in our frames. What is not sane is refused with a ValueError.
 
 `READERS` has a function for each type of message and use; a mapping of the user's own is called
-alike. World ENU becomes NED, body FLU becomes FRD; see `frames`. Pictures are in `pictures`.
+alike. World ENU becomes NED, body FLU FRD; optical axes stay. See `frames`. Pictures are in
+`pictures`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,13 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from nodes.ros2_bridge.frames import Axes, turn_covariance, turn_rotation, turn_vector, unit
+from nodes.ros2_bridge.frames import (
+    axes_of,
+    turn_covariance,
+    turn_rotation,
+    turn_vector,
+    unit,
+)
 from nodes.ros2_bridge.pictures import read_depth, read_image
 from nodes.ros2_bridge.stamps import Stamps
 
@@ -77,18 +84,18 @@ def estimate_with_covariance(message: Any, reading: Reading) -> Event:
 
 def odometry(message: Any, reading: Reading) -> Event:
     """Read an Odometry as a body's pose and twist."""
-    frame_id = reading.frame(message.header, "odom")
-    position, orientation = _pose(message.pose.pose, _axes(frame_id))
-    twist = message.twist.twist
+    frame_id, child = reading.frame(message.header, "odom"), message.child_frame_id or "base_link"
+    position, orientation = _pose(message.pose.pose, frame_id, child)
+    twist, axes = message.twist.twist, axes_of(child)
     return Odometry(
         stamp=reading.stamp(message.header),
         source=reading.source,
         frame_id=frame_id,
-        child_frame_id=message.child_frame_id or "base_link",
+        child_frame_id=child,
         position=position,
         orientation=orientation,
-        linear_velocity=turn_vector("body", _vector(twist.linear)),
-        angular_velocity=turn_vector("body", _vector(twist.angular)),
+        linear_velocity=turn_vector(axes, _vector(twist.linear)),
+        angular_velocity=turn_vector(axes, _vector(twist.angular)),
     )
 
 
@@ -128,12 +135,14 @@ def pose(message: Any, reading: Reading) -> Event:
 
 def imu(message: Any, reading: Reading) -> Event:
     """Read an Imu, without its orientation."""
+    frame_id = reading.frame(message.header, "base_link")
+    axes = axes_of(frame_id)
     return Imu(
         stamp=reading.stamp(message.header),
         source=reading.source,
-        frame_id=reading.frame(message.header, "base_link"),
-        angular_velocity=turn_vector("body", _vector(message.angular_velocity)),
-        linear_acceleration=turn_vector("body", _vector(message.linear_acceleration)),
+        frame_id=frame_id,
+        angular_velocity=turn_vector(axes, _vector(message.angular_velocity)),
+        linear_acceleration=turn_vector(axes, _vector(message.linear_acceleration)),
     )
 
 
@@ -174,9 +183,8 @@ def _estimate(
     header: Any, pose: Any, covariance: Any, reading: Reading, child: str = "base_link"
 ) -> Event:
     frame_id = reading.frame(header, "odom")
-    axes = _axes(frame_id)
-    place, orientation = _pose(pose, axes)
-    given = turn_covariance(axes, covariance).tolist() if len(covariance) else ()
+    place, orientation = _pose(pose, frame_id, child)
+    given = turn_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
     return PoseEstimate(
         stamp=reading.stamp(header),
         source=reading.source,
@@ -203,19 +211,16 @@ def _pose_in_map(message: Any, reading: Reading) -> tuple[Vector3, Quaternion]:
     frame_id = reading.frame(message.header, "map")
     if frame_id != "map":
         raise ValueError(f'frame_id: expected "map", found {frame_id!r:.80}')
-    return _pose(message.pose, "world")
+    return _pose(message.pose, "map", "base_link")
 
 
-def _pose(pose: Any, axes: Axes) -> tuple[Vector3, Quaternion]:
-    q = pose.orientation
+def _pose(pose: Any, parent: str, child: str) -> tuple[Vector3, Quaternion]:
+    q, axes = pose.orientation, axes_of(parent)
+    rotation = unit((float(q.w), float(q.x), float(q.y), float(q.z)))
     return (
         turn_vector(axes, _vector(pose.position)),
-        turn_rotation(axes, "body", unit((float(q.w), float(q.x), float(q.y), float(q.z)))),
+        turn_rotation(axes, axes_of(child), rotation),
     )
-
-
-def _axes(frame_id: str) -> Axes:
-    return "world" if frame_id == "map" else "body"
 
 
 def _vector(vector: Any) -> Vector3:

@@ -87,6 +87,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             for kind in (Image, DepthImage, SegmentationImage, PointCloud, LaserScan3D)
         }
         self._hearings: list[Hearing] = []
+        self._seen: list[Stream[bytes]] = []
+        """Pictures from ROS that wait to be read."""
         self._tellings: list[tuple[Telling, Stream[Event]]] = []
         self._cameras: list[CameraAnnouncement] = []
         self._stamps: Stamps | None = None
@@ -149,6 +151,9 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         except FatalError:
             await self.offload(session.close)
             raise
+        except asyncio.CancelledError:
+            session.give_up()
+            raise
 
     def announce(self) -> Iterable[Announcement]:
         """Say which estimates and cameras will come from ROS."""
@@ -175,7 +180,10 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         assert publishing is not None
         assert session is not None
         self._open = True
+        self._told()
         publishing.begin()
+        for line in publishing.unannounced():
+            self.log.warning("%s", line)
         for kind, events in self._lanes.items():
             self.start(self._lane(events, publishing.large[kind]))
         for telling, waiting in self._tellings:
@@ -191,7 +199,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             return
         sent = [each for each in publishing.publishers if each.sent]
         heard = sum(hearing.heard for hearing in self._hearings)
-        refused = sum(self._complaints.counts.values())
+        refused = sum(self._complaints.counts.values()) + sum(lane.dropped for lane in self._seen)
         self.log.info(
             "%d messages published on %d topics (%d pictures, %d others dropped); %d heard, "
             "%d refused or dropped",
@@ -202,6 +210,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             heard,
             refused,
         )
+        for line in publishing.unused():
+            self.log.warning("%s", line)
         if not await self.offload(session.close):
             self.log.warning("a peer that stands still keeps the session from closing")
 
@@ -253,6 +263,13 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         async for event in events:
             await self.offload(put, event)
 
+    async def _look(self, hearing: Hearing, waiting: Stream[bytes]) -> None:
+        """Read pictures beside the loop."""
+        async for data in waiting:
+            event = await self.offload(hearing.event, data, self.clock.now(), self._told())
+            if event is not None:
+                self._send(event)
+
     def _inbox(self, hearing: Hearing) -> Inbox:
         said = hearing.subscription
 
@@ -262,9 +279,16 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                 if event is not None:
                     self._send(event)
 
+        take: Callable[[bytes], object] = deliver
+        if said.use in {"image", "depth"}:
+            name = f"{self.name}.{hearing.topic.name}"
+            waiting = Stream[bytes](name, said.depth, "drop_oldest", soon=True)
+            self._seen.append(waiting)
+            self.start(self._look(hearing, waiting))
+            take = waiting.offer
         return Inbox(
             asyncio.get_running_loop(),
-            deliver,
+            take,
             depth=said.depth,
             rate=said.rate,
             largest=self.config.largest,
@@ -291,16 +315,22 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     async def _find_camera(self, session: Session, hearing: Hearing) -> None:
         """Wait for a camera's calibration, and remember to announce it."""
         wait, topic = hearing.subscription.wait, hearing.topic
-        data = await self.offload(session.first, topic, wait, self.config.largest)
-        if data is None:
+        images, frame_id = self._images_of(hearing.source), hearing.subscription.frame_id
+
+        def read(size: int, data: Callable[[], bytes]) -> CameraAnnouncement | None:
+            try:
+                if size > self.config.largest:
+                    raise ValueError(f"expected {self.config.largest} bytes or less, found {size}")
+                message = self._store.deserialize(data(), topic.type)
+                return camera_announcement(message, hearing.source, images, frame_id)
+            except ValueError as error:
+                hearing.complain("calibration refused", str(error))
+                return None
+
+        found = await self.offload(session.first, topic, wait, read)
+        if found is None:
             self.log.fatal("%s: expected a calibration within %g s, found none", topic.name, wait)
-        try:
-            message = self._store.deserialize(data, topic.type)
-            images, frame_id = self._images_of(hearing.source), hearing.subscription.frame_id
-            announcement = camera_announcement(message, hearing.source, images, frame_id)
-            self._cameras.append(announcement)
-        except ValueError as error:
-            self.log.fatal("%s: %s", topic.name, error)
+        self._cameras.append(found)
 
     def _images_of(self, source: str) -> tuple[str, ...]:
         kinds = {"image": "rgb", "depth": "depth"}

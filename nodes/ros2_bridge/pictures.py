@@ -25,6 +25,12 @@ _LENGTH = struct.Struct("<I")
 _NONE = np.zeros(0, np.uint8)
 _POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
 _PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
+_TURNS = {
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "8UC3": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+}
 
 
 class ImageWriter:
@@ -38,8 +44,8 @@ class ImageWriter:
 
     def __init__(self, store: TypeStore, frame_id: str, encoding: str) -> None:
         self._store = store
-        self._frame_id = frame_id
-        self._encoding = encoding
+        self.frame_id = frame_id
+        self.encoding = encoding
         self._shape: tuple[int, ...] | None = None
         self._buffer = bytearray()
 
@@ -60,10 +66,10 @@ class ImageWriter:
         message = self._store.message("sensor_msgs/msg/Image")
         head = self._store.serialize(
             message(
-                header=make_header(self._store, (0, 0), self._frame_id),
+                header=make_header(self._store, (0, 0), self.frame_id),
                 height=data.shape[0],
                 width=data.shape[1],
-                encoding=self._encoding,
+                encoding=self.encoding,
                 is_bigendian=0,
                 step=data.nbytes // max(data.shape[0], 1),
                 data=_NONE,
@@ -159,7 +165,7 @@ class CloudWriter:
                 point_step=_POINT.itemsize,
                 row_step=_POINT.itemsize * count,
                 data=_NONE,
-                is_dense=True,
+                is_dense=bool(np.isfinite(points).all()),
             )
         )
         dense = frame.pop()  # follows the data
@@ -191,15 +197,14 @@ def read_image(message: Any, source: str, stamp: int, frame_id: str) -> Image:
         raise ValueError(
             f"encoding: expected one of {', '.join(_PIXEL_BYTES)}, found {message.encoding!r:.80}"
         )
-    rows = _rows(message, channels)
-    pixels = rows.reshape(message.height, message.width, channels)
+    pixels = _rows(message, channels).reshape(message.height, message.width, channels)
     if channels == 1:
         return Image(
             stamp=stamp, source=source, frame_id=frame_id, encoding="mono8", data=pixels[:, :, 0]
         )
-    order = [2, 1, 0] if message.encoding in {"bgr8", "bgra8", "8UC3"} else [0, 1, 2]
-    rgb = pixels if channels == 3 and order[0] == 0 else pixels[:, :, order]
-    return Image(stamp=stamp, source=source, frame_id=frame_id, data=np.ascontiguousarray(rgb))
+    turn = _TURNS.get(message.encoding)
+    rgb: Any = np.ascontiguousarray(pixels) if turn is None else cv2.cvtColor(pixels, turn)
+    return Image(stamp=stamp, source=source, frame_id=frame_id, data=rgb)
 
 
 def read_depth(message: Any, source: str, stamp: int, frame_id: str) -> DepthImage:

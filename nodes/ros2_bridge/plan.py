@@ -17,7 +17,7 @@ from events import (
     ImuAnnouncement,
     VehicleAnnouncement,
 )
-from nodes.ros2_bridge.frames import Axes
+from nodes.ros2_bridge.frames import Axes, axes_of
 from nodes.ros2_bridge.keys import Qos, ros_name, topic_name
 from nodes.ros2_bridge.settings import Kind, Ros2BridgeConfig
 
@@ -84,10 +84,11 @@ _QOS: dict[What, Qos] = {
     "path": Qos(depth=1),
 }
 
-_PICTURES: set[What] = {
+_SENSORS: set[What] = {
     "image", "mono", "info", "compressed", "depth", "depth_info", "compressed_depth",
-    "segmentation", "cloud", "lidar"
+    "segmentation", "lidar", "imu", "range", "pressure", "magnetic", "fix"
 }  # fmt: skip
+"""With the quality of service of rclcpp's ``SensorDataQoS``."""
 
 
 class Publication(msgspec.Struct, frozen=True, kw_only=True):
@@ -120,13 +121,13 @@ def publication(what: What, source: str, config: Ros2BridgeConfig) -> Publicatio
     given = config.topics.get(full, config.topics.get(name))
     if what == "estimate" and config.covariance:
         type_ = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    pictures = Qos(depth=5, reliable=config.image_qos == "reliable")
+    sensors = Qos(depth=5, reliable=config.sensor_qos == "reliable")
     return Publication(
         what=what,
         source=source,
         topic=full if given is None else topic_name(config.namespace, given),
         type=type_,
-        qos=pictures if what in _PICTURES else _QOS.get(what, Qos()),
+        qos=sensors if what in _SENSORS else _QOS.get(what, Qos()),
     )
 
 
@@ -231,10 +232,7 @@ class FrameNames:
 
     def axes(self, frame_id: str) -> Axes:
         """Return how a frame's axes lie."""
-        if frame_id == "map":
-            return "world"
-        known = frame_id in self._cameras or frame_id.endswith("_optical")
-        return "optical" if known else "body"
+        return "optical" if frame_id in self._cameras else axes_of(frame_id)
 
     def _carrier(self, source: str) -> str:
         for vehicle in self._vehicles:

@@ -7,13 +7,14 @@ small and put at once.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from events import (
     Announcement,
     CameraAnnouncement,
     DepthImage,
+    EstimatorAnnouncement,
     Event,
     FluidPressure,
     Image,
@@ -32,10 +33,11 @@ from events import (
     SegmentationImage,
     TransformStamped,
     Vector3,
+    VehicleAnnouncement,
 )
 from nodes.ros2_bridge.depth import CompressedDepthWriter
 from nodes.ros2_bridge.frames import turn_points, turn_rotation, turn_vector
-from nodes.ros2_bridge.keys import Topic
+from nodes.ros2_bridge.keys import Topic, topic_name
 from nodes.ros2_bridge.messages import Messages, Time
 from nodes.ros2_bridge.paths import Path
 from nodes.ros2_bridge.pictures import CloudWriter, CompressedWriter, ImageWriter
@@ -75,12 +77,14 @@ class Publishing:
         self._transforms = Transforms(self._names, config.vehicle, config.tf)
         self._cameras: dict[str, CameraAnnouncement] = {}
         self._imus: dict[str, ImuAnnouncement] = {}
+        self._vehicles: list[str] = []
+        self._estimators: list[str] = []
         self._publishers: dict[tuple[What, str], Publisher | None] = {}
         self._writers: dict[tuple[What, str], Any] = {}
         self._paths: dict[str, tuple[Path, int]] = {}
         """By source: the path, and when it is to be sent again."""
-        self._own: dict[str, Publisher] = {}
-        """By topic: what mappings of the user's own make."""
+        self._own: dict[Telling, Publisher] = {}
+        """What mappings of the user's own make."""
         self._lock = threading.Lock()
         self.large: dict[type[Event], Callable[[Any], None]] = {
             Image: self.image,
@@ -114,6 +118,10 @@ class Publishing:
             self._cameras[announcement.source] = announcement
         elif isinstance(announcement, ImuAnnouncement):
             self._imus[announcement.source] = announcement
+        elif isinstance(announcement, VehicleAnnouncement):
+            self._vehicles.append(announcement.source)
+        elif isinstance(announcement, EstimatorAnnouncement):
+            self._estimators.append(announcement.source)
         self._transforms.announced(announcement)
         for found in announced(announcement, self._config):
             self._declare(found)
@@ -127,9 +135,29 @@ class Publishing:
         """Put what holds for the whole run."""
         self._put_static()
 
+    def unannounced(self) -> Iterator[str]:
+        """Yield a line for each setting that names what nobody announced."""
+        config = self._config
+        for setting, name, known, what in (
+            ("vehicle", config.vehicle, self._vehicles, "a vehicle"),
+            ("tf", "" if config.tf == "truth" else config.tf, self._estimators, "an estimator"),
+        ):
+            if name and name not in known:
+                yield (
+                    f'{setting}: expected {what} that is announced, found "{name}" '
+                    f"(there are: {', '.join(known) or 'none'})"
+                )
+
+    def unused(self) -> Iterator[str]:
+        """Yield a line for each new name that no topic got."""
+        names = {each.topic.name for each in self.publishers}
+        for given, name in self._config.topics.items():
+            if topic_name(self._config.namespace, name) not in names:
+                yield f'topics: expected the name of a topic, found "{given}", which none has'
+
     def declare(self, telling: Telling) -> None:
         """Declare the publisher of a mapping of the user's own."""
-        self._own[telling.topic.name] = self._session.publisher(telling.topic)
+        self._own[telling] = self._session.publisher(telling.topic)
 
     # Beside the loop.
 
@@ -191,7 +219,7 @@ class Publishing:
         """Put what a mapping of the user's own makes of an event."""
         message = telling.message(event, self._writing)
         if message is not None:
-            self._own[telling.topic.name].put(message)
+            self._own[telling].put(message)
 
     # At once.
 
@@ -310,9 +338,9 @@ class Publishing:
         publisher = self._publisher(what, event.source)
         if publisher is None:
             return
+        frame = self._names.name(event.frame_id, event.source)
         writer = self._writers.get((what, event.source))
-        if writer is None:
-            frame = self._names.name(event.frame_id, event.source)
+        if writer is None or (writer.encoding, writer.frame_id) != (encoding, frame):
             writer = ImageWriter(self._store, frame, encoding)
             self._writers[what, event.source] = writer
         publisher.put(writer.write(self._time(event.stamp), event.data))

@@ -8,11 +8,12 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import re
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import zenoh
 
@@ -26,6 +27,8 @@ from nodes.ros2_bridge.keys import (
     node_token,
     ros2dds_key,
 )
+
+T = TypeVar("T")
 
 Take = Callable[[int, Callable[[], bytes]], None]
 """Called in a thread with a message's size and what returns its bytes."""
@@ -43,6 +46,23 @@ PAUSE = 0.001
 CLOSING = 3.0
 """Seconds."""
 
+_OURS: dict[str, Any] = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": True,
+    "connect/endpoints": ["tcp/localhost:7447"],
+    "listen/endpoints": ["tcp/localhost:0"],
+    "connect/timeout_ms": -1,  # try for ever,
+    "connect/exit_on_failure": False,  # but beside the run; and again if a router goes
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP,
+}
+"""In the place of what Zenoh has where nobody says anything: among that, to listen to all the
+world, and multicast."""
+
+_IN_ZENOH = re.compile(r" at /\S+\.rs:\d+\.?")
+_IN_FILE = re.compile(r'Message \{ msg: "(.*)", location: .*line: (\d+), column: (\d+).*')
+"""Where in Zenoh an error arose; how Rust shows one of JSON5, and where that is."""
+
 
 class SessionError(Exception):
     """A session cannot be opened; the message says why."""
@@ -56,8 +76,8 @@ class Session:
         keys: How topics are named.
         connect: Endpoints to connect to, again and again until they answer.
         listen: Endpoints to listen on.
-        file: A Zenoh configuration; it also says what the two are if they are `None`, which
-            without a file are those that rmw_zenoh_cpp has.
+        file: A Zenoh configuration. What it leaves out, and the two endpoints if they are `None`,
+            is as without a file: that of rmw_zenoh_cpp.
 
     Raises:
         SessionError: It cannot be opened.
@@ -74,12 +94,17 @@ class Session:
     ) -> None:
         self._node = node
         self._keys = keys
+        configuration = _configuration(connect, listen, file)
         try:
-            self._session = zenoh.open(_configuration(connect, listen, file))
+            self._session = zenoh.open(configuration)
         except (zenoh.ZError, OSError) as error:
-            raise SessionError(f"expected a Zenoh session, found: {error}") from error
+            raise SessionError(
+                "expected a Zenoh session that listens on "
+                f"{configuration.get_json('listen/endpoints')}, found: {_reason(error)}"
+            ) from error
         self.zid = str(self._session.info.zid())
         self._ids = itertools.count(1)
+        self._given_up = threading.Event()
         self._kept: list[Any] = []
         if keys == "rmw_zenoh":
             self._keep(node_token(node, self.zid, 0))
@@ -111,9 +136,7 @@ class Session:
         """Declare a subscription, and show it to ROS."""
         # Not called by Zenoh for each message: each call takes the interpreter from the loop, and
         # under a flood the loop would wait for it again and again.
-        subscriber = self._session.declare_subscriber(
-            self._key(topic), zenoh.handlers.FifoChannel(WAITING)
-        )
+        subscriber = self._subscriber(topic, late=topic.qos.transient_local)
         self._kept.append(subscriber)
         threading.Thread(
             target=_read, args=(subscriber, take), name=f"hears {topic.name}", daemon=True
@@ -121,21 +144,32 @@ class Session:
         if self._keys == "rmw_zenoh":
             self._keep(endpoint_token(self._node, self.zid, 0, next(self._ids), "MS", topic))
 
-    def first(self, topic: Topic, seconds: float, largest: int) -> bytes | None:
-        """Wait for one message of a topic, in the caller's thread; `None` if none came in time."""
-        found: list[bytes] = []
-        came = threading.Event()
+    def first(
+        self, topic: Topic, seconds: float, read: Callable[[int, Callable[[], bytes]], T | None]
+    ) -> T | None:
+        """Wait in the caller's thread for a message of which `read` makes something.
 
-        def heard(sample: zenoh.Sample) -> None:
-            if not came.is_set() and len(sample.payload) <= largest:
-                found.append(sample.payload.to_bytes())
-                came.set()
+        Args:
+            topic: Which; a message that was said before, and is kept, counts too.
+            seconds: For how long; `None` is returned if nothing came, or after `give_up`.
+            read: Called as `Take` is; `None` for what is of no use.
+        """
+        end = time.monotonic() + seconds
+        subscriber = self._subscriber(topic, late=True)
+        try:
+            while True:
+                while (sample := subscriber.try_recv()) is not None:
+                    found = read(len(sample.payload), sample.payload.to_bytes)
+                    if found is not None:
+                        return found
+                if time.monotonic() >= end or self._given_up.wait(5 * PAUSE):
+                    return None
+        finally:
+            subscriber.undeclare()
 
-        with self._session.declare_subscriber(
-            self._key(topic), zenoh.handlers.Callback(heard, indirect=False)
-        ):
-            came.wait(seconds)
-        return found[0] if found else None
+    def give_up(self) -> None:
+        """Have `first` return, in whatever thread it waits."""
+        self._given_up.set()
 
     def close(self) -> bool:
         """Leave, and tell whether that was done within `CLOSING`.
@@ -147,6 +181,15 @@ class Session:
         thread.start()
         thread.join(CLOSING)
         return not thread.is_alive()
+
+    def _subscriber(self, topic: Topic, *, late: bool) -> Any:
+        """Declare a subscriber; `late`: one that gets what was said before, and is kept."""
+        key = self._key(topic)
+        channel: Any = zenoh.handlers.FifoChannel(WAITING)
+        if not late:
+            return self._session.declare_subscriber(key, channel)
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.qos.depth)
+        return zenoh.ext.declare_advanced_subscriber(self._session, key, channel, history=history)
 
     def _key(self, topic: Topic) -> str:
         if self._keys == "ros2dds":
@@ -201,26 +244,33 @@ def _read(subscriber: Any, take: Take) -> None:
 def _configuration(
     connect: tuple[str, ...] | None, listen: tuple[str, ...] | None, file: str
 ) -> zenoh.Config:
-    """Return the configuration of a peer as rmw_zenoh_cpp opens it (or as `file` says)."""
+    """Return the configuration of a peer as rmw_zenoh_cpp opens it, or as `file` says."""
+    plain, configuration = zenoh.Config(), zenoh.Config()
     if file:
         if not Path(file).is_file():
             raise SessionError(f"zenoh_config: expected a file, found none at {file}")
-        configuration = zenoh.Config.from_file(file)
-    else:
-        configuration = zenoh.Config()
-        for key, value in {
-            "mode": "peer",
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": True,
-            "timestamping/enabled": True,  # the cache of an advanced publisher needs it
-            "connect/endpoints": ["tcp/localhost:7447"],
-            "listen/endpoints": ["tcp/localhost:0"],
-            "connect/timeout_ms": -1,  # try for ever,
-            "connect/exit_on_failure": False,  # but beside the run; and again if a router goes
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP,
-        }.items():
+        try:
+            configuration = zenoh.Config.from_file(file)
+        except zenoh.ZError as error:
+            raise SessionError(
+                f"zenoh_config: {file}: expected a Zenoh configuration, found: {_reason(error)}"
+            ) from error
+    for key, value in _OURS.items():
+        if configuration.get_json(key) == plain.get_json(key):
             configuration.insert_json5(key, json.dumps(value))
+    # The cache of an advanced publisher needs it.
+    configuration.insert_json5("timestamping/enabled", "true")
     for way, endpoints in (("connect", connect), ("listen", listen)):
         if endpoints is not None:
-            configuration.insert_json5(f"{way}/endpoints", json.dumps(endpoints))
+            try:
+                configuration.insert_json5(f"{way}/endpoints", json.dumps(endpoints))
+            except zenoh.ZError as error:
+                raise SessionError(
+                    f'{way}: expected endpoints such as "tcp/127.0.0.1:7447", '
+                    f"found {list(endpoints)}: {_reason(error)}"
+                ) from error
     return configuration
+
+
+def _reason(error: Exception) -> str:
+    return _IN_FILE.sub(r"\1 (line \2, column \3)", _IN_ZENOH.sub("", str(error)))

@@ -60,6 +60,8 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         reliable: Quality of service, as ROS shows it.
         depth: How many messages wait at most.
         rate: Messages a second at most; what comes faster is dropped.
+        transient_local: Whether to hear what was said before, and is kept (``/map``,
+            ``/tf_static``); a ``camera`` always does.
         wait: Seconds that the run's start waits for a ``camera``.
     """
 
@@ -73,7 +75,8 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     reliable: bool = True
     depth: _Positive = 10
     rate: _Rate = 1000.0
-    wait: Annotated[float, msgspec.Meta(ge=0)] = 10.0
+    transient_local: bool = False
+    wait: Annotated[float, msgspec.Meta(ge=0, le=86_400)] = 10.0
 
     def __post_init__(self) -> None:
         dds_type(self.type)
@@ -88,11 +91,16 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 f"{self.topic}: expected one of: {', '.join(known)}; "
                 f"found {self.use} from {self.type}"
             )
+        if self.use == "velocity" and self.frame_id not in {"", "map", "heading"}:
+            raise ValueError(
+                f'{self.topic}: frame_id: expected "map" or "heading" for a velocity, '
+                f"found {self.frame_id!r}"
+            )
 
     @property
     def qos(self) -> Qos:
         """Return the quality of service."""
-        return Qos(reliable=self.reliable, depth=self.depth)
+        return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
 
 
 class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -145,11 +153,11 @@ class Ros2BridgeConfig(NodeConfig):
         node_name: As ``ros2 node list`` shows it.
         distribution: Of ROS 2, on the other side.
         keys: ``rmw_zenoh``, or ``ros2dds`` for a bridge with zenoh-plugin-ros2dds.
-        connect: Zenoh endpoints; if not given, those of `zenoh_config`, or without such a file
+        connect: Zenoh endpoints; if not given, those of `zenoh_config`, or else
             ``tcp/localhost:7447``, where ``rmw_zenohd`` listens.
-        listen: The same for listening; without anything, any port of the loopback.
+        listen: The same for listening; or else any port of the loopback.
         zenoh_config: A Zenoh configuration file (JSON5) for whatever else: TLS, access control,
-            shared memory.
+            shared memory. What it leaves out is as without it: no multicast, for one.
         publish: What to publish.
         topics: Other names for topics, by the name that they would have.
         time: ``simulated``: stamps count from the run's start, and ``/clock`` tells the time (set
@@ -171,7 +179,7 @@ class Ros2BridgeConfig(NodeConfig):
         depth_quantization: Metres near which steps of such depth are a hundredth of the depth;
             farther away they grow with its square.
         jpeg_quality: 1 to 100.
-        image_qos: ``reliable`` or ``best_effort``.
+        sensor_qos: ``best_effort`` (as ROS's sensor data) or ``reliable``, of what sensors measure.
         largest: Bytes of a message from outside at most.
         definitions: Types that ROS 2 does not come with, and the ``.msg`` file of each.
         subscriptions: What to hear.
@@ -194,7 +202,7 @@ class Ros2BridgeConfig(NodeConfig):
     tf: str = "truth"
     path_rate: _Rate = 2.0
     path_step: _Rate = 0.05
-    path_length: Annotated[int, msgspec.Meta(ge=3)] = 1000
+    path_length: Annotated[int, msgspec.Meta(ge=3, le=1_000_000)] = 1000
     covariance: bool = False
     raw: bool = True
     compressed: Literal["", "jpeg", "png"] = ""
@@ -202,7 +210,7 @@ class Ros2BridgeConfig(NodeConfig):
     depth_max: _Rate = 10.0
     depth_quantization: _Rate = 100.0
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
-    image_qos: Literal["reliable", "best_effort"] = "reliable"
+    sensor_qos: Literal["best_effort", "reliable"] = "best_effort"
     largest: _Positive = 64 * 1024 * 1024
     definitions: dict[str, str] = msgspec.field(default_factory=dict)
     subscriptions: tuple[Subscription, ...] = ()
@@ -211,12 +219,22 @@ class Ros2BridgeConfig(NodeConfig):
     def __post_init__(self) -> None:
         if not self.namespace.startswith("/"):
             raise ValueError(f"namespace: expected a leading slash, found {self.namespace!r}")
-        if self.namespace != "/":
-            topic_name("/", self.namespace)
-        topic_name("/", f"/{self.node_name}")
         if "/" in self.node_name:
             raise ValueError(f"node_name: expected no slash, found {self.node_name!r}")
-        for name in self.topics.values():
-            topic_name("/", name)
+        if self.namespace != "/":
+            _checked("namespace", self.namespace)
+        _checked("node_name", f"/{self.node_name}")
+        for given, name in self.topics.items():
+            _checked(f'topics: "{given}"', name)
         for type_ in self.definitions:
-            dds_type(type_)
+            try:
+                dds_type(type_)
+            except ValueError as error:
+                raise ValueError(f"definitions: {error}") from None
+
+
+def _checked(where: str, name: str) -> None:
+    try:
+        topic_name("/", name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None

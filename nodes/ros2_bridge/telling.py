@@ -19,7 +19,8 @@ from typing import Any
 
 from events import Event
 from nodes.ros2_bridge.complaints import Complaints
-from nodes.ros2_bridge.keys import Topic, topic_name
+from nodes.ros2_bridge.hearing import topic
+from nodes.ros2_bridge.keys import topic_name
 from nodes.ros2_bridge.messages import Time
 from nodes.ros2_bridge.pictures import make_header
 from nodes.ros2_bridge.plan import FrameNames
@@ -95,12 +96,8 @@ class Telling:
         complaints: Complaints,
     ) -> None:
         self.publication = publication
-        self.topic = Topic(
-            name=topic_name(config.namespace, publication.topic),
-            type=publication.type,
-            hash=store.hash(publication.type),
-            qos=publication.qos,
-        )
+        name = topic_name(config.namespace, publication.topic)
+        self.topic = topic(store, name, publication.type, publication.qos)
         self._store = store
         self._complaints = complaints
         self.event = event_type(publication)

@@ -119,10 +119,12 @@ class Transforms:
 
     def moving(self, event: TransformStamped) -> list[Transform]:
         """Return a moving transform that a node sent."""
-        if self._names.camera(event.child_frame_id) or event.child_frame_id == "base_link":
+        child = event.child_frame_id
+        fixed = (self._names.vehicle(event.source), child) in self._fixed
+        if fixed or self._names.camera(child) or child == "base_link":
             return []
         pose = event.translation, event.rotation
-        return [self._turned(event.frame_id, event.child_frame_id, pose, event.source)]
+        return [self._turned(event.frame_id, child, pose, event.source)]
 
     def _of_body(self, source: str) -> bool:
         return self._names.vehicle(source) == self._names.vehicle(self._body)

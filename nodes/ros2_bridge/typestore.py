@@ -162,7 +162,11 @@ class Bag:
             # For bags that have no definitions, as SQLite's of before Iron.
             store = get_typestore(Stores.ROS2_JAZZY)
             self._reader = AnyReader([path], default_typestore=store)
-            self._reader.open()
+            try:
+                self._reader.open()
+            except BaseException:
+                self._reader.close()
+                raise
         except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
             raise ValueError(f"{path}: expected a bag of ROS, found: {error}") from error
         self._errors = (AnyReaderError, ValueError, ArithmeticError, LookupError, MemoryError)

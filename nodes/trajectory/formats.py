@@ -91,8 +91,11 @@ def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
     """
     velocities: list[Vector3] = [(0.0, 0.0, 0.0)] * len(trajectory)
     if len(trajectory) > 1:
-        seconds = (trajectory.stamps - trajectory.stamps[0]) / 1e9
-        slopes: Floats = np.asarray(np.gradient(trajectory.positions, seconds, axis=0))
+        # As np.gradient, whose seconds since the start cannot tell stamps of nanoseconds apart.
+        steps = np.diff(trajectory.stamps)[:, None] / 1e9
+        each = np.diff(trajectory.positions, axis=0) / steps
+        inner = (each[:-1] * steps[1:] + each[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
+        slopes: Floats = np.concatenate([each[:1], inner, each[-1:]])
         velocities = [(x, y, z) for x, y, z in slopes.tolist()]
     rows = (
         euroc_row(*pose, velocity)

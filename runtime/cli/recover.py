@@ -18,7 +18,7 @@ def recover(
     """Mend the recording of a run that was killed, or whose disk was full.
 
     What can be read is written to a complete file with an index. Such a run has at most its last
-    second missing.
+    second missing. A file that has its index is only looked through.
     """
     import importlib
 
@@ -34,5 +34,7 @@ def recover(
         print(f"{file}: {trouble}")
     if done.mended:
         print(f"{done.path}: {done.messages} messages, complete")
+    elif done.trouble:
+        print(f"{done.path}: has its index, left as it is; {done.messages} messages can be read")
     else:
-        print(f"{done.path}: complete, nothing to mend")
+        print(f"{done.path}: {done.messages} messages, complete, nothing to mend")

@@ -104,32 +104,38 @@ class Session:
 
 
 def _configuration(network: NetworkConfig) -> zenoh.Config:
-    """Return a peer's configuration: the file's, or one that finds or makes the meeting place."""
-    settings: dict[str, Any] = {"transport/link/tx/lease": round(float(network.lease) * 1000)}
+    """Return the file's configuration, and where that is silent, one that finds who is there."""
+    plain, configuration = zenoh.Config(), zenoh.Config()
     if network.zenoh:
         if not Path(network.zenoh).is_file():
             raise PeerError(f"network.zenoh: expected a file, found none at {network.zenoh}")
-        configuration = zenoh.Config.from_file(network.zenoh)
-    else:
-        configuration = zenoh.Config()
-        here = re.search(r"/(127\.|localhost)", network.meet)
-        settings |= {
-            "mode": "peer",
-            "scouting/multicast/enabled": False,
-            # The first process on that host takes the address, and the others connect to it; each
-            # tells the rest where else it listens.
-            "listen/endpoints": [network.meet, "tcp/127.0.0.1:0" if here else "tcp/0.0.0.0:0"],
-            "listen/exit_on_failure": False,
-            "listen/timeout_ms": 0,
-            "connect/endpoints": [network.meet],
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
-            "connect/retry": {
-                "period_init_ms": 100,
-                "period_max_ms": 400,
-                "period_increase_factor": 2,
-            },
-        }
+        try:
+            configuration = zenoh.Config.from_file(network.zenoh)
+        except zenoh.ZError as error:
+            raise PeerError(
+                f"network.zenoh: {network.zenoh}: expected a Zenoh configuration, found: {error}"
+            ) from error
+    here = re.search(r"/(127\.|localhost)", network.meet)
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        # The first process on that host takes the address, and the others connect to it; each
+        # tells the rest where else it listens.
+        "listen/endpoints": [network.meet, "tcp/127.0.0.1:0" if here else "tcp/0.0.0.0:0"],
+        "listen/exit_on_failure": False,
+        "listen/timeout_ms": 0,
+        "connect/endpoints": [network.meet],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 400,
+            "period_increase_factor": 2,
+        },
+    }
     for key, value in settings.items():
-        configuration.insert_json5(key, json.dumps(value))
+        if configuration.get_json(key) == plain.get_json(key):
+            configuration.insert_json5(key, json.dumps(value))
+    lease = round(float(network.lease) * 1000)
+    configuration.insert_json5("transport/link/tx/lease", json.dumps(lease))
     return configuration

@@ -10,7 +10,7 @@ from typing import IO, Any
 import pytest
 from mcap.reader import make_reader
 
-from nodes.mcap_recorder import mcap_file
+from nodes.mcap_recorder import records
 from nodes.mcap_recorder.disk import RecordingError
 from nodes.mcap_recorder.mcap_file import Compression, McapWriter, contents, read
 from nodes.mcap_recorder.recover import recover_file
@@ -134,6 +134,7 @@ def test_a_damaged_first_chunk_takes_its_topics_along(tmp_path: Path) -> None:
     writer.end_chunk()
     data = bytearray(path.read_bytes())
     data[data.index(b"half")] ^= 0xFF
+    writer._file.close()  # as a kill does
     path.write_bytes(data)
     trouble: list[str] = []
     assert [r.topic for r in read(path, damaged=trouble.append)] == ["/other"]
@@ -161,6 +162,26 @@ def test_a_full_disk_is_told_and_what_was_written_is_valid(tmp_path: Path) -> No
     writer.abandon()
     with path.open("rb") as found:
         assert [m.sequence for _, _, m in make_reader(found).iter_messages()] == [0, 0, 1, 1]
+
+
+def test_a_disk_with_no_room_for_the_index_leaves_all_messages(tmp_path: Path) -> None:
+    """Closing fails, and what is abandoned then is valid nevertheless."""
+    path = tmp_path / "a.mcap"
+    unclosed = write(tmp_path / "b.mcap", close=False).size
+
+    def open_file(path: Path) -> IO[bytes]:
+        file = FullDisk(path, "w")
+        file.room = unclosed + 100
+        return file
+
+    writer = McapWriter(path, open_file=open_file)
+    fill(writer)
+    with pytest.raises(RecordingError, match=r"a\.mcap cannot be written: No space"):
+        writer.close()
+    writer.abandon()
+    trouble: list[str] = []
+    assert len(list(read(path, damaged=trouble.append))) == 2 * CHUNKS
+    assert trouble == []
 
 
 def test_an_abandoned_file_is_valid_without_an_index(tmp_path: Path) -> None:
@@ -212,7 +233,7 @@ def test_without_mcap_the_error_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For writing as for reading."""
-    monkeypatch.setattr(mcap_file, "_MISSING", ImportError("mcap"))
+    monkeypatch.setattr(records, "_MISSING", ImportError("mcap"))
     for ask in (McapWriter, contents, recover_file):
         with pytest.raises(MissingDependencyError, match=r"visnav-runtime\[record\]"):
             ask(tmp_path / "a.mcap")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from nodes.mcap_recorder.process import Process
 from nodes.mcap_recorder.recording import Recording
 from nodes.replay.recorded import Recorded
 from runtime import Tick, every
-from runtime.errors import FatalError
+from runtime.errors import FatalError, NodeError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from runtime.wire import pack
 from tests.nodes.mcap_recorder.samples import announcements, imu, said, same
@@ -72,6 +74,44 @@ def test_a_full_disk_ends_the_run_in_order(tmp_path: Path) -> None:
     (tmp_path / "recording.mcap").symlink_to("/dev/full")
     with pytest.raises(FatalError, match=r"recording\.mcap cannot be written: No space left"):
         record([imu(0)], tmp_path)
+
+
+def test_a_disk_that_is_full_at_the_very_end_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the run itself is over when the last chunk is written."""
+    start = Recording.start
+
+    def limited(recording: Recording) -> None:
+        resource.prlimit(recording._child.pid, resource.RLIMIT_FSIZE, (500, 500))
+        start(recording)
+
+    monkeypatch.setattr(Recording, "start", limited)
+    with pytest.raises(NodeError, match=r"recording\.mcap cannot be written: File too large"):
+        record([*announcements(), *said(0)], tmp_path, chunk_size=1 << 30)
+
+
+def test_a_disk_that_is_slow_at_the_end_has_its_time_after_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What the run's end has no time for is written nevertheless."""
+
+    def close(_: Recording, end: int, patience: float) -> bool:
+        assert 0 < patience < 10
+        return False
+
+    monkeypatch.setattr(Recording, "close", close)
+    asked = list[tuple[McapRecorder, Callable[[Path], Any]]]()
+    monkeypatch.setattr(McapRecorder, "after_run", lambda *of: asked.append(of))
+    record([imu(0)], tmp_path)
+    assert "are yet to be written" in caplog.text
+    path = tmp_path / "recording.mcap"
+    assert not contents(path).complete
+    monkeypatch.undo()
+    ((_, after),) = asked
+    after(tmp_path)
+    assert contents(path).complete
+    assert Recorded(path).end() == 3 * SECOND
 
 
 def test_what_a_failed_chunk_had_is_not_counted(
@@ -145,7 +185,8 @@ def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> 
     for stamp in range(2, 9):
         backlog.put(stamp, big(stamp))
     backlog.wait_for_room()
-    recording.close(9)
+    assert recording.close(9)
+    assert recording.unwritten <= 7  # what it had written is not among them
     assert "the process that writes it ended with -9" in str(failures)
     assert recording.unwritten >= 6
     trouble: list[str] = []

@@ -44,7 +44,7 @@ def recording(folder: Path, **settings: Any) -> Path:
         topics.write(event.stamp, pack(event).frame(), isinstance(event, Announcement))
         if event.stamp:
             writer.end_chunk()
-    writer.close()
+    writer.close({"visnav": {"end": str(events()[-1].stamp)}})
     return path
 
 

@@ -85,6 +85,12 @@ def test_a_loop_begins_again_and_time_goes_on(path: Path) -> None:
     assert result.reason == "duration"
 
 
+def test_a_loop_of_one_moment_is_an_error(path: Path) -> None:
+    """It would go round for ever, and time would stand."""
+    with pytest.raises(FatalError, match="loop: expected a recording that takes some time"):
+        replay(path, loop=True, start="60ms")
+
+
 def test_a_recording_that_does_not_say_its_end_lingers(tmp_path: Path) -> None:
     """For those who have something to say of the last picture."""
     result = replay(sets.euroc(tmp_path), linger="250ms")
@@ -170,6 +176,23 @@ def test_a_pause_makes_all_that_follows_later(path: Path) -> None:
     stamps = [(time, e.stamp) for time, e in Pausing.heard if isinstance(e, Imu)]
     assert stamps == [(0, 0), (30 * MS, 30 * MS), (160 * MS, 160 * MS)]
     assert len(Pausing.heard) == len(flight(sets.FRAMES)) - 2
+
+
+class SeekingInAPause(Pausing):
+    """Goes to the beginning while it pauses."""
+
+    async def resume(self) -> None:
+        self.drone.seek(0.0)
+        await self.clock.sleep(0.1)
+        assert self.drone.position == 0.0
+        self.drone.resume()
+
+
+def test_seeking_in_a_pause_is_where_it_goes_on(path: Path) -> None:
+    """Not before it is over."""
+    replay(path, SeekingInAPause)
+    times = [time for time, e in SeekingInAPause.heard if isinstance(e, Imu)]
+    assert times == [0, 30 * MS, 130 * MS, 160 * MS, 190 * MS]
 
 
 def test_a_pause_can_be_set_from_outside(path: Path) -> None:

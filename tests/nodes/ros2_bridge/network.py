@@ -87,10 +87,10 @@ def bridged_run(
         run.communicate()
 
 
-def client(port: int, seconds: float = 30.0) -> Any:
-    """Run the client that nobody here wrote, and return what it saw."""
+def client(port: int, topics: int, seconds: float = 30.0) -> Any:
+    """Run the client that nobody here wrote, and return what it saw of so many topics."""
     ended = subprocess.run(
-        [sys.executable, "-m", "tests.nodes.ros2_bridge.sdk_client", str(port), str(seconds)],
+        [sys.executable, "-m", f"{__package__}.sdk_client", str(port), str(seconds), str(topics)],
         capture_output=True,
         text=True,
         timeout=seconds + 20.0,

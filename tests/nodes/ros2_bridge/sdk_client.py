@@ -1,10 +1,11 @@
 """The other side of the tests: zenoh-ros2-sdk, a client that nobody here wrote, in its process.
 
-    python sdk_client.py PORT SECONDS
+    python sdk_client.py PORT SECONDS TOPICS
 
-Lists topics, subscribes to each and decodes it, publishes a pose and a twist until it has heard
-all, and prints what it saw as JSON. It gets the definitions of messages from rosbags, since it
-would otherwise fetch them from the network; the types' hashes it takes from what is on offer.
+Waits for so many topics, subscribes to each and decodes it, publishes a pose and a twist until it
+has heard all, and prints what it saw as JSON. It gets the definitions of messages from rosbags,
+since it would otherwise fetch them from the network; the types' hashes it takes from what is on
+offer.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def main() -> None:
     where: dict[str, Any] = {"router_ip": "127.0.0.1", "router_port": port, "domain_id": 0}
     session = sessions.ZenohSession.get_instance("127.0.0.1", port)
     topics: dict[str, list[str]] = {}
-    while "/clock" not in topics and time.monotonic() < end:
+    while len(topics) < int(sys.argv[3]) and time.monotonic() < end:
         topics = dict(discovery.get_topic_names_and_types(**where))
     nodes = {
         str(reply.ok.key_expr)

@@ -54,7 +54,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, str]:
     """Return what the client saw, what the run heard of it, and the run's log."""
     folder = tmp_path_factory.mktemp("run")
     with bridged_run(folder) as (run, port):
-        found = client(port)
+        found = client(port, len(TOPICS))
         try:
             output, _ = run.communicate(timeout=30)
         except subprocess.TimeoutExpired:

@@ -177,6 +177,49 @@ def test_a_calibration_becomes_an_announcement() -> None:
     assert (found.source, found.images, found.frame_id) == ("ros/eye", ("rgb",), "eye")
 
 
+def part(width: int, height: int) -> Any:
+    names = {"width": width, "height": height, "x_offset": 0, "y_offset": 0, "do_rectify": False}
+    return make("sensor_msgs/msg/RegionOfInterest", **names)
+
+
+def test_a_calibration_may_name_the_whole_picture() -> None:
+    data = Messages(said.store(), FrameNames()).camera_info((0, 0), said.camera().info, "eye")
+    message = said.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
+    message.roi, message.binning_x, message.binning_y = part(64, 48), 1, 1
+    assert camera_announcement(message, "eye", ("rgb",)).info == said.camera().info
+
+
+@pytest.mark.parametrize("frame", ["eye_optical", "eye_imu_optical_frame"])
+def test_optical_axes_stay_as_they_are(frame: str) -> None:
+    """Of a camera's own IMU, and of an odometry whose body is the camera."""
+    data = Messages(said.store(), FrameNames()).odometry((3, 7), said.odometry())
+    message: Any = said.store().deserialize(bytes(data), "nav_msgs/msg/Odometry")
+    message.child_frame_id = frame
+    q = message.pose.pose.orientation
+    q.w, q.x, q.y, q.z = S, -S, 0.0, 0.0  # looks north: x (right) is east, y is down
+    for use in ("odometry", "estimate"):
+        event: Any = read(message, use)
+        assert event.child_frame_id == frame
+        np.testing.assert_allclose(event.orientation, (0.5, 0.5, 0.5, 0.5), atol=1e-12)
+    twist = message.twist.twist
+    event = read(message, "odometry")
+    assert event.linear_velocity == (twist.linear.x, twist.linear.y, twist.linear.z)
+    assert event.angular_velocity == (twist.angular.x, twist.angular.y, twist.angular.z)
+    measured = make(
+        "sensor_msgs/msg/Imu",
+        header=make_header(said.store(), (3, 7), frame),
+        orientation=q,
+        orientation_covariance=np.zeros(9),
+        angular_velocity=vector(1.0, 2.0, 3.0),
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=vector(0.0, -9.8, 0.0),
+        linear_acceleration_covariance=np.zeros(9),
+    )
+    event = read(measured, "imu")
+    assert event.angular_velocity == (1.0, 2.0, 3.0)
+    assert event.linear_acceleration == (0.0, -9.8, 0.0)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -184,6 +227,11 @@ def test_a_calibration_becomes_an_announcement() -> None:
         {"k": np.zeros(9)},
         {"k": np.full(9, np.nan)},
         {"distortion_model": "equidistant", "d": np.ones(4)},
+        {"d": np.array([0.1, np.nan, 0.0, 0.0, 0.0])},
+        {"d": np.array([0.1, np.inf, 0.0, 0.0, 0.0])},
+        {"binning_x": 2, "binning_y": 2},
+        {"roi": part(32, 48)},
+        {"roi": part(64, 24)},
     ],
 )
 def test_a_calibration_that_is_none_is_refused(wrong: dict[str, Any]) -> None:

@@ -26,6 +26,7 @@ from events import (
 from nodes.ros2_bridge.keys import Topic, data_key
 from nodes.ros2_bridge.messages import Messages
 from nodes.ros2_bridge.node import Ros2Bridge
+from nodes.ros2_bridge.pictures import ImageWriter, read_image
 from nodes.ros2_bridge.plan import FrameNames
 from nodes.ros2_bridge.typestore import TypeStore
 from runtime.errors import ConfigError, FatalError, MissingDependencyError
@@ -33,9 +34,11 @@ from runtime.testing import run_node
 from tests.nodes.ros2_bridge import said
 from tests.nodes.ros2_bridge.mappings import Battery
 from tests.nodes.ros2_bridge.network import free_port, zenoh_session
+from tests.nodes.ros2_bridge.taken import TakingSession
 
 ANNOUNCED = [said.vehicle(), said.camera(), said.imu(), said.estimator()]
 POSE = "geometry_msgs/msg/PoseStamped"
+TWIST = {"topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "as": "velocity"}
 
 
 class Listener:
@@ -67,32 +70,6 @@ def listener() -> Iterator[Listener]:
         yield Listener(session, locator)
 
 
-def frames(count: int) -> list[Image]:
-    return [said.image(10_000_000 * (i + 1)) for i in range(count)]
-
-
-@pytest.mark.slow  # on a busy machine Zenoh drops for a reader that is slow
-def test_in_lockstep_every_picture_is_published_in_order(listener: Listener) -> None:
-    pictures = frames(20)
-    odometry = said.odometry(300_000_000)
-    run_node(
-        Ros2Bridge, inputs=[*ANNOUNCED, *pictures, odometry], config=listener.config, duration=0.4
-    )
-    found = listener.collect("0/drone/odom/")
-    (key,) = [each for each in found if each.startswith("0/drone/camera/image_raw/")]
-    messages: list[Any] = [
-        said.store().deserialize(sample.payload.to_bytes(), "sensor_msgs/msg/Image")
-        for sample in found[key]
-    ]
-    stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in messages]
-    assert stamps == [each.stamp for each in pictures]
-    assert messages[0].data.tobytes() == pictures[0].data.tobytes()
-    (info,) = [each for each in found if each.startswith("0/drone/camera/camera_info/")]
-    assert len(found[info]) == 20
-    (clock,) = [each for each in found if each.startswith("0/clock/")]
-    assert len(found[clock]) >= 29
-
-
 def test_a_bridge_of_zenoh_s_for_dds_gets_its_own_keys_and_no_attachment(
     listener: Listener,
 ) -> None:
@@ -112,7 +89,7 @@ def test_only_what_is_asked_for_is_published_under_the_name_that_is_asked_for(
         "compressed": "jpeg",
         "topics": {"drone/odom": "/truth"},
     }
-    inputs = [*ANNOUNCED, *frames(1), said.odometry(20_000_000)]
+    inputs = [*ANNOUNCED, said.image(10_000_000), said.odometry(20_000_000)]
     run_node(Ros2Bridge, inputs=inputs, config=config, duration=0.1)
     found = listener.collect("0/truth/")
     topics = {"/".join(key.split("/")[1:-2]) for key in found}
@@ -187,7 +164,10 @@ def test_subscriptions_in_lockstep_are_warned_of_and_announced(
     assert any("lockstep" in record.getMessage() for record in caplog.records)
 
 
-def test_a_camera_of_ros_is_waited_for_and_announced(listener: Listener) -> None:
+def test_a_camera_of_ros_is_waited_for_and_announced(
+    listener: Listener, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever else comes on its topic first."""
     type_ = "sensor_msgs/msg/CameraInfo"
     topic = Topic(name="/eye/camera_info", type=type_, hash=said.store().hash(type_))
     info = said.camera().info
@@ -196,14 +176,16 @@ def test_a_camera_of_ros_is_waited_for_and_announced(listener: Listener) -> None
 
     def publish() -> None:
         while not done.wait(0.02):
-            listener.session.put(data_key(0, topic), bytes(data))
+            for each in (b"", b"garbage", bytes(200_000), bytes(data)):
+                listener.session.put(data_key(0, topic), each)
 
     common = {"source": "eye"}
     config = listener.config | {
+        "largest": 100_000,
         "subscriptions": [
             {"topic": "/eye/camera_info", "type": type_, "as": "camera"} | common,
             {"topic": "/eye/image", "type": "sensor_msgs/msg/Image", "as": "image"} | common,
-        ]
+        ],
     }
     thread = threading.Thread(target=publish)
     thread.start()
@@ -214,6 +196,33 @@ def test_a_camera_of_ros_is_waited_for_and_announced(listener: Listener) -> None
         thread.join()
     (camera,) = result.of(CameraAnnouncement)
     assert (camera.source, camera.images, camera.info) == ("eye", ("rgb",), info)
+    assert "/eye/camera_info: calibration refused: " in caplog.text
+
+
+def test_pictures_are_read_in_order_beside_the_loop(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Turning the colours of a large one takes longer than a controller can wait."""
+    caplog.set_level("INFO")
+    threads = []
+
+    def read(*given: Any) -> Image:
+        threads.append(threading.current_thread())
+        return read_image(*given)
+
+    writer = ImageWriter(said.store(), "eye", "bgr8")
+    pixels = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
+    pictures = [bytes(writer.write((0, n), pixels)) for n in range(1, 6)]
+    session = TakingSession([*pictures, b"nonsense"])
+    monkeypatch.setattr("nodes.ros2_bridge.node.Session", lambda *_, **__: session)
+    monkeypatch.setattr("nodes.ros2_bridge.incoming.read_image", read)
+    table = {"topic": "/eye", "type": "sensor_msgs/msg/Image", "as": "image"}
+    found = run_node(Ros2Bridge, config={"subscriptions": [table]}, duration=0.1).of(Image)
+    assert [each.stamp for each in found] == [1, 2, 3, 4, 5]
+    np.testing.assert_array_equal(found[0].data, pixels[..., ::-1])
+    assert len(threads) == 5
+    assert threading.current_thread() not in threads
+    assert "5 heard, 1 refused or dropped" in caplog.text
 
 
 def test_a_camera_that_never_comes_ends_the_run() -> None:
@@ -248,9 +257,18 @@ def test_what_cannot_work_ends_the_run_with_a_reason(config: dict[str, Any], mes
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"namespace": "fleet"}, "leading slash"),
-        ({"node_name": "a/b"}, "no slash"),
-        ({"topics": {"a": "1b"}}, "expected a topic"),
+        ({"namespace": "fleet"}, "namespace: expected a leading slash"),
+        ({"namespace": "/1a"}, "namespace: expected a topic"),
+        ({"node_name": "a/b"}, "node_name: expected no slash"),
+        ({"node_name": ""}, "node_name: expected a topic"),
+        ({"topics": {"a": "1b"}}, 'topics: "a": expected a topic'),
+        ({"definitions": {"a/B": "f"}}, "definitions: expected a type"),
+        ({"path_length": 10**10}, "path_length"),
+        (
+            {"subscriptions": [TWIST | {"frame_id": "odom"}]},
+            'frame_id: expected "map" or "heading" for a velocity, found \'odom\'',
+        ),
+        ({"subscriptions": [TWIST | {"wait": float("inf")}]}, r"subscriptions\[0\].wait"),
         ({"domain_id": 300}, "domain_id"),
         ({"publish": ["smell"]}, "publish"),
         ({"subscriptions": [{"topic": "a", "type": POSE, "as": "velocity"}]}, "found velocity"),

@@ -80,6 +80,14 @@ def test_a_cloud_has_the_bytes_that_rosbags_makes(count: int) -> None:
     np.testing.assert_array_equal(packed & 255, colours[:, 2])
 
 
+def test_a_cloud_with_points_that_are_nowhere_is_not_dense() -> None:
+    points = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]], np.float32)
+    for fields in ("xyz", "xyzrgb"):
+        data = CloudWriter(said.store(), "map", fields).write((1, 2), points)
+        message: Any = said.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
+        assert not message.is_dense
+
+
 def test_a_sweep_has_no_colours() -> None:
     points = RANDOM.random((5, 3), np.float32)
     data = CloudWriter(said.store(), "lidar", "xyz").write((1, 2), points)
@@ -113,7 +121,14 @@ def parsed(encoding: str, data: np.ndarray) -> Any:
 
 def test_images_come_back_as_they_went() -> None:
     data = RANDOM.integers(0, 256, (4, 6, 3), np.uint8)
-    for encoding, pixels in (("rgb8", data), ("bgr8", data[..., ::-1])):
+    full = np.full((4, 6, 1), 255, np.uint8)
+    for encoding, pixels in (
+        ("rgb8", data),
+        ("bgr8", data[..., ::-1]),
+        ("8UC3", data[..., ::-1]),
+        ("rgba8", np.concatenate([data, full], axis=2)),
+        ("bgra8", np.concatenate([data[..., ::-1], full], axis=2)),
+    ):
         event = read_image(parsed(encoding, pixels), "s", 1, "f")
         np.testing.assert_array_equal(event.data, data)
         assert (event.encoding, event.stamp, event.frame_id) == ("rgb8", 1, "f")
@@ -127,6 +142,10 @@ def test_rows_may_be_filled_up() -> None:
     message.width = 5
     event = read_image(message, "s", 1, "f")
     np.testing.assert_array_equal(event.data, np.arange(24).reshape(3, 8)[:, :5])
+    message = parsed("bgr8", np.arange(36, dtype=np.uint8).reshape(3, 4, 3))
+    message.width = 3
+    event = read_image(message, "s", 1, "f")
+    np.testing.assert_array_equal(event.data, np.arange(36).reshape(3, 4, 3)[:, :3, ::-1])
 
 
 def test_depth_comes_in_metres_and_what_is_unknown_is_infinite() -> None:

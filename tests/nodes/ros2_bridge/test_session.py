@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from nodes.ros2_bridge.attachment import unpack
 from nodes.ros2_bridge.gid import gid
 from nodes.ros2_bridge.keys import NodeName, Qos, Topic, data_key, endpoint_token, node_token
-from nodes.ros2_bridge.session import Session, SessionError
+from nodes.ros2_bridge.session import Session, SessionError, _configuration
 from tests.nodes.ros2_bridge.network import free_port, zenoh_session
 
 TOPIC = Topic(name="/a/b", type="std_msgs/msg/Empty", hash="RIHS01_0", qos=Qos(depth=3))
@@ -70,5 +71,69 @@ def test_a_configuration_file_says_where_to_listen(tmp_path: Path) -> None:
 def test_a_broken_configuration_file_is_told_of(tmp_path: Path) -> None:
     file = tmp_path / "zenoh.json5"
     file.write_text("{ mode: ")
-    with pytest.raises(SessionError, match="expected a Zenoh session, found"):
+    with pytest.raises(SessionError, match=r"zenoh\.json5: expected a Zenoh configuration, found"):
         Session(NODE, file=str(file))
+    file.write_text("{\n mod: 1 }")
+    with pytest.raises(SessionError, match=r"unknown field `mod`.* \(line 2, column 2\)$"):
+        Session(NODE, file=str(file))
+
+
+@pytest.mark.parametrize("way", ["connect", "listen"])
+def test_an_endpoint_that_is_none_is_named_with_its_setting(way: str) -> None:
+    endpoints: dict[str, Any] = {"connect": (), way: ("tcp:localhost:7447",)}
+    with pytest.raises(SessionError, match=f"^{way}: expected endpoints such as") as caught:
+        Session(NODE, **endpoints)
+    assert ".rs" not in str(caught.value)
+    assert "tcp:localhost:7447" in str(caught.value)
+
+
+def test_what_a_file_leaves_out_is_as_without_it(tmp_path: Path) -> None:
+    """Or else a file about TLS would have Zenoh listen to all the world, and multicast."""
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{ transport: { link: { tls: { verify_name_on_connect: true } } } }")
+    names = [
+        *("mode", "listen/endpoints", "connect/endpoints", "scouting/multicast/enabled"),
+        *("timestamping/enabled", "connect/exit_on_failure"),
+    ]
+    with_file, without = _configuration(None, None, str(file)), _configuration(None, None, "")
+    assert [with_file.get_json(each) for each in names] == [
+        without.get_json(each) for each in names
+    ]
+    assert without.get_json("listen/endpoints") == '["tcp/localhost:0"]'
+    assert without.get_json("scouting/multicast/enabled") == "false"
+    file.write_text(
+        '{ mode: "client", listen: { endpoints: ["tls/[::]:1"] }, '
+        "scouting: { multicast: { enabled: true } }, timestamping: { enabled: false } }"
+    )
+    found = _configuration((), None, str(file))
+    assert [found.get_json(each) for each in names[:5]] == [
+        *('"client"', '["tls/[::]:1"]', "[]", "true"),
+        "true",  # or there would be no /tf_static
+    ]
+
+
+def test_what_was_said_before_is_heard_by_those_who_ask_for_it() -> None:
+    """As ROS's transient local: by a subscription that has it, and by one that waits."""
+    locator = f"tcp/127.0.0.1:{free_port()}"
+    qos = Qos(transient_local=True, depth=2)
+    kept = Topic(name="/kept", type="std_msgs/msg/Empty", hash="RIHS01_0", qos=qos)
+    speaking = Session(NODE, connect=(), listen=(locator,))
+    publisher = speaking.publisher(kept)
+    for message in (b"one", b"two", b"three"):
+        publisher.put(bytearray(message))
+    hearing = Session(NODE, connect=(locator,), listen=())
+    try:
+        heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        hearing.subscribe(kept, lambda _, data: heard.put(data()))
+        assert [heard.get(timeout=10) for _ in range(2)] == [b"two", b"three"]
+
+        def three(size: int, data: Callable[[], bytes]) -> bytes | None:
+            return data() if size == 5 else None
+
+        assert hearing.first(kept, 10.0, three) == b"three"
+        assert hearing.first(kept, 0.0, lambda _, __: None) is None
+        hearing.give_up()
+        assert hearing.first(TOPIC, 1e6, three) is None
+    finally:
+        hearing.close()
+        speaking.close()

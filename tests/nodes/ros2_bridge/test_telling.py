@@ -90,7 +90,7 @@ def test_what_a_mapping_does_wrong_is_counted_and_told(mapping: str, what: str) 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"type": "a/msg/B"}, "known message type"),
+        ({"type": "a/msg/B"}, "/fleet/battery: expected a known message type"),
         ({"event": f"{HERE}:Nothing"}, "battery: event: expected something that can be imported"),
         ({"event": f"{HERE}:tell_battery"}, "battery: event: expected a type of event"),
         ({"mapping": "no_such_module:f"}, "battery: mapping: expected something that can be impor"),

@@ -161,5 +161,6 @@ def test_no_frame_gets_two_parents() -> None:
     assert not tree.add_static(msgspec.structs.replace(mounting, child_frame_id="lidar"))
     children = [each.child for each in tree.static()]
     assert len(children) == len(set(children)) == 4
-    moving = msgspec.structs.replace(mounting, static=False, child_frame_id="base_link")
-    assert tree.moving(moving) == []
+    for taken in ("base_link", "odom", "lidar", "drone/camera_optical"):
+        moving = msgspec.structs.replace(mounting, static=False, child_frame_id=taken)
+        assert tree.moving(moving) == []
