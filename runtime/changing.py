@@ -52,7 +52,7 @@ class Changing:
         """
         lives = self._supervisor._lives
         node, config, values = change(
-            {name: life.node.config for name, life in lives.items() if life.node is not None}, text
+            {n: (life.node or life.spec).config for n, life in lives.items()}, text
         )
         if not values:
             return {}

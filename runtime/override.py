@@ -27,9 +27,12 @@ def override(table: dict[str, Any], change: str) -> None:
     if not equals or len(keys) < 2 or not all(keys):
         raise ConfigError(f"{where}: expected node.key=value or run.key=value")
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        found = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
-        value = text.strip()
+        found = {"value": text.strip()}
+    if len(found) > 1:
+        raise ConfigError(f"{where}: expected one setting, found more lines")
+    value = found["value"]
     nodes = _by_name(table.get("nodes"))
     if keys[0] in {"run", "network"}:
         target = table.setdefault(keys[0], {})

@@ -59,8 +59,9 @@ def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
         ConfigError: There is no such setting, it cannot change, or not to this value.
     """
     text = text.strip()
-    if text.partition("=")[0].strip().partition(".")[0] == "run":
-        raise ConfigError(f"{text}: expected node.key=value: what [run] says holds to its end")
+    first = text.partition("=")[0].strip().partition(".")[0]
+    if first in {"run", "network"}:
+        raise ConfigError(f"{text}: expected node.key=value: what [{first}] says holds to its end")
     before = {name: _table(config) for name, config in configs.items()}
     tables = [{"name": name} | copy.deepcopy(table) for name, table in before.items()]
     try:

@@ -133,7 +133,8 @@ class Probes:
                 self.on_task(name, task)
             for worker in life.workers:
                 self.on_worker(worker)
-        self._supervisor.connect()
+        if self._supervisor._running:  # before, nodes must not be able to send
+            self._supervisor.connect()
 
     def _request(self, process: _Process, message: Any) -> Future[Any]:
         answer = _Process.request(process, message)

@@ -6,6 +6,7 @@ Errors that the project raises on purpose become one line on standard error and 
 
 from __future__ import annotations
 
+import io
 import sys
 
 import typer
@@ -56,6 +57,9 @@ app.command(  # the arguments, --help among them, are the benchmarks' own
 
 def main() -> None:
     """Run the command line; the process ends here."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal may lack an arrow
     try:
         app()
     except VisnavError as error:

@@ -59,7 +59,10 @@ def run(
         bool, typer.Option("--top", help="Show the monitor's screen instead of a progress bar.")
     ] = False,
     web: Annotated[
-        int | None, typer.Option(metavar="PORT", help="Show the monitor as a page, on this port.")
+        int | None,
+        typer.Option(
+            min=0, max=65535, metavar="PORT", help="Show the monitor as a page, on this port."
+        ),
     ] = None,
 ) -> None:
     """Run the nodes of a file until they, its duration or Ctrl-C end the run.

@@ -25,7 +25,28 @@ def top(
 
     from runtime.monitor.address import find
 
+    _check_terminal()
     asyncio.run(_show(find(run), leave))
+
+
+def _check_terminal() -> None:
+    """Refuse what cannot show a screen.
+
+    Raises:
+        CommandError: It is no terminal, or has not the characters.
+    """
+    import codecs
+    import sys
+
+    from runtime.errors import CommandError
+
+    drawn_on = sys.__stderr__  # by Textual
+    if drawn_on is None or not (sys.stdin.isatty() and drawn_on.isatty()):
+        raise CommandError('expected a terminal, found none; "python -m runtime web" needs none')
+    if codecs.lookup(drawn_on.encoding).name != "utf-8":
+        raise CommandError(
+            f"expected a terminal in UTF-8, found {drawn_on.encoding}: set LC_ALL=C.UTF-8 if it is"
+        )
 
 
 async def _show(path: Path, leave: bool) -> None:

@@ -31,7 +31,7 @@ def trace(
 
     found = read_trace(file)
     console = Console()
-    for table in tables(found):
+    for table in tables(found, console.encoding):
         console.print(table)
     clock = found.about.get("clock", "?")
     console.print(
@@ -40,8 +40,8 @@ def trace(
     )
 
 
-def tables(found: Trace) -> Iterator[Table | Text]:
-    """Return the paths of a trace, and its nodes."""
+def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
+    """Return the paths of a trace, and its nodes, as a terminal of this encoding can show them."""
     from rich.table import Table
     from rich.text import Text
 
@@ -49,7 +49,7 @@ def tables(found: Trace) -> Iterator[Table | Text]:
 
     routes = paths(found)
     for number, route in enumerate(routes, 1):
-        yield Text(f"path {number}: {route.path}")
+        yield Text(f"path {number}: {_for(encoding, route.path)}")
     table = Table(
         "path", "times", "run p50 ms", "p99", "max", "real p50 ms", "p99", "max",
         title="from sensor to set-point", title_justify="left",
@@ -71,14 +71,24 @@ def tables(found: Trace) -> Iterator[Table | Text]:
     )  # fmt: skip
     for share in shares(found):
         table.add_row(
-            share.node,
+            _for(encoding, share.node),
             f"{share.steps}",
             f"{share.busy_ms:.1f}",
             f"{share.share:.1%}",
             f"{share.longest_ms:.3f}",
-            share.longest,
+            _for(encoding, share.longest),
         )
     yield _right(table)
+
+
+def _for(encoding: str, text: str) -> str:
+    """Return a text in characters that an encoding has."""
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        text = text.replace("→", "->").replace("⇢", "~>")
+        return text.encode(encoding, "replace").decode(encoding)
+    return text
 
 
 def _right(table: Table) -> Table:

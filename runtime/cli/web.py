@@ -16,7 +16,9 @@ DEFAULT_PORT = 8420
 
 def web(
     run: Run = None,
-    port: Annotated[int, typer.Option(help="On this machine; 0 for any.")] = DEFAULT_PORT,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="On this machine; 0 for any.")
+    ] = DEFAULT_PORT,
     token: Annotated[
         str | None, typer.Option(help="What the address must hold; made up if not given.")
     ] = None,

@@ -33,6 +33,7 @@ class Client:
         self._writer = writer
         self._numbers = itertools.count()
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        self._over = False
 
     @classmethod
     async def connect(cls, path: Path) -> Client:
@@ -48,26 +49,39 @@ class Client:
         return cls(reader, writer)
 
     async def snapshots(self) -> AsyncIterator[Snapshot]:
-        """Yield snapshots until the run is over; answers come only while somebody iterates."""
+        """Yield snapshots until the run is over; answers come only while somebody iterates.
+
+        Raises:
+            CommandError: What comes is not to be understood.
+        """
         self._writer.write(encode(Watch()) + b"\n")
         try:
             async for line in self._reader:
                 message = decode_from_run(line)
                 if isinstance(message, Snapshot):
                     yield message
-                elif message.number in self._waiting:
-                    self._waiting.pop(message.number).set_result(message)
+                else:
+                    self._settle(message)
         except OSError:
             pass
+        except UNREADABLE as error:
+            raise CommandError(f"expected a run of this version: {error}") from None
         finally:
-            for number, waiting in self._waiting.items():
-                waiting.set_result(Answer(number=number, done=False, text="the run is over"))
-            self._waiting.clear()
+            self._over = True
+            for number in list(self._waiting):
+                self._settle(_gone(number))
             self.close()
+
+    def _settle(self, answer: Answer) -> None:
+        waiting = self._waiting.pop(answer.number, None)
+        if waiting is not None and not waiting.done():  # else nobody waits any more
+            waiting.set_result(answer)
 
     async def ask(self, command: Command) -> Answer:
         """Ask the run to do something, and return what came of it."""
         number = next(self._numbers)
+        if self._over:
+            return _gone(number)
         waiting: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._waiting[number] = waiting
         self._writer.write(encode(Asked(number=number, command=command)) + b"\n")
@@ -75,6 +89,7 @@ class Client:
             async with asyncio.timeout(PATIENCE):
                 return await waiting
         except TimeoutError:
+            self._waiting.pop(number, None)
             return Answer(number=number, done=False, text="the run does not answer")
 
     def close(self) -> None:
@@ -103,6 +118,10 @@ def ask(path: Path, command: Command) -> str:
     if not answer.done:
         raise CommandError(answer.text)
     return answer.text
+
+
+def _gone(number: int) -> Answer:
+    return Answer(number=number, done=False, text="the run is over")
 
 
 def _nobody(path: Path, error: Exception) -> CommandError:

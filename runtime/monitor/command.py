@@ -8,6 +8,9 @@ import msgspec
 
 from runtime.monitor.snapshot import Snapshot
 
+SLOWEST, QUICKEST = 1e-3, 1e6
+"""Speeds that can be asked for."""
+
 
 class _Asked(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", forbid_unknown_fields=True):
     """Base of the commands."""
@@ -30,7 +33,7 @@ class Step(_Asked, frozen=True, tag="step"):
 class Speed(_Asked, frozen=True, tag="speed"):
     """Let it run at so many simulated seconds per real second; without a number, its fastest."""
 
-    factor: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
+    factor: Annotated[float, msgspec.Meta(ge=SLOWEST, le=QUICKEST)] | None = None
 
 
 class Restart(_Asked, frozen=True, tag="restart"):
@@ -88,5 +91,8 @@ decode_command = msgspec.json.Decoder(Command).decode
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
 """What decoding raises: no JSON, no text, something else, or nested too deeply."""
 
+LONGEST_COMMAND = 256 << 10
+"""Bytes of a line to a run at most."""
+
 LONGEST_LINE = 16 << 20
-"""Bytes of a line at most; a snapshot of a hundred nodes has some tens of thousands."""
+"""Bytes of a line from a run at most; a snapshot of a hundred nodes has some tens of thousands."""

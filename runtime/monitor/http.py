@@ -63,7 +63,10 @@ async def read_request(reader: asyncio.StreamReader) -> Request:
     parts = first.split(" ")
     if len(parts) != 3 or not parts[2].startswith("HTTP/1."):
         raise HttpError(400, "expected a request of HTTP/1.1")
-    url = urlsplit(parts[1])
+    try:
+        url = urlsplit(parts[1])
+    except ValueError as error:
+        raise HttpError(400, f"expected an address: {error}") from None
     query = {key: values[0] for key, values in parse_qs(url.query).items()}
     headers = {}
     for line in lines:
@@ -73,7 +76,7 @@ async def read_request(reader: asyncio.StreamReader) -> Request:
     length = headers.get("content-length", "0")
     if not length.isascii() or not length.isdigit():
         raise HttpError(400, "expected a length")
-    if int(length) > LONGEST_BODY:
+    if len(length) > 9 or int(length) > LONGEST_BODY:
         raise HttpError(413, f"expected at most {LONGEST_BODY} bytes")
     return Request(parts[0], url.path, query, headers, await reader.readexactly(int(length)))
 

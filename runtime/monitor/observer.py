@@ -47,7 +47,7 @@ class Observer:
         self._supervisor = supervisor
         self._config = config
         self._records = records
-        self._keeper = Timekeeper(supervisor.clock)
+        self._keeper = Timekeeper(supervisor.clock, over=lambda: bool(supervisor.reason))
         self._meter: Meter | None = None
         self._window = Window(self._sample())
         self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}

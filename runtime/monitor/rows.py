@@ -56,6 +56,11 @@ def pace(clock: ClockState) -> str:
     return f"{speed} ({'as fast as it can' if clock.asked is None else f'asked: {clock.asked:g}'})"
 
 
+def aim(clock: ClockState) -> float:
+    """Return the speed that faster and slower start from: what was asked for, or what there is."""
+    return clock.asked if clock.asked is not None else max(round(clock.speed, 1), 1.0)
+
+
 def _nodes(snapshot: Snapshot) -> Rows:
     return [
         (

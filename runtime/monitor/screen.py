@@ -9,10 +9,13 @@ import time
 from collections.abc import AsyncIterator
 from typing import Any, ClassVar, Protocol
 
+import msgspec
 from rich.text import Text
 
-from runtime.errors import MissingDependencyError
+from runtime.errors import MissingDependencyError, VisnavError
 from runtime.monitor.command import (
+    QUICKEST,
+    SLOWEST,
     Answer,
     Command,
     Pause,
@@ -23,7 +26,7 @@ from runtime.monitor.command import (
     Step,
     Stop,
 )
-from runtime.monitor.rows import COLUMNS, LEFT, RIGHT, headline, is_number, rows
+from runtime.monitor.rows import COLUMNS, LEFT, RIGHT, aim, headline, is_number, rows
 from runtime.monitor.snapshot import LogLine, Snapshot
 
 try:
@@ -123,10 +126,14 @@ class Screen(App[str]):
         self.run_worker(self._listen(), exclusive=True)
 
     async def _listen(self) -> None:
-        async for snapshot in self._connection.snapshots():
-            self.show(snapshot)
+        reason = ""
+        try:
+            async for snapshot in self._connection.snapshots():
+                self.show(snapshot)
+                reason = snapshot.ended
+        except VisnavError as error:
+            reason = str(error)
         head = self.query_one("#head", Static)
-        reason = self.snapshot.ended if self.snapshot else ""
         head.update(Text(f"the run is over: {reason or 'it does not answer any more'}"))
         if self._leave:
             self.exit()
@@ -162,45 +169,58 @@ class Screen(App[str]):
 
     # Keys.
 
-    async def _ask(self, command: Command) -> None:
+    def _ask(self, command: Command) -> None:
+        """Ask the run; keys work on while it has not answered."""
+        self.run_worker(self._tell(command))
+
+    async def _tell(self, command: Command) -> None:
         answer = await self._connection.ask(command)
         severity = "information" if answer.done else "error"
         self.notify(answer.text, severity=severity, markup=False)  # type: ignore[arg-type]
 
-    async def action_pause(self) -> None:
+    def action_pause(self) -> None:
         """Let time stand, or run again."""
-        paused = self.snapshot is not None and self.snapshot.clock.paused
-        await self._ask(Resume() if paused else Pause())
+        if self.snapshot is not None:
+            paused = self.snapshot.clock.paused
+            self._ask(Resume() if paused else Pause())
+            self._expect(paused=not paused)
 
-    async def action_step(self) -> None:
+    def action_step(self) -> None:
         """Let the next thing happen."""
-        await self._ask(Step())
+        self._ask(Step())
 
-    async def action_step_far(self) -> None:
+    def action_step_far(self) -> None:
         """Let a second go by."""
-        await self._ask(Step(seconds=1.0))
+        self._ask(Step(seconds=1.0))
 
-    async def action_speed(self, factor: float) -> None:
+    def action_speed(self, factor: float) -> None:
         """Let time run faster, or slower."""
         if self.snapshot is not None:
-            clock = self.snapshot.clock
-            now = clock.asked if clock.asked is not None else max(round(clock.speed, 1), 1.0)
-            await self._ask(Speed(factor=now * factor))
+            asked = min(max(aim(self.snapshot.clock) * factor, SLOWEST), QUICKEST)
+            self._ask(Speed(factor=asked))
+            self._expect(asked=asked)
 
-    async def action_fastest(self) -> None:
+    def action_fastest(self) -> None:
         """Let time run as fast as it can."""
-        await self._ask(Speed(factor=None))
+        self._ask(Speed(factor=None))
+        self._expect(asked=None)
 
-    async def action_restart(self) -> None:
+    def _expect(self, **changes: Any) -> None:
+        """Go by what was asked until the next snapshot, as the next key may come before it."""
+        if self.snapshot is not None and not self.snapshot.clock.fixed:
+            clock = msgspec.structs.replace(self.snapshot.clock, **changes)
+            self.snapshot = msgspec.structs.replace(self.snapshot, clock=clock)
+
+    def action_restart(self) -> None:
         """Start the node under the cursor anew."""
         if (node := self._chosen()) is not None:
-            await self._ask(Restart(node=node))
+            self._ask(Restart(node=node))
 
-    async def action_stop(self) -> None:
+    def action_stop(self) -> None:
         """End the run, if the key is pressed twice."""
         now = time.monotonic()
         if now - self._stop_asked < CONFIRM:
-            await self._ask(Stop())
+            self._ask(Stop())
         else:
             self.notify("press it again to end the run", severity="warning")
         self._stop_asked = now
@@ -228,11 +248,11 @@ class Screen(App[str]):
         self.query_one("#prompt").remove_class("asking")
         self.query_one("#nodes").focus()
 
-    async def on_input_submitted(self, event: Input.Submitted) -> None:
+    def on_input_submitted(self, event: Input.Submitted) -> None:
         """Set what was asked for."""
         self.action_leave_prompt()
         if event.value.strip():
-            await self._ask(Set(text=event.value))
+            self._ask(Set(text=event.value))
 
     def _chosen(self) -> str | None:
         """Return the node under the cursor."""

@@ -11,6 +11,7 @@ import asyncio
 import concurrent.futures
 import contextlib
 import logging
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import TypeVar
 from runtime.errors import CommandError, VisnavError
 from runtime.monitor.address import socket_of
 from runtime.monitor.command import (
-    LONGEST_LINE,
+    LONGEST_COMMAND,
     UNREADABLE,
     Answer,
     Asked,
@@ -36,6 +37,12 @@ log = logging.getLogger("visnav.runtime")
 
 PERIOD = 0.2
 """Real seconds between two snapshots."""
+
+PARTING = 1.0
+"""Real seconds within which those who watch must take the last snapshot."""
+
+BEHIND = 1 << 20
+"""Bytes that may wait for one who watches; whoever is slower than that misses snapshots."""
 
 
 class Server:
@@ -86,38 +93,62 @@ class Server:
 
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
-        server = await asyncio.start_unix_server(self._accept, self._path, limit=LONGEST_LINE)
-        self._path.chmod(0o600)
+        listener = self._listener()
+        server = await asyncio.start_unix_server(self._accept, sock=listener, limit=LONGEST_COMMAND)
         self._ready.set()
         publishing = asyncio.create_task(self._publish())
         await self._end.wait()
         publishing.cancel()
         server.close()
-        for writer in list(self._watching):  # some may leave meanwhile
+        for _ in range(5):  # whoever was just let in becomes one of the clients
+            await asyncio.sleep(0)
+        for writer in self._watching:
             writer.write(self._last)
-            with contextlib.suppress(OSError, TimeoutError):
-                await asyncio.wait_for(writer.drain(), 1.0)
-        for writer in self._clients.values():
-            writer.close()  # what was written still goes out; the tasks then read an end
-        if self._clients:
-            await asyncio.wait(list(self._clients), timeout=1.0)
+        writers = list(self._clients.values())
+        for task in self._clients:
+            task.cancel()
+        closing = asyncio.gather(*(w.wait_closed() for w in writers), return_exceptions=True)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(closing, PARTING)  # what was written still goes out
+        for writer in writers:
+            writer.transport.abort()
+        await asyncio.sleep(0)  # they let go of their sockets
         with contextlib.suppress(OSError):
             self._path.unlink()
 
+    def _listener(self) -> socket.socket:
+        """Return a socket that listens; until it does, it has not the name by which it is found.
+
+        Others would take it for one that a killed run has left, and remove it.
+        """
+        listener = socket.socket(socket.AF_UNIX)
+        new = self._path.with_suffix(".new")
+        new.unlink(missing_ok=True)
+        listener.bind(str(new))
+        new.chmod(0o600)
+        listener.listen(100)
+        new.rename(self._path)
+        return listener
+
     async def _publish(self) -> None:
-        """Send snapshots to those who watch."""
+        """Measure and send snapshots while there is somebody who watches."""
+        measuring = failed = False
         while True:
             await asyncio.sleep(PERIOD)
-            if not self._watching:
-                continue
             try:
-                line = encode(await self._on_run_loop(self._observer.take)) + b"\n"
+                if measuring != bool(self._watching):
+                    measuring = not measuring
+                    change = self._observer.begin if measuring else self._observer.end
+                    await self._on_run_loop(change)
+                elif measuring:
+                    line = encode(await self._on_run_loop(self._observer.take)) + b"\n"
+                    for writer in self._watching:
+                        if writer.transport.get_write_buffer_size() < BEHIND:
+                            writer.write(line)
             except Exception:
-                log.exception("the monitor failed")
-                continue
-            for writer in self._watching:
-                if writer.transport.get_write_buffer_size() < LONGEST_LINE:  # else it is too slow
-                    writer.write(line)
+                if not failed:
+                    log.exception("the monitor failed")
+                failed = True
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -126,14 +157,14 @@ class Server:
         try:
             async for line in reader:
                 await self._hear(line, writer)
+                await writer.drain()  # whoever reads no answers is asked for no more
         except (OSError, ValueError):  # gone, or a line without an end
+            pass
+        except asyncio.CancelledError:  # the run is over
             pass
         finally:
             del self._clients[task]
-            if writer in self._watching:
-                self._watching.remove(writer)
-                if not self._watching and not self._end.is_set():
-                    self._run_loop.call_soon_threadsafe(self._observer.end)
+            self._watching.discard(writer)
             writer.close()
 
     async def _hear(self, line: bytes, writer: asyncio.StreamWriter) -> None:
@@ -145,8 +176,6 @@ class Server:
             return
         match message:
             case Watch():
-                if not self._watching:
-                    await self._on_run_loop(self._observer.begin)
                 self._watching.add(writer)
             case Asked():
                 writer.write(encode(await self._answer(message)) + b"\n")
@@ -156,6 +185,10 @@ class Server:
             text = await self._on_run_loop(lambda: self._observer.do(asked.command))
         except VisnavError as error:
             return Answer(number=asked.number, done=False, text=str(error))
+        except Exception:
+            log.exception("the monitor failed")
+            text = "the run could not do it, and its log says why"
+            return Answer(number=asked.number, done=False, text=text)
         if not isinstance(asked.command, Set):  # which says so itself
             log.info("asked by hand: %s", told(asked.command))
         return Answer(number=asked.number, done=True, text=text)

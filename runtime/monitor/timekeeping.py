@@ -5,6 +5,8 @@ In real time none of this is possible: sensors and vehicles do not wait.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from runtime.clock import Clock
 from runtime.errors import CommandError
 from runtime.lockstep import LockstepClock, LockstepLoop
@@ -16,9 +18,11 @@ class Timekeeper:
 
     Args:
         clock: The run's clock.
+        over: Tells whether the run is ending, which takes time and cannot stand.
     """
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, over: Callable[[], bool] = lambda: False) -> None:
+        self._over = over
         self._loop = clock._loop if isinstance(clock, LockstepClock) else None
         self._limit = 0
         """The time (ns) beyond which nothing happens while this is the loop's gate."""
@@ -45,7 +49,7 @@ class Timekeeper:
 
     def may_go(self, key: tuple[int, int, int]) -> bool:
         """Tell whether to go on to what is due next; asked by the loop."""
-        return key[0] <= self._limit
+        return key[0] <= self._limit or self._over()
 
     def pause(self) -> None:
         """Let time stand.
@@ -79,8 +83,7 @@ class Timekeeper:
         loop = self._checked()
         begin = max(loop.now, self._limit) if loop.gate is self else loop.now
         if seconds is None:
-            due = loop.schedule.next_due()
-            self._limit = begin if due is None else max(due, begin)
+            self._limit = max(_next_due(loop), begin)
         else:
             self._limit = begin + round(seconds * SECOND)
         loop.gate = self
@@ -104,3 +107,12 @@ class Timekeeper:
             raise CommandError(reason)
         assert self._loop is not None
         return self._loop
+
+
+def _next_due(loop: LockstepLoop) -> int:
+    """Return when something is due next: of the schedule, a timer or work beside; 0 if nothing."""
+    entry = loop.schedule.next_due()
+    due = [] if entry is None else [entry]
+    due += [round(timer.when() * SECOND) for timer in loop._scheduled[:1]]  # type: ignore[attr-defined]
+    due += [held[0] for held in loop._held[:1]]
+    return min(due, default=0)

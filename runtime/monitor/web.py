@@ -13,12 +13,14 @@ import secrets
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import jinja2
 import msgspec
 
+from runtime.errors import VisnavError
 from runtime.monitor.client import Client
-from runtime.monitor.command import UNREADABLE, Answer, decode_command, encode
+from runtime.monitor.command import QUICKEST, SLOWEST, UNREADABLE, Answer, decode_command, encode
 from runtime.monitor.http import (
     LONGEST_HEAD,
     HttpError,
@@ -28,7 +30,7 @@ from runtime.monitor.http import (
     response,
     server_sent,
 )
-from runtime.monitor.rows import COLUMNS, LEFT, RIGHT, headline, is_number, rows
+from runtime.monitor.rows import COLUMNS, LEFT, RIGHT, aim, headline, is_number, rows
 from runtime.monitor.snapshot import Snapshot
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # its name, not itself
@@ -52,6 +54,7 @@ class Page:
         self._client = client
         self._pages: set[asyncio.Queue[bytes | None]] = set()
         self._last: bytes | None = None
+        self._end = "the run is over: it does not answer any more"
 
     async def listen(self) -> None:
         """Hand the run's snapshots to all pages until it is over."""
@@ -59,6 +62,10 @@ class Page:
             async for snapshot in self._client.snapshots():
                 self._last = encode(shown(snapshot))
                 self._offer(self._last)
+                if snapshot.ended:
+                    self._end = f"the run is over: {snapshot.ended}"
+        except VisnavError as error:
+            self._end = str(error)
         finally:
             self._offer(None)
             self.over.set()
@@ -121,6 +128,8 @@ class Page:
         nonce = secrets.token_urlsafe(16)
         text = _template().render(
             nonce=nonce,
+            slowest=SLOWEST,
+            quickest=QUICKEST,
             token=self.token,
             first=None if self._last is None else msgspec.json.decode(self._last),
             stacks=[
@@ -146,9 +155,10 @@ class Page:
         try:
             if self._last is not None:
                 yield server_sent(self._last)
-            while not self.over.is_set() and (data := await page.get()) is not None:
-                yield server_sent(data)
-            yield server_sent(encode({"over": True}))
+            if not self.over.is_set():
+                while (data := await page.get()) is not None:
+                    yield server_sent(data)
+            yield server_sent(encode({"over": self._end}))
         finally:
             self._pages.discard(page)
 
@@ -167,7 +177,7 @@ def shown(snapshot: Snapshot) -> dict[str, Any]:
     return {
         "headline": headline(snapshot),
         "paused": snapshot.clock.paused,
-        "speed": snapshot.clock.asked or snapshot.clock.speed,
+        "speed": aim(snapshot.clock),
         "fixed": snapshot.clock.fixed,
         "tables": {name: rows(name, snapshot) for name in COLUMNS},
         "settings": [
@@ -194,7 +204,10 @@ async def serve(client: Client, port: int, token: str | None = None, leave: bool
     page = Page(client, token)
     server = await asyncio.start_server(page.serve, "127.0.0.1", port, limit=LONGEST_HEAD)
     number = server.sockets[0].getsockname()[1]
-    print(f"the monitor is at http://127.0.0.1:{number}/?token={page.token}", flush=True)
+    print(
+        f"the monitor is at http://127.0.0.1:{number}/?token={quote(page.token, safe='')}",
+        flush=True,
+    )
     listening = asyncio.create_task(page.listen())
     try:
         if leave:

@@ -99,7 +99,8 @@ class Causes:
         self._kinds = kinds
         self._hearers = hearers
         self._pasts: dict[str, _Past] = {}
-        self._by_identity: OrderedDict[int, Said] = OrderedDict()
+        self._by_identity: OrderedDict[int, tuple[Said, tuple[str, ...]]] = OrderedDict()
+        """Events, and who heard them."""
 
     def add(
         self,
@@ -126,14 +127,17 @@ class Causes:
         """
         node, kind = sender.partition(".")[0], self._kinds[event]
         said = Said(time, run, node, event, source, stamp)
-        self._trace_back(said, kind, self._by_identity.get(given))
+        # Another event may lie where one lay that has come from elsewhere.
+        found, heard = self._by_identity.get(given, (None, ()))
+        self._trace_back(said, kind, found if node in heard else None)
         said.seen = kind.seen if said.cause is None else said.cause.seen
-        self._by_identity[identity] = said
+        hearers = self._hearers.get((sender, event, source), ())
+        self._by_identity[identity] = said, hearers
         self._by_identity.move_to_end(identity)
         if len(self._by_identity) > IDENTITIES:
             self._by_identity.popitem(last=False)
         if not kind.asked and (kind.sensed or said.cause is not None):
-            for hearer in self._hearers.get((sender, event, source), ()):
+            for hearer in hearers:
                 if hearer != node:
                     self._pasts.setdefault(hearer, _Past()).add(said)
         return said

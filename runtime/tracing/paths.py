@@ -6,13 +6,14 @@ Works on any trace that `runtime.tracing.write` wrote; knows nothing of a run.
 from __future__ import annotations
 
 import gzip
+import zlib
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from runtime.errors import ConfigError
-from runtime.tracing.write import LOOP
+from runtime.tracing.write import LOOP, MADE_BY
 
 
 class TraceEvent(msgspec.Struct):
@@ -78,11 +79,17 @@ def read_trace(path: Path) -> Trace:
         content = path.read_bytes()
         if content.startswith(b"\x1f\x8b"):
             content = gzip.decompress(content)
-        return msgspec.json.decode(content, type=Trace)
+        trace = msgspec.json.decode(content, type=Trace)
     except OSError as error:
-        raise ConfigError(f"{path}: expected a trace, found: {error.strerror or error}") from None
-    except (msgspec.DecodeError, EOFError) as error:
+        found = error.strerror or str(error)
+        if path.with_name(path.name + ".part").exists():
+            found += ": its run goes on, or was killed and could not write it"
+        raise ConfigError(f"{path}: expected a trace, found: {found}") from None
+    except (msgspec.DecodeError, EOFError, zlib.error, RecursionError) as error:
         raise ConfigError(f"{path}: expected a trace, found: {error}") from None
+    if trace.about.get("made by") != MADE_BY:
+        raise ConfigError(f"{path}: expected a trace of ours, by {MADE_BY}; found another's")
+    return trace
 
 
 def paths(trace: Trace) -> list[Route]:

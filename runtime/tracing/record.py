@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import functools
+import logging
 import sys
 import threading
 import time
@@ -24,6 +25,8 @@ from runtime.supervisor import Supervisor
 from runtime.tracing.spool import CHUNK, Pace, Spool
 from runtime.tracing.write import write_trace
 
+log = logging.getLogger("visnav.runtime")
+
 OUTSIDE = "runtime"
 """Who offloaded what no node did."""
 
@@ -40,7 +43,8 @@ class Recorder:
 
     Times are nanoseconds of `time.perf_counter_ns`; `run` and `stamp` are of the run's clock, but
     for `run` in real time (see `Pace`).
-    An identity is `id` of the event; a cause is the identity of what the innermost step was given.
+    An identity is `id` of the event; a cause is the identity of the event that the innermost step
+    was given, or 0.
 
     Args:
         clock: The run's clock.
@@ -65,7 +69,8 @@ class Recorder:
 
         def noting(argument: Any) -> Any:
             before = current[0]
-            current[0] = cause = identity(argument)
+            # A tick, say, may lie where an event lay before.
+            current[0] = cause = identity(argument) if isinstance(argument, Event) else 0
             run, begin = now(), time_ns()
             try:
                 return call(argument)
@@ -169,6 +174,8 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
     Raises:
         ConfigError: There can be no such file.
     """
+    if not path.name or path.is_dir():
+        raise ConfigError(f"{path}: expected the name of a file for a trace, found a folder")
     try:
         spool = Spool(path.with_name(path.name + ".part"))
     except OSError as error:
@@ -183,8 +190,18 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
     finally:
         recorder.close()
         spool.close()
-        order = [node.name for node in supervisor.ever]
+        if spool.failed is None:
+            _write(spool, path, supervisor, name)
+        spool.discard()
+
+
+def _write(spool: Spool, path: Path, supervisor: Supervisor, name: str) -> None:
+    order = [node.name for node in supervisor.ever]
+    try:
         write_trace(spool, path, name=name, clock=supervisor.clock.kind, nodes=order)
+    except OSError as error:  # a full disk: the run's other results must not go with the trace
+        log.error("%s: the trace could not be written: %s", path, error)
+        path.unlink(missing_ok=True)
 
 
 def _asker() -> str:

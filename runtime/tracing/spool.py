@@ -6,8 +6,10 @@ the notes mean is in `runtime.tracing.record`.
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +18,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from events import Category, Event, Image, Setpoint
+
+log = logging.getLogger("visnav.runtime")
 
 CHUNK = 1024
 """Notes in a list, about; encoding one takes some tenths of a millisecond."""
@@ -73,7 +77,11 @@ class Spool:
         self.pace: Pace | None = None
         self.kinds: dict[str, Kind] = {}
         self.hearers: dict[tuple[str, str, str], tuple[str, ...]] = {}
-        self._file = path.open("wb")
+        self.origin = time.perf_counter_ns()
+        """Before all that is noted."""
+        self.failed: OSError | None = None
+        """Why there can be no trace any more."""
+        self._file = path.open("wb", buffering=0)
         self._lists: queue.SimpleQueue[list[tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._encode = msgspec.msgpack.Encoder().encode
         self._thread = threading.Thread(target=self._write, name="trace", daemon=True)
@@ -89,17 +97,29 @@ class Spool:
         self._thread.join()
         self._file.close()
 
+    def discard(self) -> None:
+        """Delete the file."""
+        self.path.unlink(missing_ok=True)
+
     def read(self) -> Iterator[list[Any]]:
         """Yield all notes in the order in which they were taken, and delete the file."""
         with self.path.open("rb") as file:
             while length := file.read(_LENGTH_BYTES):
                 yield from msgspec.msgpack.decode(file.read(int.from_bytes(length, "little")))
-        self.path.unlink()
+        self.discard()
 
     def _write(self) -> None:
         while (notes := self._lists.get()) is not None:
-            self._append(self._drained() + notes)
-        self._append(self._drained())
+            self._try_to_append(self._drained() + notes)
+        self._try_to_append(self._drained())
+
+    def _try_to_append(self, notes: list[tuple[Any, ...]]) -> None:
+        if self.failed is None:
+            try:
+                self._append(notes)
+            except OSError as error:  # a full disk, which must not spoil the run
+                self.failed = error
+                log.warning("no trace from here on: %s", error)
 
     def _drained(self) -> list[tuple[Any, ...]]:
         found = []
@@ -109,8 +129,9 @@ class Spool:
 
     def _append(self, notes: list[tuple[Any, ...]]) -> None:
         content = self._encode([self._plain(n) if n[0] == "event" else n for n in notes])
-        self._file.write(len(content).to_bytes(_LENGTH_BYTES, "little"))
-        self._file.write(content)
+        rest = memoryview(len(content).to_bytes(_LENGTH_BYTES, "little") + content)
+        while rest:
+            rest = rest[self._file.write(rest) :]
 
     def _plain(self, note: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return the note of an event in words and numbers, and remember who heard it."""

@@ -17,6 +17,9 @@ import msgspec
 from runtime.tracing.causes import Causes, Said
 from runtime.tracing.spool import Pace, Spool
 
+MADE_BY = "python -m runtime run --trace"
+"""Tells our traces from others."""
+
 LOOP, THREADS, WORKERS, SENSORS = 1, 2, 3, 4
 """Numbers of what the trace shows as processes."""
 
@@ -30,8 +33,6 @@ _MOMENT = 0.1
 """Microseconds that a moment is given, so that an arrow has something to begin at. What follows
 comes later: between reading the time and delivering an event lies the note itself."""
 
-_MILLION = 1_000_000
-
 
 def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Iterable[str]) -> None:
     """Write the notes of a run as a trace.
@@ -43,7 +44,7 @@ def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Itera
         clock: ``lockstep`` or ``real``.
         nodes: Names, in the order in which they are to be shown.
     """
-    about = {"run": name, "clock": clock, "made by": "python -m runtime run --trace"}
+    about = {"run": name, "clock": clock, "made by": MADE_BY}
     with _open(path) as file:
         file.write(b'{"displayTimeUnit":"ms","otherData":' + msgspec.json.encode(about))
         file.write(b',"traceEvents":[\n')
@@ -69,7 +70,6 @@ class _Writer:
         self._moments = _Moments(spool.pace)
         self._tracks: dict[tuple[int, str], int] = {}
         self._answered: dict[str, int] = {}
-        self._origin: int | None = None
         self._flows = 0
         self._exposed: set[tuple[str, int]] = set()
         self._nodes = list(nodes)
@@ -82,8 +82,6 @@ class _Writer:
         for node in self._nodes:
             yield from self._track(LOOP, node)
         for kind, *note in self._spool.read():
-            if self._origin is None:
-                self._origin = min(n for n in note if isinstance(n, int) and n > _MILLION)
             if kind == "step":
                 yield from self._step(*note)
             elif kind == "event":
@@ -196,7 +194,7 @@ class _Writer:
         yield from self._slice(WORKERS, process, method, begin, answered, waited_ms=waited)
 
     def _us(self, time: int) -> float:
-        return round((time - (self._origin or 0)) / 1e3, 3)
+        return round((time - self._spool.origin) / 1e3, 3)
 
 
 class _Moments:

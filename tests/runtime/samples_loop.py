@@ -14,6 +14,7 @@ from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on, 
 from runtime.config import Config, NodeSpec, RunConfig
 from runtime.digest import Digest
 from runtime.execute import make_clock, make_loop
+from runtime.node import senders
 from runtime.parameters import Changeable
 from runtime.sender import Sender
 from runtime.supervisor import Supervisor
@@ -126,6 +127,20 @@ class Looked:
         self.supervisor = supervisor
         self.sent = sent
         self.digest = digest
+
+
+async def until_sent(supervisor: Supervisor, name: str, more: int) -> None:
+    """Wait until a node has sent some more events, however slow the machine is."""
+
+    def count() -> int:
+        node = supervisor._lives[name].node
+        return (
+            0 if node is None else sum(sender.sent().total() for sender in senders(node).values())
+        )
+
+    begin = count()
+    while count() < begin + more:
+        await supervisor.clock.sleep(0.01)
 
 
 Body = Callable[[Supervisor], Coroutine[Any, Any, None]]

@@ -19,6 +19,7 @@ from tests.runtime.samples import Speaker, SpeakerConfig
 from tests.runtime.test_config import CAMERAS, DRONE, SPEAKER, message, read
 
 BAD_OVERRIDES = [
+    ("s.rate=1\nx=2", "expected one setting, found more lines"),
     ("x", "--set x: expected node.key=value or run.key=value"),
     ("drone=1", "--set drone=1: expected node.key=value or run.key=value"),
     ("frnt.rate=3", 'expected "run" or the name of a node, found "frnt" (did you mean \'front\'?)'),

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import pytest
 
 from events import ParameterChanged, VelocitySetpoint
-from runtime import Duration, NodeConfig
+from runtime import Duration, Node, NodeConfig
 from runtime.errors import ConfigError
 from runtime.parameters import Changeable, change, changeable, settings
 from runtime.supervisor import Supervisor
 from runtime.testing import spec
-from tests.runtime.samples_loop import Camera, Estimator, Listener, Pilot, look
+from tests.runtime.samples_loop import Camera, Estimator, Listener, Pilot, look, until_sent
 
 
 class Lens(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,6 +74,7 @@ def test_all_else_stays_and_the_old_settings_too() -> None:
         ("front.loss=2", r"rig.lenses\[0\].loss: expected a number <= 1, found 2"),
         ("rig", "expected node.key=value"),
         ("run.seed=2", "what .run. says holds to its end"),
+        ("network.port=2", "what .network. says holds to its end"),
         ("rig.name=2", "a node's name cannot change"),
     ],
 )
@@ -93,10 +94,13 @@ def test_what_can_change_is_listed_with_its_values() -> None:
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> None:
     async def body(supervisor: Supervisor) -> None:
-        await supervisor.clock.sleep(0.2)
+        await until_sent(supervisor, "pilot", 1)
         assert supervisor.changing.set("pilot.gain=3") == {"gain": "3.0"}
         with pytest.raises(ConfigError, match="pilot refuses: expected a gain that brings no"):
             supervisor.changing.set("pilot.gain=13")
+        if clock == "real":
+            await until_sent(supervisor, "pilot", 1)
+            supervisor.stop("seen enough")
 
     nodes = [
         spec(Camera, "drone"),
@@ -104,7 +108,7 @@ def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> Non
         spec(Pilot, "pilot"),
         spec(Listener, "listener"),
     ]
-    looked = look(nodes, body, clock=clock, duration=0.4)
+    looked = look(nodes, body, clock=clock, duration=0.4 if clock == "lockstep" else 60)
     (changed,) = [e for e in looked.sent if isinstance(e, ParameterChanged)]
     assert (changed.source, changed.key, changed.value) == ("pilot", "gain", "3.0")
     gains = [e.velocity[0] for e in looked.sent if isinstance(e, VelocitySetpoint)]
@@ -128,6 +132,16 @@ def test_a_node_that_restarts_keeps_what_was_changed() -> None:
     assert first is not second
     assert isinstance(second, Pilot)
     assert second.config.gain == 3.0
+
+
+def test_a_node_that_has_not_started_cannot_change() -> None:
+    class First(Node):
+        async def on_startup(self) -> None:
+            supervisor: Any = self._host
+            with pytest.raises(ConfigError, match="pilot does not just now"):
+                supervisor.changing.set("pilot.gain=3")
+
+    look([spec(First, "first"), spec(Pilot, "pilot")], duration=0.1)
 
 
 def test_a_node_that_does_not_run_cannot_change() -> None:

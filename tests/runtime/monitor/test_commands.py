@@ -88,7 +88,9 @@ def test_the_page_shows_a_run_in_a_browser(tmp_path: Path, sockets: Path) -> Non
             check=True,
         ).stdout
     # The browser's virtual time waits for the stream, which ends with the run.
-    assert re.search(r"<h1[^>]*>sample   [3-5]\.\d+ of 5 s", shown)
+    assert re.search(
+        r"<h1[^>]*>the run is over: duration \(last seen: sample   [3-5]\.\d+ of", shown
+    )
     assert re.search(r"<td[^>]*>drone.images</td><td[^>]*>Image</td><td[^>]*>\d+</td>", shown)
     assert 'value="pilot.gain=1.0"' in shown
 
@@ -140,3 +142,30 @@ def _wait_for(sockets: Path, process: subprocess.Popen[str]) -> None:
         assert process.poll() is None
         time.sleep(0.05)  # another process is starting
     raise AssertionError("expected a run that listens")
+
+
+@pytest.mark.slow
+def test_a_screen_needs_a_terminal_that_can_show_it(tmp_path: Path, sockets: Path) -> None:
+    with running(tmp_path) as process:
+        _wait_for(sockets, process)
+        done = command("top", folder=tmp_path)
+        assert done.returncode == 2
+        assert "error: expected a terminal, found none" in done.stderr
+        terminal, inside = pty.openpty()
+        try:
+            refused = subprocess.run(
+                [sys.executable, "-m", "runtime", "top"],
+                cwd=tmp_path,
+                env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "latin-1"},
+                stdin=inside,
+                stdout=inside,
+                stderr=inside,
+                start_new_session=True,
+                timeout=20,
+                check=False,
+            )
+            assert refused.returncode == 2
+            assert b"expected a terminal in UTF-8, found " in os.read(terminal, 65536)
+        finally:
+            os.close(terminal)
+            os.close(inside)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from runtime import Duration
 from runtime.config import Config, RunConfig
 from runtime.errors import VisnavError
 from runtime.monitor.command import Pause, Restart, Set, Speed, Step, Stop
@@ -128,6 +129,28 @@ def test_commands_end_the_run_and_change_settings() -> None:
 
     assert observe(script).supervisor.reason == "stopped by hand"
     assert told(Step(seconds=0.5)) == "step 0.5"
+
+
+def test_a_run_ends_in_order_though_time_stands() -> None:
+    class Slow(Pilot):
+        landed = False
+
+        async def on_shutdown(self) -> None:
+            await self.clock.sleep(0.5)
+            Slow.landed = True
+
+    async def body(supervisor: Supervisor) -> None:
+        config = Config(
+            run=RunConfig(name="sample", shutdown_limit=Duration(1)), nodes=tuple(NODES)
+        )
+        supervisor._config = config
+        observer = Observer(supervisor, config, LastRecords())
+        await supervisor.clock.sleep(0.1)
+        observer.do(Pause())
+        observer.do(Stop())
+
+    assert look([*NODES[:2], spec(Slow, "pilot")], body).supervisor.reason == "stopped by hand"
+    assert Slow.landed
 
 
 @pytest.mark.parametrize("command", [Pause(), Step(), Speed(factor=2.0)])

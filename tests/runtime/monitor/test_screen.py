@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -10,8 +11,21 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import DataTable, Input, Static
 
-from runtime.monitor.command import Pause, Restart, Resume, Set, Speed, Step, Stop
+from runtime.errors import CommandError
+from runtime.monitor.command import (
+    SLOWEST,
+    Answer,
+    Command,
+    Pause,
+    Restart,
+    Resume,
+    Set,
+    Speed,
+    Step,
+    Stop,
+)
 from runtime.monitor.screen import Screen
+from runtime.monitor.snapshot import Snapshot
 from tests.runtime.monitor.samples import Stand, snapshot
 
 
@@ -52,7 +66,7 @@ async def test_keys_ask_the_run() -> None:
     presses: list[tuple[list[str], list[Any]]] = [
         (["space"], [Pause()]),
         (["full_stop", "s"], [Step(), Step(seconds=1.0)]),
-        (["plus", "minus"], [Speed(factor=4.0), Speed(factor=1.0)]),
+        (["plus", "minus"], [Speed(factor=4.0), Speed(factor=2.0)]),
         (["m"], [Speed(factor=None)]),
         (["down", "r"], [Restart(node="pilot")]),
         (["x"], []),
@@ -65,11 +79,35 @@ async def test_keys_ask_the_run() -> None:
             await pilot.pause()
             assert stand.asked == commands
         stand.asked.clear()
-        stand.coming.put_nowait(snapshot(clock_paused=True))
+        stand.coming.put_nowait(snapshot(clock_paused=True, clock_asked=SLOWEST))
         await pilot.pause()
-        await pilot.press("space")
+        await pilot.press("minus", "space", "space")
         await pilot.pause()
-        assert stand.asked == [Resume()]
+        assert stand.asked == [Speed(factor=SLOWEST), Resume(), Pause()]
+
+
+async def test_a_run_that_does_not_answer_does_not_hold_up_the_keys() -> None:
+    class Deaf(Stand):
+        async def ask(self, command: Command) -> Answer:
+            await super().ask(command)
+            return await asyncio.Event().wait()  # type: ignore[return-value]
+
+    stand = Deaf(snapshot())
+    async with shown(stand) as (screen, pilot):
+        async with asyncio.timeout(10):
+            await pilot.press("s", "m", "q")
+        assert stand.asked == [Step(seconds=1.0), Speed(factor=None)]
+        assert not screen.is_running
+
+
+async def test_what_is_not_to_be_understood_is_told() -> None:
+    class Foreign(Stand):
+        async def snapshots(self) -> AsyncIterator[Snapshot]:
+            raise CommandError("expected a run of this version")
+            yield
+
+    async with shown(Foreign()) as (screen, _):
+        assert text(screen, "head") == "the run is over: expected a run of this version"
 
 
 @pytest.mark.slow

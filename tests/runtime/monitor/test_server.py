@@ -8,20 +8,22 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
 from runtime.config import Config, RunConfig
 from runtime.errors import VisnavError
-from runtime.monitor import server
-from runtime.monitor.address import find
+from runtime.monitor import client, server
+from runtime.monitor.address import find, runs
 from runtime.monitor.client import Client, ask
-from runtime.monitor.command import Command, Pause, Resume, Set, Speed, Stop
+from runtime.monitor.command import Answer, Command, Pause, Resume, Set, Speed, Stop, encode
 from runtime.monitor.observer import Observer
 from runtime.monitor.records import LastRecords
-from runtime.monitor.snapshot import Snapshot
+from runtime.monitor.snapshot import LogLine, Snapshot
 from runtime.supervisor import Supervisor
 from runtime.testing import spec
+from tests.runtime.monitor.samples import snapshot
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
 
 NODES = [spec(Camera, "drone"), spec(Estimator, "vo"), spec(Pilot, "pilot")]
@@ -50,18 +52,18 @@ def served(outside: Callable[[], Any], clock: str = "lockstep") -> Looked:
 
 async def attached(*commands: Command) -> tuple[list[Snapshot], list[Any]]:
     """Attach, ask for some things, and return what was seen and answered."""
-    client = await Client.connect(find("sample"))
+    connection = await Client.connect(find("sample"))
     seen: list[Snapshot] = []
     asking: asyncio.Task[Any] | None = None
 
     async def ask_all() -> list[Any]:
-        return [await client.ask(command) for command in commands]
+        return [await connection.ask(command) for command in commands]
 
-    async for snapshot in client.snapshots():
-        seen.append(snapshot)
+    async for found in connection.snapshots():
+        seen.append(found)
         asking = asking or asyncio.create_task(ask_all())
         if len(seen) >= 3 and asking.done():
-            client.close()
+            connection.close()
             break
     assert asking is not None
     return seen, await asking
@@ -71,7 +73,7 @@ async def attached(*commands: Command) -> tuple[list[Snapshot], list[Any]]:
 def test_snapshots_come_and_commands_are_answered(clock: str) -> None:
     def outside() -> None:
         seen, answers = asyncio.run(attached(Set(text="pilot.gain=3"), Speed(factor=5.0)))
-        numbers = [snapshot.number for snapshot in seen]
+        numbers = [each.number for each in seen]
         assert numbers == list(range(1, len(seen) + 1))
         assert [node.name for node in seen[0].nodes] == ["drone", "vo", "pilot"]
         changed, paced = answers
@@ -113,12 +115,12 @@ def test_nonsense_is_answered_and_does_no_harm() -> None:
 def test_who_looks_sees_the_end() -> None:
     def outside() -> None:
         async def until_the_end() -> list[Snapshot]:
-            client = await Client.connect(find(None))
+            connection = await Client.connect(find(None))
             seen = []
-            async for snapshot in client.snapshots():
-                seen.append(snapshot)
+            async for found in connection.snapshots():
+                seen.append(found)
                 if len(seen) == 1:
-                    asking.append(asyncio.create_task(client.ask(Stop())))
+                    asking.append(asyncio.create_task(connection.ask(Stop())))
             return seen
 
         asking: list[Any] = []
@@ -160,24 +162,144 @@ def test_a_monitor_that_fails_leaves_the_run_alone(monkeypatch: pytest.MonkeyPat
     assert served(outside).supervisor.reason == "seen enough"
 
 
-def test_who_leaves_while_the_end_is_told_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
-    left = []
+def test_those_who_read_nothing_do_not_hold_up_the_end(
+    monkeypatch: pytest.MonkeyPatch, sockets: Path
+) -> None:
+    monkeypatch.setattr(server, "PARTING", 0.1)
+    long = LogLine(number=0, seconds=0.0, level="INFO", speaker="x", text="x" * 400_000)
+    monkeypatch.setattr(LastRecords, "lines", lambda _: [long])
+    enough = threading.Event()
+    take = Observer.take
 
-    async def leave(writer: asyncio.StreamWriter) -> None:
-        left.append(writer)
-        writer.transport.abort()
-        for _ in range(20):
-            await asyncio.sleep(0)  # the task that listened to it notices
+    def counted(observer: Observer) -> Snapshot:
+        found = take(observer)
+        if found.number > 3:
+            enough.set()
+        return found
+
+    monkeypatch.setattr(Observer, "take", counted)
+    watching = [socket.socket(socket.AF_UNIX) for _ in range(8)]
 
     def outside() -> None:
-        with socket.socket(socket.AF_UNIX) as connection:
-            connection.connect(str(find(None)))
-            connection.sendall(b'{"type":"watch"}\n')
-            assert ask(find(None), Set(text="pilot.gain=2")) == "gain = 2.0"
-            monkeypatch.setattr(asyncio.StreamWriter, "drain", leave)
-            stays.append(connection.dup())
+        for each in watching:
+            each.connect(str(find(None)))
+            each.sendall(b'{"type":"watch"}\n')
+        assert enough.wait(10)
 
-    stays: list[socket.socket] = []
+    try:
+        assert served(outside).supervisor.reason == "seen enough"
+        assert list(sockets.iterdir()) == []  # its thread has come to its end
+    finally:
+        for each in watching:
+            each.close()
+
+
+async def test_who_reads_no_answers_is_asked_for_no_more() -> None:
+    class Stuck:
+        """A writer whose other side reads nothing."""
+
+        written = 0
+
+        def write(self, _: bytes) -> None:
+            self.written += 1
+
+        async def drain(self) -> None:
+            await asyncio.Event().wait()
+
+        def close(self) -> None: ...
+
+    reader, stuck = asyncio.StreamReader(), Stuck()
+    reader.feed_data(b"nonsense\n" * 100)
+    serving: Any = server.Server(None, asyncio.get_running_loop(), Path())  # type: ignore[arg-type]
+    task = asyncio.create_task(serving._accept(reader, stuck))
+    for _ in range(300):
+        await asyncio.sleep(0)
+    assert stuck.written == 1
+    task.cancel()
+    await task
+
+
+async def test_measuring_begins_and_ends_with_those_who_watch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(server, "PERIOD", 0)
+    done: list[str] = []
+
+    class Noting:
+        def begin(self) -> None:
+            done.append("begin")
+
+        def end(self) -> None:
+            done.append("end")
+
+        def take(self) -> Snapshot:
+            done.append("take")
+            return snapshot()
+
+    loop = asyncio.get_running_loop()
+    serving: Any = server.Server(Noting(), loop, Path())  # type: ignore[arg-type]
+    one, other = Mock(), Mock()
+    for writer in (one, other):
+        writer.transport.get_write_buffer_size.return_value = 0
+        writer.drain = AsyncMock()
+    watch = asyncio.StreamReader()
+    watch.feed_data(b'{"type":"watch"}\n')
+    watch.feed_eof()
+    publishing = asyncio.create_task(serving._publish())
+    await serving._accept(watch, one)  # and is gone
+    await serving._hear(b'{"type":"watch"}', other)
+    for _ in range(100):
+        await asyncio.sleep(0)
+    serving._watching.clear()
+    for _ in range(100):
+        await asyncio.sleep(0)
+    publishing.cancel()
+    assert [what for what in done if what != "take"] == ["begin", "end"]
+    assert other.write.called
+
+
+def test_who_looks_for_runs_does_no_harm_to_one_that_begins(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    listen = socket.socket.listen
+
+    def looked_for(new: socket.socket, backlog: int) -> None:
+        runs()
+        listen(new, backlog)
+
+    monkeypatch.setattr(socket.socket, "listen", looked_for)
+    served(lambda: find("sample"))
+
+
+def test_an_error_of_the_monitors_own_is_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: Observer, __: Command) -> str:
+        raise RuntimeError("no hands")
+
+    monkeypatch.setattr(Observer, "do", fail)
+
+    def outside() -> None:
+        with pytest.raises(VisnavError, match="could not do it, and its log says why"):
+            ask(find(None), Stop())
+
     assert served(outside).supervisor.reason == "seen enough"
-    stays.pop().close()
-    assert left
+
+
+async def test_a_late_answer_and_the_end_disturb_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "PATIENCE", 0.0)
+    reader = asyncio.StreamReader()
+    connection = Client(reader, Mock())
+    assert (await connection.ask(Stop())).text == "the run does not answer"
+    reader.feed_data(encode(Answer(number=0, done=True, text="at last")) + b"\n")
+    reader.feed_data(encode(snapshot()) + b"\n")
+    reader.feed_eof()
+    assert [seen.run async for seen in connection.snapshots()] == ["sample"]
+    monkeypatch.setattr(client, "PATIENCE", 60.0)
+    assert (await connection.ask(Stop())).text == "the run is over"
+
+
+@pytest.mark.parametrize("line", [b"nonsense\n", b'{"type":"snapshot","run":1}\n', b"\xff\n"])
+async def test_another_version_at_the_other_end_is_an_error(line: bytes) -> None:
+    reader = asyncio.StreamReader()
+    reader.feed_data(line)
+    with pytest.raises(VisnavError, match="expected a run of this version: "):
+        await anext(Client(reader, Mock()).snapshots())

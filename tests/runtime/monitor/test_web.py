@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from runtime.monitor.command import Pause, Set
-from runtime.monitor.web import Page
+from runtime.monitor.web import Page, shown
 from tests.runtime.monitor.samples import Stand, snapshot
 
 TOKEN = "abc"
@@ -71,8 +71,10 @@ async def test_the_page_comes_with_the_token_and_runs_no_script_but_its_own() ->
         (get(f"/nothing?token={TOKEN}"), 404),
         (f"PUT /?token={TOKEN} HTTP/1.1\r\nHost: localhost", 405),
         ("nonsense", 400),
+        ("GET http://[ HTTP/1.1\r\nHost: localhost", 400),
         (get("/") + "\r\nContent-Length: many", 400),
         (get("/") + "\r\nContent-Length: 9999999", 413),
+        (get("/") + "\r\nContent-Length: " + "9" * 5000, 413),
         (get("/") + "\r\nX: " + "x" * 100_000, 413),
     ],
 )
@@ -118,10 +120,30 @@ async def test_snapshots_come_as_events_and_so_does_the_end() -> None:
         stand.coming.put_nowait(snapshot(clock_now=2.0))
         second = await event()
         stand.coming.put_nowait(None)
-        assert await event() == {"over": True}
+        assert await event() == {"over": "the run is over: it does not answer any more"}
         assert await reader.read() == b""
         writer.close()
     assert first["headline"].startswith("sample   1.500")
     assert second["headline"].startswith("sample   2.000")
     assert second["tables"]["nodes"][0][0] == "drone"
     assert second["settings"] == ["pilot.gain=1.0", "pilot.patience=0.5"]
+
+
+async def test_a_page_that_is_slow_still_sees_how_it_ended() -> None:
+    page = Page(Stand(*(snapshot() for _ in range(9)), snapshot(ended="duration"), None))  # type: ignore[arg-type]
+
+    async def look() -> list[bytes]:
+        return [event async for event in page._events()]
+
+    looking = asyncio.create_task(look())
+    await asyncio.sleep(0)
+    await page.listen()
+    seen = await looking
+    told = [json.loads(each.removeprefix(b"data: ")) for each in seen]
+    assert told[-2]["headline"].endswith("ends: duration")
+    assert told[-1] == {"over": "the run is over: duration"}
+
+
+def test_faster_starts_from_a_speed_even_when_time_stands() -> None:
+    assert shown(snapshot(clock_paused=True, clock_speed=0.0))["speed"] == 1.0
+    assert shown(snapshot(clock_asked=0.5))["speed"] == 0.5

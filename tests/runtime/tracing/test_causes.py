@@ -94,3 +94,12 @@ def test_a_sensor_begins_whatever_its_node_was_given() -> None:
 
 def test_without_a_sensor_there_is_no_path() -> None:
     assert Story()("pilot.setpoints", "Setpoint", 1).cause is None
+
+
+def test_nothing_follows_from_what_its_node_does_not_hear() -> None:
+    tell = Story()
+    tell("drone.images", "Image", 10)
+    tell("vo.poses", "Pose", 10)
+    tell("drone.notes", "Note", 12, given=2)
+    said = tell("pilot.setpoints", "Setpoint", 13, given=3)  # which is vo's alone
+    assert path(said) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "holds")]

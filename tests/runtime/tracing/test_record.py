@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.schedule import Tick
 from runtime.sender import Sender
 from runtime.tracing.record import OUTSIDE, NotingExecutor, Recorder
 from runtime.tracing.spool import CHUNK, Spool
@@ -48,6 +49,16 @@ def test_what_is_sent_after_an_inner_step_is_the_outer_ones(tmp_path: Path) -> N
     assert (within[1:3], within[-1]) == (["b", "hear"], id(reply))
     assert outside[-1] == 0
     assert around[3] <= first[1] <= within[3] <= within[4] <= second[1] <= around[4]
+
+
+def test_what_is_no_event_is_no_cause(tmp_path: Path) -> None:
+    tick = Tick(stamp=1, index=0, late=0, missed=0)  # it may lie where an event lay
+
+    def do(recorder: Recorder) -> None:
+        recorder.around("a", "tick", lambda _: recorder.tap(None, Ping(stamp=1, source="a")))(tick)
+
+    event, step = notes(tmp_path, do)
+    assert (event[-1], step[-1]) == (0, 0)
 
 
 def test_the_order_is_kept_however_many_there_are(tmp_path: Path) -> None:

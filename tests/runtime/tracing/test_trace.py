@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import itertools
 import json
 from collections import defaultdict
@@ -12,12 +13,23 @@ import pytest
 
 from events import PoseEstimate
 from runtime import on
+from runtime.cli.trace import tables
 from runtime.errors import ConfigError
+from runtime.supervisor import Supervisor
 from runtime.testing import spec
+from runtime.tracing import spool, write
 from runtime.tracing.paths import Trace, TraceEvent, paths, quantile, read_trace, shares
 from runtime.tracing.record import tracing
 from runtime.tracing.write import LOOP, SENSORS, THREADS
-from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, SteadyPilot, look
+from tests.runtime.samples_loop import (
+    Camera,
+    Estimator,
+    Looked,
+    Pilot,
+    SteadyPilot,
+    look,
+    until_sent,
+)
 
 NODES = [spec(Camera, "drone"), spec(Estimator, "vo"), spec(Pilot, "pilot")]
 STEADY = [*NODES[:2], spec(SteadyPilot, "pilot")]
@@ -83,11 +95,15 @@ def test_all_that_a_node_did_has_its_place(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 def test_a_run_that_is_traced_says_the_same(tmp_path: Path, clock: str) -> None:
-    trace, looked = traced(tmp_path / "t.json", clock=clock, duration=0.15)
-    plain = look(NODES, clock=clock, duration=0.15)
-    assert [type(e) for e in looked.sent] == [type(e) for e in plain.sent]
+    async def body(supervisor: Supervisor) -> None:
+        await until_sent(supervisor, "pilot", 2)
+        supervisor.stop("seen enough")
+
+    trace, looked = traced(tmp_path / "t.json", body=body, clock=clock, duration=60)
+    told = [e.name.removeprefix("send ") for e in trace.events if e.name.startswith("send ")]
+    assert told == [type(event).__name__ for event in looked.sent]
     if clock == "lockstep":
-        assert looked.digest == plain.digest
+        assert looked.digest == look(NODES, body, duration=60).digest
     (route,) = paths(trace)
     assert min(route.run_ms) >= 30.0
     if clock == "real":  # the two clocks are one
@@ -109,6 +125,46 @@ def test_a_trace_without_a_place_is_refused_before_the_run(tmp_path: Path) -> No
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="expected a place for a trace, found: "):
         traced(tmp_path / "file" / "t.json")
+
+
+@pytest.mark.parametrize("name", [".", "/", ".."])
+def test_a_folder_is_no_place_for_a_trace(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match="expected the name of a file for a trace"):
+        traced(tmp_path / name)
+
+
+@pytest.mark.parametrize("when", ["in the run", "after it"])
+def test_a_full_disk_costs_the_trace_and_not_the_run(
+    tmp_path: Path, when: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    if when == "in the run":
+        monkeypatch.setattr(spool.Spool, "_append", full)
+    else:
+        monkeypatch.setattr(write._Writer, "_step", full)
+    looked = look(NODES, watch=lambda s: tracing(s, tmp_path / "t.json", "loop"))
+    assert looked.supervisor.reason == "duration"
+    assert list(tmp_path.iterdir()) == []
+    assert "No space left on device" in caplog.text
+
+
+def test_time_in_a_trace_begins_before_all_that_is_in_it(tmp_path: Path) -> None:
+    notes = spool.Spool(tmp_path / "notes")
+    begin = notes.origin
+    late = 123_456_789_000_000_000  # of an announcement that bears the time of day, say
+    announced = ("event", begin + 5_000, 0, None, PoseEstimate, "a", late, 7_000_000, 0, None)
+    notes.put([announced, ("step", "a", "run", begin + 2_000, begin + 9_000, 0, 0)])
+    notes.close()
+    write.write_trace(notes, tmp_path / "t.json", name="x", clock="lockstep", nodes=["a"])
+    assert [e.ts for e in read_trace(tmp_path / "t.json").events if e.ph == "X"] == [5.0, 2.0]
+
+
+def test_a_terminal_without_arrows_gets_others(tmp_path: Path) -> None:
+    trace, _ = traced(tmp_path / "t.json", STEADY)
+    shown = str(next(tables(trace, "latin-1")))
+    assert shown == "path 1: drone/front Image -> vo PoseEstimate ~> pilot VelocitySetpoint"
 
 
 def test_shares_leave_out_what_a_step_called_in_others() -> None:
@@ -137,6 +193,14 @@ def test_what_is_no_trace_is_refused(tmp_path: Path) -> None:
     other.write_text(json.dumps({"a": 1}))
     with pytest.raises(ConfigError, match="expected a trace, found"):
         read_trace(other)
-    other.write_bytes(b"\x1f\x8bnonsense")
-    with pytest.raises(ConfigError, match="expected a trace, found"):
+    whole = gzip.compress(b'{"traceEvents":[]}', mtime=0)
+    for broken in (b"\x1f\x8bnonsense", whole[:-9], whole[:12] + b"\xff" * 9, b"[" * 100_000):
+        other.write_bytes(broken)
+        with pytest.raises(ConfigError, match="expected a trace, found"):
+            read_trace(other)
+    other.write_text('{"traceEvents":[{"ph":"X","pid":1,"tid":1,"name":"x","args":{"path":"/"}}]}')
+    with pytest.raises(ConfigError, match="expected a trace of ours, by python -m runtime run"):
         read_trace(other)
+    (tmp_path / "none.part").touch()
+    with pytest.raises(ConfigError, match="its run goes on, or was killed"):
+        read_trace(tmp_path / "none")
