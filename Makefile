@@ -36,7 +36,7 @@ demo: $(CORE)  ## Fly the standard tour, judge visual odometry on it, and report
 
 test: $(READY)  ## Run the quick tests.
 	@sh tools/system_packages.sh display
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow'
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m 'not slow'
 
 test-all: $(READY)  ## Run all tests.
 	@sh tools/system_packages.sh display
