@@ -100,13 +100,12 @@ class Server:
         await self._end.wait()
         publishing.cancel()
         server.close()
-        for _ in range(5):  # whoever was just let in becomes one of the clients
-            await asyncio.sleep(0)
         for writer in self._watching:
             writer.write(self._last)
         writers = list(self._clients.values())
-        for task in self._clients:
+        for task, writer in self._clients.items():
             task.cancel()
+            writer.close()
         closing = asyncio.gather(*(w.wait_closed() for w in writers), return_exceptions=True)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(closing, PARTING)  # what was written still goes out
@@ -150,10 +149,15 @@ class Server:
                     log.exception("the monitor failed")
                 failed = True
 
-    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._clients[task] = writer
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._end.is_set():
+            writer.transport.abort()
+            return
+        task = asyncio.create_task(self._attend(reader, writer))
+        self._clients[task] = writer  # at once: a task that has not begun ends without a word
+        task.add_done_callback(self._clients.pop)
+
+    async def _attend(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             async for line in reader:
                 await self._hear(line, writer)
@@ -163,7 +167,6 @@ class Server:
         except asyncio.CancelledError:  # the run is over
             pass
         finally:
-            del self._clients[task]
             self._watching.discard(writer)
             writer.close()
 

@@ -69,7 +69,7 @@ def test_a_start_that_takes_too_long_ends_the_run(clock: str) -> None:
     outcome = supervise(
         [spec(Diarist, "a"), spec(Sleepy, "s"), spec(Diarist, "z")], clock=clock, startup_limit=0.1
     )
-    assert time.monotonic() - begin < 3
+    assert time.monotonic() - begin < 20
     assert isinstance(outcome.error, NodeTimeoutError)
     assert "s: expected on_startup to end within 0.1 s" in str(outcome.error)
     assert "z made" not in DIARY
@@ -192,7 +192,7 @@ def test_duration_is_time_of_the_clock() -> None:
     begin = time.monotonic()
     result = run_nodes(diarists("a"), duration=3600.0)
     assert (result.reason, result.seconds) == ("duration", 3600.0)
-    assert time.monotonic() - begin < 5
+    assert time.monotonic() - begin < 20
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from typing import ClassVar
 
 import pytest
@@ -67,9 +66,7 @@ def test_a_worker_that_ends_is_its_nodes_fault(
     fate: str, clock: str, error: type[Exception], text: str
 ) -> None:
     Gardener.fate = fate
-    begin = time.monotonic()
     outcome = supervise([spec(Gardener, "g")], clock=clock, duration=10)
-    assert time.monotonic() - begin < 8
     assert outcome.reason == "g failed"
     assert outcome.error is not None
     assert isinstance(outcome.error.__cause__, error)

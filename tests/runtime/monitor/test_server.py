@@ -211,7 +211,7 @@ async def test_who_reads_no_answers_is_asked_for_no_more() -> None:
     reader, stuck = asyncio.StreamReader(), Stuck()
     reader.feed_data(b"nonsense\n" * 100)
     serving: Any = server.Server(None, asyncio.get_running_loop(), Path())  # type: ignore[arg-type]
-    task = asyncio.create_task(serving._accept(reader, stuck))
+    task = asyncio.create_task(serving._attend(reader, stuck))
     for _ in range(300):
         await asyncio.sleep(0)
     assert stuck.written == 1
@@ -246,7 +246,7 @@ async def test_measuring_begins_and_ends_with_those_who_watch(
     watch.feed_data(b'{"type":"watch"}\n')
     watch.feed_eof()
     publishing = asyncio.create_task(serving._publish())
-    await serving._accept(watch, one)  # and is gone
+    await serving._attend(watch, one)  # and is gone
     await serving._hear(b'{"type":"watch"}', other)
     for _ in range(100):
         await asyncio.sleep(0)
@@ -303,3 +303,19 @@ async def test_another_version_at_the_other_end_is_an_error(line: bytes) -> None
     reader.feed_data(line)
     with pytest.raises(VisnavError, match="expected a run of this version: "):
         await anext(Client(reader, Mock()).snapshots())
+
+
+async def test_who_comes_in_the_last_moment_is_let_go() -> None:
+    """Also one whose task has not begun when all are cancelled."""
+    serving: Any = server.Server(Mock(), asyncio.get_running_loop(), Path())
+    early, late = Mock(), Mock()
+    serving._accept(asyncio.StreamReader(), early)
+    ((task, writer),) = serving._clients.items()
+    assert writer is early  # so the end closes it
+    task.cancel()
+    await asyncio.wait([task])
+    assert not serving._clients
+    serving._end.set()
+    serving._accept(asyncio.StreamReader(), late)
+    assert late.transport.abort.called
+    assert not serving._clients
