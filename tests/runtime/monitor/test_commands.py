@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
 import pty
@@ -114,12 +113,17 @@ def test_the_screen_and_the_run_share_a_terminal(tmp_path: Path, sockets: Path) 
         start_new_session=True,
     ) as process:
         os.close(inside)
-        with contextlib.suppress(OSError):  # how a terminal says that nobody is there any more
+        try:
             while piece := os.read(terminal, 65536):
                 shown += piece
                 left = b"\x1b[?1049l" in shown
-                if b"drone.images" in shown and b"10.0" in shown and not left:
+                if b"drone.images" in shown and not left:
                     os.write(terminal, b"x")  # twice at least, and no harm in more
+        except OSError:  # how a terminal says that nobody is there any more
+            pass
+        except BaseException:  # this took too long
+            process.kill()
+            raise
     os.close(terminal)
     assert process.returncode == 0
     assert b"ended by: stopped by hand" in b" ".join(shown.split())  # wherever lines end
