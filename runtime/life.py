@@ -30,6 +30,7 @@ class Life:
         self.workers: list[Worker[Any]] = []
         self.links: dict[str, Link] = {}
         self.started = False
+        self.starts = 0
         self.failures = 0
         self.recovering = False
         self.ending = asyncio.Lock()
@@ -46,7 +47,7 @@ class Life:
         """
         spec = self.spec
         try:
-            self.node = make_node(spec.node, spec.name, spec.config, host, spec.inputs)
+            self.node = make_node(spec.node, spec.name, spec.config, host, spec.inputs, self.starts)
             self.links = {
                 port: Link(f"{spec.name}.{port}", config, host.clock, host.seed)
                 for port, config in spec.links.items()
@@ -54,6 +55,7 @@ class Life:
             async with real_time_limit(limit):
                 await self.node.on_startup()
             self.started = True
+            self.starts += 1
         except NodeError:
             raise
         except TimeoutError:

@@ -131,6 +131,7 @@ class Node(Generic[C]):
         rng: Random numbers that depend on the run's seed and the node's name only.
         out: Folder for files, or `None` if the run writes none.
         sources: Ports narrowed to a source, by the file or by `narrow`.
+        restarts: How often this node was brought up before in this run; 0 the first time.
     """
 
     deterministic: ClassVar[bool] = True
@@ -145,6 +146,7 @@ class Node(Generic[C]):
     rng: np.random.Generator
     out: Path | None
     sources: dict[str, str]
+    restarts: int
     _host: Host
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -275,6 +277,7 @@ def make_node(
     config: NodeConfig,
     host: Host,
     sources: Mapping[str, str] | None = None,
+    restarts: int = 0,
 ) -> N:
     """Make a node with its ports in place."""
     node = cls.__new__(cls)
@@ -285,6 +288,7 @@ def make_node(
     node.rng = np.random.default_rng([host.seed, zlib.crc32(name.encode())])
     node.out = host.out
     node.sources = dict(sources or {})
+    node.restarts = restarts
     node._host = host
     for port, declared in cls.declared.inputs.items():
         setattr(node, port, declared.make(name))

@@ -152,6 +152,25 @@ def test_a_restarted_node_hears_the_announcements_again() -> None:
     assert Patient.heard == [(0, -1.0), (1, -1.0)]
 
 
+@pytest.mark.parametrize("place", ["run", "on_startup"])
+def test_a_node_knows_how_often_it_was_up_before(place: str) -> None:
+    knows: list[tuple[int, float]] = []
+
+    class Knowing(Patient):
+        async def run(self) -> None:
+            knows.append((self.restarts, self.now))
+            await self.clock.sleep(0.1)
+            raise RuntimeError("out of order")
+
+        async def on_startup(self) -> None:
+            if place == "on_startup" and len(knows) == 1 and self.now < 1.0:
+                raise RuntimeError("cannot get up")  # this attempt was never up
+
+    supervise([spec(Knowing, "k", on_error="restart")], duration=5.0)
+    assert [restarts for restarts, _ in knows] == list(range(len(knows)))
+    assert len(knows) > 2
+
+
 def test_statistics_carry_on_over_a_restart() -> None:
     treated = treat("tick", "restart")
     ticks = treated.supervisor.tickers["p.tick"]
