@@ -100,7 +100,7 @@ class Host(Protocol):
     def stop(self, reason: str) -> None:
         """End the run in order."""
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool) -> None:
+    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         """Put a verdict into the summary."""
 
     def after_run(self, call: Callable[[Path], Any]) -> None:
@@ -248,7 +248,9 @@ class Node(Generic[C]):
         """End the run in order, as Ctrl-C would."""
         self._host.stop(reason)
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], *, passed: bool = True) -> None:
+    def conclude(
+        self, subject: str, figures: Mapping[str, Any], *, passed: bool | None = True
+    ) -> None:
         """Put a verdict about something into the run's summary.
 
         If any verdict of a run is not passed, the command line ends with exit code 1.
@@ -256,7 +258,7 @@ class Node(Generic[C]):
         Args:
             subject: What was judged: the source of an estimator.
             figures: Numbers and words about it.
-            passed: Whether it met its thresholds.
+            passed: Whether it met its thresholds; `None` if nothing was asked of it.
         """
         self._host.conclude(subject, figures, passed)
 

@@ -7,6 +7,7 @@ import os
 import platform
 import time
 from collections import Counter
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -54,11 +55,11 @@ class Verdict(msgspec.Struct, frozen=True):
     """How those did whom the run was about.
 
     Attributes:
-        passed: Whether all met their thresholds.
+        passed: Whether all met their thresholds; `None` if none failed and one was not judged.
         estimators: By source: ``passed``, and figures such as ``ate_rmse_m``.
     """
 
-    passed: bool
+    passed: bool | None
     estimators: dict[str, dict[str, Any]]
 
 
@@ -226,7 +227,13 @@ def summarise(
 def _verdict(found: dict[str, dict[str, Any]]) -> Verdict | None:
     if not found:
         return None
-    return Verdict(all(each["passed"] for each in found.values()), found)
+    return Verdict(overall(each["passed"] for each in found.values()), found)
+
+
+def overall(passed: Iterable[bool | None]) -> bool | None:
+    """Return what several verdicts are together: failed before not judged before passed."""
+    each = set(passed)
+    return False if False in each else None if None in each else True
 
 
 def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:

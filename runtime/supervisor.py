@@ -142,7 +142,7 @@ class Supervisor:
         if self._begin is not None and not self._begin.done():
             self._begin.cancel()
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool) -> None:
+    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         """Note a verdict for the summary."""
         self.verdicts[subject] = {"passed": passed, **figures}
 

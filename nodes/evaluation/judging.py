@@ -5,6 +5,7 @@ Pure functions; `nodes.evaluation.node` collects, and `nodes.evaluation.results`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import msgspec
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.alignment import How, align, associate, transform
+from nodes.evaluation.coverage import SECOND, Interval, Stamps, choose_frames, cover, seconds
 from nodes.evaluation.metrics import (
     absolute_error,
     drift_percent,
@@ -19,21 +21,24 @@ from nodes.evaluation.metrics import (
     relative_error,
     rotation_errors,
 )
-from nodes.evaluation.record import EstimatorRecord, Interval, seconds
+from nodes.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory
 
 Floats = npt.NDArray[np.float64]
 
-SECOND = 1_000_000_000
 MILLISECOND = 1_000_000
 
 
 class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What an estimator's figures may be at most; what is not given is not asked for.
+    """What an estimator's figures may be; what is not given, and has no default, is not asked for.
+
+    All are upper limits but those of coverage, which are lower ones.
 
     Attributes:
         ate_rmse_m: Absolute trajectory error, metres.
         ate_percent: The same in percent of the true path.
+        ate_max_m: Greatest position error, metres.
+        rot_rmse_deg: Rotation error.
         rpe_trans_percent: Relative pose error of the position.
         rpe_rot_deg_per_m: Relative pose error of the orientation.
         drift_percent: Error of the last pose seen from the first, in percent of the path.
@@ -41,10 +46,18 @@ class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         latency_p99_ms: From exposure to estimate.
         available_rmse_m: Error of the newest pose there was at each control tick.
         plan_rmse_m: How far the vehicle was from its `PlannedPose`.
+        coverage_percent: Share of the flight with poses, at least.
+        frame_coverage_percent: Share of the images with a pose, at least.
+        restarts: Times that it began anew in a frame of its own.
+        repeated_stamps: Poses whose stamp was not later than that of the one before.
+        future_stamps: Poses whose time had not come when they arrived.
+        collisions: Of the vehicle.
     """
 
     ate_rmse_m: float | None = None
     ate_percent: float | None = None
+    ate_max_m: float | None = None
+    rot_rmse_deg: float | None = None
     rpe_trans_percent: float | None = None
     rpe_rot_deg_per_m: float | None = None
     drift_percent: float | None = None
@@ -52,19 +65,38 @@ class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     latency_p99_ms: float | None = None
     available_rmse_m: float | None = None
     plan_rmse_m: float | None = None
+    coverage_percent: float = 90.0
+    frame_coverage_percent: float | None = None
+    restarts: int = 0
+    repeated_stamps: int = 0
+    future_stamps: int = 0
+    collisions: int = 0
+
+    @property
+    def given(self) -> bool:
+        """Whether anything is asked for beyond what is asked of everybody."""
+        return self != Thresholds()
 
     def missed(self, figures: dict[str, Any]) -> list[str]:
         """Return a sentence for each threshold that is not met."""
         found = []
         for name in self.__struct_fields__:
             limit, value = getattr(self, name), figures.get(name)
-            if limit is None:
+            if limit is None or (value is None and name in _COUNTS):
                 continue
+            side = "least" if name in AT_LEAST else "most"
             if value is None:
-                found.append(f"{name}: expected at most {limit:g}, found none")
-            elif not value <= limit:
-                found.append(f"{name}: expected at most {limit:g}, found {value:.4g}")
+                found.append(f"{name}: expected at {side} {limit:g}, found none")
+            elif not (value >= limit if name in AT_LEAST else value <= limit):
+                found.append(f"{name}: expected at {side} {limit:g}, found {value:.4g}")
         return found
+
+
+AT_LEAST = {"coverage_percent", "frame_coverage_percent"}
+"""Thresholds that are lower limits."""
+
+_COUNTS = {"restarts", "repeated_stamps", "future_stamps", "collisions"}
+"""Figures that are counted; where there was nothing to count, none was found."""
 
 
 class Errors(msgspec.Struct, frozen=True, eq=False):
@@ -77,8 +109,8 @@ class Errors(msgspec.Struct, frozen=True, eq=False):
         rotation: Radians, after alignment.
     """
 
-    stamps: npt.NDArray[np.int64]
-    since: npt.NDArray[np.int64]
+    stamps: Stamps
+    since: Stamps
     position: Floats
     rotation: Floats
 
@@ -107,6 +139,8 @@ def judge(
     record: EstimatorRecord,
     truth: Trajectory,
     *,
+    cameras: Mapping[str, Stamps] | None = None,
+    end: int | None = None,
     alignment: How | Literal["auto"] = "auto",
     rate: float = 400.0,
     delta: float = 1.0,
@@ -117,39 +151,62 @@ def judge(
     Args:
         record: What it said.
         truth: The true poses of the same body.
+        cameras: Stamps of the images (ns), strictly rising, by camera. The flight is from the
+            first to the last image of the camera that the estimator follows; without cameras it
+            is that of the truth.
+        end: When the run ended (ns); the end of the truth if not given.
         alignment: How the two frames are brought together; see `choose_alignment`.
         rate: Control ticks a second.
         delta: Metres of path over which relative errors are taken.
         gap: Seconds of silence that count as lost.
     """
-    if not len(record):
-        return Judgement(figures={"method": record.method, "estimates": 0}, estimate=None)
-    estimate = record.rows.trajectory()
-    how = choose_alignment(record) if alignment == "auto" else alignment
-    end = int(truth.stamps[-1])
-    # The last estimates of an orderly run are those whose latency had passed when it ended.
-    latencies = (record.arrivals(estimate) - estimate.stamps) / MILLISECOND
-    lost = record.lost(end, round(gap * SECOND) + round(float(latencies.max()) * MILLISECOND))
+    end = int(truth.stamps[-1]) if end is None else end
+    estimate = record.rows.trajectory() if len(record) else None
+    poses = np.empty(0, np.int64) if estimate is None else estimate.stamps
+    frames = choose_frames(cameras or {}, poses)
+    waits = 0
+    if estimate is not None:
+        # The last images of an orderly run are not answered yet, if answers take their time.
+        usual = int(np.median(record.arrivals() - poses))
+        waits = min(max(usual, 0), round(gap * SECOND))
+    due = truth.stamps if frames is None else frames
+    due = due[: max(int(np.searchsorted(due, end - waits, side="right")), 1)]
+    coverage = cover(due, poses, round(gap * SECOND), record.said_lost(end))
+    inside = (truth.stamps >= coverage.flight.start) & (truth.stamps <= coverage.flight.end)
+    flight = truth.take(inside) if inside.any() else truth
     figures: dict[str, Any] = {
         "method": record.method,
+        "estimates": len(record),
+        "coverage_percent": coverage.percent,
+        "frame_coverage_percent": None if frames is None else coverage.frames_percent,
+        "lost_seconds": seconds(coverage.lost),
+        "lost_count": len(coverage.lost),
+        "restarts": record.restarts,
+        "repeated_stamps": record.repeated,
+        "future_stamps": record.future,
+        "path_m": flight.length(),
+    }
+    if estimate is None:
+        return Judgement(figures=figures, estimate=None, lost=coverage.lost)
+    how = choose_alignment(record) if alignment == "auto" else alignment
+    latencies = (record.arrivals() - poses) / MILLISECOND
+    figures |= {
         "alignment": how,
-        "estimates": len(estimate),
         "rate_hz": (len(estimate) - 1) / estimate.seconds if estimate.seconds else 0.0,
         "latency_p50_ms": float(np.percentile(latencies, 50)),
         "latency_p99_ms": float(np.percentile(latencies, 99)),
-        "first_s": int(estimate.stamps[0]) / SECOND,
-        "lost_seconds": seconds(lost),
-        "lost_count": len(lost),
-        "path_m": truth.length(),
+        "first_s": (int(poses[0]) - coverage.flight.start) / SECOND,
     }
     try:
         there, kept = associate(truth, estimate)
         aligned = align(kept, there, how)
     except ValueError as error:  # too little to align, or no time in common
-        return Judgement(figures={**figures, "why": str(error)}, estimate=estimate, lost=lost)
+        return Judgement(
+            figures={**figures, "why": str(error)}, estimate=estimate, lost=coverage.lost
+        )
     moved = aligned.trajectory
     absolute = absolute_error(there, moved)
-    path = truth.length()
+    path = flight.length()
     figures |= {
         "scale": aligned.scale,
         "ate_rmse_m": absolute.rmse_m,
@@ -167,21 +224,22 @@ def judge(
         }
     except ValueError as error:  # it did not get that far
         figures["why"] = str(error)
+    inside = truth.covers(poses)
     of_images = Errors(
         stamps=there.stamps,
-        since=record.arrivals(moved),
+        since=record.arrivals()[inside],
         position=position_errors(there.positions, moved.positions),
         rotation=rotation_errors(there.orientations, moved.orientations),
     )
     whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
-    of_ticks = errors_at_ticks(truth, whole, record.arrivals(estimate), rate)
+    of_ticks = errors_at_ticks(truth, whole, record.arrivals(), rate)
     if of_ticks is not None:
         figures |= {
             "available_rmse_m": _rms(of_ticks.position),
             "available_rot_rmse_deg": float(np.degrees(_rms(of_ticks.rotation))),
             "available_age_ms": float(np.mean(of_ticks.stamps - of_ticks.since)) / MILLISECOND,
         }
-    return Judgement(figures, estimate, moved, of_images, of_ticks, lost)
+    return Judgement(figures, estimate, moved, of_images, of_ticks, coverage.lost)
 
 
 def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from array import array
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from events import (
     Announcement,
+    Collision,
     EstimatorAnnouncement,
     Image,
     Odometry,
@@ -27,10 +31,11 @@ from nodes.evaluation.judging import Judgement, Thresholds, beside_the_plan, jud
 from nodes.evaluation.live import LiveErrors, RecentTruth
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import file_name, write_results
-from nodes.trajectory import PoseRows
+from nodes.trajectory import PoseRows, Trajectory
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.growing import GrowingFile
 from runtime import Duration, Node, NodeConfig, Output, on
+from runtime.summary import overall
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -45,7 +50,10 @@ class EvaluationConfig(NodeConfig):
         control_rate: Hertz of the controller for which the newest pose is judged.
         delta: Metres of path over which relative errors are taken.
         gap: Silence of an estimator that counts as lost.
-        thresholds: What the figures may be at most; if one is above, the run's exit code is 1.
+        thresholds: What the figures may be; if one is missed, the run's exit code is 1. Without
+            any, an estimator is not judged, unless it misses what is asked of everybody (it was
+            there for nine tenths of the flight, in one frame, with stamps that rise; its vehicle
+            hit nothing).
         pictures: Sample pictures with features, for each estimator; 0 for none.
         report: Whether to write ``report.html`` and its pictures at the end.
     """
@@ -76,6 +84,8 @@ class Evaluation(Node[EvaluationConfig]):
         self._setpoints = PoseRows()
         self._records: dict[str, EstimatorRecord] = {}
         self._live: dict[str, LiveErrors] = {}
+        self._frames: dict[str, array[int]] = {}  # stamps by camera
+        self._collisions = 0
         self._album = Album(self.config.pictures)
         self._files: dict[str, GrowingFile] = {}
         self._closed = False
@@ -84,6 +94,7 @@ class Evaluation(Node[EvaluationConfig]):
         """Take the first vehicle's truth, unless the file names another; expect estimators."""
         if isinstance(announcement, VehicleAnnouncement):
             self.narrow("moved", announcement.source)
+            self.narrow("collided", announcement.source)
         if isinstance(announcement, EstimatorAnnouncement):
             record = EstimatorRecord(announcement.scale_free, announcement.method)
             self._records[announcement.source] = record
@@ -107,7 +118,8 @@ class Evaluation(Node[EvaluationConfig]):
         """Note an estimate, and say how good it is."""
         name, now = event.source, self.clock.now()
         record = self._records.setdefault(name, EstimatorRecord())
-        record.add(event, now)
+        if not record.add(event, now):
+            return
         self._append(name, event)
         self._say(event, "latency", (now - event.stamp) / 1e9, "s")
         truth = self._recent.at(event.stamp)
@@ -126,8 +138,16 @@ class Evaluation(Node[EvaluationConfig]):
 
     @on(Image)
     def saw(self, event: Image) -> None:
-        """Hold the picture for a while: its features may follow."""
+        """Note that there was an image; hold it for a while: its features may follow."""
+        stamps = self._frames.setdefault(event.source, array("q"))
+        if not stamps or event.stamp > stamps[-1]:
+            stamps.append(event.stamp)
         self._album.see(event)
+
+    @on(Collision)
+    def collided(self, event: Collision) -> None:  # noqa: ARG002
+        """Count the vehicle's collisions."""
+        self._collisions += 1
 
     @on(TrackedFeatures)
     def followed(self, event: TrackedFeatures) -> None:
@@ -141,54 +161,81 @@ class Evaluation(Node[EvaluationConfig]):
             file.close()
         if not self._records and self.clock.now() > 0:
             self.log.warning("no estimator has announced itself or said anything")
-        judgements, verdict = await self.offload(self._finish)
+        judgements, verdict = await self.offload(self._finish, self.clock.now())
         for name, judgement in judgements.items():
             figures = verdict["estimators"][name]
-            passed = bool(figures["passed"])
-            self.conclude(name, {k: v for k, v in figures.items() if k != "passed"}, passed=passed)
+            rest = {k: v for k, v in figures.items() if k != "passed"}
+            self.conclude(name, rest, passed=figures["passed"])
             if judgement.figures.get("why"):
                 self.log.warning("%s: %s", name, judgement.figures["why"])
         if self.out is not None and self.config.report:
             self.after_run(_write_report)
 
-    def _finish(self) -> tuple[dict[str, Judgement], dict[str, Any]]:
+    def _finish(self, end: int) -> tuple[dict[str, Judgement], dict[str, Any]]:
         config = self.config
         truth = self._truth.trajectory() if len(self._truth) else None
         plan = self._plan.trajectory() if len(self._plan) else None
-        flown = {} if truth is None or plan is None else beside_the_plan(truth, plan)
-        judgements = {}
+        flown: dict[str, float] = {"collisions": self._collisions}
+        if truth is not None and plan is not None:
+            flown |= beside_the_plan(truth, plan)
+        cameras = {name: np.array(stamps, np.int64) for name, stamps in self._frames.items()}
+        judgements, estimators = {}, {}
         for name, record in self._records.items():
-            if truth is None:
-                why = "expected a truth to hold it against, found no odometry"
-                judgements[name] = Judgement(figures={"why": why}, estimate=None)
-            else:
-                judgements[name] = judge(
-                    record,
-                    truth,
-                    alignment=config.alignment,
-                    rate=config.control_rate,
-                    delta=config.delta,
-                    gap=config.gap,
-                )
-        estimators = {}
-        for name, judgement in judgements.items():
+            judgement = self._judge(record, truth, cameras, end)
             judgement.figures.update(flown)
-            failed = config.thresholds.missed(judgement.figures)
+            failed = []
             if judgement.figures.get("ate_rmse_m") is None:
                 failed.append(judgement.figures.get("why", "expected estimates, found none"))
-            figures = {"passed": not failed, **judgement.figures, "failed": failed}
-            estimators[name] = figures
+            if "coverage_percent" in judgement.figures:
+                failed += config.thresholds.missed(judgement.figures)
+            if self.restarts:
+                failed.append(
+                    f"{self.name}: expected it to judge the whole flight, found that it was "
+                    "restarted: what was said before is not in the figures"
+                )
+            passed = not failed if failed or config.thresholds.given else None
+            estimators[name] = {"passed": passed, **judgement.figures, "failed": failed}
+            judgements[name] = judgement
         verdict = {
-            "passed": all(figures["passed"] for figures in estimators.values()),
+            "passed": overall(figures["passed"] for figures in estimators.values()),
             "estimators": estimators,
             "thresholds": msgspec.to_builtins(config.thresholds),
         }
         if self.out is not None:
             if plan is None and len(self._setpoints):
                 plan = self._setpoints.trajectory()
-            write_results(self.out, truth, plan, judgements, verdict)
+            partial = self.restarts > 0
+            write_results(self.out, truth, plan, judgements, verdict, partial=partial)
             self._album.write(self.out / "frames")
         return judgements, verdict
+
+    def _judge(
+        self,
+        record: EstimatorRecord,
+        truth: Trajectory | None,
+        cameras: dict[str, npt.NDArray[np.int64]],
+        end: int,
+    ) -> Judgement:
+        """Judge one estimator; whatever it said, the others are judged."""
+        if truth is None:
+            why = "expected a truth to hold it against, found no odometry"
+            return Judgement(figures={"why": why}, estimate=None)
+        config = self.config
+        try:
+            return judge(
+                record,
+                truth,
+                cameras=cameras,
+                end=end,
+                alignment=config.alignment,
+                rate=config.control_rate,
+                delta=config.delta,
+                gap=config.gap,
+            )
+        except Exception as error:
+            self.log.exception("it cannot be judged")
+            why = f"cannot be judged: {type(error).__name__}: {error}"
+            return Judgement(figures={"why": why}, estimate=None)
 
     def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
         """Add a pose to a file: should the run be killed, what was said until then is there."""

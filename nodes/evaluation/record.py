@@ -1,47 +1,70 @@
-"""What was said of one estimator's poses while a run went on, and the intervals it was lost in."""
+"""What one estimator said while a run went on, and what is wrong with it on the face of it."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from array import array
 
 import numpy as np
 import numpy.typing as npt
 
 from events import PoseEstimate, TrackingEvent, TrackingLost
-from nodes.trajectory import PoseRows, Trajectory
+from nodes.evaluation.coverage import Interval
+from nodes.trajectory import PoseRows
 
-SECOND = 1_000_000_000
-
-
-class Interval(NamedTuple):
-    """A stretch of time, nanoseconds."""
-
-    start: int
-    end: int
+_AHEAD = 1_000_000
+"""Nanoseconds by which a stamp may be later than its arrival: clocks are that close."""
 
 
 class EstimatorRecord:
     """Everything that came from one estimator.
 
+    Its trajectory is made of the poses in the frame in which it spoke first, with stamps that
+    rise. All others are counted, and are no poses of the flight:
+
     Args:
         scale_free: Whether its unit of length is its own.
         method: What it is.
+
+    Attributes:
+        rows: The poses of its trajectory.
+        repeated: Poses whose stamp was not later than the one before: said twice, or backwards.
+        future: Poses of a time that had not come when they arrived.
+        elsewhere: Poses in another frame than the first one.
+        restarts: How often it began to speak in another frame: each time it has lost where it is.
     """
 
     def __init__(self, scale_free: bool = False, method: str = "") -> None:
         self.scale_free = scale_free
         self.method = method
         self.frame_id = ""
-        self.child_frame_id = ""
         self.rows = PoseRows()
-        self._arrivals: dict[int, int] = {}  # by stamp
+        self.repeated = 0
+        self.future = 0
+        self.elsewhere = 0
+        self.restarts = 0
+        self._last_stamp: int | None = None
+        self._last_frame = ""
+        self._arrivals = array("q")
         self._tracking: list[TrackingEvent] = []
 
-    def add(self, event: PoseEstimate, now: int) -> None:
-        """Note an estimate that has come at a time (ns)."""
-        self.frame_id, self.child_frame_id = event.frame_id, event.child_frame_id
+    def add(self, event: PoseEstimate, now: int) -> bool:
+        """Note an estimate that has come at a time (ns); tell if it is part of the trajectory."""
+        if event.stamp > now + _AHEAD:
+            self.future += 1
+            return False
+        if self._last_stamp is not None and event.stamp <= self._last_stamp:
+            self.repeated += 1
+            return False
+        self._last_stamp = event.stamp
+        self.frame_id = self.frame_id or event.frame_id
+        self.restarts += event.frame_id not in {self.frame_id, self._last_frame}
+        self._last_frame = event.frame_id
+        if event.frame_id != self.frame_id:
+            self.elsewhere += 1
+            return False
         self.rows.add(event.stamp, event.position, event.orientation)
-        self._arrivals[event.stamp] = now
+        self._arrivals.append(now)
+        return True
 
     def note(self, event: TrackingEvent) -> None:
         """Note that tracking was lost or regained."""
@@ -50,18 +73,15 @@ class EstimatorRecord:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def arrivals(self, estimate: Trajectory) -> npt.NDArray[np.int64]:
-        """Return when each pose came (ns), shape (n,)."""
-        return np.array([self._arrivals[stamp] for stamp in estimate.stamps.tolist()], np.int64)
+    def arrivals(self) -> npt.NDArray[np.int64]:
+        """Return when each pose of the trajectory came (ns), shape (n,)."""
+        return np.array(self._arrivals, np.int64)
 
-    def lost(self, end: int, gap: int) -> list[Interval]:
-        """Return when there were no poses: by its own word, or by its silence.
-
-        Time before the first pose is not counted: a monocular estimator has to see motion first.
+    def said_lost(self, end: int) -> list[Interval]:
+        """Return when it was lost by its own word.
 
         Args:
-            end: Of the run (ns).
-            gap: Silence that counts (ns).
+            end: Of the run (ns); it is lost until then if it does not say that it has regained.
         """
         found = []
         since: int | None = None
@@ -73,24 +93,4 @@ class EstimatorRecord:
                 since = None
         if since is not None:
             found.append(Interval(since, end))
-        stamps = sorted(self._arrivals)
-        for before, after in zip(stamps, [*stamps[1:], end], strict=True):
-            if after - before > gap:
-                found.append(Interval(before, after))
-        return union(found)
-
-
-def union(intervals: list[Interval]) -> list[Interval]:
-    """Return the same time as intervals that do not touch, in order."""
-    found: list[Interval] = []
-    for each in sorted(intervals):
-        if found and each.start <= found[-1].end:
-            found[-1] = Interval(found[-1].start, max(found[-1].end, each.end))
-        else:
-            found.append(each)
-    return found
-
-
-def seconds(intervals: list[Interval]) -> float:
-    """Return how long intervals are together."""
-    return sum(each.end - each.start for each in intervals) / SECOND
+        return found

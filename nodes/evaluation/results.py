@@ -31,18 +31,30 @@ def write_results(
     plan: Trajectory | None,
     judgements: dict[str, Judgement],
     verdict: dict[str, Any],
+    *,
+    partial: bool = False,
 ) -> None:
-    """Write all of the above into a run's folder."""
+    """Write all of the above into a run's folder.
+
+    Args:
+        out: The folder.
+        truth: True poses, if any came.
+        plan: Where the pilot meant to be, if it said so.
+        judgements: By source of the estimator.
+        verdict: All figures.
+        partial: What is known is not all there was: the trajectories that have grown with the run
+            are left as they are.
+    """
     trajectories, evaluation = out / "trajectories", out / "evaluation"
     trajectories.mkdir(exist_ok=True)
     evaluation.mkdir(exist_ok=True)
-    if truth is not None:
+    if truth is not None and not partial:
         write_tum(trajectories / "truth.tum", truth, FRAMES.format("map (NED)"))
     if plan is not None:
         write_tum(trajectories / "plan.tum", plan, FRAMES.format("map (NED)"))
     for source, judgement in judgements.items():
         name = file_name(source)
-        if judgement.estimate is not None:
+        if judgement.estimate is not None and not partial:
             comment = FRAMES.format("the estimator's own frame")
             write_tum(trajectories / f"{name}.tum", judgement.estimate, comment)
         if judgement.aligned is not None:

@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
+from nodes.evaluation.coverage import Interval
 from nodes.evaluation.judging import Errors
-from nodes.evaluation.record import Interval
 from nodes.trajectory import Trajectory
 from runtime.summary import LinkSummary, StreamSummary, TickSummary
 
@@ -38,7 +38,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
 class Verdict(msgspec.Struct, frozen=True):
     """What ``evaluation/verdict.json`` holds, and without thresholds the summary."""
 
-    passed: bool
+    passed: bool | None
     estimators: dict[str, dict[str, Any]]
     thresholds: dict[str, float | None] = {}
 

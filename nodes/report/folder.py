@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from nodes.evaluation.coverage import Interval, seconds
 from nodes.evaluation.judging import Errors
-from nodes.evaluation.record import Interval, seconds
 from nodes.evaluation.results import file_name, read_errors
 from nodes.report.contents import Estimator, Facts, Run, Verdict
 from nodes.report.poses import gaps, lay_on, read_poses
@@ -131,7 +131,7 @@ class _Reader:
                 )
         lost = self._try(f"evaluation/{file}.lost.csv", _intervals)
         if lost is None:
-            lost = gaps(aligned, errors, truth)
+            lost = gaps(aligned, truth)
             known, counted = seconds(lost), figures.get("lost_seconds")
             if isinstance(counted, int | float) and abs(counted - known) > _ABOUT:
                 self.missing.append(

@@ -92,7 +92,7 @@ def render(run: Run, curves: list[Picture], frames: list[Picture], clouds: list[
         frames=[_embedded(p) for p in frames],
         clouds=[_embedded(p) for p in clouds],
         left=[_embedded(p) for p in left],
-        verdicts=[_verdict(run, e.name, e.figures, e.color) for e in run.estimators],
+        verdicts=[_verdict(e.name, e.figures, e.color) for e in run.estimators],
     )
 
 
@@ -119,9 +119,8 @@ def _embedded(picture: Picture) -> dict[str, str]:
     }
 
 
-def _verdict(run: Run, name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
+def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
     """Return what the top of the page says of an estimator."""
-    asked = run.verdict is not None and any(v is not None for v in run.verdict.thresholds.values())
     passed = figures.get("passed")
     failed = figures.get("failed")
     return {
@@ -130,6 +129,5 @@ def _verdict(run: Run, name: str, figures: dict[str, Any], color: str) -> dict[s
         "method": str(figures.get("method") or ""),
         "alignment": _ALIGNED.get(str(figures.get("alignment")), ""),
         "state": "not judged" if passed is None else "passed" if passed else "failed",
-        "asked": asked,
         "failed": [str(each) for each in failed] if isinstance(failed, list) else [],
     }

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.evaluation.record import Interval
+from nodes.evaluation.coverage import Interval
 from nodes.report.contents import Run
 from nodes.report.poses import Floats, broken
 from nodes.report.style import PLAN, TRUTH, WIDTH, Picture, label, legend_columns, save, sheet, thin

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.alignment import align, associate
+from nodes.evaluation.coverage import Interval, cover
 from nodes.evaluation.judging import Errors
 from nodes.evaluation.metrics import position_errors, rotation_errors
-from nodes.evaluation.record import Interval, union
 from nodes.trajectory import Trajectory
 
 Floats = npt.NDArray[np.float64]
@@ -19,7 +19,7 @@ Indices = npt.NDArray[np.int64]
 
 SECOND = 1_000_000_000
 GAP = SECOND // 2
-"""Silence that counts as lost, beside the estimator's latency."""
+"""Silence that counts as lost (ns)."""
 
 _FARTHEST = 1e12
 """Metres: an estimate that has burst goes beyond all that can be squared, or drawn."""
@@ -66,20 +66,12 @@ def lay_on(truth: Trajectory, said: Trajectory) -> tuple[Trajectory, Errors]:
     return moved, errors
 
 
-def gaps(
-    estimate: Trajectory | None, errors: Errors | None, truth: Trajectory | None
-) -> list[Interval]:
-    """Return where an estimator was silent, judged by the stamps of its poses alone."""
+def gaps(estimate: Trajectory | None, truth: Trajectory | None) -> list[Interval]:
+    """Return where an estimator was silent while there was a truth, by the stamps of its poses."""
     if estimate is None:
         return []
-    stamps = estimate.stamps
-    late = 0
-    if errors is not None and len(errors.since):
-        late = int((errors.since - errors.stamps).max())
-    end = int(truth.stamps[-1]) if truth is not None else int(stamps[-1])
-    ends = np.append(stamps[1:], end)
-    silent = np.flatnonzero(ends - stamps > GAP + late).tolist()
-    return union([Interval(int(stamps[k]), int(ends[k])) for k in silent])
+    frames = estimate.stamps if truth is None else truth.stamps
+    return cover(frames, estimate.stamps, GAP).lost
 
 
 def broken(values: Floats, stamps: npt.NDArray[np.int64], lost: Sequence[Interval]) -> Floats:

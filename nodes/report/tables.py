@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from nodes.evaluation.judging import AT_LEAST
 from nodes.report.contents import Facts, Run
 from nodes.report.style import number
 
@@ -23,8 +24,14 @@ MAIN = {
     "plan_max_m": ("greatest distance of the flight from its plan", "m"),
     "latency_p50_ms": ("latency, median", "ms"),
     "latency_p99_ms": ("latency, 99th percentile", "ms"),
+    "coverage_percent": ("share of the flight with poses", "%"),
+    "frame_coverage_percent": ("share of the images with a pose", "%"),
     "lost_seconds": ("time without a pose", "s"),
     "lost_count": ("times lost", ""),
+    "restarts": ("times that it began anew in a frame of its own", ""),
+    "repeated_stamps": ("poses whose stamp was not later than the one before", ""),
+    "future_stamps": ("poses of a time that had not come", ""),
+    "collisions": ("collisions of the vehicle", ""),
     "rate_hz": ("estimates a second", "Hz"),
 }
 """Figures that the top of the report shows: what they are, and their units."""
@@ -78,8 +85,10 @@ def figures(run: Run, *, main: bool) -> list[Row]:
         if limit is None and all(value is None for value in values):
             continue
         meaning, unit = MAIN.get(name) or (name.replace("_", " "), _unit(name))
-        cells = [(show(value), _missed(value, limit)) for value in values]
-        rows.append(Row(name, meaning, unit, "" if limit is None else f"≤ {limit:g}", cells))
+        cells = [(show(value), _missed(name, value, limit)) for value in values]
+        rows.append(
+            Row(name, meaning, unit, "" if limit is None else f"{_side(name)} {limit:g}", cells)
+        )
     return rows
 
 
@@ -169,10 +178,16 @@ def _unit(name: str) -> str:
     return next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
 
 
-def _missed(value: Any, limit: float | None) -> bool:
+def _missed(name: str, value: Any, limit: float | None) -> bool:
     if limit is None:
         return False
-    return not (isinstance(value, int | float) and value <= limit)
+    if not isinstance(value, int | float):
+        return True
+    return not (value >= limit if name in AT_LEAST else value <= limit)
+
+
+def _side(name: str) -> str:
+    return "≥" if name in AT_LEAST else "≤"
 
 
 def _counts(missed: dict[str, int]) -> str:

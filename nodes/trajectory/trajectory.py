@@ -6,6 +6,7 @@ Pure numpy and scipy. Files are in `nodes.trajectory.formats`; errors between tw
 
 from __future__ import annotations
 
+import array as compact
 from typing import Any
 
 import msgspec
@@ -188,34 +189,37 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
 
 
 class PoseRows:
-    """Poses as events bring them, in any order, until a trajectory is made of them."""
+    """Poses as events bring them, in any order, until a trajectory is made of them.
+
+    They take 64 bytes each, whatever the length of the run.
+    """
 
     def __init__(self) -> None:
-        self._rows: dict[int, tuple[Vector3, Quaternion]] = {}
-        self.replaced = 0
-        """How many poses came for a stamp that had one; the later one holds."""
+        self._stamps = compact.array("q")
+        self._poses = compact.array("d")
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._stamps)
 
     def add(self, stamp: int, position: Vector3, orientation: Quaternion) -> None:
         """Note a pose: nanoseconds, metres, quaternion w, x, y, z."""
-        self.replaced += stamp in self._rows
-        self._rows[stamp] = (position, orientation)
+        self._stamps.append(stamp)
+        self._poses.extend(position)
+        self._poses.extend(orientation)
 
     def trajectory(self) -> Trajectory:
-        """Return what has come so far, in order of time.
+        """Return what has come so far, in order of time; of several for one stamp the latest.
 
         Raises:
             ValueError: Nothing has, or a pose is none.
         """
-        stamps = sorted(self._rows)
-        rows = [self._rows[stamp] for stamp in stamps]
-        return Trajectory(
-            np.array(stamps, dtype=np.int64),
-            np.array([position for position, _ in rows], dtype=np.float64),
-            np.array([orientation for _, orientation in rows], dtype=np.float64),
-        )
+        stamps = np.array(self._stamps, np.int64)
+        poses = np.array(self._poses, np.float64).reshape(-1, 7)
+        if not (np.diff(stamps) > 0).all():
+            order = np.argsort(stamps, kind="stable")
+            newest = np.append(np.diff(stamps[order]) > 0, True)
+            stamps, poses = stamps[order[newest]], poses[order[newest]]
+        return Trajectory(stamps, poses[:, :3], poses[:, 3:])
 
 
 def quaternions(rotations: Floats) -> Floats:

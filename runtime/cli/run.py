@@ -20,6 +20,13 @@ if TYPE_CHECKING:
     from runtime.summary import Summary, Verdict
 
 
+_STATES = {
+    True: "[green]passed[/green]",
+    False: "[red]failed[/red]",
+    None: "[yellow]not judged: no thresholds were given[/yellow]",
+}
+
+
 class Log(Enum):
     """What ``--log`` takes: a level, or ``events``."""
 
@@ -95,7 +102,7 @@ def run(
     )
     if not quiet:
         report(summary, folder)
-    code = 0 if summary.verdict is None or summary.verdict.passed else 1
+    code = 1 if summary.verdict is not None and summary.verdict.passed is False else 0
     leave_threads_behind(code)
     raise typer.Exit(code)
 
@@ -159,7 +166,7 @@ def report(summary: Summary, folder: Path) -> None:
 def _judge(console: Console, verdict: Verdict) -> None:
     """Print who passed, and what those failed that did not."""
     for name, figures in verdict.estimators.items():
-        passed = "[green]passed[/green]" if figures["passed"] else "[red]failed[/red]"
+        passed = _STATES[figures["passed"]]
         reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
         console.print(f"{name} {passed}{': ' + reasons if reasons else ''}", highlight=False)
 

@@ -59,6 +59,8 @@ def _verdict(verdict: Verdict) -> Iterator[Table]:
 
 
 def _show(value: Any) -> str:
+    if value is None:
+        return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

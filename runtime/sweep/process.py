@@ -138,7 +138,7 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
     verdict = ended and ended.verdict
     if code < 0:
         row["error"] = f"ended by {signal.Signals(-code).name}"
-    elif code and not (code == 1 and verdict and not verdict.passed):
+    elif code and not (code == 1 and verdict and verdict.passed is False):
         text = (out / "output.txt").read_text(encoding="utf-8", errors="replace")
         row["error"] = _same_everywhere(last_error(text), job) or f"exit code {code}"
     else:

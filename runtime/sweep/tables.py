@@ -23,7 +23,9 @@ MAIN_FIGURES = (
     "ate_percent",
     "rpe_trans_percent",
     "rpe_rot_deg_per_m",
+    "coverage_percent",
     "lost_seconds",
+    "restarts",
     "latency_p50_ms",
     "available_rmse_m",
 )

@@ -65,7 +65,7 @@ class NoHost:
     def stop(self, reason: str) -> None:
         raise NotImplementedError
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool) -> None:
+    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         raise NotImplementedError
 
     def after_run(self, call: Callable[[Path], Any]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.evaluation.record import Interval
+from nodes.evaluation.coverage import Interval
 from nodes.report.ply import read_ply
 from nodes.report.poses import broken, gaps, read_poses
 from nodes.report.splat import Shown, View, paint
@@ -47,7 +47,7 @@ def test_what_holds_no_poses_is_an_error(tmp_path: Path, text: str) -> None:
 def test_gaps_are_where_no_pose_is_and_lines_break_there() -> None:
     truth = walk(10)
     said = recorded(truth, silent=(4.0, 6.0)).rows.trajectory()
-    (lost,) = gaps(said, None, truth)
+    (lost,) = gaps(said, truth)
     assert (lost.start / SECOND, lost.end / SECOND) == pytest.approx((4.0, 6.0), abs=0.04)
     line = broken(said.positions, said.stamps, [lost])
     assert np.isnan(line[:, 0]).sum() == 1
@@ -59,7 +59,7 @@ def test_gaps_are_where_no_pose_is_and_lines_break_there() -> None:
 def test_an_end_in_silence_is_a_gap() -> None:
     truth = walk(10)
     said = recorded(truth).rows.trajectory()
-    (lost,) = gaps(said.slice(0, 7 * SECOND), None, truth)
+    (lost,) = gaps(said.slice(0, 7 * SECOND), truth)
     assert lost.end == truth.stamps[-1]
 
 
