@@ -18,6 +18,17 @@ from runtime.errors import MissingDependencyError, suggest
 Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 
 
+def _hash_as_ros_2_does() -> None:
+    """Have rosbags hash ``char`` as ROS 2 has it in message files: as ``uint8``.
+
+    rosidl_adapter turns the one into the other before anything is hashed. rosbags takes it for
+    IDL's char, so that keys of such types would meet nobody, and bags with them be refused.
+    """
+    from rosbags.typesys.store import TIDMAP
+
+    TIDMAP["char"] = TIDMAP["uint8"]
+
+
 class MessageError(ValueError):
     """Bytes are not the message that they should be; the message says what is wrong."""
 
@@ -40,6 +51,8 @@ class TypeStore:
         try:
             from rosbags.serde import SerdeError
             from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+            _hash_as_ros_2_does()
         except ImportError as error:
             raise MissingDependencyError(
                 "the ROS 2 bridge needs rosbags: pip install 'visnav-runtime[ros2]'"
@@ -153,6 +166,8 @@ class Bag:
         try:
             from rosbags.highlevel import AnyReader, AnyReaderError
             from rosbags.typesys import Stores, get_typestore
+
+            _hash_as_ros_2_does()
         except ImportError as error:
             raise MissingDependencyError(
                 "bags need rosbags: pip install 'visnav-runtime[record]'"
@@ -162,11 +177,7 @@ class Bag:
             # For bags that have no definitions, as SQLite's of before Iron.
             store = get_typestore(Stores.ROS2_JAZZY)
             self._reader = AnyReader([path], default_typestore=store)
-            try:
-                self._reader.open()
-            except BaseException:
-                self._reader.close()
-                raise
+            self._reader.open()  # one that fails closes what it had opened
         except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
             raise ValueError(f"{path}: expected a bag of ROS, found: {error}") from error
         self._errors = (AnyReaderError, ValueError, ArithmeticError, LookupError, MemoryError)

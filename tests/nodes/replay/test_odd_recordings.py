@@ -88,6 +88,29 @@ def test_a_bag_that_is_cut_is_an_error_of_one_line(tmp_path: Path, plugin: Stora
             stamps(torn)
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "cause"),
+    [
+        ("bag/metadata.yaml", b"rosbag2_bagfile_information: [", "YAML|yaml|parse|metadata"),
+        ("bag/metadata.yaml", b"\xff\xfe", "decode|metadata|YAML"),
+        ("bag/metadata.yaml", b"other: 1\n", "rosbag2_bagfile_information|key"),
+        ("torn.bag", b"#ROSBAG V2.0\n" + bytes(50), "."),
+        ("torn.db3", b"SQLite format 3\0" + bytes(4000), "."),
+        ("torn.db3", b"", "."),
+    ],
+)
+def test_a_damaged_bag_is_an_error_that_says_what_is_wrong_with_it(
+    tmp_path: Path, name: str, content: bytes, cause: str
+) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
+    bag = path.parent if path.name == "metadata.yaml" else path
+    with pytest.raises(ReplayError, match=rf"{bag}[^\n]*: [^\n]*({cause})[^\n]*\Z") as raised:
+        stamps(bag)
+    assert "AnyReader is not open" not in str(raised.value)
+
+
 @pytest.mark.parametrize("wrong", [RuntimeError("malformed\nimage"), MemoryError()])
 def test_whatever_a_library_raises_is_an_error_of_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: Exception

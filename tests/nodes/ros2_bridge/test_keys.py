@@ -91,6 +91,34 @@ def test_types_hash_as_ros_does_and_not_at_all_on_humble() -> None:
         store.hash("std_msgs/msg/Strin")
 
 
+@pytest.mark.parametrize(
+    ("type_", "digits"),
+    [  # as rosidl's generators print them
+        (
+            "std_msgs/msg/Char",
+            "3ad2d04dd29ba19d04b16659afa3ccaedd691914b02a64e82e252f2fa6a586a9",
+        ),
+        (
+            "service_msgs/msg/ServiceEventInfo",
+            "41bcbbe07a75c9b52bc96bfd5c24d7f0fc0a08c0cb7921b3373c5732345a6f45",
+        ),
+        (
+            "rmw_dds_common/msg/Gid",
+            "ab6f21cfbb0a6dbb837161e1110c2051a2850ed9f9c53944d7115d9bcebedf71",
+        ),
+        (
+            "rmw_dds_common/msg/NodeEntitiesInfo",
+            "8ffef65ee2d088c63b1e8fcd31e800ba9fc8dbe0ee15ca60d1676de5218087a7",
+        ),
+    ],
+)
+def test_a_char_is_what_ros_2_makes_of_it(type_: str, digits: str) -> None:
+    store = TypeStore()
+    assert store.hash(type_) == f"RIHS01_{digits}"
+    if type_.endswith("Char"):  # the definition keeps its word
+        assert store.definition(type_).startswith("char data")
+
+
 def test_a_gid_is_the_hash_of_the_token_low_half_first() -> None:
     # XXH3's published 128-bit hash of nothing is 99aa06d3014798d8 6001c324468d497f.
     assert gid("") == bytes.fromhex("7f498d4624c30160d8984701d306aa99")
