@@ -21,13 +21,24 @@ HEAD = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
 """With its head: where the summary begins, where its offsets do, checksum of the summary."""
 
-_IS_FOOTER, _IS_DATA_END, _LAST, _PRIVATE = 0x02, 0x0F, 0x0F, 0x80
+_IS_FOOTER, _IS_CHUNK, _IS_DATA_END, _LAST, _PRIVATE = 0x02, 0x06, 0x0F, 0x0F, 0x80
+
+LARGEST = 1 << 29
+"""Bytes that a chunk may have when it is unpacked: many times what any writer makes."""
+
+_CHUNK = struct.Struct("<QQQII")
+"""First and last time, size when unpacked, checksum, length of the compression's name."""
+
+_ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
 
 END_WITHOUT_INDEX = (
     struct.pack("<BQI", _IS_DATA_END, 4, 0)  # no checksum
     + _FOOTER.pack(_IS_FOOTER, 20, 0, 0, 0)  # there is no summary
     + MAGIC
 )
+
+
+NOT_CLOSED = "the end is missing: the file was not closed"
 
 
 class TornError(ValueError):
@@ -40,19 +51,72 @@ def pieces(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, byte
     Raises:
         TornError: There is no footer, or something else than a record before it.
     """
+    for opcode, length in _heads(file):
+        if opcode in wanted:
+            yield opcode, file.read(length)
+
+
+def check_chunks(file: IO[bytes]) -> None:
+    """Look at what all chunks say of their sizes, for readers that would believe it.
+
+    Raises:
+        ValueError: One of them claims more than `LARGEST`.
+    """
+    try:
+        for opcode, length in _heads(file):
+            if opcode == _IS_CHUNK:
+                check_chunk(file.read(min(length, 128)))
+    except TornError:
+        pass  # who reads it will say so
+
+
+def check_chunk(content: bytes) -> None:
+    """Look at what the beginning of a chunk says of its size: its own word, and its frame's.
+
+    Raises:
+        ValueError: That is more than `LARGEST`, or there is no such beginning.
+    """
+    try:
+        _, _, size, _, length = _CHUNK.unpack_from(content)
+        size = max(size, frame_size(content[_CHUNK.size + length + 8 :]))
+    except (struct.error, IndexError):
+        raise ValueError("expected a chunk, found something else") from None
+    if size > LARGEST:
+        raise ValueError(f"expected a chunk of at most {LARGEST} bytes, found one of {size}")
+
+
+def frame_size(data: bytes) -> int:
+    """Return the size that a compressed frame claims (RFC 8878; LZ4's frame format); 0 if none."""
+    if data.startswith(_ZSTD):
+        flags = data[4]
+        single = flags >> 5 & 1
+        width = (single, 2, 4, 8)[flags >> 6]
+        begin = 5 + (not single) + (0, 1, 2, 4)[flags & 3]
+        size = int.from_bytes(data[begin : begin + width], "little")
+        return size + 256 if width == 2 else size
+    if data.startswith(_LZ4) and data[4] & 8:
+        return int.from_bytes(data[6:14], "little")
+    return 0
+
+
+def _heads(file: IO[bytes]) -> Iterator[tuple[int, int]]:
+    """Yield opcode and length of each record, with the file at its content.
+
+    Raises:
+        TornError: As for `pieces`.
+    """
     size = file.seek(0, io.SEEK_END)
     at = len(MAGIC)
     while True:
         file.seek(at)
         head = file.read(HEAD.size)
         if len(head) < HEAD.size:
-            raise TornError("the end is missing: the file was not closed")
+            raise TornError(NOT_CLOSED)
         opcode, length = HEAD.unpack(head)
         after = at + HEAD.size + length
         if not (0 < opcode <= _LAST or opcode >= _PRIVATE) or after > size:
             raise TornError(_why(file, at, size))
-        if opcode in wanted:
-            yield opcode, file.read(length)
+        yield opcode, length
         if opcode == _IS_FOOTER:
             return
         at = after
@@ -99,5 +163,5 @@ def _why(file: IO[bytes], at: int, size: int) -> str:
     """Tell a file that ends too early from one that is damaged in the middle."""
     file.seek(-len(MAGIC), os.SEEK_END)
     if file.read() != MAGIC:
-        return "the end is missing: the file was not closed"
+        return NOT_CLOSED
     return f"damaged: nothing can be read from byte {at} of {size} on"

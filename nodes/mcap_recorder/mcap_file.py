@@ -34,7 +34,7 @@ class Record(NamedTuple):
         type: Name of its schema.
         metadata: Of its channel.
         time: When it was published, nanoseconds.
-        sequence: Number of the event that it came from.
+        sequence: Its number among those of its channel, from 0; a gap tells of a lost one.
         data: Its bytes.
     """
 
@@ -89,6 +89,7 @@ class McapWriter:
         self.messages = 0
         self._fsync = fsync
         self._schemas: dict[str, int] = {}
+        self._counts: dict[int, int] = {}
         self._pending = 0
         try:
             self._file = WholeWrites((open_file or open_anew)(path))  # type: ignore[arg-type]
@@ -126,9 +127,11 @@ class McapWriter:
             self._schemas[type_] = schema
         return self._writer.register_channel(topic, "cdr", schema, dict(metadata or {}))
 
-    def write(self, channel: int, time: int, sequence: int, data: bytes | bytearray) -> None:
-        """Add a message; its bytes are copied."""
-        self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)  # type: ignore[arg-type]
+    def write(self, channel: int, time: int, data: bytes | bytearray) -> None:
+        """Add a message, with the next number of its channel; its bytes are copied."""
+        sequence = self._counts.get(channel, 0)
+        self._counts[channel] = (sequence + 1) & 0xFFFFFFFF
+        self._writer.add_message(channel, time, data, time, sequence)  # type: ignore[arg-type]
         self.messages += 1
         self._pending += len(data)
 

@@ -2,7 +2,7 @@
 
 The message is a ``std_msgs/msg/UInt8MultiArray``, so that a file holds nothing but CDR: ``ros2
 bag`` refuses files in which encodings are mixed. Its data is a frame; or, if the arrays stand in
-another message with the same sequence number, only the frame's beginning, up to its arrays.
+another message of the same time, only the frame's beginning, up to its arrays.
 """
 
 from __future__ import annotations

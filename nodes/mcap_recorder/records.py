@@ -6,6 +6,7 @@ The only module that imports mcap (mcap.dev/spec).
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import struct
 from collections.abc import Callable, Iterator
 from io import BytesIO
@@ -17,6 +18,7 @@ from nodes.mcap_recorder.disk import RecordingError
 from runtime.errors import MissingDependencyError
 
 try:
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
     from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
     from mcap.opcode import Opcode
@@ -25,6 +27,7 @@ try:
     from mcap.stream_reader import breakup_chunk
     from mcap.summary import Summary
     from mcap.writer import CompressionType, Writer
+    from zstandard import ZstdDecompressor
 
     _MISSING: ImportError | None = None
 except ImportError as error:
@@ -67,7 +70,12 @@ def writer(
     Raises:
         OSError: It cannot be written.
     """
-    found = Writer(file, chunk_size=chunk_size, compression=CompressionType[compression.upper()])
+    found = Writer(
+        file,
+        chunk_size=chunk_size,
+        compression=CompressionType[compression.upper()],
+        use_summary_offsets=False,  # optional, and its writer makes them of empty groups too
+    )
     found.start(profile=profile, library=library)
     return found
 
@@ -241,14 +249,33 @@ def _broken_up(content: bytes, damaged: Callable[[str], None]) -> list[Any]:
     """Return the records of a chunk; none if it is damaged."""
     stream = ReadDataStream(BytesIO(content))
     try:
+        layout.check_chunk(content)
         chunk = Chunk.read(stream)
         if stream.count != len(content):
             raise ValueError(f"expected {len(content)} bytes, found {stream.count}")
-        return breakup_chunk(chunk, validate_crc=True)
+        return breakup_chunk(_unpacked(chunk), validate_crc=True)
     except Exception as error:  # whatever its compression raises
         first, last = _TIMES.unpack_from(content) if len(content) >= _TIMES.size else (0, 0)
         damaged(_left_out(first, last, error))
         return []
+
+
+def _unpacked(chunk: Chunk) -> Chunk:
+    """Return a chunk without compression: however much comes out, no more is made than it says."""
+    size = chunk.uncompressed_size
+    if chunk.compression == "zstd":
+        data = (
+            ZstdDecompressor(max_window_size=layout.LARGEST)
+            .stream_reader(chunk.data)
+            .read(size + 1)
+        )
+    elif chunk.compression == "lz4":
+        data = LZ4FrameDecompressor().decompress(chunk.data, size + 1)
+    else:
+        return chunk
+    if len(data) != size:
+        raise ValueError(f"expected {size} bytes, found {len(data)}{'+' * (len(data) > size)}")
+    return dataclasses.replace(chunk, compression="", data=data)
 
 
 def _left_out(first: int, last: int, error: Exception) -> str:

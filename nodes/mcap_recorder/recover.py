@@ -9,9 +9,12 @@ from typing import Any
 
 import msgspec
 
-from nodes.mcap_recorder import records
+from nodes.mcap_recorder import layout, records
 from nodes.mcap_recorder.disk import RecordingError, is_being_written, unwritable
 from nodes.mcap_recorder.mcap_file import contents
+
+MENDED = "visnav_mended"
+"""Metadata of a file in which something could not be mended: what, by number."""
 
 
 class Recovery(msgspec.Struct, frozen=True):
@@ -20,14 +23,17 @@ class Recovery(msgspec.Struct, frozen=True):
     Attributes:
         path: The whole file.
         messages: How many it has.
-        trouble: What could not be read; empty if the file was whole.
+        trouble: What could not be read, now or when it was mended before; empty if the file was
+            whole.
         mended: Whether there was anything to do.
+        partial: Whether messages are missing between others, and not just after the last one.
     """
 
     path: Path
     messages: int
     trouble: list[str]
     mended: bool
+    partial: bool
 
 
 def recover_file(path: Path, out: Path | None = None) -> Recovery:
@@ -50,7 +56,8 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
     if found.complete and out is None:
         trouble: list[str] = []
         messages = sum(isinstance(r, records.Message) for r in _all_of(path, trouble))
-        return Recovery(path, messages, trouble, mended=False)
+        trouble += found.metadata.get(MENDED, {}).values()
+        return Recovery(path, messages, trouble, mended=False, partial=bool(trouble))
     if out is not None and out.exists():
         raise RecordingError(f"{out}: expected the name of a new file, found one that is there")
     place = out or path.with_name(f"{path.name}.mended")
@@ -63,7 +70,8 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
         raise
     if out is None:
         place.replace(path)
-    return Recovery(out or path, messages, trouble, mended=True)
+    partial = any(each != layout.NOT_CLOSED for each in trouble)
+    return Recovery(out or path, messages, trouble, mended=True, partial=partial)
 
 
 def _all_of(path: Path, trouble: list[str]) -> Iterator[Any]:
@@ -111,6 +119,9 @@ def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
                         number = channels[record.channel_id]
                         writer.add_message(number, time, record.data, published, record.sequence)
                         messages += 1
+            lost = [each for each in trouble if each != layout.NOT_CLOSED]
+            if lost:  # so that nobody takes it for whole, now that it has an index
+                writer.add_metadata(MENDED, {str(n): each for n, each in enumerate(lost, 1)})
             writer.finish()  # type: ignore[no-untyped-call]
             file.flush()
             os.fsync(file.fileno())  # it may take the place of the only other one there is

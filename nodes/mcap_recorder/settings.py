@@ -12,6 +12,7 @@ from nodes.ros2_bridge.typestore import Distribution
 from runtime import NodeConfig
 
 Bytes = Annotated[int, msgspec.Meta(ge=1 << 16)]
+ChunkBytes = Annotated[int, msgspec.Meta(ge=1 << 16, le=1 << 28)]
 
 
 class McapRecorderConfig(NodeConfig):
@@ -42,7 +43,7 @@ class McapRecorderConfig(NodeConfig):
     depth: Literal["raw", "png"] = "raw"
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
     compression: Compression = "zstd"
-    chunk_size: Bytes = 4 << 20
+    chunk_size: ChunkBytes = 4 << 20
     memory: Bytes = 256 << 20
     when_full: WhenFull = "wait"
     fsync: bool = False

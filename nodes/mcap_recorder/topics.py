@@ -1,7 +1,7 @@
 """Events to messages of a recording: those of ROS, as the bridge makes them, and the event itself.
 
-A large array stands in the file once, in ROS's message; the event's own message then lacks it, and
-has the same sequence number. Runs in the process that writes.
+A large array stands in the file once, in ROS's message; the event's own message then lacks it, has
+the same time, and names that topic in its channel. Runs in the process that writes.
 """
 
 from __future__ import annotations
@@ -85,12 +85,11 @@ class Topics:
         self._ros = Publishing(session, self._store, self._names, Stamps().out)
         self._frames = FrameNames()
         self._puts: dict[str, Any] = {}
-        self._own: dict[tuple[str, str], int] = {}
+        self._own: dict[tuple[str, str, str], int] = {}
         self._depth_topics: dict[str, _Topic] = {}
         self._definitions: dict[str, str] = {}
         self._begun = False
         self.time = 0
-        self.sequence = 0
         self.holder = ""
         """Topic that has got the arrays of the event at hand."""
 
@@ -106,7 +105,6 @@ class Topics:
             WireError: It is no frame.
         """
         self.time = time
-        self.sequence += 1
         self.holder = ""
         kind, source = native.describe(frame)
         if not announcement and not self._begun:
@@ -137,7 +135,7 @@ class Topics:
 
     def put(self, channel: int, data: bytes | bytearray) -> None:
         """Write a message of the event at hand."""
-        self._writer.write(channel, self.time, self.sequence, data)
+        self._writer.write(channel, self.time, data)
 
     def _putter(self, kind: str) -> Any:
         """Return what writes ROS's messages of a kind of event; `None` if there are none."""
@@ -183,7 +181,7 @@ class Topics:
     def _write_own(
         self, kind: str, source: str, frame: bytes | bytearray, announcement: bool
     ) -> None:
-        channel = self._own.get((kind, source))
+        channel = self._own.get((kind, source, self.holder))
         if channel is None:
             metadata = {
                 "kind": kind,
@@ -193,7 +191,8 @@ class Topics:
             }
             name = re.sub(r"\W", "_", kind.rpartition(":")[2])
             topic = f"{PREFIX}/{ros_name(source)}/{name}"
-            channel = self._own[kind, source] = self.add_channel(topic, native.TYPE, metadata)
+            channel = self.add_channel(topic, native.TYPE, metadata)
+            self._own[kind, source, self.holder] = channel
         self.put(channel, native.message(frame, arrays=not self.holder))
 
 

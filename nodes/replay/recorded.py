@@ -53,13 +53,14 @@ class Recorded(Reader):
 
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
         """Yield its events, equal to what was recorded."""
-        holder: Record | None = None
+        holders: dict[str, Record] = {}  # the newest of each topic, until its event has come
         for record in read(self._path, start, end, self.complain):
             if record.type in HOLDERS:
-                holder = record
+                holders[record.topic] = record
             kind = record.metadata.get("kind")
             if kind is None or record.metadata.get("announcement"):
                 continue
+            holder = holders.pop(record.metadata.get("arrays", ""), None)
             try:
                 if wants(event_type(kind), record.metadata.get("source", "")):
                     yield Timed(record.time, self._event(record, holder))
@@ -76,8 +77,8 @@ class Recorded(Reader):
         lacking = native.lacking(record.data)
         if not lacking:
             return native.event(record.data)
-        if holder is None or holder.sequence != record.sequence:
-            raise ValueError(f"expected a message with the arrays of event {record.sequence}")
+        if holder is None or holder.time != record.time:
+            raise ValueError(f"expected a message of {record.time} ns with its arrays, found none")
         # All events with arrays and a message have a frame.
         frame = native.fields(record.data).get("frame_id", "map")
         axes = self._frames.axes(frame)

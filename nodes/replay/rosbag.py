@@ -28,6 +28,7 @@ from events import (
     Odometry,
     PoseEstimate,
 )
+from nodes.mcap_recorder import layout
 from nodes.mcap_recorder.arrays import decoded
 from nodes.replay.bag_topics import chosen
 from nodes.replay.folders import standing
@@ -73,6 +74,10 @@ class RosBag(Reader):
         self._path = path
         self._vehicle = vehicle
         with _readable(path):
+            for each in [path] if path.is_file() else sorted(path.glob("*.mcap")):
+                with each.open("rb") as file:
+                    if file.read(len(layout.MAGIC)) == layout.MAGIC:
+                        layout.check_chunks(file)  # rosbags would believe whatever they claim
             self._bag = Bag(path)
         try:
             with _readable(path):

@@ -32,9 +32,10 @@ def recover(
         raise ConfigError(str(error)) from None
     for trouble in done.trouble:
         print(f"{file}: {trouble}")
+    partial = "; what is named above is missing" if done.partial else ""
     if done.mended:
-        print(f"{done.path}: {done.messages} messages, complete")
-    elif done.trouble:
-        print(f"{done.path}: has its index, left as it is; {done.messages} messages can be read")
+        print(f"{done.path}: {done.messages} messages, now with an index{partial}")
+    elif done.partial:
+        print(f"{done.path}: {done.messages} messages, has its index, left as it is{partial}")
     else:
         print(f"{done.path}: {done.messages} messages, complete, nothing to mend")

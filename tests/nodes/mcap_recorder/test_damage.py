@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import struct
+import tracemalloc
 from pathlib import Path
 
+import lz4.frame  # type: ignore[import-untyped]
 import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
@@ -12,6 +18,9 @@ from nodes.mcap_recorder import layout
 from nodes.mcap_recorder.disk import RecordingError
 from nodes.mcap_recorder.mcap_file import McapWriter, contents, read
 from nodes.mcap_recorder.recover import recover_file
+from nodes.replay.formats import open_reader
+from nodes.replay.reader import ReplayError
+from nodes.replay.settings import ReplayConfig
 from tests.nodes.mcap_recorder.test_mcap_file import fill, write
 
 CLOSED = "the end is missing: the file was not closed"
@@ -64,10 +73,10 @@ def test_a_hole_is_told(tmp_path: Path, index: bool, after: int) -> None:
     trouble: list[str] = []
     found = [record.sequence for record in read(path, damaged=trouble.append)]
     if index or after:  # else nothing tells where the next chunk begins
-        assert found == [0, 0, 2, 2, 3, 3]
+        assert found == [0, 1, 4, 5, 6, 7]
         assert "a damaged chunk is left out" in trouble[0]
     else:
-        assert found == [0, 0]
+        assert found == [0, 1]
         assert trouble == [CLOSED]
 
 
@@ -140,3 +149,83 @@ def test_a_file_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
     assert path.read_bytes() == before
     writer.abandon()
     assert recover_file(path).mended
+
+
+def claiming(path: Path, compression: str, size: int) -> None:
+    """Write a file whose one chunk unpacks, as it or its frame says, to so many bytes."""
+    pack = {
+        "zstd": zstandard.ZstdCompressor().compress,
+        "lz4": lz4.frame.compress,
+        "": bytes,
+    }[compression]
+    data = bytearray(pack(bytes(1000)))
+    if compression == "zstd":  # a frame of 1000 bytes has two of them for its size
+        assert data[4] >> 6 == 1
+        data = data[:4] + bytes([data[4] | 0xC0]) + struct.pack("<Q", size) + data[7:]
+    elif compression == "lz4":
+        assert data[4] & 8
+        data[6:14] = struct.pack("<Q", size)
+    name = compression.encode()
+    head = struct.pack("<QQQI", 0, 9, 1000 if compression else size, 0)
+    chunk = head + struct.pack("<I", len(name)) + name + struct.pack("<Q", len(data)) + data
+    header = struct.pack("<BQII", 1, 8, 0, 0)
+    path.write_bytes(
+        layout.MAGIC + header + struct.pack("<BQ", 6, len(chunk)) + chunk + layout.END_WITHOUT_INDEX
+    )
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+def test_a_chunk_that_claims_too_much_is_refused_before_it_is_unpacked(
+    tmp_path: Path, compression: str
+) -> None:
+    """By our own reader, and before another one believes it."""
+    path = tmp_path / "a.mcap"
+    claiming(path, compression, 2 << 30)
+    tracemalloc.start()
+    trouble: list[str] = []
+    assert not list(read(path, damaged=trouble.append))
+    with pytest.raises(ReplayError, match=rf"a\.mcap: expected .* found one of {2 << 30}\Z"):
+        open_reader(ReplayConfig(file=str(path)), "replay")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert f"found one of {2 << 30}" in trouble[0]
+    assert peak < 100 << 20
+
+
+@settings(deadline=None, max_examples=50)
+@given(size=st.integers(0, 70_000), compression=st.sampled_from(["zstd", "lz4"]))
+def test_what_a_frame_says_of_its_size_is_read_as_its_library_reads_it(
+    size: int, compression: str
+) -> None:
+    """Of every width that the field has."""
+    if compression == "zstd":
+        data = zstandard.ZstdCompressor().compress(bytes(size))
+    else:
+        data = lz4.frame.compress(bytes(size), store_size=True)
+    assert layout.frame_size(data) == size
+
+
+@settings(deadline=None, max_examples=100)
+@given(data=st.data())
+def test_no_file_raises_anything_but_our_own_error(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Cut anywhere, with any bytes changed: one line, for replay and mending alike."""
+    path = tmp_path_factory.mktemp("fuzz") / "a.mcap"
+    write(path, compression=data.draw(st.sampled_from(["zstd", "lz4", "none"])))
+    content = bytearray(path.read_bytes())
+    del content[data.draw(st.integers(1, len(content))) :]
+    for place in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=4)):
+        content[place] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    errors: list[str] = []
+    for call in (
+        lambda: list(read(path)),
+        lambda: recover_file(path, path.with_name("b.mcap")),
+        lambda: open_reader(ReplayConfig(file=str(path)), "replay"),
+    ):
+        try:
+            call()
+        except (RecordingError, ReplayError) as error:
+            errors.append(str(error))
+    assert not any("\n" in each for each in errors)

@@ -88,7 +88,7 @@ def test_a_disk_that_is_full_at_the_very_end_is_an_error(
 
     monkeypatch.setattr(Recording, "start", limited)
     with pytest.raises(NodeError, match=r"recording\.mcap cannot be written: File too large"):
-        record([*announcements(), *said(0)], tmp_path, chunk_size=1 << 30)
+        record([*announcements(), *said(0)], tmp_path, chunk_size=1 << 28)
 
 
 def test_a_disk_that_is_slow_at_the_end_has_its_time_after_the_run(

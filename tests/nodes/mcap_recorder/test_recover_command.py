@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from nodes.mcap_recorder import layout
+from nodes.mcap_recorder.mcap_file import read
 from runtime.cli.recover import recover
 from runtime.errors import VisnavError
 from tests.nodes.mcap_recorder.test_mcap_file import write
@@ -23,7 +24,7 @@ def test_a_torn_file_is_mended_and_a_whole_one_is_not(
     recover(path)
     assert capsys.readouterr().out.splitlines() == [
         f"{path}: the end is missing: the file was not closed",
-        f"{path}: 8 messages, complete",
+        f"{path}: 8 messages, now with an index",
     ]
     recover(path)
     assert capsys.readouterr().out == f"{path}: 8 messages, complete, nothing to mend\n"
@@ -41,7 +42,9 @@ def test_a_damaged_file_with_an_index_is_left_as_it_is(
     recover(path)
     first, last = capsys.readouterr().out.splitlines()
     assert "0.000 s to 0.500 s: a damaged chunk is left out" in first
-    assert last == f"{path}: has its index, left as it is; 6 messages can be read"
+    assert last == (
+        f"{path}: 6 messages, has its index, left as it is; what is named above is missing"
+    )
 
 
 @pytest.mark.parametrize("what", ["nothing", "a folder", "a text"])
@@ -54,3 +57,23 @@ def test_what_is_no_recording_is_an_error_of_one_line(tmp_path: Path, what: str)
         path.write_text("hello")
     with pytest.raises(VisnavError, match=r"a\.mcap: expected [^\n]+\Z"):
         recover(path)
+
+
+def test_what_a_damaged_chunk_took_stays_missing_however_often_it_is_mended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A new index does not make such a file complete, and its numbers have a gap."""
+    path = tmp_path / "a.mcap"
+    write(path, compression="none")
+    data = bytearray(path.read_bytes())
+    data[data.index(b"half")] ^= 0xFF
+    path.write_bytes(data)
+    out = tmp_path / "b.mcap"
+    recover(path, out)
+    first, last = capsys.readouterr().out.splitlines()
+    assert last == f"{out}: 6 messages, now with an index; what is named above is missing"
+    recover(out)
+    again, last = capsys.readouterr().out.splitlines()
+    assert again.partition(": ")[2] == first.partition(": ")[2]
+    assert last.endswith("has its index, left as it is; what is named above is missing")
+    assert [record.sequence for record in read(out)] == [2, 3, 4, 5, 6, 7]
