@@ -1,16 +1,22 @@
-"""What a flight leaves to look at: the true trajectory, a plot of it, and a sheet of pictures."""
+"""What a flight leaves to look at: the true trajectory, a plot of it, and a sheet of pictures.
+
+After a restart the trajectory goes on in the same file; plot and sheet get a number (``flight-2``)
+and show what came after it.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import cv2
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from events import Collision, Image, Odometry
-from nodes.pictures import Row, Thumbnail, draw_contact_sheet, draw_flight
-from nodes.trajectory.growing import GrowingFile
+from nodes.pictures import Thumbnail, draw_contact_sheet, draw_flight
+from nodes.trajectory.growing import GrowingFile, part_name
 from runtime import Duration, Node, NodeConfig, on
 
 Count = Annotated[int, msgspec.Meta(ge=1, le=100)]
@@ -43,7 +49,6 @@ class FlightLog(Node[FlightLogConfig]):
 
     async def on_startup(self) -> None:
         """Open the trajectory: it grows as the vehicle flies."""
-        self._rows: list[Row] = []
         self._thumbnails: list[Thumbnail] = []
         self._collisions: list[Collision] = []
         self._interval = round(self.config.interval * 1e9)
@@ -57,7 +62,6 @@ class FlightLog(Node[FlightLogConfig]):
     def moved(self, event: Odometry) -> None:
         """Note where the vehicle is."""
         (x, y, z), (qw, qx, qy, qz) = event.position, event.orientation
-        self._rows.append((event.stamp, x, y, z, *event.linear_velocity))
         if self._file is not None:
             # TUM's format (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): xyzw.
             seconds, rest = divmod(event.stamp, 1_000_000_000)
@@ -90,8 +94,28 @@ class FlightLog(Node[FlightLogConfig]):
         if self._file is None or self.out is None:
             return
         self._file.close()
-        if self._rows:
-            places = [(c.position[0], c.position[1]) for c in self._collisions]
-            await self.offload(draw_flight, self._rows, places, self.out / self.config.plot)
+        plot = self.out / part_name(self, self.config.plot)
+        await self.offload(self._draw, self.out / self.config.trajectory, self._file.begin, plot)
         if self._thumbnails:
-            await self.offload(draw_contact_sheet, self._thumbnails, self.out / self.config.sheet)
+            sheet = self.out / part_name(self, self.config.sheet)
+            await self.offload(draw_contact_sheet, self._thumbnails, sheet)
+
+    def _draw(self, trajectory: Path, begin: int, plot: Path) -> None:
+        rows = _flown(trajectory, begin)
+        if len(rows):
+            places = [(c.position[0], c.position[1]) for c in self._collisions]
+            draw_flight(rows, places, plot)
+
+
+def _flown(path: Path, begin: int) -> npt.NDArray[np.float64]:
+    """Return the rows from a byte on, with velocities by differences, as `draw_flight` has it."""
+    with path.open(encoding="ascii") as file:
+        file.seek(begin)
+        lines = [line for line in file if not line.startswith("#")]
+    if not lines:
+        return np.empty((0, 7))
+    poses = np.loadtxt(lines, usecols=range(4), ndmin=2)
+    steps = np.diff(poses, axis=0, append=poses[-1:])
+    steps[-1] = steps[-2] if len(steps) > 1 else 0.0
+    seconds = np.where(steps[:, :1] > 0.0, steps[:, :1], np.inf)  # none where time stands still
+    return np.hstack([poses[:, :1] * 1e9, poses[:, 1:], steps[:, 1:] / seconds])

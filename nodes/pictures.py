@@ -11,18 +11,16 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-Row = tuple[int, float, float, float, float, float, float]
-"""Stamp (ns), position x, y, z (m, NED), linear velocity x, y, z (m/s)."""
-
 Thumbnail = tuple[int, str, npt.NDArray[np.uint8]]
 """Stamp (ns), source, picture (h, w, 1 or 3)."""
 
 
-def draw_flight(rows: Sequence[Row], hits: Sequence[tuple[float, float]], out: Path) -> None:
+def draw_flight(rows: npt.ArrayLike, hits: Sequence[tuple[float, float]], out: Path) -> None:
     """Draw a flight from above and over time.
 
     Args:
-        rows: The flight.
+        rows: The flight, shape (n, 7): stamp (ns), position x, y, z (m, NED), linear velocity
+            x, y, z (m/s).
         hits: Places of collisions, x and y (m).
         out: The PNG to write.
     """

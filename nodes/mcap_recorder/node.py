@@ -13,6 +13,7 @@ from nodes.mcap_recorder.disk import RecordingError
 from nodes.mcap_recorder.order import Order
 from nodes.mcap_recorder.recording import Recording, spare_cores
 from nodes.mcap_recorder.settings import McapRecorderConfig
+from nodes.trajectory.growing import part_name
 from runtime import Input, Node
 
 _WAITING = 1 << 16
@@ -158,22 +159,13 @@ class McapRecorder(Node[McapRecorderConfig]):
                 loop.call_soon_threadsafe(self._fail, error)
 
         order = Order(
-            path=str(self._path(self.out)),
+            path=str(self.out / part_name(self, self.config.file)),
             config=self.config,
             attachment=str(self.out / "config.toml"),
             niceness=5,
             cores=spare_cores() if self.clock.kind == "real" else (),
         )
         return Recording(order, self._backlog, failed, complain)
-
-    def _path(self, out: Path) -> Path:
-        """Return the file; should the node be restarted in the run, one beside that of before."""
-        path = out / self.config.file
-        number = 1
-        while self.clock.now() > 0 and path.exists():
-            number += 1
-            path = out / self.config.file.replace(".mcap", f"-{number}.mcap")
-        return path
 
     def _fail(self, error: RecordingError) -> None:
         if self._failed is not None and not self._failed.done():

@@ -1,4 +1,8 @@
-"""Text files that grow with a run, so that a run that is killed leaves all but its last second."""
+"""Files of a run that outlast what happens to it.
+
+Text files grow with a run, so that a run that is killed leaves all but its last second; and what a
+node wrote before it was restarted is never overwritten.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +17,30 @@ _INTERVAL = 500_000_000
 """Nanoseconds of the run's clock between two writes."""
 
 
+def part_name(node: Node[Any], name: str) -> str:
+    """Return the name of a node's file or folder; after a restart one beside those of before.
+
+    ``flight.png`` is followed by ``flight-2.png``, ``dataset`` by ``dataset-2``.
+    """
+    stem, dot, suffix = name.partition(".")
+    return f"{stem}-{node.restarts + 1}{dot}{suffix}" if node.restarts else name
+
+
 class GrowingFile:
     """A file of lines: they are added on the loop, and written beside it twice a second.
 
     Args:
         node: In whose name it is written.
-        path: The file; made anew.
+        path: The file; made anew, unless the node was restarted: then it goes on.
         head: Its first line.
     """
 
     def __init__(self, node: Node[Any], path: Path, head: str = "") -> None:
         self._node = node
-        self._file = path.open("wb", buffering=0)
-        self._lines = deque([head])
+        self._file = path.open("ab" if node.restarts else "wb", buffering=0)
+        self.begin = self._file.tell()
+        """Bytes that were there before."""
+        self._lines = deque([] if self.begin else [head])
         self._due = 0
         self._writing = False
         self._lock = threading.Lock()

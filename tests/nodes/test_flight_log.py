@@ -11,11 +11,11 @@ import pytest
 
 from events import Collision, Event, Image, Odometry
 from nodes.flight_log import FlightLog
-from runtime import Duration
+from runtime import Duration, Tick, every
 from runtime.config import Config, RunConfig
 from runtime.errors import NodeError
 from runtime.execute import execute
-from runtime.testing import run_node, spec
+from runtime.testing import run_node, run_nodes, spec
 from tests.nodes.test_tour import Vehicle
 
 
@@ -131,3 +131,31 @@ def test_a_run_that_is_stopped_leaves_a_whole_file(tmp_path: Path) -> None:
     assert len(rows) == 101
     assert all(len(row) == 8 for row in rows)
     assert (tmp_path / "flight.png").exists()
+
+
+class Failing(FlightLog):
+    """Fails now and then, and is brought up again."""
+
+    @every(hz=1)
+    def fail(self, tick: Tick) -> None:
+        if tick.index == 2:
+            raise RuntimeError("now")
+
+
+def test_a_restart_keeps_what_was_written_before(tmp_path: Path) -> None:
+    """The trajectory goes on, whatever was said while it was down; pictures are drawn by part."""
+    inputs: list[Event] = [odometry(100_000_000 * k, 0.1 * k) for k in range(60)]
+    inputs += [image(500_000_000 * k) for k in range(12)]
+    node = spec(Failing, "log", on_error="restart")
+    run_nodes([node], inputs=sorted(inputs, key=lambda e: e.stamp), out=tmp_path, duration=6.0)
+    text = (tmp_path / "trajectory.tum").read_text()
+    assert text.count("#") == 1
+    stamps = [row[0] for row in trajectory(tmp_path / "trajectory.tum")]
+    assert stamps == sorted(set(stamps))
+    assert stamps[0] == 0.0
+    assert stamps[-1] == 5.9
+    assert len(stamps) > 40
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "trajectory.tum",
+        *(f"{name}{part}.png" for name in ("flight", "pictures") for part in ("", "-2", "-3")),
+    }
