@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from events.base import Category, Event, Quaternion, Vector3
+from events.checks import check, check_pose
 from events.sensors import CameraInfo
 
 
@@ -15,6 +16,9 @@ class Announcement(Event):
     """Base of all announcements; `source` names what is announced."""
 
     category: ClassVar[Category] = Category.ANNOUNCEMENT
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 class VehicleAnnouncement(Announcement):
@@ -33,6 +37,10 @@ class VehicleAnnouncement(Announcement):
     control_rate: float
     position: Vector3
     orientation: Quaternion
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
+        check(self, (self.mass, self.max_thrust, self.control_rate))
 
 
 class CameraAnnouncement(Announcement):
@@ -57,6 +65,10 @@ class CameraAnnouncement(Announcement):
     parent_frame_id: str
     position: Vector3
     orientation: Quaternion
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
+        check(self, (self.rate, self.latency, 0.0))
 
 
 class ImuAnnouncement(Announcement):

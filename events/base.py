@@ -50,7 +50,7 @@ class Event(msgspec.Struct, metaclass=EventMeta, frozen=True, kw_only=True):
 
     Attributes:
         stamp: Nanoseconds on the run's clock at which what the event describes was true
-            (the exposure of an image, not its arrival).
+            (the exposure of an image, not its arrival). An `int`: no bool, float or numpy number.
         source: Who says it, as a path: ``drone``, ``drone/front_center``.
     """
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from events.base import Category, Event, Quaternion, Vector3
+from events.checks import check, check_pose
 
 
 class Command(Event):
@@ -15,11 +16,17 @@ class Command(Event):
 
     category: ClassVar[Category] = Category.CONTROL
 
+    def __post_init__(self) -> None:
+        check(self)
+
 
 class Setpoint(Event):
     """Base of what is sent again and again, and where only the newest counts."""
 
     category: ClassVar[Category] = Category.CONTROL
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 class Arm(Command):
@@ -38,6 +45,9 @@ class Takeoff(Command):
     """
 
     altitude: float = 1.5
+
+    def __post_init__(self) -> None:
+        check(self, (self.altitude, 0.0, 0.0))
 
 
 class Land(Command):
@@ -65,6 +75,10 @@ class PositionSetpoint(Setpoint):
     yaw: float = 0.0
     yaw_rate: float = 0.0
 
+    def __post_init__(self) -> None:
+        turn = (self.yaw, self.yaw_rate, 0.0)
+        check(self, self.position, self.velocity, self.acceleration, turn)
+
 
 class PoseSetpoint(Setpoint):
     """Be at a place in an attitude; for what can be in any, such as a free camera.
@@ -76,6 +90,9 @@ class PoseSetpoint(Setpoint):
 
     position: Vector3
     orientation: Quaternion
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
 
 
 class VelocitySetpoint(Setpoint):
@@ -91,6 +108,9 @@ class VelocitySetpoint(Setpoint):
     velocity: Vector3
     yaw_rate: float = 0.0
 
+    def __post_init__(self) -> None:
+        check(self, self.velocity, (self.yaw_rate, 0.0, 0.0))
+
 
 class AttitudeSetpoint(Setpoint):
     """Hold an attitude at a thrust.
@@ -103,6 +123,9 @@ class AttitudeSetpoint(Setpoint):
     orientation: Quaternion
     thrust: float
 
+    def __post_init__(self) -> None:
+        check_pose(self, (self.thrust, 0.0, 0.0), self.orientation)
+
 
 class BodyRateSetpoint(Setpoint):
     """Turn at given rates at a thrust.
@@ -114,6 +137,9 @@ class BodyRateSetpoint(Setpoint):
 
     angular_velocity: Vector3
     thrust: float
+
+    def __post_init__(self) -> None:
+        check(self, self.angular_velocity, (self.thrust, 0.0, 0.0))
 
 
 class PlannedPose(Event):
@@ -130,3 +156,6 @@ class PlannedPose(Event):
     frame_id: str = "map"
     position: Vector3
     yaw: float
+
+    def __post_init__(self) -> None:
+        check(self, self.position, (self.yaw, 0.0, 0.0))

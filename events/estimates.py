@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Category, Event, Quaternion, Vector3
+from events.checks import check, check_pose
 from events.sensors import publish
 
 
@@ -30,11 +31,17 @@ class PoseEstimate(Event):
     orientation: Quaternion
     covariance: tuple[float, ...] = ()
 
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
+
 
 class TrackingEvent(Event):
     """Base of what happens to an estimator's tracking."""
 
     category: ClassVar[Category] = Category.ESTIMATE
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 class TrackingLost(TrackingEvent):
@@ -67,6 +74,7 @@ class TrackedFeatures(Event, eq=False):
     inliers: npt.NDArray[np.bool_]
 
     def __post_init__(self) -> None:
+        check(self)
         publish("TrackedFeatures", "points", self.points, np.float32, {2})
         publish("TrackedFeatures", "inliers", self.inliers, np.bool_, {1})
         if self.points.shape != (len(self.inliers), 2):

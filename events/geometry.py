@@ -17,6 +17,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from events.base import Category, Event, Quaternion, Vector3
+from events.checks import check, check_pose
 
 
 class PoseStamped(Event):
@@ -33,6 +34,9 @@ class PoseStamped(Event):
     frame_id: str = "map"
     position: Vector3
     orientation: Quaternion
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
 
 
 class TransformStamped(Event):
@@ -53,6 +57,9 @@ class TransformStamped(Event):
     translation: Vector3
     rotation: Quaternion
     static: bool = False
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.translation, self.rotation)
 
 
 class Odometry(Event):
@@ -77,3 +84,7 @@ class Odometry(Event):
     orientation: Quaternion
     linear_velocity: Vector3
     angular_velocity: Vector3
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
+        check(self, self.linear_velocity, self.angular_velocity)

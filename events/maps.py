@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Category, Event
+from events.checks import check
 from events.sensors import publish
 
 
@@ -27,5 +28,6 @@ class PointCloud(Event, eq=False):
     colors: npt.NDArray[np.uint8]
 
     def __post_init__(self) -> None:
+        check(self)
         publish("PointCloud", "points", self.points, np.float32, {2})
         publish("PointCloud", "colors", self.colors, np.uint8, {2})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from events.base import Category, Event
+from events.checks import check
 
 
 class Score(Event):
@@ -23,3 +24,6 @@ class Score(Event):
     metric: str
     value: float
     unit: str
+
+    def __post_init__(self) -> None:
+        check(self)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Category, Event, Quaternion, Vector3
+from events.checks import check, check_pose
 
 
 def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
@@ -87,6 +88,7 @@ class Image(Event, eq=False):
     data: npt.NDArray[np.uint8]
 
     def __post_init__(self) -> None:
+        check(self)
         publish("Image", "data", self.data, np.uint8, {2, 3})
 
 
@@ -104,6 +106,7 @@ class DepthImage(Event, eq=False):
     data: npt.NDArray[np.float32]
 
     def __post_init__(self) -> None:
+        check(self)
         publish("DepthImage", "data", self.data, np.float32, {2})
 
 
@@ -121,6 +124,7 @@ class SegmentationImage(Event, eq=False):
     data: npt.NDArray[np.int32]
 
     def __post_init__(self) -> None:
+        check(self)
         publish("SegmentationImage", "data", self.data, np.int32, {2})
 
 
@@ -140,6 +144,9 @@ class Imu(Event):
     angular_velocity: Vector3
     linear_acceleration: Vector3
 
+    def __post_init__(self) -> None:
+        check(self, self.angular_velocity, self.linear_acceleration)
+
 
 class FluidPressure(Event):
     """Barometer, as ROS's ``sensor_msgs/FluidPressure``.
@@ -154,6 +161,9 @@ class FluidPressure(Event):
     fluid_pressure: float
     variance: float = 0.0
 
+    def __post_init__(self) -> None:
+        check(self, (self.fluid_pressure, self.variance, 0.0))
+
 
 class MagneticField(Event):
     """Magnetometer, as ROS's ``sensor_msgs/MagneticField``.
@@ -165,6 +175,9 @@ class MagneticField(Event):
     category: ClassVar[Category] = Category.SENSOR
 
     magnetic_field: Vector3
+
+    def __post_init__(self) -> None:
+        check(self, self.magnetic_field)
 
 
 class NavSatFix(Event):
@@ -182,6 +195,9 @@ class NavSatFix(Event):
     longitude: float
     altitude: float
 
+    def __post_init__(self) -> None:
+        check(self, (self.latitude, self.longitude, self.altitude))
+
 
 class Range(Event):
     """Distance sensor, as ROS's ``sensor_msgs/Range``.
@@ -197,6 +213,9 @@ class Range(Event):
     range: float
     min_range: float
     max_range: float
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 class LaserScan3D(Event, eq=False):
@@ -215,4 +234,5 @@ class LaserScan3D(Event, eq=False):
     orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        check_pose(self, (0.0, 0.0, 0.0), self.orientation)
         publish("LaserScan3D", "points", self.points, np.float32, {2})

@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import ClassVar
 
 from events.base import Category, Event, Vector3
+from events.checks import check
 
 
 class VehicleEvent(Event):
     """Base of all that can happen to a vehicle."""
 
     category: ClassVar[Category] = Category.VEHICLE
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 class Armed(VehicleEvent):
@@ -43,3 +47,6 @@ class Collision(VehicleEvent):
     position: Vector3
     normal: Vector3
     speed: float
+
+    def __post_init__(self) -> None:
+        check(self, self.position, self.normal, (self.speed, 0.0, 0.0))

@@ -1,0 +1,137 @@
+"""Events that say nonsense cannot be made; whoever tries is told which field is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import inf, nan
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import events
+from events import Category, Event, PoseEstimate, PoseStamped, Quaternion, Vector3
+from runtime.wire import pack, unpack
+
+UNCHECKED = Category.WINDOW | Category.INPUT | Category.LIFECYCLE
+CHECKED = [
+    cls
+    for name in events.__all__
+    if isinstance(cls := getattr(events, name), type)
+    and issubclass(cls, Event)
+    and cls is not Event
+    and not cls.category & UNCHECKED
+]
+INFO = events.CameraInfo.from_fov(4, 3, 1.0)
+VALID: dict[Any, Any] = {
+    int: 1,
+    str: "a",
+    float: 0.5,
+    bool: False,
+    Vector3: (1.0, -2.0, 3.0),
+    Quaternion: (0.5, -0.5, 0.5, 0.5),
+    tuple[str, ...]: ("rgb",),
+    tuple[float, ...]: (),
+    events.CameraInfo: INFO,
+}
+ARRAYS: dict[str, Any] = {
+    "points": np.zeros((2, 3), np.float32),
+    "colors": np.zeros((2, 3), np.uint8),
+    "inliers": np.zeros(2, np.bool_),
+}
+FINITE = st.floats(allow_nan=False, allow_infinity=False, width=32)
+
+
+def fields_of(cls: type[Event]) -> dict[str, Any]:
+    """Return a valid value for each field of a type of event."""
+    values = {
+        f.name: VALID[f.type] if f.type in VALID else ARRAYS.get(f.name)
+        for f in msgspec.structs.fields(cls)
+    }
+    if cls is events.TrackedFeatures:
+        values["points"] = np.zeros((2, 2), np.float32)
+    if "data" in values:
+        kind = {"Image": np.uint8, "DepthImage": np.float32, "SegmentationImage": np.int32}
+        values["data"] = np.zeros((3, 4), kind[cls.__name__])
+    return values
+
+
+def wrong_values(type_: Any, name: str) -> Iterator[Any]:
+    if name == "stamp":
+        yield from (1.0, True, np.int64(1), np.float64(1), None, "1", nan)
+    if type_ in {Vector3, Quaternion}:
+        size = 3 if type_ == Vector3 else 4
+        for number in (nan, inf, -inf, None, "1"):
+            yield (number, *(0.5,) * (size - 1))
+            yield (*(0.5,) * (size - 1), number)
+        yield from ((0.5,) * (size + 1), (0.5,) * (size - 1), [0.5] * size, np.full(size, 0.5), nan)
+    if type_ == Quaternion:
+        yield from ((0.0,) * 4, (0.0, 0.0, 0.0, 1.002), (0.998, 0.0, 0.0, 0.0), (1.0,) * 4)
+
+
+@pytest.mark.parametrize("cls", CHECKED, ids=lambda cls: cls.__name__)
+def test_no_field_of_any_event_may_be_wrong(cls: type[Event]) -> None:
+    right = fields_of(cls)
+    cls(**right)
+    tried = 0
+    for field in msgspec.structs.fields(cls):
+        for value in wrong_values(field.type, field.name):
+            with pytest.raises((TypeError, ValueError), match=rf"^{cls.__name__}\.{field.name}: "):
+                cls(**right | {field.name: value})
+            tried += 1
+    assert tried > 5
+
+
+@pytest.mark.parametrize(
+    ("cls", "field"),
+    [
+        (events.PositionSetpoint, "yaw"),
+        (events.PositionSetpoint, "yaw_rate"),
+        (events.VelocitySetpoint, "yaw_rate"),
+        (events.AttitudeSetpoint, "thrust"),
+        (events.BodyRateSetpoint, "thrust"),
+        (events.PlannedPose, "yaw"),
+        (events.Takeoff, "altitude"),
+        (events.NavSatFix, "latitude"),
+        (events.FluidPressure, "fluid_pressure"),
+        (events.CameraAnnouncement, "rate"),
+        (events.VehicleAnnouncement, "mass"),
+    ],
+)
+def test_what_steers_or_is_measured_is_finite(cls: type[Event], field: str) -> None:
+    for wrong in (nan, inf):
+        with pytest.raises(ValueError, match=rf"^{cls.__name__}\.{field}: expected finite"):
+            cls(**fields_of(cls) | {field: wrong})
+
+
+def test_the_message_says_what_was_found() -> None:
+    with pytest.raises(ValueError, match=r"found \(0\.5, 0, 0, 0\) \(tuple\), whose norm is 0\.5"):
+        PoseStamped(stamp=0, source="a", position=(0, 0, 0), orientation=(0.5, 0, 0, 0))
+
+
+@given(st.tuples(FINITE, FINITE, FINITE), st.tuples(FINITE, FINITE, FINITE, FINITE))
+def test_a_pose_is_made_exactly_if_it_is_one(position: Vector3, orientation: Quaternion) -> None:
+    norm = sum(n * n for n in orientation) ** 0.5
+    scaled = tuple(n / norm for n in orientation) if norm > 1e-6 else (1.0, 0.0, 0.0, 0.0)
+    for each in (orientation, scaled):
+        right = abs(sum(n * n for n in each) ** 0.5 - 1.0) <= 1e-3
+        try:
+            made = PoseEstimate(stamp=0, source="a", position=position, orientation=each)  # type: ignore[arg-type]
+        except ValueError:
+            assert not right
+        else:
+            assert right
+            assert unpack(pack(made).frame()) == made
+
+
+def test_a_range_without_an_end_and_numbers_of_numpy_are_right() -> None:
+    found = events.Range(stamp=0, source="a", range=inf, min_range=0.1, max_range=9.0)
+    assert found.range == inf
+    position = tuple(np.array([1.0, 2.0, 3.0]))
+    turn = tuple(np.array([1.0, 0.0, 0.0, 0.0], np.float32))
+    assert PoseStamped(stamp=0, source="a", position=position, orientation=turn).position[1] == 2.0  # type: ignore[arg-type]
+    huge = (1e308, 1e308, 1e308)  # whose norm is not finite, but they are
+    PoseStamped(stamp=0, source="a", position=huge, orientation=(1.0, 0.0, 0.0, 0.0))
