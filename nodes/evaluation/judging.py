@@ -114,6 +114,14 @@ class Errors(msgspec.Struct, frozen=True, eq=False):
     position: Floats
     rotation: Floats
 
+    def thinned(self, most: int) -> Errors:
+        """Return every row, or of more than `most` every second, fourth, …."""
+        step = 1
+        while len(self.stamps) > most * step:
+            step *= 2
+        kept = slice(None, None, step)
+        return Errors(self.stamps[kept], self.since[kept], self.position[kept], self.rotation[kept])
+
 
 class Judgement(msgspec.Struct, frozen=True, eq=False):
     """All that is known of one estimator at the end.

@@ -30,7 +30,7 @@ from nodes.evaluation.album import Album
 from nodes.evaluation.judging import Judgement, Thresholds, beside_the_plan, judge
 from nodes.evaluation.live import LiveErrors, RecentTruth
 from nodes.evaluation.record import EstimatorRecord
-from nodes.evaluation.results import file_name, write_results
+from nodes.evaluation.results import FRAMES, file_name, write_results
 from nodes.trajectory import PoseRows, Trajectory
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.growing import GrowingFile
@@ -202,10 +202,8 @@ class Evaluation(Node[EvaluationConfig]):
             "thresholds": msgspec.to_builtins(config.thresholds),
         }
         if self.out is not None:
-            if plan is None and len(self._setpoints):
-                plan = self._setpoints.trajectory()
-            partial = self.restarts > 0
-            write_results(self.out, truth, plan, judgements, verdict, partial=partial)
+            setpoints = self._setpoints.trajectory() if len(self._setpoints) else None
+            write_results(self.out, plan or setpoints, judgements, verdict)
             self._album.write(self.out / "frames")
         return judgements, verdict
 
@@ -246,7 +244,9 @@ class Evaluation(Node[EvaluationConfig]):
             folder = self.out / "trajectories"
             folder.mkdir(exist_ok=True)
             path = folder / f"{file_name(name)}.tum"
-            file = self._files[name] = GrowingFile(self, path)
+            frame = "map (NED)" if name == "truth" else f"{event.frame_id}, as it was said"
+            head = f"# {FRAMES.format(frame)}\n"
+            file = self._files[name] = GrowingFile(self, path, head)
         file.add(tum_row(event.stamp, event.position, event.orientation))
 
     def _say(self, event: PoseEstimate, metric: str, value: float, unit: str) -> None:

@@ -1,11 +1,12 @@
 """What an evaluation leaves in a run's folder, for people, for plots and for other tools.
 
-trajectories/truth.tum              the true poses
-trajectories/<estimator>.tum        the estimates as they were said
+trajectories/truth.tum              the true poses; it grows with the run
+trajectories/<estimator>.tum        the estimates as they were said; likewise
 trajectories/plan.tum               where the pilot meant to be
 evaluation/<estimator>.csv          errors of each estimate at the time of its image
 evaluation/<estimator>.lost.csv     when it had no pose
-evaluation/<estimator>.ticks.csv    errors of the newest pose there was at each control tick
+evaluation/<estimator>.ticks.csv    errors of the newest pose there was at each control tick (of a
+                                    long run every second one, fourth, …)
 evaluation/<estimator>.aligned.tum  the estimates in the truth's frame
 evaluation/verdict.json             all figures
 """
@@ -22,41 +23,25 @@ from nodes.evaluation.judging import Errors, Judgement
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
 
-FRAMES = "base_link (FRD) in {}: timestamp[s] x y z[m] qx qy qz qw"
+_MOST_TICKS = 100_000
+
+FRAMES = "base_link (FRD) in {}: timestamp[s] tx ty tz[m] qx qy qz qw"
 
 
 def write_results(
     out: Path,
-    truth: Trajectory | None,
     plan: Trajectory | None,
     judgements: dict[str, Judgement],
     verdict: dict[str, Any],
-    *,
-    partial: bool = False,
 ) -> None:
-    """Write all of the above into a run's folder.
-
-    Args:
-        out: The folder.
-        truth: True poses, if any came.
-        plan: Where the pilot meant to be, if it said so.
-        judgements: By source of the estimator.
-        verdict: All figures.
-        partial: What is known is not all there was: the trajectories that have grown with the run
-            are left as they are.
-    """
+    """Write all of the above into a run's folder, but for what has grown with the run."""
     trajectories, evaluation = out / "trajectories", out / "evaluation"
     trajectories.mkdir(exist_ok=True)
     evaluation.mkdir(exist_ok=True)
-    if truth is not None and not partial:
-        write_tum(trajectories / "truth.tum", truth, FRAMES.format("map (NED)"))
     if plan is not None:
         write_tum(trajectories / "plan.tum", plan, FRAMES.format("map (NED)"))
     for source, judgement in judgements.items():
         name = file_name(source)
-        if judgement.estimate is not None and not partial:
-            comment = FRAMES.format("the estimator's own frame")
-            write_tum(trajectories / f"{name}.tum", judgement.estimate, comment)
         if judgement.aligned is not None:
             comment = FRAMES.format("map (NED), aligned")
             write_tum(evaluation / f"{name}.aligned.tum", judgement.aligned, comment)
@@ -66,7 +51,8 @@ def write_results(
         if judgement.of_images is not None:
             _write_errors(evaluation / f"{name}.csv", "arrival_ns", judgement.of_images)
         if judgement.of_ticks is not None:
-            _write_errors(evaluation / f"{name}.ticks.csv", "pose_ns", judgement.of_ticks)
+            thin = judgement.of_ticks.thinned(_MOST_TICKS)
+            _write_errors(evaluation / f"{name}.ticks.csv", "pose_ns", thin)
     text = msgspec.json.format(msgspec.json.encode(verdict), indent=2)
     (evaluation / "verdict.json").write_bytes(text + b"\n")
 

@@ -208,3 +208,36 @@ def test_an_unknown_threshold_is_refused() -> None:
 
     with pytest.raises(ConfigError, match=r"thresholds.*unknown key 'ate'"):
         run_node(Evaluation, config={"thresholds": {"ate": 1}})
+
+
+class Restarted(Evaluation):
+    """Fails once in mid-flight."""
+
+    failed = False
+
+    async def on_startup(self) -> None:
+        await super().on_startup()
+        self.start(self._fail())
+
+    async def _fail(self) -> None:
+        await self.clock.sleep(6.0)
+        if not self.restarts:
+            raise RuntimeError("fails once")
+
+
+def test_an_evaluation_that_was_restarted_fails_and_what_was_written_stays(tmp_path: Path) -> None:
+    from runtime.testing import run_nodes, spec
+
+    estimates: list[Event] = [estimate(s) for s in FRAMES]
+    limits = {"ate_rmse_m": 1.0}
+    node = spec(
+        Restarted, "evaluation", {"report": False, "thresholds": limits}, on_error="restart"
+    )
+    script = sorted([*announced(), *truth(10), *estimates], key=lambda e: e.stamp)
+    run_nodes([node], inputs=script, duration=11.0, out=tmp_path)
+    verdict = json.loads((tmp_path / "evaluation" / "verdict.json").read_text())
+    assert verdict["passed"] is False
+    assert "restarted" in "".join(verdict["estimators"]["est"]["failed"])
+    stamps = read_tum(tmp_path / "trajectories" / "est.tum").stamps
+    assert stamps[0] == 0
+    assert len(stamps) >= 90

@@ -70,6 +70,16 @@ def twice(stamp: int) -> list[Said]:
     return [*good(stamp), *good(stamp)]
 
 
+def not_a_number(stamp: int) -> list[Said]:
+    ((_, _, q, frame),) = good(stamp)
+    return [(stamp, (math.nan, 0.0, 0.0), q, frame)] if stamp > 5 * SECOND else good(stamp)
+
+
+def no_rotation(stamp: int) -> list[Said]:
+    ((_, p, _, frame),) = good(stamp)
+    return [(stamp, p, (0.0, 0.0, 0.0, 0.0), frame)] if stamp > 5 * SECOND else good(stamp)
+
+
 def frozen(stamp: int) -> list[Said]:
     return [(stamp, *good(min(stamp, 5 * SECOND))[0][1:])]
 
@@ -113,6 +123,8 @@ ZOO: dict[str, tuple[Callable[[int], list[Said]], str]] = {
     "backwards": (backwards, "repeated_stamps"),
     "future": (future, "future_stamps"),
     "twice": (twice, "repeated_stamps"),
+    "not_a_number": (not_a_number, "lost_seconds"),
+    "no_rotation": (no_rotation, "lost_seconds"),
     "frozen": (frozen, "ate_percent"),
     "jump": (moved((1.0, 0.0, 0.0), 5.0, 5.05), "ate_max_m"),
     "jump_that_stays": (moved((0.0, 0.5, 0.0), 6.0, 99.0), "ate_percent"),

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from events import PoseEstimate
 from nodes.evaluation.judging import Judgement, Thresholds, judge
 from nodes.evaluation.record import EstimatorRecord
-from nodes.evaluation.results import write_results
+from nodes.evaluation.results import file_name, write_results
 from nodes.trajectory import Trajectory
+from nodes.trajectory.formats import write_tum
 
 SECOND = 1_000_000_000
 
@@ -94,7 +95,12 @@ def evaluated(
         "estimators": figures,
         "thresholds": msgspec.to_builtins(thresholds),
     }
-    write_results(out, truth, plan, judgements, verdict)
+    (out / "trajectories").mkdir(exist_ok=True)
+    write_tum(out / "trajectories" / "truth.tum", truth)
+    for name, judgement in judgements.items():
+        if judgement.estimate is not None:
+            write_tum(out / "trajectories" / f"{file_name(name)}.tum", judgement.estimate)
+    write_results(out, plan, judgements, verdict)
     return verdict
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 import hypothesis.strategies as st
@@ -161,3 +162,28 @@ def test_rows_come_in_any_order_and_the_last_word_on_a_stamp_holds() -> None:
 def test_no_rows_are_no_trajectory() -> None:
     with pytest.raises(ValueError, match="expected one or more"):
         PoseRows().trajectory()
+
+
+@pytest.mark.parametrize("full_after", [10**9, 2, 0])
+def test_many_rows_wait_in_a_file_or_in_memory_if_the_disk_is_full(
+    monkeypatch: pytest.MonkeyPatch, full_after: int
+) -> None:
+    class Disk(io.BytesIO):
+        writes = 0
+
+        def write(self, block: Any) -> int:
+            self.writes += 1
+            if self.writes > full_after:
+                raise OSError(28, "No space left on device")
+            return super().write(block)
+
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: Disk())
+    rows = PoseRows()
+    n = 5000
+    for k in range(n):
+        rows.add(k, (float(k), 0.0, -1.0), (1.0, 0.0, 0.0, 0.0))
+    assert len(rows) == n
+    for _ in range(2):
+        path = rows.trajectory()
+        assert path.stamps.tolist() == list(range(n))
+        assert path.positions[:, 0].tolist() == [float(k) for k in range(n)]
