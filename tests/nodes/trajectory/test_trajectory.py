@@ -171,7 +171,7 @@ def test_many_rows_wait_in_a_file_or_in_memory_if_the_disk_is_full(
     class Disk(io.BytesIO):
         writes = 0
 
-        def write(self, block: Any) -> int:
+        def write(self, block: Any, /) -> int:
             self.writes += 1
             if self.writes > full_after:
                 raise OSError(28, "No space left on device")
