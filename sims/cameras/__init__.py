@@ -9,6 +9,7 @@ from sims.cameras.spec import (
     add_camera,
     announcement,
     camera_info,
+    check_cameras,
     optical_frame,
     optical_in_body,
 )
@@ -22,6 +23,7 @@ __all__ = [
     "add_free_camera",
     "announcement",
     "camera_info",
+    "check_cameras",
     "model_from_bytes",
     "model_to_bytes",
     "optical_frame",

@@ -6,6 +6,7 @@ No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.free`,
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import msgspec
@@ -34,7 +35,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         width: Pixels.
         height: Pixels.
         fov: **Horizontal** field of view, degrees.
-        rate: Frames per second.
+        rate: Exposures per second, at equal intervals.
         position: Where it sits on the body, metres in FRD.
         orientation: Roll, pitch, yaw of the camera's body frame in the body's, degrees, applied
             yaw first (Z-Y-X). Positive pitch is nose up: -90 looks straight down.
@@ -57,7 +58,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     width: Pixels = 512
     height: Pixels = 512
     fov: Annotated[float, msgspec.Meta(ge=1.0, le=170.0)] = 90.0
-    rate: Annotated[float, msgspec.Meta(gt=0.0)] = 30.0
+    rate: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 30.0
     position: Vector3 = (0.15, 0.0, 0.0)
     orientation: Vector3 = (0.0, 0.0, 0.0)
     light: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
@@ -74,6 +75,25 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if not self.images or len(set(self.images)) != len(self.images):
             found = ", ".join(self.images) or "none"
             raise ValueError(f"images: expected one or more kinds, each once, found {found}")
+
+
+def check_cameras(specs: Iterable[CameraSpec]) -> None:
+    """Check what can be known of a body's cameras before there is a world.
+
+    Raises:
+        ValueError: Two have one name, or a shutter would still be open at the next exposure.
+    """
+    names: set[str] = set()
+    for spec in specs:
+        where = f"cameras: {spec.name}"
+        if spec.name in names:
+            raise ValueError(f"{where}: expected a name of its own, found two cameras called so")
+        names.add(spec.name)
+        if spec.exposure > 1.0 / spec.rate:
+            raise ValueError(
+                f"{where}: exposure: expected at most the {1e3 / spec.rate:.4g} ms between two "
+                f"exposures, found {1e3 * spec.exposure:.4g} ms"
+            )
 
 
 def camera_info(spec: CameraSpec) -> events.CameraInfo:

@@ -5,9 +5,10 @@ Physics, control and cameras are pure modules beside this one and in `sims.camer
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -28,7 +29,7 @@ from events import (
     VehicleEvent,
 )
 from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
-from sims.cameras import CameraSpec, add_camera
+from sims.cameras import CameraSpec, add_camera, check_cameras
 from sims.cameras.rig import CameraOutputs, CameraRig
 from sims.frames import rotate_inverse
 from sims.multirotor import (
@@ -40,6 +41,7 @@ from sims.multirotor import (
     Limits,
     Phase,
     Physics,
+    State,
     attach_vehicle,
 )
 from sims.multirotor.physics import Contact
@@ -60,10 +62,13 @@ class MultirotorConfig(NodeConfig):
         height: Height of the ground there, metres above the world's zero.
         yaw: Where it looks at the start, degrees clockwise from north.
         control_rate: Hertz of the controller.
-        imu_rate: Hertz of IMU and ground truth. Exposures fall on IMU samples, as with cameras
-            that an IMU triggers, so that image, depth, pose and IMU share their stamps.
+        imu_rate: Hertz of the IMU, and of the ground truth, which is also told at each exposure.
         imu: Noise of the IMU.
         cameras: What it carries.
+        trigger: ``free``: each camera exposes at its own rate, at equal intervals. ``imu``: the
+            next IMU sample after that triggers the exposure, so that image, depth, pose and IMU
+            share their stamps; the intervals are equal only if the camera's rate divides the
+            IMU's.
         camera_processes: How many processes render.
         render_threads: Threads of the software renderer in each of them.
         setpoint_timeout: After this long a velocity, attitude or rate set-point is void.
@@ -79,11 +84,21 @@ class MultirotorConfig(NodeConfig):
     imu_rate: Rate = 200
     imu: ImuParameters = ImuParameters()
     cameras: tuple[CameraSpec, ...] = ()
+    trigger: Literal["free", "imu"] = "free"
     camera_processes: Count = 2
     render_threads: Count = 1
     setpoint_timeout: Duration = Duration(0.5)  # immutable
     gains: Gains = Gains()
     limits: Limits = Limits()
+
+    def __post_init__(self) -> None:
+        check_cameras(self.cameras)
+        for camera in self.cameras:
+            if self.trigger == "imu" and camera.rate > self.imu_rate:
+                raise ValueError(
+                    f"cameras: {camera.name}: rate: expected at most the {self.imu_rate:g} Hz of "
+                    f'the IMU that triggers it (or trigger = "free"), found {camera.rate:g} Hz'
+                )
 
 
 class Multirotor(Node[MultirotorConfig]):
@@ -110,6 +125,7 @@ class Multirotor(Node[MultirotorConfig]):
         )
         model = await self.offload(self._build)
         self._physics = Physics(model, self.name)
+        await self.offload(self._physics.settle)
         self._autopilot = Autopilot(
             self._physics.parameters,
             config.gains,
@@ -119,10 +135,17 @@ class Multirotor(Node[MultirotorConfig]):
         self._noise = ImuNoise(config.imu, config.imu_rate, self.rng)
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
-        self._to_expose: list[str] = []
+        self._told = -1
+        self._triggered: list[str] = []
         await self._rig.start(model)
+        free = config.trigger == "free"
+        if free:  # a picture that comes at once comes after the IMU sample of its stamp
+            self.every(config.imu_rate, self.sense, "sense")
         for camera in config.cameras:
-            self.every(camera.rate, self._trigger(camera.name), camera.name)
+            call = self._expose if free else self._trigger
+            self.every(camera.rate, functools.partial(call, camera.name), camera.name)
+        if not free:
+            self.every(config.imu_rate, self.sense, "sense")
 
     def _build(self) -> Any:
         config = self.config
@@ -154,6 +177,17 @@ class Multirotor(Node[MultirotorConfig]):
             **msgspec.structs.asdict(self.config.imu),
         )
         yield from self._rig.announcements(FRAME)
+        if self.config.trigger == "imu":
+            for camera in self.config.cameras:
+                periods = self.config.imu_rate / camera.rate
+                if not math.isclose(periods, round(periods)):
+                    self.log.warning(
+                        "%s: %g Hz does not divide the %g Hz of the IMU that triggers it: its "
+                        'exposures come at unequal intervals (trigger = "free": at equal ones)',
+                        camera.name,
+                        camera.rate,
+                        self.config.imu_rate,
+                    )
 
     def on_change(self, before: MultirotorConfig) -> None:  # noqa: ARG002
         """Deliver pictures as the settings now say."""
@@ -192,13 +226,13 @@ class Multirotor(Node[MultirotorConfig]):
         elif not touching:
             self._touched = frozenset()
 
-    @every(hz="imu_rate")
     def sense(self, tick: Tick) -> None:
-        """Measure, tell the truth, and expose the cameras whose time has come."""
-        physics = self._physics
-        physics.advance_to(tick.stamp)
-        stamp = physics.time_ns
-        rates, force = self._noise.add(*physics.imu())
+        """Measure, tell the truth, and expose the cameras that this triggers."""
+        stamp = self._advance(tick)
+        # Between two steps the acceleration is constant.
+        _, force = self._physics.imu()
+        state, qpos, qvel = self._physics.state_at(stamp)
+        rates, force = self._noise.add(state.angular_velocity, force)
         self.imu.send(
             Imu(
                 stamp=stamp,
@@ -207,7 +241,34 @@ class Multirotor(Node[MultirotorConfig]):
                 linear_acceleration=force,
             )
         )
-        state = physics.state()
+        self._tell(stamp, state)
+        for camera in self._triggered:
+            self._rig.expose(camera, stamp, qpos, qvel)
+        self._triggered.clear()
+
+    def _trigger(self, camera: str, _: Tick) -> None:
+        self._triggered.append(camera)
+
+    def _expose(self, camera: str, tick: Tick) -> None:
+        stamp = self._advance(tick)
+        state, qpos, qvel = self._physics.state_at(stamp)
+        self._tell(stamp, state)
+        self._rig.expose(camera, stamp, qpos, qvel)
+
+    def _advance(self, tick: Tick) -> int:
+        """Step the physics up to a tick, and return the stamp of what is then true.
+
+        That is the tick's; in real time, where a later one may have been served before, maybe the
+        physics'.
+        """
+        self._physics.advance_to(tick.stamp)
+        return max(tick.stamp, self._physics.time_ns)
+
+    def _tell(self, stamp: int, state: State) -> None:
+        """Tell the truth about a time, once."""
+        if stamp <= self._told:
+            return
+        self._told = stamp
         self.odometry.send(
             Odometry(
                 stamp=stamp,
@@ -218,19 +279,10 @@ class Multirotor(Node[MultirotorConfig]):
                 angular_velocity=state.angular_velocity,
             )
         )
-        for camera in self._to_expose:
-            self._rig.expose(camera, stamp, physics.qpos(), physics.data.qvel.copy())
-        self._to_expose.clear()
 
     async def on_shutdown(self) -> None:
         """Say which pictures are missing."""
         self._rig.say_what_is_missing()
-
-    def _trigger(self, camera: str) -> Any:
-        def trigger(_: Tick) -> None:
-            self._to_expose.append(camera)
-
-        return trigger
 
     def _look_at_contacts(self) -> None:
         contacts = [c for c in self._physics.contacts() if not _stands_on(c)]

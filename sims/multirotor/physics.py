@@ -16,6 +16,8 @@ import numpy.typing as npt
 from events import Quaternion, Vector3
 from sims.multirotor.model import TIMESTEP_NS, VehicleParameters, read_parameters
 
+Floats = npt.NDArray[np.float64]
+
 
 class PhysicsDivergedError(Exception):
     """The state is no longer finite: the world's model or what was written into it is at fault."""
@@ -86,8 +88,9 @@ class Physics:
         motor = model.actuator(f"{name}/motor1").id
         sensor = int(model.sensor(f"{name}/gyroscope").adr[0])
         # Views on MuJoCo's own memory; `tolist` makes plain floats of them in one C call each.
-        self._pose = self.data.qpos[pose : pose + 7]
-        self._twist = self.data.qvel[twist : twist + 6]
+        self._of_pose, self._of_twist = slice(pose, pose + 7), slice(twist, twist + 6)
+        self._pose = self.data.qpos[self._of_pose]
+        self._twist = self.data.qvel[self._of_twist]
         self._motors = self.data.ctrl[motor : motor + 4]
         self._imu = self.data.sensordata[sensor : sensor + 6]
         self._steps = 0
@@ -134,9 +137,35 @@ class Physics:
 
     def state(self) -> State:
         """Return where the vehicle is and how it moves."""
-        x, y, z, qw, qx, qy, qz = self._pose.tolist()
-        vx, vy, vz, wx, wy, wz = self._twist.tolist()
-        return State((x, -y, -z), (qw, qx, -qy, -qz), (vx, -vy, -vz), (wx, -wy, -wz))
+        return _state(self._pose, self._twist)
+
+    def state_at(self, stamp_ns: int) -> tuple[State, Floats, Floats]:
+        """Return the state at a time at or after `time_ns`, less than or just one step later.
+
+        Between two steps the world is carried on as the next step will carry it: a whole step
+        later this is what `advance_to` gives. (Damped joints of other bodies, which MuJoCo steps
+        implicitly, may differ slightly.)
+
+        Returns:
+            The vehicle's state; copies of the world's generalised positions, shape (nq,), and
+            velocities, shape (nv,), for a renderer.
+
+        Raises:
+            ValueError: The time is before `time_ns`, or more than a step later.
+        """
+        ahead = stamp_ns - self.time_ns
+        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        if not 0 <= ahead <= TIMESTEP_NS:
+            expected = f"{self.time_ns} to {self.time_ns + TIMESTEP_NS} ns"
+            raise ValueError(f"state_at: expected a time of {expected}, found {stamp_ns} ns")
+        if ahead:
+            if not self._fresh:
+                self._refresh()
+            # As semi-implicit Euler does it: first the velocity, and with that the position.
+            next_qvel = qvel + self.data.qacc * (TIMESTEP_NS * 1e-9)
+            mujoco.mj_integratePos(self.model, qpos, next_qvel, ahead * 1e-9)
+            qvel += self.data.qacc * (ahead * 1e-9)
+        return _state(qpos[self._of_pose], qvel[self._of_twist]), qpos, qvel
 
     def imu(self) -> tuple[Vector3, Vector3]:
         """Return the true angular velocity (rad/s, FRD) and specific force (m/s², FRD).
@@ -162,10 +191,19 @@ class Physics:
             return []
         return [self._contact(index, own) for index, own in self._own_contacts()]
 
-    def qpos(self) -> npt.NDArray[np.float64]:
-        """Return a copy of the whole world's generalised positions, shape (nq,), for a renderer."""
-        copy: npt.NDArray[np.float64] = self.data.qpos.copy()
-        return copy
+    def settle(self) -> None:
+        """Have the vehicle rest on the ground, its weight carried, if that is where it starts.
+
+        Feet that only just touch the ground are pushed by nothing: the vehicle would begin with a
+        free fall of 0.1 mm. A vehicle that does not come to rest within 1 cm and half a second
+        stays where it is; so does all else in the world. Call it before the first step.
+        """
+        trial = mujoco.MjData(self.model)
+        mujoco.mj_step(self.model, trial, 500_000_000 // TIMESTEP_NS)
+        pose, twist = trial.qpos[self._of_pose], trial.qvel[self._of_twist]
+        if np.abs(twist).max() < 1e-3 and np.linalg.norm(pose[:3] - self._pose[:3]) < 0.01:
+            self._pose[:] = pose
+            self._fresh = False
 
     def reset(self) -> None:
         """Go back to the start: time 0, the world as compiled, motors off."""
@@ -224,3 +262,10 @@ class Physics:
             body = int(self.model.geom_bodyid[geom])
             name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_BODY, body)
         return str(name or f"geom {geom}")
+
+
+def _state(pose: Floats, twist: Floats) -> State:
+    """Return a free joint's qpos, shape (7,), and qvel, shape (6,), in our frames."""
+    x, y, z, qw, qx, qy, qz = pose.tolist()
+    vx, vy, vz, wx, wy, wz = twist.tolist()
+    return State((x, -y, -z), (qw, qx, -qy, -qz), (vx, -vy, -vz), (wx, -wy, -wz))

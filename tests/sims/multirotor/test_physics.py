@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from events import Vector3
 from sims import frames
@@ -65,6 +67,70 @@ def test_at_rest_the_imu_feels_the_ground_push() -> None:
     assert force == pytest.approx((0.0, 0.0, -9.81), abs=1e-3)
     assert rates == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
     assert physics.state().position == pytest.approx((0.0, 0.0, -STANDING_HEIGHT), abs=1e-3)
+
+
+def test_a_settled_vehicle_rests_from_the_first_instant() -> None:
+    """Feet that only just touch the ground carry nothing: the IMU would feel a free fall."""
+    physics = Physics(compiled(yaw=0.3), "drone")
+    ball = physics.data.qpos[:7].tolist()
+    physics.settle()
+    assert physics.time_ns == 0
+    assert physics.data.qpos[:7].tolist() == ball
+    before = physics.state()
+    assert before.position == pytest.approx((0.0, 0.0, -STANDING_HEIGHT), abs=1e-3)
+    for stamp in range(0, 500 * MS, MS):
+        physics.advance_to(stamp)
+        rates, force = physics.imu()
+        assert force == pytest.approx((0.0, 0.0, -9.81), abs=1e-3)
+        assert rates == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert physics.state().position == pytest.approx(before.position, abs=1e-6)
+
+
+def test_what_does_not_stand_does_not_settle() -> None:
+    physics = Physics(compiled(UP), "drone")
+    before = physics.data.qpos.tolist()
+    physics.settle()
+    assert physics.data.qpos.tolist() == before
+
+
+@given(
+    motors=st.tuples(*[st.floats(0.0, 1.0)] * 4),
+    height=st.sampled_from([0.12, 0.3, UP]),
+    steps=st.integers(1, 400),
+    offsets=st.lists(st.integers(0, MS), min_size=1, max_size=4),
+)
+@settings(max_examples=20, deadline=None)
+def test_between_two_steps_the_state_is_on_the_way_from_one_to_the_other(
+    motors: tuple[float, float, float, float], height: float, steps: int, offsets: list[int]
+) -> None:
+    """In flight and in contact; a whole step later it is that of the step; and looking changes
+    nothing."""
+    physics, plain = (Physics(compiled(height), "drone") for _ in range(2))
+    for each in (physics, plain):
+        each.set_motors(*motors)
+        each.advance_to(steps * MS)
+    now = physics.state()
+    asked = {offset: physics.state_at(steps * MS + offset) for offset in [0, MS, *offsets]}
+    assert asked[0][0] == now
+    plain.advance_to((steps + 1) * MS)
+    physics.advance_to((steps + 1) * MS)
+    assert physics.state() == plain.state()
+    after, qpos, qvel = asked[MS]
+    np.testing.assert_allclose(qpos, plain.data.qpos, atol=1e-12)
+    np.testing.assert_allclose(qvel, plain.data.qvel, atol=1e-12)
+    for offset, (state, _, _) in asked.items():
+        for field in ("position", "velocity", "angular_velocity"):
+            start, end = np.array(getattr(now, field)), np.array(getattr(after, field))
+            expected = start + offset / MS * (end - start)
+            np.testing.assert_allclose(getattr(state, field), expected, atol=1e-9)
+
+
+def test_the_past_and_the_far_future_are_not_between_two_steps() -> None:
+    physics = Physics(compiled(UP), "drone")
+    physics.advance_to(5 * MS)
+    for stamp in (5 * MS - 1, 6 * MS + 1):
+        with pytest.raises(ValueError, match=f"found {stamp} ns"):
+            physics.state_at(stamp)
 
 
 def test_in_free_fall_the_imu_feels_nothing() -> None:
@@ -207,12 +273,13 @@ def test_what_others_touch_is_not_ours() -> None:
     assert physics.contacts() == []
 
 
-def test_qpos_is_a_copy() -> None:
+def test_the_state_comes_as_copies() -> None:
     physics = Physics(compiled(), "drone")
-    copy = physics.qpos()
-    copy[:] = 7.0
-    assert copy.shape == (physics.model.nq,)
+    _, qpos, qvel = physics.state_at(0)
+    qpos[:] = qvel[:] = 7.0
+    assert (qpos.shape, qvel.shape) == ((physics.model.nq,), (physics.model.nv,))
     assert physics.state().position == pytest.approx((0.0, 0.0, -STANDING_HEIGHT))
+    assert physics.state().velocity == (0.0, 0.0, 0.0)
 
 
 def test_a_state_that_is_not_finite_is_an_error(
