@@ -30,16 +30,22 @@ from events import (
     VelocitySetpoint,
 )
 from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
-from sims.cameras import CameraSpec, add_free_camera, pose_to_qpos, qvel_between
+from sims.cameras import (
+    CameraSpec,
+    add_free_camera,
+    check_cameras,
+    pose_to_qpos,
+    qvel_between,
+)
 from sims.cameras.rig import CameraOutputs, CameraRig
-from sims.frames import from_euler, multiply, normalize, rotate, yaw_of
+from sims.frames import from_euler, multiply, normalize, rotate, rotate_inverse, yaw_of
 from sims.worlds import load_world
 
 Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Count = Annotated[int, msgspec.Meta(ge=1, le=16)]
 
 MOMENT = 1e-3
-"""Seconds over which the camera's velocity is taken."""
+"""Seconds, half of them before the stamp, over which the camera's velocity is taken."""
 
 
 class FreeCameraConfig(NodeConfig):
@@ -68,9 +74,17 @@ class FreeCameraConfig(NodeConfig):
     camera_processes: Count = 2
     render_threads: Count = 1
 
+    def __post_init__(self) -> None:
+        check_cameras(_at_rate(self))
+
 
 class FreeCamera(Node[FreeCameraConfig]):
-    """Cameras that go where they are told, with no vehicle and no physics."""
+    """Cameras that go where they are told, with no vehicle and no physics.
+
+    The odometry's twist is that of the trajectory, or of the velocity that it was told: where the
+    rows of a file are knots between straight lines, the mean of both sides. A camera that is put
+    somewhere at once rests there.
+    """
 
     images = Output(Image)
     depth = Output(DepthImage)
@@ -139,6 +153,9 @@ class FreeCamera(Node[FreeCameraConfig]):
             return
         self._drift(tick.stamp)
         self._stamp = tick.stamp
+        before, after = (self._pose_in(sign * MOMENT / 2, tick.stamp) for sign in (-1, 1))
+        qvel = qvel_between(pose_to_qpos(*before), pose_to_qpos(*after), MOMENT)
+        vx, vy, vz, wx, wy, wz = qvel.tolist()  # FLU, as MuJoCo has it: half a turn from FRD
         self.odometry.send(
             Odometry(
                 stamp=tick.stamp,
@@ -146,13 +163,11 @@ class FreeCamera(Node[FreeCameraConfig]):
                 child_frame_id=self.name,
                 position=self._position,
                 orientation=self._orientation,
-                linear_velocity=(0.0, 0.0, 0.0),
-                angular_velocity=(0.0, 0.0, 0.0),
+                linear_velocity=rotate_inverse(self._orientation, (vx, -vy, -vz)),
+                angular_velocity=(wx, -wy, -wz),
             )
         )
         qpos = pose_to_qpos(self._position, self._orientation)
-        soon = pose_to_qpos(*self._pose_in(MOMENT, tick.stamp))
-        qvel = qvel_between(qpos, soon, MOMENT)
         for camera in self._cameras:
             self._rig.expose(camera, tick.stamp, qpos, qvel)
 
@@ -165,9 +180,9 @@ class FreeCamera(Node[FreeCameraConfig]):
         self._position, self._orientation = self._drifted((stamp - self._stamp) / 1e9, stamp)
 
     def _pose_in(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
-        """Return the pose a moment after `stamp`; whoever goes where it is told at once rests."""
+        """Return the pose a moment after (or before) `stamp`; what is put somewhere rests there."""
         if self._rows is not None:
-            return pose_at(self._rows, self._rows[0, 0] + stamp / 1e9 + seconds)
+            return pose_at(self._rows, stamp / 1e9 + seconds)
         return self._drifted(seconds, stamp)
 
     def _drifted(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
@@ -187,10 +202,9 @@ class FreeCamera(Node[FreeCameraConfig]):
     def _follow(self, stamp: int) -> bool:
         """Take the pose of this time from the trajectory; False when it is over."""
         assert self._rows is not None
-        seconds = self._rows[0, 0] + stamp / 1e9
-        if seconds > self._rows[-1, 0]:
+        if stamp / 1e9 > self._rows[-1, 0]:
             return False
-        self._position, self._orientation = pose_at(self._rows, seconds)
+        self._position, self._orientation = pose_at(self._rows, stamp / 1e9)
         return True
 
 
@@ -198,7 +212,7 @@ def read_tum(path: Path) -> npt.NDArray[np.float64]:
     """Read a TUM trajectory.
 
     Returns:
-        Rows of stamp (s), x, y, z, qx, qy, qz, qw; shape (n, 8), n ≥ 2, in order of time.
+        Rows of time since the first (s), x, y, z, qx, qy, qz, qw; shape (n, 8), n ≥ 2, in order.
 
     Raises:
         ValueError: The file is missing or holds something else.
@@ -213,6 +227,7 @@ def read_tum(path: Path) -> npt.NDArray[np.float64]:
         )
     if not (np.diff(rows[:, 0]) > 0).all():
         raise ValueError(f"trajectory: {path}: expected rising stamps, found a step back")
+    rows[:, 0] -= rows[0, 0]  # seconds since 1970 would leave a quarter of a microsecond
     return rows
 
 
@@ -221,7 +236,7 @@ def pose_at(rows: npt.NDArray[np.float64], seconds: float) -> tuple[Vector3, Qua
 
     Args:
         rows: As from `read_tum`.
-        seconds: On the file's clock.
+        seconds: Since the first row.
     """
     after = int(np.clip(np.searchsorted(rows[:, 0], seconds), 1, len(rows) - 1))
     a, b = rows[after - 1], rows[after]
