@@ -16,6 +16,7 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from events import (
+    Announcement,
     Command,
     Hover,
     Land,
@@ -27,6 +28,8 @@ from events import (
     TakenOff,
     Takeoff,
     Vector3,
+    VehicleAnnouncement,
+    VehicleEvent,
 )
 from nodes.path import Path, plan
 from runtime import Duration, Node, NodeConfig, Output, on
@@ -76,6 +79,26 @@ class Pilot(Node[C], ABC):
         self._placed = asyncio.Event()
         self._taken_off = asyncio.Event()
         self._landed = asyncio.Event()
+        self._vehicles: list[str] = []
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Refuse to take several vehicles for one."""
+        if not isinstance(announcement, VehicleAnnouncement):
+            return
+        self._vehicles.append(announcement.source)
+        ports = [
+            port
+            for port, handles in self.declared.handlers.items()
+            if port not in self.sources
+            and any(issubclass(event, Odometry | VehicleEvent) for event in handles.events)
+        ]
+        if ports and len(self._vehicles) > 1:
+            first = self._vehicles[0]
+            line = ", ".join(f'{port} = "{first}"' for port in ports)
+            raise ValueError(
+                f"of several vehicles, {self.name} was expected to say which it flies, but it "
+                f"hears them all: write inputs = {{ {line} }} into its entry, if it is {first}"
+            )
 
     def see(self, here: Odometry | PoseEstimate) -> None:
         """Note where the vehicle is."""

@@ -189,6 +189,18 @@ class Multirotor(Node[MultirotorConfig]):
                         self.config.imu_rate,
                     )
 
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Refuse to share a pilot with another vehicle, which would be steered by it, too."""
+        if not isinstance(announcement, VehicleAnnouncement) or announcement.source == self.name:
+            return
+        if obeying_all := [port for port in ("command", "setpoint") if port not in self.sources]:
+            line = ", ".join(f'{port} = "PILOT"' for port in obeying_all)
+            raise ValueError(
+                "of several vehicles, each was expected to say which node it obeys, but "
+                f"{self.name} obeys them all: write inputs = {{ {line} }} into its entry, "
+                "with the name of that node in place of PILOT"
+            )
+
     def on_change(self, before: MultirotorConfig) -> None:  # noqa: ARG002
         """Deliver pictures as the settings now say."""
         self._rig.change(self.config.cameras)

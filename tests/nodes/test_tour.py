@@ -7,9 +7,11 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar
 
+import msgspec
 import pytest
 
 from events import (
+    Announcement,
     Event,
     Hover,
     Land,
@@ -20,10 +22,11 @@ from events import (
     TakenOff,
     Takeoff,
     Vector3,
+    VehicleAnnouncement,
 )
 from nodes.tour import Tour
 from runtime import Node, Output, Tick, every, on
-from runtime.errors import ConfigError
+from runtime.errors import ConfigError, RefusedError
 from runtime.testing import NodeResult, run_nodes, spec
 
 
@@ -67,6 +70,19 @@ class Vehicle(Node):
     async def later(self, happening: type[Event]) -> None:
         await self.clock.sleep(1.0)
         self.happenings.send(happening(stamp=self.clock.now(), source=self.name))
+
+    def announce(self) -> list[Announcement]:
+        return [
+            VehicleAnnouncement(
+                stamp=0,
+                source=self.name,
+                mass=1.0,
+                max_thrust=20.0,
+                control_rate=50.0,
+                position=self.place,
+                orientation=(1.0, 0.0, 0.0, 0.0),
+            )
+        ]
 
 
 def fly(waypoints: Sequence[Sequence[float]], **settings: object) -> NodeResult:
@@ -129,3 +145,17 @@ def test_it_waits_as_long_as_it_is_told() -> None:
 def test_no_waypoints_are_a_mistake_in_the_file() -> None:
     with pytest.raises(ConfigError, match="waypoints: expected a list of length >= 1"):
         fly([])
+
+
+def test_of_several_vehicles_a_tour_says_which_it_flies() -> None:
+    """Otherwise it would begin where the other one is, and end when that has landed."""
+    vehicles = [spec(Vehicle, "v"), spec(Vehicle, "w")]
+    tour = spec(Tour, "tour", {"waypoints": SQUARE})
+    line = r'inputs = \{ taken_off = "v", landed = "v", moved = "v" \}'
+    with pytest.raises(RefusedError, match=f"^tour: cannot work with w: .*{line}"):
+        run_nodes([*vehicles, tour], duration=60)
+    tour = msgspec.structs.replace(
+        tour, inputs=dict.fromkeys(("taken_off", "landed", "moved"), "w")
+    )
+    result = run_nodes([*vehicles, tour], duration=60)
+    assert result.reason == "tour: tour flown"

@@ -7,6 +7,7 @@ from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -30,8 +31,9 @@ from events import (
     VehicleEvent,
     VelocitySetpoint,
 )
-from runtime.errors import ConfigError, NodeError
-from runtime.testing import NodeResult, run_node, spec
+from runtime.config import NodeSpec
+from runtime.errors import ConfigError, NodeError, RefusedError
+from runtime.testing import NodeResult, run_node, run_nodes, spec
 from sims import frames
 from sims.multirotor import STANDING_HEIGHT
 from sims.multirotor.node import Multirotor
@@ -189,6 +191,34 @@ def test_cameras_that_cannot_be_are_refused_with_the_file(
 ) -> None:
     with pytest.raises(ConfigError, match=said):
         spec(Multirotor, "drone", config)
+
+
+def test_several_vehicles_say_whom_they_obey() -> None:
+    """Otherwise one pilot would steer all of them; the refusal has the words to write."""
+    vehicles = [spec(Multirotor, name, {"world": world}) for name in ("a", "b")]
+    with pytest.raises(RefusedError, match=r"^a: .* inputs = \{ command = .PILOT., setpoint"):
+        run_nodes(vehicles, duration=0.1)
+    half = msgspec.structs.replace(vehicles[0], inputs={"setpoint": "tour"})
+    with pytest.raises(RefusedError, match=r"^a: .* inputs = \{ command = .PILOT. \}"):
+        run_nodes([half, vehicles[1]], duration=0.1)
+
+
+def test_several_vehicles_are_each_steered_by_their_own_pilot() -> None:
+    def obeying(name: str) -> NodeSpec:
+        inputs = {"command": f"{name}/pilot", "setpoint": f"{name}/pilot"}
+        return msgspec.structs.replace(spec(Multirotor, name, {"world": world}), inputs=inputs)
+
+    orders = [
+        Takeoff(stamp=0, source="a/pilot", altitude=1.0),
+        Takeoff(stamp=SECOND, source="b/pilot", altitude=2.0),
+        PositionSetpoint(stamp=4 * SECOND, source="a/pilot", position=(1.0, 0.0, -1.0)),
+    ]
+    result = run_nodes([obeying("a"), obeying("b")], inputs=orders, duration=7.0)
+    for name, place in (("a", (1.0, 0.0, -1.0)), ("b", (0.0, 0.0, -2.1))):
+        (up,) = [e for e in result.of(TakenOff) if e.source == name]
+        last = [e for e in result.of(Odometry) if e.source == name][-1]
+        assert last.position == pytest.approx(place, abs=0.1)
+        assert up.stamp > (name == "b") * SECOND
 
 
 def test_take_off_and_landing_are_told() -> None:
