@@ -102,6 +102,17 @@ def test_what_one_frame_sees_stands_where_another_sees_it(read: Any, run: Path) 
     assert np.corrcoef(before, after)[0, 1] > 0.7
 
 
+def test_the_recorded_velocity_is_that_of_the_poses(run: Path) -> None:
+    """Within the curvature of a path that is seen every tenth of a second."""
+    folder = run / "euroc" / "mav0" / "state_groundtruth_estimate0"
+    rows = np.loadtxt(folder / "data.csv", delimiter=",")
+    places, velocities = rows[:, 1:4], rows[:, 8:11]
+    seconds = (rows[2:, 0] - rows[:-2, 0])[:, None] / 1e9
+    between = (places[2:] - places[:-2]) / seconds
+    assert np.linalg.norm(between, axis=1).min() > 0.2
+    np.testing.assert_allclose(velocities[1:-1], between, atol=0.02)
+
+
 def test_the_world_is_z_up(run: Path) -> None:
     _, _, _, poses = tum(run / "tum")
     assert (poses[:, 2, 3] > 1.0).all()
