@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, PoseStamped
+from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, PoseStamped, Vector3
 from nodes.dataset.pictures import PictureFile, in_16_bits, in_grey
 from nodes.dataset.recording import Recording, real
 from nodes.dataset.rig import Rig, mounting
@@ -25,6 +25,7 @@ _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
 )
+_TRUTH = "mav0/state_groundtruth_estimate0"
 _BODY = "body: x forward, y right, z down"
 
 
@@ -42,8 +43,8 @@ class Euroc(Recording):
         ValueError: A camera or the IMU does not sit on the body.
     """
 
-    def __init__(self, folder: Path, rig: Rig, depth_factor: float) -> None:
-        super().__init__(folder, rig, depth_factor)
+    def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
+        super().__init__(folder, rig, depth_factor, epoch)
         frame = rig.cameras[0].parent_frame_id
         for sensor, parent in (
             *((camera.source, camera.parent_frame_id) for camera in rig.cameras),
@@ -54,7 +55,7 @@ class Euroc(Recording):
                     f"{sensor}: expected a sensor on the body of {rig.cameras[0].source}, "
                     f"found it in the frame {parent!r}"
                 )
-        self.write("mav0/body.yaml", f'comment: "{rig.body}; {_BODY}"\n')
+        self.write("mav0/body.yaml", f'comment: "{rig.body}; {_BODY}"\n{self.epoch_line()}')
         self._pictures: dict[str, tuple[str, RowFile]] = {}
         self._depths: dict[str, tuple[str, RowFile]] = {}
         for number, camera in enumerate(rig.cameras):
@@ -72,10 +73,10 @@ class Euroc(Recording):
         if rig.imu is not None:
             self._imu = self.rows("mav0/imu0/data.csv", _IMU_HEADER)
             self.write("mav0/imu0/sensor.yaml", self._imu_yaml())
-        folder_name = "mav0/state_groundtruth_estimate0"
-        self._truth = self.rows(f"{folder_name}/data.csv", f"{EUROC_HEADER}\n")
-        comment = f"{WORLD}; {_BODY}; true poses and velocities, biases not recorded (zeros)"
-        self.write(f"{folder_name}/sensor.yaml", _head("ground-truth", comment, np.eye(4)))
+        self._truth = self.rows(f"{_TRUTH}/data.csv", f"{EUROC_HEADER}\n")
+        self._velocity_said = False
+        self._places: set[Vector3] = set()  # no more than two
+        self._describe_truth("velocities as the vehicle said them")
 
     def picture(self, event: Image) -> PictureFile | None:
         """Note a picture of one of the cameras."""
@@ -92,8 +93,11 @@ class Euroc(Recording):
     def odometry(self, event: Odometry) -> None:
         """Note where the body is, and its velocity in the world."""
         if event.source == self.rig.body:
+            self._velocity_said |= any(event.linear_velocity)
+            if len(self._places) < 2:
+                self._places.add(event.position)
             row = euroc_row(
-                event.stamp,
+                self.epoch + event.stamp,
                 vector_to_nwu(event.position),
                 rotation_to_nwu(event.orientation),
                 vector_to_nwu(to_parent(event.orientation, event.linear_velocity)),
@@ -105,7 +109,27 @@ class Euroc(Recording):
         if self.rig.imu is not None and event.source == self.rig.imu.source:
             values = (*event.angular_velocity, *event.linear_acceleration)
             row = ",".join(f"{value:.12g}" for value in values)
-            self._imu.add(event.stamp, f"{event.stamp},{row}\n")
+            self._imu.add(event.stamp, f"{self.epoch + event.stamp},{row}\n")
+
+    def close(self) -> None:
+        """Write out what is left, and say so if the velocities are none."""
+        if self._velocity_unknown:
+            self._describe_truth("velocities unknown (zeros)")
+        super().close()
+
+    def warnings(self) -> list[str]:
+        """Return what a reader should know."""
+        if self._velocity_unknown:
+            return ["the vehicle moved and said no velocity: those of the ground truth are zeros"]
+        return []
+
+    @property
+    def _velocity_unknown(self) -> bool:
+        return len(self._places) > 1 and not self._velocity_said
+
+    def _describe_truth(self, velocities: str) -> None:
+        comment = f"{WORLD}; {_BODY}; true poses, {velocities}, biases not recorded (zeros)"
+        self.write(f"{_TRUTH}/sensor.yaml", _head("ground-truth", comment, np.eye(4)))
 
     def _note(
         self,
@@ -116,9 +140,10 @@ class Euroc(Recording):
         if event.source not in places:
             return None
         name, rows = places[event.source]
-        if not rows.add(event.stamp, f"{event.stamp},{event.stamp}.png\n"):
+        stamp = self.epoch + event.stamp
+        if not rows.add(event.stamp, f"{stamp},{stamp}.png\n"):
             return None
-        return make(self.folder / "mav0" / name / "data" / f"{event.stamp}.png", event.data)
+        return make(self.folder / "mav0" / name / "data" / f"{stamp}.png", event.data)
 
     def _camera(
         self, name: str, camera: CameraAnnouncement, kind: str, more: str = ""

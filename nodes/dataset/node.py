@@ -15,6 +15,8 @@ from nodes.dataset.pictures import PictureFile
 from nodes.dataset.recording import Recording
 from nodes.dataset.rig import choose
 from nodes.dataset.tum_rgbd import TumRgbd
+from nodes.trajectory.growing import part_name
+from nodes.trajectory.table import EPOCH, epoch_of
 from runtime import Input, Node, NodeConfig, on
 from runtime.errors import ConfigError
 
@@ -36,18 +38,25 @@ class DatasetConfig(NodeConfig):
         folder: Its name in the run's folder. A data set that was there is removed.
         depth_factor: Steps of a depth picture per metre; 65535 of them are the limit, so 5000
             reach 13.1 m, and depth beyond that is written as none.
+        epoch: The run's time 0 in the files: a date (ISO 8601), or nanoseconds of Unix time. It
+            is noted in them (``epoch_ns``), and `nodes.replay` counts from there.
     """
 
     format: Literal["euroc", "tum_rgbd"] = "euroc"
     folder: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")] = "dataset"
     depth_factor: Annotated[float, msgspec.Meta(gt=0)] = 5000.0
+    epoch: int | str = EPOCH
+
+    def __post_init__(self) -> None:
+        epoch_of(self.epoch)
 
 
 class DatasetWriter(Node[DatasetConfig]):
     """Writes what cameras, an IMU and the ground truth say, as EuRoC or TUM RGB-D have it.
 
     Which camera (or vehicle) can be said with ``inputs = { images = "drone/front" }``. The world
-    of the files is z up: north, west, up.
+    of the files is z up: north, west, up. After a restart a numbered folder (``dataset-2``) holds
+    what came then.
     """
 
     images = Input(Image, bound=_WAITING, overflow="drop_oldest")
@@ -60,7 +69,8 @@ class DatasetWriter(Node[DatasetConfig]):
         self._unwritten: set[PictureFile] = set()
         self._queue: asyncio.Queue[PictureFile] = asyncio.Queue(maxsize=1)
         if self.out is not None:
-            await self.offload(_make_empty, self.out / self.config.folder)
+            self._folder = self.out / part_name(self, self.config.folder)
+            await self.offload(_make_empty, self._folder)
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Note what sensors there are."""
@@ -115,6 +125,8 @@ class DatasetWriter(Node[DatasetConfig]):
         for _ in range(self.depths.statistics().buffered):
             self._depth(self.depths.receive_nowait())
         await self.offload(_finish, self._recording, list(self._unwritten))
+        for each in self._recording.warnings():
+            self.log.warning("%s", each)
         dropped = self.images.statistics().dropped + self.depths.statistics().dropped
         if dropped:
             self.log.warning("%d pictures are missing: writing was too slow for them", dropped)
@@ -129,8 +141,8 @@ class DatasetWriter(Node[DatasetConfig]):
             layout = Euroc if self.config.format == "euroc" else TumRgbd
             try:
                 rig = choose(self._announcements, self.sources.get("images"))
-                folder = self.out / self.config.folder
-                self._recording = layout(folder, rig, self.config.depth_factor)
+                epoch = epoch_of(self.config.epoch)
+                self._recording = layout(self._folder, rig, self.config.depth_factor, epoch)
             except ValueError as error:
                 self.log.fatal("%s", error)
         return self._recording

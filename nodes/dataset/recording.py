@@ -22,12 +22,14 @@ class Recording(ABC):
         folder: Where; it exists and is empty.
         rig: The sensors. Events of others are passed over.
         depth_factor: Steps of a depth picture per metre.
+        epoch: The run's time 0 in the files, nanoseconds of Unix time.
     """
 
-    def __init__(self, folder: Path, rig: Rig, depth_factor: float) -> None:
+    def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
         self.folder = folder
         self.rig = rig
         self.depth_factor = depth_factor
+        self.epoch = epoch
         self.files: list[RowFile] = []
 
     @abstractmethod
@@ -55,6 +57,10 @@ class Recording(ABC):
         for file in self.files:
             file.close()
 
+    def epoch_line(self) -> str:
+        """Return the line of a YAML file that says what was the run's time 0."""
+        return f"epoch_ns: {self.epoch}  # the run's time 0; all stamps are Unix time\n"
+
     def rows(self, name: str, header: str) -> RowFile:
         """Open a file of rows in the folder; its folder is made if need be."""
         path = self.folder / name
@@ -72,6 +78,10 @@ class Recording(ABC):
     def empty(self) -> list[str]:
         """Return the files that have no rows yet."""
         return [str(f.path.relative_to(self.folder)) for f in self.files if not f.count]
+
+    def warnings(self) -> list[str]:
+        """Return what else a reader should know."""
+        return []
 
     def left_out(self) -> int:
         """Return how many events came out of order and are in no file."""

@@ -32,8 +32,8 @@ class TumRgbd(Recording):
         camera.yaml                       intrinsics
     """
 
-    def __init__(self, folder: Path, rig: Rig, depth_factor: float) -> None:
-        super().__init__(folder, rig, depth_factor)
+    def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
+        super().__init__(folder, rig, depth_factor, epoch)
         self._camera = camera = rig.cameras[0]
         colour = "rgb" in camera.images
         self._files = {
@@ -72,7 +72,7 @@ class TumRgbd(Recording):
         """Note where the camera is."""
         if event.source == self._camera.source:
             pose = vector_to_nwu(event.position), rotation_to_nwu(event.orientation)
-            self._files["groundtruth"].add(event.stamp, tum_row(event.stamp, *pose))
+            self._files["groundtruth"].add(event.stamp, tum_row(self.epoch + event.stamp, *pose))
 
     def odometry(self, event: Odometry) -> None:
         """Do nothing: the layout has no place for the body."""
@@ -81,12 +81,12 @@ class TumRgbd(Recording):
         """Note the accelerations."""
         if self.rig.imu is not None and event.source == self.rig.imu.source:
             x, y, z = event.linear_acceleration
-            row = f"{seconds_text(event.stamp)} {x:.9f} {y:.9f} {z:.9f}\n"
+            row = f"{self._seconds(event.stamp)} {x:.9f} {y:.9f} {z:.9f}\n"
             self._files["accelerometer"].add(event.stamp, row)
 
     def _add(self, kind: str, stamp: int) -> bool:
         """Note a picture, and its partner if that has come; tell whether it is in order."""
-        name = f"{seconds_text(stamp)} {kind}/{seconds_text(stamp)}.png"
+        name = f"{self._seconds(stamp)} {kind}/{self._seconds(stamp)}.png"
         if kind not in self._files or not self._files[kind].add(stamp, f"{name}\n"):
             return False
         if "depth" in self._files:
@@ -100,7 +100,10 @@ class TumRgbd(Recording):
         return True
 
     def _path(self, kind: str, stamp: int) -> Path:
-        return self.folder / kind / f"{seconds_text(stamp)}.png"
+        return self.folder / kind / f"{self._seconds(stamp)}.png"
+
+    def _seconds(self, stamp: int) -> str:
+        return seconds_text(self.epoch + stamp)
 
     def _index(self, kind: str, title: str) -> RowFile:
         (self.folder / kind).mkdir()
@@ -120,6 +123,7 @@ class TumRgbd(Recording):
             f"distortion: [{lens}]  # k1, k2, p1, p2, k3\n"
             f"rate_hz: {real(self._camera.rate)}\n"
             f"depth_factor: {real(self.depth_factor)}\n"
+            f"{self.epoch_line()}"
         )
 
 

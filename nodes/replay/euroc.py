@@ -1,7 +1,8 @@
 """Data sets in the layout of EuRoC MAV, as published, and as `nodes.dataset` writes them.
 
 M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The world's z points up; it
-is turned to NED by half a turn about x. The body keeps the axes that the data set gives it: with
+is turned to NED by half a turn about x. Times count from the first stamp, or from the epoch that
+``body.yaml`` notes (``epoch_ns``). The body keeps the axes that the data set gives it: with
 EuRoC's own those of its IMU, which is no FRD, but cameras and truth agree on it.
 """
 
@@ -34,6 +35,7 @@ from nodes.replay.folders import (
     standing,
     to_child,
     vector_to_ned,
+    while_seen,
 )
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.trajectory.table import read_rows
@@ -105,11 +107,13 @@ class Euroc(Reader):
             raise
         except ValueError as error:
             raise ReplayError(str(error)) from None
-        firsts = [rows[0][0] for rows in (self._imu, self._truth) if rows]
-        firsts += [rows[0][0] for rows in self._pictures.values() if rows]
-        if not firsts:
+        stamps = [row[0] for row in self._imu]
+        stamps += [stamp for rows in self._pictures.values() for stamp, _ in rows]
+        if not stamps:
             raise ReplayError(f"{folder}: expected the data of cameras or an IMU, found none")
-        self._origin = min(firsts)
+        self._truth = while_seen(self._truth, min(stamps), max(stamps))
+        firsts = [min(stamps), *(row[0] for row in self._truth[:1])]
+        self._origin = min(firsts + noted_epoch(folder / "body.yaml"))
         if self._truth:
             pictures = [rows[0][0] for rows in self._pictures.values() if rows]
             first = min(pictures, default=self._truth[0][0])
@@ -240,6 +244,18 @@ class Euroc(Reader):
             return []
         rows = read_rows(path, ",", (columns,), meaning)
         return sorted((row.nanoseconds(), row.numbers(1, columns)) for row in rows)
+
+
+def noted_epoch(path: Path) -> list[int]:
+    """Return the epoch that a data set of ours notes in a file (ns); none if there is none.
+
+    Raises:
+        ReplayError: It is no number.
+    """
+    said = read_sensor(path).texts.get("epoch_ns") if path.is_file() else None
+    if said is not None and not (said.isdecimal() and len(said) <= 19):
+        raise ReplayError(f"{path}: epoch_ns: expected whole nanoseconds, found {said!r:.80}")
+    return [] if said is None else [int(said)]
 
 
 def read_sensor(path: Path) -> Sensor:

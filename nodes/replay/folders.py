@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import bisect
 import heapq
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -14,6 +15,8 @@ import numpy.typing as npt
 from events import DepthImage, Event, Image, Quaternion, Vector3, VehicleAnnouncement
 from nodes.dataset.world import vector_to_nwu
 from nodes.replay.reader import ReplayError, Timed
+
+R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
 
 vector_to_ned = vector_to_nwu
 """Take a vector from north, west, up to NED; the same half turn goes both ways."""
@@ -36,6 +39,21 @@ def to_child(rotation: Quaternion, vector: Vector3) -> Vector3:
         y + w * ty + qz * tx - qx * tz,
         z + w * tz + qx * ty - qy * tx,
     )
+
+
+def while_seen(truth: list[R], first: int, last: int) -> list[R]:
+    """Return the truth of the time of the sensors, with the row before it and the one after.
+
+    More than that belongs to no flight that an estimator could have seen.
+
+    Args:
+        truth: Rows, the first field of each its stamp (ns), in order.
+        first: The first stamp of any sensor.
+        last: The last.
+    """
+    begin = bisect.bisect_right(truth, first, key=lambda row: row[0]) - 1
+    end = bisect.bisect_left(truth, last, key=lambda row: row[0]) + 1
+    return truth[max(begin, 0) : end]
 
 
 def standing(source: str, position: Vector3, orientation: Quaternion) -> VehicleAnnouncement:

@@ -69,8 +69,7 @@ class ReplayConfig(NodeConfig):
         topics: What is read of a ROS bag, and as what.
         vehicle: Source of a data set's true poses; its cameras are below it. If empty, the
             node's name.
-        camera: Intrinsics of a data set in TUM's layout. If not given, those of its camera.yaml,
-            or else the 525 pixels that its authors recommend.
+        camera: Intrinsics of a data set in TUM's layout, if it has no camera.yaml.
         depth_factor: Steps of its depth pictures per metre.
     """
 

@@ -3,7 +3,8 @@
 J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and
 cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. The world's z points up; it is turned to
 NED by half a turn about x. A depth picture is taken with the colour picture nearest to it, within
-20 ms as their associate.py does it, and gets its stamp, so that estimators find pairs.
+20 ms as their associate.py does it, and gets its stamp, so that estimators find pairs. Times count
+from the first stamp, or from the epoch that ``camera.yaml`` notes (``epoch_ns``).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from events import (
     Quaternion,
     Vector3,
 )
-from nodes.replay.euroc import read_sensor
+from nodes.replay.euroc import noted_epoch, read_sensor
 from nodes.replay.folders import (
     in_order,
     read_depth,
@@ -32,6 +33,7 @@ from nodes.replay.folders import (
     rotation_to_ned,
     standing,
     vector_to_ned,
+    while_seen,
 )
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.replay.settings import Pinhole
@@ -41,9 +43,6 @@ from nodes.trajectory.table import read_rows
 
 FARTHEST = 20_000_000
 """Nanoseconds between a depth picture and its colour picture."""
-
-RECOMMENDED = Pinhole(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
-"""What the data set's authors recommend for all three of their cameras' registered depth."""
 
 _Rows = list[tuple[int, Path]]
 
@@ -57,11 +56,11 @@ class TumRgbd(Reader):
     Args:
         folder: The one with rgb.txt in it.
         vehicle: Source of the truth; the camera is below it.
-        camera: Intrinsics; if `None`, those of camera.yaml, or else the recommended ones.
+        camera: Intrinsics; if `None`, those of camera.yaml.
         depth_factor: Steps per metre.
 
     Raises:
-        ReplayError: Something in it is not as published.
+        ReplayError: Something in it is not as published, or nothing says the intrinsics.
     """
 
     def __init__(
@@ -97,8 +96,16 @@ class TumRgbd(Reader):
                     cy=sensor.number("cy"),
                     distortion=(k1, k2, p1, p2, k3),
                 )
-        self._origin = min([self._rgb[0][0], *(row[0] for row in self._truth[:1])])
-        self._announcements = self._announced(camera or RECOMMENDED, rate)
+        if camera is None:
+            raise ReplayError(
+                f"{folder}: expected a camera.yaml or the setting camera, found neither: write "
+                "camera = { fx = …, fy = …, cx = …, cy = … } (pixels); the benchmark's page has "
+                "those of its sequences (freiburg1: 517.3, 516.5, 318.6, 255.3)"
+            )
+        self._truth = while_seen(self._truth, self._rgb[0][0], self._rgb[-1][0])
+        firsts = [self._rgb[0][0], *(row[0] for row in self._truth[:1])]
+        self._origin = min(firsts + noted_epoch(calibration))
+        self._announcements = self._announced(camera, rate)
 
     def announcements(self) -> Sequence[Announcement]:
         """Return the body where it begins, and the camera."""

@@ -2,13 +2,24 @@
 
 A run leaves them as ``trajectories/truth.tum`` and ``trajectories/<estimator>.tum``, in ``map``
 (NED) or the estimator's own frame, just as the estimator said them; nothing here aligns them.
+
+Stamps of an export are Unix time: its files say which epoch is the run's time 0. TUM's files keep
+the run's frames; EuRoC's world is z up (north, west, up), as that data set's own; KITTI's poses are
+those of the left camera, from identity.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import Quaternion, Vector3
+from nodes.estimation import pose_matrix
 from nodes.trajectory.formats import read_tum, write_euroc, write_kitti, write_tum
+from nodes.trajectory.table import EPOCH, epoch_of
 from nodes.trajectory.trajectory import Trajectory
 
 FORMATS = ("tum", "euroc", "kitti")
@@ -18,30 +29,37 @@ PLAN = "plan"
 """Names of those files that hold no estimate."""
 
 _COMMENT = {
-    TRUTH: "ground truth: base_link (FRD) in map (NED: x north, y east, z down)",
-    "": "estimate, as it was said: base_link (FRD) in the estimator's frame",
+    ("tum", TRUTH): "ground truth: base_link (FRD) in map (NED: x north, y east, z down)",
+    ("tum", ""): "estimate, as it was said: base_link (FRD) in the estimator's frame",
+    ("euroc", TRUTH): "ground truth: base_link (FRD) in the world (x north, y west, z up)",
+    ("euroc", ""): "estimate: base_link (FRD) in the estimator's frame, turned to z up",
 }
+_VELOCITIES = "\nvelocities: by differences of the positions; biases: not known (zeros)"
 
 
-def export(run: Path, form: str, out: Path | None = None) -> list[Path]:
+def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPOCH) -> list[Path]:
     """Write a run's true trajectory and its estimates in another format.
 
     ``tum`` and ``euroc`` give a file each for the truth and every estimator. As evo compares a
     EuRoC truth with an estimate in TUM's format, ``euroc`` adds the latter. ``kitti``, whose files
-    go together line by line, gives a pair for every estimator, at the estimator's stamps.
+    go together line by line, gives a pair for every estimator, at the estimator's stamps: poses
+    of the first camera that the run announced, in the frame of its first one. Without a camera on
+    the body it is one at the body's origin that looks ahead.
 
     Args:
         run: The run's folder.
         form: One of `FORMATS`.
         out: Folder for the files, made if need be; ``export`` in the run's folder if None.
+        epoch: The run's time 0: a date (ISO 8601), or nanoseconds of Unix time.
 
     Returns:
         What was written, the truth first.
 
     Raises:
-        ValueError: The run left no trajectories, or one of them is none.
+        ValueError: The run left no trajectories, one of them is none, or so is the epoch.
         OSError: A file cannot be written.
     """
+    zero = epoch_of(epoch)
     if form not in FORMATS:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, found {form!r}")
     truth, estimates = load(run)
@@ -58,24 +76,72 @@ def export(run: Path, form: str, out: Path | None = None) -> list[Path]:
     folder = out or run / "export"
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
+    mounted = _mounting(run) if pairs else np.eye(4)
     for name, (true, said) in pairs.items():
         for path, poses in (
             (folder / f"{name}.{TRUTH}.kitti.txt", true),
             (folder / f"{name}.kitti.txt", said),
         ):
-            write_kitti(path, poses)
+            matrices = poses.matrices() @ mounted
+            matrices = np.linalg.inv(matrices[0]) @ matrices
+            write_kitti(path, Trajectory.from_matrices(poses.stamps, matrices))
             written.append(path)
     if form == "kitti":
         return written
     for name, trajectory in ({TRUTH: truth} | estimates).items():
-        comment = _COMMENT.get(name, _COMMENT[""])
+        comment = _COMMENT[form, name if name == TRUTH else ""]
+        comment = f"{comment}\nthe run's time 0 is {zero} ns"
+        placed = _placed(trajectory, zero, z_up=form == "euroc")
         if form == "euroc":
             written.append(folder / f"{name}.csv")
-            write_euroc(written[-1], trajectory, comment)
+            write_euroc(written[-1], placed, comment + _VELOCITIES)
         if form == "tum" or name != TRUTH:
             written.append(folder / f"{name}.tum")
-            write_tum(written[-1], trajectory, comment)
+            write_tum(written[-1], placed, comment)
     return written
+
+
+def _placed(trajectory: Trajectory, epoch: int, *, z_up: bool) -> Trajectory:
+    """Return a trajectory in Unix time, and in a parent frame that is turned by half a turn."""
+    positions, (w, x, y, z) = trajectory.positions, trajectory.orientations.T
+    orientations = trajectory.orientations
+    if z_up:
+        positions = positions * [1.0, -1.0, -1.0]
+        orientations = np.stack([-x, w, -z, y], axis=1)  # (0, 1, 0, 0) ⊗ orientation
+    return Trajectory(trajectory.stamps + epoch, positions, orientations)
+
+
+def _mounting(run: Path) -> npt.NDArray[np.float64]:
+    """Return the transform from the run's first camera to its body, shape (4, 4).
+
+    Raises:
+        ValueError: The run's summary is none.
+    """
+    path = run / "summary.json"
+    try:
+        content = path.read_bytes() if path.is_file() else b"{}"
+        announced = msgspec.json.decode(content, type=_Summary).announcements
+    except (OSError, msgspec.DecodeError) as error:
+        raise ValueError(f"{path}: expected the run's summary, found: {error}") from None
+    for each in announced:
+        if each.type == "CameraAnnouncement" and each.parent_frame_id != "map":
+            return pose_matrix(each.position, each.orientation)
+    return pose_matrix((0.0, 0.0, 0.0), (0.5, 0.5, 0.5, 0.5))
+
+
+class _Announced(msgspec.Struct):
+    """What an export asks of an announcement."""
+
+    type: str
+    parent_frame_id: str = "map"
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (0.5, 0.5, 0.5, 0.5)
+
+
+class _Summary(msgspec.Struct):
+    """What an export asks of a run's summary."""
+
+    announcements: list[_Announced] = []
 
 
 def load(run: Path) -> tuple[Trajectory, dict[str, Trajectory]]:

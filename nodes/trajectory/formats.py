@@ -79,7 +79,7 @@ def read_euroc(path: Path) -> Trajectory:
 
 
 def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write a EuRoC ground truth; velocities from neighbouring positions, biases zero.
+    """Write a EuRoC ground truth, poses as they are; velocities by differences, biases zero.
 
     Args:
         path: The file.

@@ -23,12 +23,16 @@ def export(
     out: Annotated[
         Path | None, typer.Option(help="Folder for the files; RUN/export if not given.")
     ] = None,
+    epoch: Annotated[
+        str, typer.Option(help="The run's time 0: a date, or nanoseconds of Unix time.")
+    ] = "2020-01-01T00:00:00Z",
 ) -> None:
     """Write the true and the estimated trajectories of a run as evo and other tools read them.
 
     tum and euroc give one file each for the truth and every estimator; euroc adds the estimates
-    in TUM's format, which is what evo_ape euroc compares with. kitti has no stamps, so it gives
-    a pair of files for every estimator, pose by pose.
+    in TUM's format, which is what evo_ape euroc compares with, and turns all to a world with z
+    up. kitti has no stamps, so it gives a pair of files for every estimator, pose by pose: those
+    of the first camera, from identity.
     """
     import importlib
 
@@ -37,7 +41,7 @@ def export(
     # By name, as nodes are: the runtime imports no other room.
     nodes = importlib.import_module("nodes.trajectory.export")
     try:
-        written = nodes.export(run, form.value, out)
+        written = nodes.export(run, form.value, out, epoch)
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None
     for path in written:

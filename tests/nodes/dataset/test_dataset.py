@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
-from events import Event, Shutdown
+from events import Event, Odometry, Shutdown
 from nodes.dataset import DatasetWriter
 from nodes.dataset.pictures import PictureFile
 from nodes.trajectory.formats import read_euroc, read_tum
@@ -33,8 +34,8 @@ from tests.nodes.dataset.samples import (
     yaml,
 )
 
-STAMPS = ["0", "30000000", "60000000"]
-SECONDS = ["0.000000000", "0.030000000", "0.060000000"]
+STAMPS = ["1577836800000000000", "1577836800030000000", "1577836800060000000"]
+SECONDS = ["1577836800.000000000", "1577836800.030000000", "1577836800.060000000"]
 
 
 def record(out: Path, events: list[Event], form: str, **config: Any) -> Path:
@@ -103,7 +104,7 @@ def test_pictures_and_depth_without_a_partner_are_in_no_pair(tmp_path: Path) -> 
     ]
     data = record(tmp_path, events, "tum_rgbd")
     stamps = [row[0] for row in table(data / "associations.txt")]
-    assert stamps == ["0.000000000", "0.090000000"]
+    assert stamps == [SECONDS[0], "1577836800.090000000"]
 
 
 def test_euroc_has_its_files(tmp_path: Path) -> None:
@@ -127,9 +128,9 @@ def test_euroc_has_its_files(tmp_path: Path) -> None:
 
 def test_euroc_has_what_the_events_said(tmp_path: Path) -> None:
     mav = record(tmp_path, flight(), "euroc") / "mav0"
-    grey = png(mav / "cam0" / "data" / "30000000.png")
+    grey = png(mav / "cam0" / "data" / f"{STAMPS[1]}.png")
     assert (grey == cv2.cvtColor(image(30_000_000).data, cv2.COLOR_RGB2GRAY)).all()
-    assert png(mav / "depth0" / "data" / "0.png")[0, :3].tolist() == [0, 65500, 0]
+    assert png(mav / "depth0" / "data" / f"{STAMPS[0]}.png")[0, :3].tolist() == [0, 65500, 0]
     row = [float(v) for v in table(mav / "imu0" / "data.csv")[1][1:]]
     assert row == [0.1, 0.2, 0.3, 0.0, 0.0, -9.81]
     truth = [float(v) for v in table(mav / "state_groundtruth_estimate0" / "data.csv")[0]]
@@ -182,9 +183,9 @@ def test_several_cameras_have_folders_of_their_own(tmp_path: Path) -> None:
         "cam0", "cam1", "depth0", "state_groundtruth_estimate0",
     }  # fmt: skip
     # The camera's own grey, where it gives any.
-    assert (png(mav / "cam0/data/0.png") == image(0, grey=True).data).all()
-    assert (png(mav / "cam1/data/5.png") == image(5, grey=True).data).all()
-    assert table(mav / "depth0/data.csv") == [["0", "0.png"]]
+    assert (png(mav / f"cam0/data/{STAMPS[0]}.png") == image(0, grey=True).data).all()
+    assert (png(mav / "cam1/data/1577836800000000005.png") == image(5, grey=True).data).all()
+    assert table(mav / "depth0/data.csv") == [[STAMPS[0], f"{STAMPS[0]}.png"]]
 
 
 def test_the_file_can_name_the_camera(tmp_path: Path) -> None:
@@ -198,11 +199,13 @@ def test_the_file_can_name_the_camera(tmp_path: Path) -> None:
     ]
     narrowed(tmp_path / "a", events, "tum_rgbd", "drone/down")
     data = tmp_path / "a" / "dataset"
-    assert table(data / "rgb.txt") == [["0.000000005", "rgb/0.000000005.png"]]
+    assert table(data / "rgb.txt") == [["1577836800.000000005", "rgb/1577836800.000000005.png"]]
     assert len(table(data / "groundtruth.txt")) == 1
     assert not (data / "depth.txt").exists()
     narrowed(tmp_path / "b", events, "euroc", "drone/down")
-    assert table(tmp_path / "b/dataset/mav0/cam0/data.csv") == [["5", "5.png"]]
+    assert table(tmp_path / "b/dataset/mav0/cam0/data.csv") == [
+        ["1577836800000000005", "1577836800000000005.png"]
+    ]
 
 
 def test_without_a_camera_the_run_ends_with_a_reason(tmp_path: Path) -> None:
@@ -321,3 +324,77 @@ def test_a_depth_factor_is_what_it_is_written_with(tmp_path: Path) -> None:
     data = record(tmp_path, flight(1), "tum_rgbd", depth_factor=1000)
     assert png(data / f"depth/{SECONDS[0]}.png")[2, 3] == 1500
     assert math.isclose(yaml(data / "camera.yaml")["depth_factor"], 1000.0)
+
+
+@pytest.mark.parametrize("form", ["euroc", "tum_rgbd"])
+def test_names_sort_in_the_order_of_time_and_are_unix_time(form: str, tmp_path: Path) -> None:
+    """Kalibr takes a name's last nine digits for nanoseconds, and what is before for seconds."""
+    stamps = [0, 7, 999_999_999, 1_000_000_000, 10_000_000_000, 100_000_000_000]
+    events: list[Event] = [imu_announcement(), camera(), *map(image, stamps)]
+    run_node(DatasetWriter, inputs=events, out=tmp_path, config={"format": form}, duration=101.0)
+    data = tmp_path / "dataset"
+    folder = data / ("mav0/cam0/data" if form == "euroc" else "rgb")
+    names = sorted(path.stem for path in folder.iterdir())
+    digits = [name.replace(".", "") for name in names]
+    assert [int(name[-9:]) for name in digits] == [stamp % 10**9 for stamp in stamps]
+    assert [int(name[:-9]) for name in digits] == [
+        1_577_836_800 + stamp // 10**9 for stamp in stamps
+    ]
+    noted = yaml(data / ("mav0/body.yaml" if form == "euroc" else "camera.yaml"))
+    assert noted["epoch_ns"] == 1_577_836_800_000_000_000
+
+
+def test_an_epoch_is_checked_with_the_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"epoch: expected nanoseconds .* found 'soon'"):
+        record(tmp_path, flight(), "euroc", epoch="soon")
+
+
+def test_a_velocity_that_nobody_says_is_not_called_true(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Zeros while the body moves are no velocity."""
+    said = tmp_path / "said"
+    unsaid = tmp_path / "unsaid"
+    path = "mav0/state_groundtruth_estimate0/sensor.yaml"
+    assert "as the vehicle said" in yaml(record(said, flight(), "euroc") / path)["comment"]
+    still = (0.0, 0.0, 0.0)
+    events = [
+        msgspec.structs.replace(each, linear_velocity=still, position=(each.stamp / 1e9, 0.0, 0.0))
+        if isinstance(each, Odometry)
+        else each
+        for each in flight()
+    ]
+    assert "velocities unknown" in yaml(record(unsaid, events, "euroc") / path)["comment"]
+    assert "said no velocity: those of the ground truth are zeros" in caplog.text
+
+
+class Restarted(DatasetWriter):
+    """Fails once, after the first frame."""
+
+    async def run(self) -> None:
+        if not self.restarts:
+            self.start(self._fail())
+        await super().run()
+
+    async def _fail(self) -> None:
+        await self.clock.sleep(0.02)
+        raise RuntimeError("now")
+
+
+@pytest.mark.parametrize("form", ["euroc", "tum_rgbd"])
+def test_a_restart_keeps_what_was_recorded_before(form: str, tmp_path: Path) -> None:
+    """What comes then is in a folder of its own, on the same clock."""
+    node = spec(Restarted, "data", {"format": form}, on_error="restart")
+    run_nodes([node], inputs=flight(60), out=tmp_path, duration=1.8)
+    first, second = (list((tmp_path / name).rglob("*.png")) for name in ("dataset", "dataset-2"))
+    index = "mav0/imu0/data.csv" if form == "euroc" else "rgb.txt"
+    stamps = [
+        row[0].replace(".", "")
+        for name in ("dataset", "dataset-2")
+        for row in table(tmp_path / name / index)
+    ]
+    assert first
+    assert second
+    assert stamps[0] == STAMPS[0]
+    assert stamps == sorted(set(stamps))
+    assert len(stamps) > 20

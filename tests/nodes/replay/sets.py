@@ -197,5 +197,7 @@ SETS = {
 
 
 def reader(path: Path, **settings: object) -> Reader:
+    if path.name.startswith("rgbd_dataset_freiburg"):  # whose authors recommend these
+        settings.setdefault("camera", {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5})
     config = msgspec.convert({"file": str(path), **settings}, ReplayConfig)
     return open_reader(config, "drone")

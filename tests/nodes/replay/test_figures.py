@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from datetime import date
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from events import (
@@ -20,13 +23,27 @@ from events import (
     PoseStamped,
     VehicleAnnouncement,
 )
+from nodes.dataset.euroc import Euroc
 from nodes.dataset.pictures import in_grey
+from nodes.dataset.rig import choose
+from nodes.dataset.tum_rgbd import TumRgbd
 from nodes.estimation import pose_matrix
 from nodes.replay.choice import Choice
 from nodes.replay.euroc import read_sensor
+from nodes.replay.formats import open_reader
 from nodes.replay.reader import Reader, ReplayError
+from nodes.replay.settings import ReplayConfig
 from nodes.ros2_bridge.frames import rotate
-from tests.nodes.dataset.samples import camera, depth, image, imu, odometry
+from nodes.trajectory.table import epoch_of
+from tests.nodes.dataset.samples import (
+    camera,
+    depth,
+    image,
+    imu,
+    imu_announcement,
+    odometry,
+    pose,
+)
 from tests.nodes.replay import sets
 
 E = TypeVar("E", bound=Event)
@@ -105,11 +122,13 @@ def test_tums_depth_has_its_colours_stamp(tum: Reader) -> None:
     assert tum.trouble == ["1 depth pictures have no colour picture near them"]
 
 
-def test_tums_camera_is_as_recommended_or_as_said(tum: Reader, tmp_path: Path) -> None:
-    """525 pixels, unless the settings know better."""
+def test_tums_camera_is_as_said_and_never_guessed(tum: Reader, tmp_path: Path) -> None:
+    """An odometry with the wrong focal length is off by as much, and nobody would know."""
     info = announced(tum, CameraAnnouncement).info
     assert (info.width, info.fx, info.cx, info.cy) == (640, 525.0, 319.5, 239.5)
     path = sets.tum_as_published(tmp_path)
+    with pytest.raises(ReplayError, match=r"xyz: expected a camera\.yaml .* write camera = \{ fx"):
+        open_reader(ReplayConfig(file=str(path)), "replay")
     pinhole = {"fx": 517.3, "fy": 516.5, "cx": 318.6, "cy": 255.3}
     found = sets.reader(path, camera=pinhole, depth_factor=1000.0)
     assert announced(found, CameraAnnouncement).info.fx == 517.3
@@ -246,3 +265,90 @@ def test_a_missing_picture_is_an_error_when_its_turn_comes(tmp_path: Path) -> No
     found = sets.reader(folder)
     with pytest.raises(ReplayError, match=rf"{last.name}: expected a picture"):
         of(found, Image)
+
+
+@pytest.mark.parametrize("layout", ["euroc", "tum_rgbd"])
+@given(
+    start=st.integers(0, 10**13),
+    gaps=st.lists(st.integers(1, 10**12), min_size=1, max_size=4),
+    epoch=st.one_of(st.integers(0, 7 << 60), st.dates(date(1970, 1, 1), date(2200, 1, 1))),
+)
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_every_stamp_of_a_data_set_comes_back(
+    tmp_path_factory: pytest.TempPathFactory,
+    layout: str,
+    start: int,
+    gaps: list[int],
+    epoch: int | date,
+) -> None:
+    """To the nanosecond, whatever the epoch, and though the flight did not begin at 0."""
+    stamps = [start + sum(gaps[:n]) for n in range(len(gaps) + 1)]
+    rig = choose([imu_announcement(), camera()], None)
+    folder = tmp_path_factory.mktemp("set")
+    zero = epoch_of(epoch if isinstance(epoch, int) else str(epoch))
+    recording = (Euroc if layout == "euroc" else TumRgbd)(folder, rig, 5000.0, zero)
+    for stamp in stamps:
+        for file in (recording.picture(image(stamp)), recording.depth(depth(stamp))):
+            assert file is not None
+            file()
+        recording.imu(imu(stamp))
+        recording.odometry(odometry(stamp))
+        recording.pose(pose(stamp))
+    recording.close()
+    found = sets.reader(folder)
+    for kind in (Image, DepthImage, Odometry):
+        assert [event.stamp for event in of(found, kind)] == stamps
+
+
+@pytest.mark.parametrize("build", [sets.euroc_as_published, sets.tum_as_published])
+def test_truth_beyond_the_sensors_is_no_part_of_a_flight(build: Any, tmp_path: Path) -> None:
+    """An estimator could see nothing then, and is not to be charged for that."""
+    path = build(tmp_path)
+    truth = next(
+        path.rglob("*groundtruth*.txt" if path.name.startswith("rgbd") else "*estimate0/*")
+    )
+    first, *_, pose_row = truth.read_text().splitlines()
+    sensors = [event.stamp for event in of(sets.reader(path), Image)]
+    origin = 1305031098_665900000 if path.name.startswith("rgbd") else 1403636579758555392
+    rows = []
+    for stamp in range(-10_000_000_000, 20_000_000_000, 50_000_000):
+        at = origin + stamp
+        text = f"{at // 10**9}.{at % 10**9:09d}" if path.name.startswith("rgbd") else str(at)
+        separator = " " if path.name.startswith("rgbd") else ","
+        rows.append(separator.join([text, *pose_row.split(separator)[1:]]))
+    truth.write_text("\n".join([first, *rows]) + "\n")
+    found = sets.reader(path)
+    images, poses = of(found, Image), of(found, Odometry)
+    assert len(images) == len(sensors)
+    assert poses[0].stamp <= images[0].stamp
+    assert images[-1].stamp <= poses[-1].stamp < images[-1].stamp + 50_000_000
+    assert min(images[0].stamp, poses[0].stamp) < 60_000_000
+
+
+@pytest.mark.parametrize("build", [sets.euroc, sets.tum_rgbd])
+@given(data=st.data())
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_damaged_texts_are_errors_of_one_line(
+    build: Any, data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Whichever file is cut or changed, and wherever."""
+    path = tmp_path_factory.getbasetemp() / f"fuzzed_{build.__name__}"
+    if not path.exists():
+        build(path)
+    files = sorted(each for each in path.rglob("*") if each.is_file())
+    file = data.draw(st.sampled_from(files))
+    whole = file.read_bytes()
+    content = bytearray(whole)
+    del content[data.draw(st.integers(1, len(content))) :]
+    for place in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=3)):
+        content[place] = data.draw(st.integers(0, 255))
+    file.write_bytes(content)
+    wrong = ""
+    try:
+        found = sets.reader(path / "dataset")
+        list(found.events(0, None, Choice()))
+    except ReplayError as error:
+        wrong = str(error)
+    finally:
+        file.write_bytes(whole)
+    assert "\n" not in wrong

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -63,25 +64,73 @@ def test_every_format_has_its_files(run: Path, tmp_path: Path) -> None:
     assert all(p.parent == run / "export" for p in export(run, "tum"))
 
 
-def test_poses_stay_where_and_when_they_were(run: Path) -> None:
+NWU = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("epoch", "zero"),
+    [
+        ("2020-01-01T00:00:00Z", 1_577_836_800 * 10**9),
+        ("2026-07-14T12:00:00.25+02:00", 1_784_023_200 * 10**9 + 250_000_000),
+        (7, 7),
+    ],
+)
+def test_poses_stay_where_they_were_and_stamps_are_of_the_epoch(
+    run: Path, epoch: int | str, zero: int
+) -> None:
     truth, estimates = load(run)
     assert list(estimates) == ["slam", "vo"]
-    export(run, "tum")
-    export(run, "euroc")
     out = run / "export"
-    for name, expected in ({"truth": truth} | estimates).items():
-        for found in (read_tum(out / f"{name}.tum"), read_euroc(out / f"{name}.csv")):
-            assert (found.stamps == expected.stamps).all()
-            assert abs(found.positions - expected.positions).max() < 1e-9
+    for form, world in (("tum", np.eye(4)), ("euroc", NWU)):
+        export(run, form, epoch=epoch)
+        for name, expected in ({"truth": truth} | estimates).items():
+            files = {f"{name}.csv": read_euroc} if form == "euroc" else {}
+            if form == "tum" or name != "truth":
+                files[f"{name}.tum"] = read_tum
+            for file, read in files.items():
+                found = read(out / file)
+                assert (found.stamps == expected.stamps + zero).all()
+                assert abs(found.matrices() - world @ expected.matrices()).max() < 1e-9
+                assert f"time 0 is {zero} ns" in (out / file).read_text()
 
 
-def test_kittis_files_go_together_line_by_line(run: Path) -> None:
+@pytest.mark.parametrize("epoch", ["yesterday", "1969-12-31", "2263-01-01", -1, 1 << 63, "１２x"])
+def test_an_epoch_that_is_none_is_refused(run: Path, epoch: int | str) -> None:
+    with pytest.raises(ValueError, match=r"epoch: expected nanoseconds of Unix time or a date as"):
+        export(run, "tum", epoch=epoch)
+    assert not (run / "export").exists()
+
+
+def test_kittis_poses_are_the_left_cameras_from_identity_line_by_line(run: Path) -> None:
+    """As that benchmark's: z forward and x right in the frame of the first pose."""
     truth, estimates = load(run)
-    export(run, "kitti")
-    true = read_kitti(run / "export" / "slam.truth.kitti.txt")
-    said = read_kitti(run / "export" / "slam.kitti.txt")
-    assert said[:, :3, 3] == pytest.approx(estimates["slam"].positions)
-    assert true[:, :3, 3] == pytest.approx(truth.at(estimates["slam"].stamps).positions)
+    for announced, mounted in (
+        ([], OPTICAL),
+        ([{"type": "CameraAnnouncement", "parent_frame_id": "map"}], OPTICAL),
+        ([{"type": "ImuAnnouncement"}, CAMERA, {**CAMERA, "position": [9, 9, 9]}], LEVER @ OPTICAL),
+    ):
+        (run / "summary.json").write_text(json.dumps({"announcements": announced}))
+        export(run, "kitti")
+        true = read_kitti(run / "export" / "slam.truth.kitti.txt")
+        said = read_kitti(run / "export" / "slam.kitti.txt")
+        for found, body in ((true, truth.at(estimates["slam"].stamps)), (said, estimates["slam"])):
+            poses = body.matrices() @ mounted
+            assert abs(found[0] - np.eye(4)).max() < 1e-9
+            assert abs(poses[0] @ found - poses).max() < 1e-9
+    (run / "summary.json").write_text("{")
+    with pytest.raises(ValueError, match=r"summary\.json: expected the run's summary, found: "):
+        export(run, "kitti")
+
+
+OPTICAL = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+LEVER = np.array([[1.0, 0, 0, 0.1], [0, 1, 0, -0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]])
+CAMERA = {
+    "type": "CameraAnnouncement",
+    "parent_frame_id": "base_link",
+    "position": [0.1, -0.2, 0.3],
+    "orientation": [0.5, 0.5, 0.5, 0.5],
+    "rate": 30.0,
+}
 
 
 def test_poses_without_a_truth_are_left_out_of_kittis_pairs() -> None:
