@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -33,6 +35,10 @@ WAITING = 8
 """Pictures of one kind that wait to be passed on; the oldest is dropped, and counted."""
 
 
+_REFUSALS = 10
+"""Different ones that are logged."""
+
+
 class FoxgloveServer(Node[FoxgloveConfig]):
     """Shows a run, live, in Foxglove: *Open connection*, ``ws://localhost:8765``.
 
@@ -62,8 +68,16 @@ class FoxgloveServer(Node[FoxgloveConfig]):
             MissingDependencyError: foxglove is not installed.
             FatalError: The port cannot be had.
         """
+        loop, told = asyncio.get_running_loop(), set[str]()
+
+        def refused(why: str) -> None:
+            if why not in told and len(told) < _REFUSALS:
+                told.add(why)
+                with contextlib.suppress(RuntimeError):  # the run is over
+                    loop.call_soon_threadsafe(self.log.warning, "somebody was refused: %s", why)
+
         try:
-            server = await self.offload(Server, self.config, f"visnav: {self.name}")
+            server = await self.offload(Server, self.config, f"visnav: {self.name}", refused)
         except MissingDependencyError:
             raise
         except VisnavError as error:

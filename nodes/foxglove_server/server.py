@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from nodes.foxglove_server.gate import Gate, hidden_host
 from nodes.foxglove_server.settings import FoxgloveConfig
 from runtime.errors import MissingDependencyError, VisnavError
 
@@ -26,13 +27,16 @@ class Server:
     Args:
         config: Where to listen.
         name: As viewers show it.
+        refused: Told, in a thread, why somebody was not let in.
 
     Raises:
         MissingDependencyError: foxglove is not installed.
         VisnavError: It cannot listen there.
     """
 
-    def __init__(self, config: FoxgloveConfig, name: str) -> None:
+    def __init__(
+        self, config: FoxgloveConfig, name: str, refused: Callable[[str], None] = lambda _: None
+    ) -> None:
         try:
             import foxglove
             import foxglove.channels
@@ -48,23 +52,30 @@ class Server:
         self._channels: dict[str, Any] = {}
         self._latched: dict[str, tuple[Make, int]] = {}
         self._lock = threading.Lock()
+        inner = hidden_host()
         listener: Any = _Listener(self._subscribed)
         try:
             self._server = foxglove.start_server(
                 name=name,
-                host=config.host,
-                port=config.port,
+                host=inner,
+                port=0,
                 capabilities=[foxglove.websocket.Capability.Time],
                 server_listener=listener,
                 message_backlog_size=config.backlog,
                 context=self._context,
             )
         except Exception as error:  # the library's own type is not public
+            raise VisnavError(f"expected the library to listen here, found: {error}") from error
+        try:
+            inside = inner, self._server.port
+            self._gate = Gate(config.host, config.port, inside, config.origins, refused)
+        except OSError as error:
+            self._server.stop()
             raise VisnavError(
-                f"port: expected to listen on {config.host}:{config.port}, found: {error}"
+                f"port: expected to listen on {config.host}:{config.port}, found: {error.strerror}"
             ) from error
         host = f"[{config.host}]" if ":" in config.host else config.host
-        self.address = f"ws://{host}:{self._server.port}"
+        self.address = f"ws://{host}:{self._gate.port}"
 
     def declare(self, topic: str, kind: str) -> None:
         """Declare a topic of one of Foxglove's own types: ``CompressedImage``."""
@@ -105,6 +116,7 @@ class Server:
         stopping = threading.Thread(target=self._server.stop, name="foxglove stops", daemon=True)
         stopping.start()
         stopping.join(_PATIENCE)
+        self._gate.close()
 
     def _subscribed(self, topic: str) -> None:
         with self._lock:

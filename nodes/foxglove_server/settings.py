@@ -13,9 +13,11 @@ class FoxgloveConfig(NodeConfig):
     """Settings of the server.
 
     Attributes:
-        host: Where it listens. Whoever reaches it sees all; hence this machine only, unless said
-            otherwise.
+        host: Where it listens. Whoever reaches it sees all, but for pages of other origins; hence
+            this machine only, unless said otherwise.
         port: The same; 0: any that is free (the log tells it).
+        origins: Pages that may connect, as browsers name them: Foxglove's own, in a browser and
+            as a program. What is no browser needs none.
         picture_rate: Pictures a second of each camera, on the run's clock; of a set (colours,
             depth) all or none. 0: no pictures.
         jpeg_quality: 1 to 100; 0: pictures as they are.
@@ -26,6 +28,7 @@ class FoxgloveConfig(NodeConfig):
 
     host: str = "127.0.0.1"
     port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 8765
+    origins: tuple[str, ...] = ("https://app.foxglove.dev", "file://")
     picture_rate: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 15.0
     jpeg_quality: Annotated[int, msgspec.Meta(ge=0, le=100)] = 80
     depth: bool = True

@@ -48,6 +48,39 @@ class Request(NamedTuple):
     body: bytes
 
 
+_ONCE = {"host", "origin", "content-length", "x-token"}
+"""Headers that say who asks, and for what: if there are two, nobody knows which one counts."""
+
+
+def parse_head(head: str) -> tuple[str, str, dict[str, str]]:
+    """Return method, target and headers of a request; names of headers are in lower case.
+
+    Raises:
+        HttpError: It is no request, or has two of a header of which there may be one.
+    """
+    first, *lines = head.split("\r\n")
+    parts = first.split(" ")
+    if len(parts) != 3 or not parts[2].startswith("HTTP/1."):
+        raise HttpError(400, "expected a request of HTTP/1.1")
+    headers: dict[str, str] = {}
+    for line in lines:
+        name, colon, value = line.partition(":")
+        name = name.strip().lower()
+        if colon and name in _ONCE and name in headers:
+            raise HttpError(400, f"expected one header {name}, found two")
+        if colon:
+            headers[name] = value.strip()
+    return parts[0], parts[1], headers
+
+
+def host_of(headers: dict[str, str]) -> str:
+    """Return the host that a request is for, without its port; empty if it names none."""
+    host = headers.get("host", "")
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.partition(":")[0]
+
+
 async def read_request(reader: asyncio.StreamReader) -> Request:
     """Read one request.
 
@@ -59,26 +92,18 @@ async def read_request(reader: asyncio.StreamReader) -> Request:
         head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
     except asyncio.LimitOverrunError:
         raise HttpError(413, "expected a shorter request") from None
-    first, *lines = head.split("\r\n")
-    parts = first.split(" ")
-    if len(parts) != 3 or not parts[2].startswith("HTTP/1."):
-        raise HttpError(400, "expected a request of HTTP/1.1")
+    method, target, headers = parse_head(head)
     try:
-        url = urlsplit(parts[1])
+        url = urlsplit(target)
     except ValueError as error:
         raise HttpError(400, f"expected an address: {error}") from None
     query = {key: values[0] for key, values in parse_qs(url.query).items()}
-    headers = {}
-    for line in lines:
-        name, colon, value = line.partition(":")
-        if colon:
-            headers[name.strip().lower()] = value.strip()
     length = headers.get("content-length", "0")
     if not length.isascii() or not length.isdigit():
         raise HttpError(400, "expected a length")
     if len(length) > 9 or int(length) > LONGEST_BODY:
         raise HttpError(413, f"expected at most {LONGEST_BODY} bytes")
-    return Request(parts[0], url.path, query, headers, await reader.readexactly(int(length)))
+    return Request(method, url.path, query, headers, await reader.readexactly(int(length)))
 
 
 def response(

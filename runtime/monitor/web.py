@@ -26,6 +26,7 @@ from runtime.monitor.http import (
     HttpError,
     Request,
     event_stream,
+    host_of,
     read_request,
     response,
     server_sent,
@@ -113,7 +114,7 @@ class Page:
         Raises:
             HttpError: They may not.
         """
-        host = request.headers.get("host", "").rpartition(":")[0] or request.headers.get("host", "")
+        host = host_of(request.headers)
         if host not in _HOSTS:
             raise HttpError(403, f"expected a request to 127.0.0.1, found {host!r}")
         given = (

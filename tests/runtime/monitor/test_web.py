@@ -68,6 +68,8 @@ async def test_the_page_comes_with_the_token_and_runs_no_script_but_its_own() ->
         (get("/?token=abd"), 403),
         (get("/?token=é"), 403),
         (get(f"/?token={TOKEN}", host="evil.example"), 403),
+        (get(f"/?token={TOKEN}") + "\r\nHost: evil.example", 400),
+        (get(f"/?token={TOKEN}", host="evil.example") + "\r\nHost: localhost", 400),
         (get(f"/nothing?token={TOKEN}"), 404),
         (f"PUT /?token={TOKEN} HTTP/1.1\r\nHost: localhost", 405),
         ("nonsense", 400),
