@@ -165,9 +165,6 @@ class TransformTree:
 
     def _add(self, parent: str, child: str, stamp: int, pose: _Pose, static: bool = False) -> None:
         where = f"{parent} → {child}"
-        norm = math.hypot(*pose[1])
-        if not (math.isfinite(sum(pose[0])) and 0.0 < norm < math.inf):
-            raise ValueError(f"{where}: expected finite numbers and a rotation, found {pose}")
         edge = self._edges.get(child)
         if edge is None:
             ancestors = self._line(parent) if parent in self._frames else [parent]

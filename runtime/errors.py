@@ -12,6 +12,8 @@
     │   ├── ChannelFullError   the receiver fell behind further than it allowed
     │   ├── ChannelClosedError you (or the end of the run) closed it
     │   ├── ChannelBusyError   two coroutines wait on one input
+    │   ├── ChannelTypeError   something else was sent than the output declares
+    │   ├── ChannelThreadError `send` was called in another thread than the loop's
     │   └── AmbiguousSourceError  an input that matches stamps hears two sources
     ├── CommandError           a run cannot do what its monitor asked it to
     ├── PeerError              another process of the run is missing, gone, or of another mind
@@ -84,6 +86,14 @@ class ChannelClosedError(ChannelError):
 
 class ChannelBusyError(ChannelError):
     """A second coroutine wanted to wait on an input that has one waiting."""
+
+
+class ChannelTypeError(ChannelError, TypeError):
+    """An output was sent something else than it declares, or what has no digest."""
+
+
+class ChannelThreadError(ChannelError):
+    """Something was sent in another thread than the loop's, in which all nodes run."""
 
 
 class AmbiguousSourceError(ChannelError):

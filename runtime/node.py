@@ -148,6 +148,7 @@ class Node(Generic[C]):
     sources: dict[str, str]
     restarts: int
     _host: Host
+    _outside: set[Any]
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -205,7 +206,8 @@ class Node(Generic[C]):
     async def offload(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
         """Run a slow function in a thread, and await its result; the loop goes on meanwhile.
 
-        In lockstep, simulated time waits for it; `offload_for` gives it time of its own.
+        In lockstep, simulated time waits for it; `offload_for` gives it time of its own. The
+        function must not send: it returns what is to be sent.
         """
         return await self.offload_for(0.0, fn, *args, **kwargs)
 
@@ -217,7 +219,12 @@ class Node(Generic[C]):
         In lockstep it comes exactly then, however long this machine takes; in real time not
         before then.
         """
-        work = self._host.executor.submit(functools.partial(fn, *args, **kwargs))
+        call = functools.partial(fn, *args, **kwargs)
+        self._outside.add(call)
+        for sender in senders(self).values():
+            sender.watch()  # lest `call` sends something
+        work = self._host.executor.submit(call)
+        work.add_done_callback(lambda _: self._outside.discard(call))
         return await self.clock.beside(work, round(latency * SECOND))
 
     async def worker(self, factory: Callable[..., W], *args: Any, **options: Any) -> Worker[W]:
@@ -292,12 +299,13 @@ def make_node(
     node.sources = dict(sources or {})
     node.restarts = restarts
     node._host = host
+    node._outside = set()
     for port, declared in cls.declared.inputs.items():
         setattr(node, port, declared.make(name))
     for port, bundle in cls.declared.bundles.items():
         setattr(node, port, bundle.make(name))
     for port, output in cls.declared.outputs.items():
-        setattr(node, port, Sender(f"{name}.{port}", output.event))
+        setattr(node, port, Sender(f"{name}.{port}", output.event, node._outside))
     node.__init__()  # type: ignore[misc]  # now that what it may use is there
     return node
 

@@ -7,12 +7,13 @@ been resumed. Who listens is decided by `runtime.graph` before the first event.
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, Generic, TypeVar
 
 from events import Event
-from runtime.errors import ChannelClosedError
+from runtime.errors import ChannelClosedError, ChannelThreadError, ChannelTypeError
 from runtime.steps import FanOut, Fault
 from runtime.streams import Stream
 
@@ -32,16 +33,22 @@ class Sender(Generic[T]):
     Args:
         name: ``node.port``.
         event: The declared type of event.
+        outside: What its node does in threads just now. While there is something, each event is
+            checked to be sent by the loop's thread; else the first only.
     """
 
     __slots__ = (
         "_candidates",
         "_deliver",
+        "_expected",
         "_fault",
+        "_known",
         "_listeners",
+        "_outside",
         "_routes",
         "_sent",
         "_taps",
+        "_thread",
         "_to_streams",
         "_waiting",
         "event",
@@ -49,9 +56,12 @@ class Sender(Generic[T]):
         "send",
     )
 
-    def __init__(self, name: str, event: type[T]) -> None:
+    def __init__(self, name: str, event: type[T], outside: Collection[Any] = ()) -> None:
         self.name = name
         self.event = event
+        self._outside = outside
+        self._thread = 0
+        self._expected: type[T] | None = None
         self._sent = 0
         self.send: Callable[[T], bool] = self._refuse
         """Deliver an event now; True if a handler ended the delivery."""
@@ -59,7 +69,8 @@ class Sender(Generic[T]):
         self._listeners: tuple[Deliver, ...] = ()
         self._to_streams = FanOut(())
         self._candidates: tuple[Listener, ...] = ()
-        self._routes: dict[tuple[type[Event], str], Route] = {}
+        self._known: dict[tuple[type[Event], str], Route] = {}
+        self._routes: dict[tuple[type[Event], str], Route] = {}  # those that need no check
         self._waiting: tuple[Stream[Any], ...] = ()
         self._taps: tuple[Tap, ...] = ()
         self._fault: Fault = _raise
@@ -70,7 +81,7 @@ class Sender(Generic[T]):
         """Freeze who listens, in order, and pick the shortest way to deliver to them."""
         self._candidates = tuple(c for c in candidates if c.may_hear(self.event))
         self._listeners = tuple(c.deliver for c in self._candidates)
-        for route in self._routes.values():
+        for route in self._known.values():
             route.listeners = self._heard_by(*route.key)
         self._waiting = tuple(
             c.stream
@@ -86,10 +97,18 @@ class Sender(Generic[T]):
             self._deliver = self._send_to_all
             streams = tuple(c.stream for c in self._candidates if c.stream and not c.stream.soon)
             if streams and len(streams) == len(self._candidates):
-                self._to_streams, before = FanOut(streams, self._fault), self._to_streams
+                fan_out = FanOut(streams, self._fault, self._check)
+                self._to_streams, before = fan_out, self._to_streams
                 self._to_streams.sent = before.sent
                 self._deliver = self._to_streams.send
         self.send = self._send_tapped if self._taps else self._deliver
+        self._thread = threading.get_ident()
+        self.watch()
+
+    def watch(self) -> None:
+        """Check the next event, and all after it while the node does something in a thread."""
+        self._expected = self._to_streams.expected = None
+        self._routes = {}
 
     def send_soon(self, event: T) -> None:
         """Deliver an event when the loop next turns; the sender goes on at once."""
@@ -102,7 +121,25 @@ class Sender(Generic[T]):
                 await stream.wait_for_room()
         return self.send(event)
 
+    def _check(self, event: T) -> None:
+        """Raise if this cannot be sent, or not from here; else see to it that the next is quick."""
+        if not isinstance(event, self.event):
+            raise ChannelTypeError(
+                f"{self.name}: expected events of type {self.event.__name__}, "
+                f"found {event!r:.80} ({type(event).__name__})"
+            )
+        if threading.get_ident() != self._thread:
+            raise ChannelThreadError(
+                f"{self.name}: expected send() in the loop's thread, found it in "
+                f"{threading.current_thread().name!r}: return the event from the function and send "
+                f"it after the await, or use loop.call_soon_threadsafe({self.name}.send, event)"
+            )
+        if not self._outside:
+            self._expected = self._to_streams.expected = self.event
+
     def _send_to_all(self, event: T) -> bool:
+        if event.__class__ is not self._expected:
+            self._check(event)
         self._sent += 1
         listeners = self._listeners  # a listener may connect anew meanwhile
         try:
@@ -116,8 +153,8 @@ class Sender(Generic[T]):
     def _send_routed(self, event: T) -> bool:
         try:
             route = self._routes[type(event), event.source]
-        except KeyError:
-            route = self._route(type(event), event.source)
+        except (KeyError, AttributeError):
+            route = self._route(event)
         route.sent += 1
         listeners = route.listeners
         try:
@@ -129,15 +166,21 @@ class Sender(Generic[T]):
         return False
 
     def _send_tapped(self, event: T) -> bool:
+        if event.__class__ is not self._expected:
+            self._check(event)
         for tap in self._taps:
             tap(self, event)
         return self._deliver(event)
 
-    def _route(self, event: type[Event], source: str) -> Route:
-        """Remember who hears events of this type and source."""
-        route = Route((event, source), self._heard_by(event, source))
-        self._routes[event, source] = route
-        return route
+    def _route(self, event: T) -> Route:
+        """Check an event, and remember who hears those of its type and source."""
+        self._check(event)
+        key = type(event), event.source
+        if key not in self._known:
+            self._known[key] = Route(key, self._heard_by(*key))
+        if not self._outside:
+            self._routes[key] = self._known[key]
+        return self._known[key]
 
     def _heard_by(self, event: type[Event], source: str) -> tuple[Deliver, ...]:
         return tuple(c.deliver for c in self._candidates if c.hears(event, source))
@@ -145,7 +188,7 @@ class Sender(Generic[T]):
     def sent(self) -> Counter[type[Event]]:
         """Count what was sent, by type."""
         counts: Counter[type[Event]] = Counter({self.event: self._sent + self._to_streams.sent})
-        for route in self._routes.values():
+        for route in self._known.values():
             counts[route.key[0]] += route.sent
         return +counts
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import functools
 import sys
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any
@@ -29,7 +30,6 @@ Fault = Callable[[Callable[[Any], Any], Exception], None]
 """Told which listener raised what; the delivery then goes on."""
 
 _NOTHING: Any = object()
-_depth = 0
 
 if sys.version_info >= (3, 14):
     from asyncio.tasks import _swap_current_task
@@ -48,6 +48,34 @@ if sys.version_info >= (3, 14):
 else:
     # One dictionary access is a tenth of `_leave_task` and `_enter_task` together.
     from asyncio.tasks import _current_tasks  # type: ignore[attr-defined]
+
+
+class _Nesting:
+    """How many resumptions are nested in one another on a loop just now; and a count of tasks."""
+
+    __slots__ = ("depth", "tasks")
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.tasks = 0
+
+
+class _Task(asyncio.Task[Any]):
+    """A task whose place in a set does not depend on its address.
+
+    Whoever goes through a set of tasks (a `TaskGroup` that cancels them, a caller of
+    `asyncio.wait`) does so in the same order in equal runs.
+    """
+
+    tasks = 0
+    """How many this one has made: its own count, so that nobody who looks on changes it."""
+
+    def __init__(self, number: int, coro: Coroutine[Any, Any, Any], **options: Any) -> None:
+        self._number = number
+        super().__init__(coro, **options)
+
+    def __hash__(self) -> int:
+        return self._number
 
 
 class _Gate(asyncio.Future[None]):
@@ -70,6 +98,7 @@ class Steps(Coroutine[Any, Any, Any]):
         "_gate",
         "_later",
         "_loop",
+        "_nesting",
         "_outcome",
         "_run",
         "_step",
@@ -82,12 +111,14 @@ class Steps(Coroutine[Any, Any, Any]):
         coro: Coroutine[Any, Any, Any],
         loop: asyncio.AbstractEventLoop,
         context: contextvars.Context,
+        nesting: _Nesting,
     ) -> None:
         self.__name__: str = getattr(coro, "__qualname__", "?")
         self._coro = coro
         self._step = coro.send
         self._run = context.run
         self._loop = loop
+        self._nesting = nesting
         self._task: asyncio.Task[Any] | None = None
         self._gate: _Gate | None = None
         self._stream: Stream[Any] | None = None
@@ -194,36 +225,36 @@ class FanOut:
     Args:
         streams: None of them declared with ``wake="soon"``.
         fault: Told which stream could not take an event; without it, that is raised.
+        check: Called with an event of another type than `expected`; may raise.
 
     Attributes:
         sent: How many events were offered.
+        expected: The type of events that need no check.
     """
 
-    __slots__ = ("_fault", "sent", "streams")
+    __slots__ = ("_check", "_fault", "expected", "sent", "streams")
 
     def __init__(
-        self, streams: tuple[Stream[Any] | _WakeUp, ...], fault: Fault | None = None
+        self,
+        streams: tuple[Stream[Any] | _WakeUp, ...],
+        fault: Fault | None = None,
+        check: Callable[[Any], None] | None = None,
     ) -> None:
         self.streams: tuple[Any, ...] = streams
         self.sent = 0
+        self.expected: type | None = None
         self._fault = fault
+        self._check = check
 
     def send(self, event: Any) -> bool:
         """Offer an event; return False, because a stream never ends a delivery.
 
         One function does it all: a call or two a receiver would cost as much as the receivers.
         """
-        global _depth
+        if event.__class__ is not self.expected and self._check is not None:
+            self._check(event)
         self.sent += 1
-        if _depth >= DEPTH_LIMIT:
-            for stream in self.streams:
-                try:
-                    stream.offer_soon(event)
-                except Exception as error:
-                    self._report(stream, error)
-            return False
-        tasks, loop, sender = _current_tasks, None, None
-        _depth += 1
+        tasks, loop, sender, nesting = _current_tasks, None, None, _NOTHING
         try:
             for stream in self.streams:
                 steps = stream.waiter
@@ -237,10 +268,15 @@ class FanOut:
                         _set_current_task(loop, sender)
                         self._report(stream, error)
                     continue
-                stream.waiter = None
                 if loop is None:
+                    if steps._nesting.depth >= DEPTH_LIMIT:
+                        stream.offer_soon(event)
+                        continue
+                    nesting = steps._nesting
+                    nesting.depth += 1
                     loop = steps._loop
                     sender = tasks.get(loop)
+                stream.waiter = None
                 tasks[loop] = steps._task
                 try:
                     waits_for = steps._run(steps._step, event)
@@ -253,8 +289,9 @@ class FanOut:
                 else:
                     steps._hand_over(waits_for)
         finally:
-            _depth -= 1
-            _set_current_task(loop, sender)
+            if loop is not None:
+                nesting.depth -= 1
+                _set_current_task(loop, sender)
         return False
 
     def _report(self, stream: Stream[Any], error: Exception) -> None:
@@ -273,7 +310,8 @@ def _set_current_task(
         _current_tasks.pop(loop, None)
 
 
-def task_factory(
+def _task_factory(
+    nesting: _Nesting,
     loop: asyncio.AbstractEventLoop,
     coro: Coroutine[Any, Any, Any],
     context: contextvars.Context | None = None,
@@ -286,10 +324,13 @@ def task_factory(
     """
     if context is None:
         context = contextvars.copy_context()
-        coro = Steps(coro, loop, context)
-    return asyncio.Task(coro, loop=loop, context=context, **options)
+        coro = Steps(coro, loop, context, nesting)
+    parent: Any = _current_tasks.get(loop)
+    counter = parent if isinstance(parent, _Task) else nesting
+    counter.tasks += 1
+    return _Task(counter.tasks, coro, loop=loop, context=context, **options)
 
 
 def install(loop: asyncio.AbstractEventLoop) -> None:
     """Make every task created on `loop` from now on one that streams can step."""
-    loop.set_task_factory(task_factory)  # type: ignore[arg-type]
+    loop.set_task_factory(functools.partial(_task_factory, _Nesting()))  # type: ignore[arg-type]

@@ -22,7 +22,7 @@ Disarm stops the motors in every phase, in the air too.
 from __future__ import annotations
 
 import enum
-from math import isfinite, sqrt
+from math import sqrt
 
 from events import (
     Arm,
@@ -189,7 +189,7 @@ class Autopilot:
             case Takeoff():
                 if not grounded:
                     reason = "already in the air"
-                elif not (event.altitude > 0.0 and isfinite(event.altitude)):
+                elif not event.altitude > 0.0:
                     reason = f"Takeoff.altitude: expected a number > 0, found {event.altitude}"
             case Land():
                 if grounded:
