@@ -9,6 +9,7 @@ nothing is left behind, however a process ends.
 
 from __future__ import annotations
 
+import bisect
 import collections
 import contextlib
 import ctypes
@@ -16,11 +17,13 @@ import fcntl
 import mmap
 import os
 import pickle
+import select
 import socket
+import struct
 import sys
 import tempfile
+import threading
 import weakref
-from multiprocessing.connection import Connection
 from typing import Any
 
 INLINE = 4096
@@ -31,6 +34,8 @@ MAPPED = 1 << 24
 
 LIMIT = 1 << 30
 """A file never grows beyond this (bytes); what does not fit travels inside the message."""
+
+_LENGTH = struct.Struct("<Q")
 
 
 def anonymous_file() -> int:
@@ -46,6 +51,11 @@ def anonymous_file() -> int:
 class Arena:
     """The writer's side of a file: which blocks are free.
 
+    Blocks are whole pages. A new one takes the first room by address that it fits into, and room
+    that comes free joins with what is free beside it. So the file stays near the most that was
+    taken at once: it never takes more than that times 1 + log2 of the largest block's pages
+    (first fit's bound, by Robson, 1977), and in practice less than twice as much.
+
     Args:
         fd: The file.
         limit: Bytes to which it may grow.
@@ -54,10 +64,10 @@ class Arena:
     def __init__(self, fd: int, limit: int = LIMIT) -> None:
         self._fd = fd
         self._limit = limit
-        self._size = 0
         self._map: mmap.mmap | None = None
-        self._blocks: dict[int, int] = {}  # offset: size
-        self._free: set[int] = set()
+        self._taken: dict[int, int] = {}  # offset: size
+        self._holes: list[tuple[int, int]] = []  # offset and size, by offset; no two touch
+        self._top = 0  # where the last block ends
 
     def put(self, data: memoryview) -> int | None:
         """Copy `data` (contiguous bytes) into a block and return its offset; `None` if full."""
@@ -68,11 +78,18 @@ class Arena:
 
     def reserve(self, size: int) -> int | None:
         """Take a block of at least `size` bytes and return its offset; `None` if full."""
-        fitting = [o for o in self._free if size <= self._blocks[o] <= 2 * size]
-        if not fitting:
-            return self._grow(size)
-        offset = min(fitting, key=self._blocks.__getitem__)
-        self._free.remove(offset)
+        size = max(-(-size // mmap.PAGESIZE), 1) * mmap.PAGESIZE
+        for index, (offset, room) in enumerate(self._holes):
+            if room >= size:
+                self._holes[index : index + 1] = [(offset + size, room - size)] * (room > size)
+                break
+        else:
+            offset = self._top
+            if offset + size > self._limit:
+                return None
+            self._reach(offset + size)
+            self._top = offset + size
+        self._taken[offset] = size
         return offset
 
     def view(self, offset: int, size: int) -> memoryview:
@@ -81,26 +98,32 @@ class Arena:
         return memoryview(self._map)[offset : offset + size]
 
     def free(self, offset: int) -> None:
-        """Let a block be used again."""
-        self._free.add(offset)
+        """Let a block be used again; where none begins, nothing happens."""
+        size = self._taken.pop(offset, 0)
+        if not size:
+            return
+        index = bisect.bisect(self._holes, (offset, 0))
+        if index < len(self._holes) and self._holes[index][0] == offset + size:
+            size += self._holes.pop(index)[1]
+        if index and sum(self._holes[index - 1]) == offset:
+            index -= 1
+            offset, room = self._holes.pop(index)
+            size += room
+        if offset + size == self._top:
+            self._top = offset
+        else:
+            self._holes.insert(index, (offset, size))
 
     def close(self) -> None:
         """Close the file."""
         os.close(self._fd)
 
-    def _grow(self, size: int) -> int | None:
-        offset = self._size
-        size = -(-size // mmap.PAGESIZE) * mmap.PAGESIZE
-        if offset + size > self._limit:
-            return None
-        if self._map is None or offset + size > len(self._map):
+    def _reach(self, end: int) -> None:
+        if self._map is None or end > len(self._map):
             # Pages cost nothing before they are used, but a new map of them does on both sides.
-            length = min(max(2 * (offset + size), MAPPED), self._limit)
+            length = min(max(2 * end, MAPPED), self._limit)
             os.ftruncate(self._fd, length)
             self._map = mmap.mmap(self._fd, length)
-        self._size += size
-        self._blocks[offset] = size
-        return offset
 
 
 class Window:
@@ -132,26 +155,39 @@ class Window:
 class SharedPipe:
     """A connection over which objects pass, one way each file.
 
-    `send` and `receive` may be called from two different threads, each from one only.
+    One thread may send and another receive, each always the same one.
 
     Args:
-        connection: Carries the messages.
+        connection: Carries the messages: one end of a pair of stream sockets.
         out_fd: File for the arrays that this side sends.
         in_fd: File for those it receives.
     """
 
-    def __init__(self, connection: Connection, out_fd: int, in_fd: int) -> None:
+    def __init__(self, connection: socket.socket, out_fd: int, in_fd: int) -> None:
         self._connection = connection
+        self._readable = select.poll()
+        self._readable.register(connection, select.POLLIN)
         self._arena = Arena(out_fd)
         self._window = Window(in_fd)
         self._returned: collections.deque[int] = collections.deque()
+        self._unsent: collections.deque[memoryview] = collections.deque()
+        self._sending = threading.Lock()
+        self._writer: threading.Thread | None = None
 
     def send(self, message: Any) -> None:
-        """Send an object.
+        """Send an object, and wait until the connection has taken it.
 
         Raises:
             OSError: The other side is gone.
         """
+        self.write(self.pack(message))
+
+    def write(self, packed: bytes) -> None:
+        """Send what `pack` returned, as `send` does."""
+        self._connection.sendall(packed)
+
+    def pack(self, message: Any) -> bytes:
+        """Put the arrays of an object into shared memory, and return what is to be sent of it."""
         while self._returned:
             self._arena.free(self._returned.popleft())
         spans: list[tuple[int, int]] = []
@@ -171,7 +207,36 @@ class SharedPipe:
                 self._arena.free(offset)
             raise
         freed = [self._window.freed.popleft() for _ in range(len(self._window.freed))]
-        self._connection.send_bytes(pickle.dumps((freed, spans, body)))
+        frame = pickle.dumps((freed, spans, body))
+        return _LENGTH.pack(len(frame)) + frame
+
+    def post(self, packed: bytes) -> None:
+        """Send what `pack` returned without ever waiting.
+
+        What the connection does not take at once, a thread sends as soon as it does.
+
+        Raises:
+            OSError: The other side is gone.
+        """
+        with self._sending:
+            sent = 0
+            if not self._unsent:
+                with contextlib.suppress(BlockingIOError):
+                    sent = self._connection.send(packed, socket.MSG_DONTWAIT)
+            if sent < len(packed):
+                self._unsent.append(memoryview(packed)[sent:])
+                if len(self._unsent) == 1:
+                    self._writer = threading.Thread(target=self._send_rest, daemon=True)
+                    self._writer.start()
+
+    def _send_rest(self) -> None:
+        with contextlib.suppress(OSError):  # whoever receives is told, too
+            while True:
+                self._connection.sendall(self._unsent[0])
+                with self._sending:
+                    self._unsent.popleft()
+                    if not self._unsent:
+                        return
 
     def receive(self) -> Any:
         """Wait for an object.
@@ -180,24 +245,49 @@ class SharedPipe:
             EOFError: The other side is gone.
             OSError: The same, found out in another way.
         """
-        freed, spans, body = pickle.loads(self._connection.recv_bytes())  # noqa: S301  # our child
+        return self.unpack(self.read())
+
+    def read(self) -> bytearray:
+        """Wait for a message, and return it as it came.
+
+        Raises:
+            EOFError: The other side is gone.
+            OSError: The same, found out in another way; `BlockingIOError` if the rest of a message
+                does not come within the time limit that the socket has.
+        """
+        (length,) = _LENGTH.unpack(self._read(_LENGTH.size))
+        return self._read(length)
+
+    def unpack(self, message: bytearray) -> Any:
+        """Return the object of a message; raises whatever making it raises."""
+        freed, spans, body = pickle.loads(message)  # noqa: S301  # from our child, or to it
         self._returned.extend(freed)
         return pickle.loads(body, buffers=[self._window.view(*span) for span in spans])  # noqa: S301
 
     def poll(self, timeout: float) -> bool:
         """Wait up to `timeout` seconds for a message, and tell whether there is one."""
-        return self._connection.poll(timeout)
+        return bool(self._readable.poll(timeout * 1e3))
 
     def shut_down(self) -> None:
         """End the connection for both sides; a thread that waits in `receive` is told."""
-        with (
-            contextlib.suppress(OSError),  # it has ended already
-            socket.socket(fileno=os.dup(self._connection.fileno())) as end,
-        ):
-            end.shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(OSError):  # it has ended already
+            self._connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Close connection and files; arrays that came through them stay valid."""
+        self.shut_down()
+        if self._writer is not None:
+            self._writer.join()
         self._connection.close()
         self._arena.close()
         self._window.close()
+
+    def _read(self, size: int) -> bytearray:
+        data = bytearray(size)
+        rest = memoryview(data)
+        while rest:
+            count = self._connection.recv_into(rest, 0, socket.MSG_WAITALL)
+            if not count:
+                raise EOFError
+            rest = rest[count:]
+        return data

@@ -30,6 +30,7 @@ from runtime import graph
 from runtime.changing import Changing
 from runtime.clock import Clock
 from runtime.config import Config
+from runtime.costs import Costs
 from runtime.errors import FatalError, NodeError, PeerError
 from runtime.life import Life, log_error, wrap
 from runtime.links import Link
@@ -91,6 +92,8 @@ class Supervisor:
         """All links of the nodes that there are, by ``node.port``."""
         self.verdicts: dict[str, dict[str, Any]] = {}
         """What nodes concluded, by what they judged."""
+        self.costs: dict[str, Costs] = {}
+        """What workers cost, by ``node.Factory``."""
         self.after: list[Callable[[Path], Any]] = []
         """What is to be called with the run's folder at the very end."""
         self.probes = Probes(self)
@@ -186,20 +189,19 @@ class Supervisor:
             loop.call_soon_threadsafe(self.fault, node.name, error)
 
         name = f"{node.name}.{getattr(factory, '__name__', 'worker')}"
-        make: Callable[..., Worker[W]] = Worker
-        worker = await asyncio.to_thread(  # starting a process takes milliseconds
-            make,
+        worker: Worker[W] = Worker(
             name,
             self.clock,
             factory,
             *args,
             printed=lambda line: node.log.debug("%s printed: %s", name, line),
             died=died,
+            costs=self.costs.setdefault(name, Costs()),
             **options,
         )
-        self._lives[node.name].workers.append(worker)
-        self.probes.on_worker(worker)
+        self._lives[node.name].workers.append(worker)  # which ends it, ready or not
         await worker.ready()
+        self.probes.on_worker(worker)
         return worker
 
     def fault(self, name: str, error: Exception) -> None:

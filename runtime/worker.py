@@ -10,20 +10,25 @@ wait for it with its name, its exit code and the last that it printed.
 
 from __future__ import annotations
 
+import asyncio
 import collections
 import concurrent.futures
 import contextlib
+import functools
+import math
 import os
+import select
 import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from multiprocessing.connection import Connection
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from runtime.clock import Clock
+from runtime.costs import Costs
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.schedule import SECOND
 from runtime.shared import SharedPipe, anonymous_file
@@ -35,9 +40,17 @@ P = ParamSpec("P")
 _GRACE = 2.0
 """Seconds a process gets to end by itself once its connection is closed."""
 
+_LOOK = 0.25
+"""Seconds after which a thread that hears nothing from a process looks whether there is one."""
+
+_LONGEST = 1e8
+"""Seconds that no limit exceeds which the kernel is told."""
+
 
 class Worker(Generic[W]):
     """One object, or several alike, each in its own process.
+
+    The processes begin with `ready` and end with `close`, whatever is cancelled in between.
 
     Args:
         name: For messages.
@@ -52,6 +65,10 @@ class Worker(Generic[W]):
             keep off one core, so that a tick need not wait for a core to come free.
         printed: Told each line that a process prints.
         died: Told when a process ends on its own or is killed for hanging; from any thread.
+        costs: Where to note what the calls cost.
+
+    Raises:
+        WorkerError: The factory is of no module that a process could import.
     """
 
     def __init__(
@@ -67,6 +84,7 @@ class Worker(Generic[W]):
         niceness: int = 5,
         printed: Callable[[str], None] = lambda _: None,
         died: Callable[[WorkerError], None] = lambda _: None,
+        costs: Costs | None = None,
     ) -> None:
         if getattr(factory, "__module__", "__main__") == "__main__":
             raise WorkerError(
@@ -74,24 +92,41 @@ class Worker(Generic[W]):
                 f"found {factory!r} of __main__"
             )
         self.name = name
+        self.costs = costs or Costs()
+        self.costs.latency = latency
+        self.costs.processes = processes
         self._clock = clock
         self._latency = latency
+        self._processes: list[_Process] = []
+        self._changing = threading.Lock()
+        self._closed = False
         environment = {**os.environ, **(env or {})}
-        self._processes = [
-            _Process(f"{name}[{n}]" if processes > 1 else name, timeout, environment, printed, died)
-            for n in range(processes)
+        names = [f"{name}[{n}]" for n in range(processes)] if processes > 1 else [name]
+        self._make = [
+            functools.partial(_Process, each, timeout, environment, printed, died, self.costs)
+            for each in names
         ]
         cores = _spare_cores() if clock.kind == "real" else None
-        self._started = [p.start(factory, args, niceness, cores) for p in self._processes]
+        self._to_make = factory, args, niceness, cores
 
     async def ready(self) -> None:
-        """Wait until the object has been made in every process.
+        """Start the processes, and wait until the object has been made in every one.
 
         Raises:
             WorkerError: A process died or hung; or whatever making the object raised.
         """
-        for started in self._started:
+        for started in await asyncio.to_thread(self._start):  # which takes milliseconds
             await self._clock.beside(started)
+
+    def _start(self) -> list[concurrent.futures.Future[Any]]:
+        with self._changing:
+            if self._closed:  # whoever wanted it has gone before this thread came to it
+                raise WorkerError(f"worker {self.name}: closed before it was ready")
+            started = []
+            for make in self._make[len(self._processes) :]:
+                self._processes.append(make())
+                started.append(self._processes[-1].start(self._to_make))
+            return started
 
     async def call(
         self, method: Callable[Concatenate[W, P], R], *args: P.args, **kwargs: P.kwargs
@@ -117,6 +152,10 @@ class Worker(Generic[W]):
         **kwargs: P.kwargs,
     ) -> R:
         """Call a method as `call` does, with a latency (seconds of the clock) of its own."""
+        if not self._processes:
+            raise WorkerError(f"worker {self.name}: expected a call from ready() until close()")
+        if latency != self.costs.latency:
+            self.costs.latency = None
         process = min(self._processes, key=_Process.outstanding)
         work = process.request((method.__name__, args, kwargs))
         result: R = await self._clock.beside(work, round(latency * SECOND))
@@ -128,10 +167,14 @@ class Worker(Generic[W]):
 
     def close(self) -> None:
         """End the processes; calls still waiting fail. Takes up to a few seconds: not on a loop."""
-        for process in self._processes:
-            process.close()
-        for process in self._processes:
-            process.join()
+        self._closed = True
+        with self._changing:
+            processes, self._processes = self._processes, []
+            for process in processes:
+                process.close()
+            until = time.monotonic() + _GRACE
+            for process in processes:
+                process.join(until)
 
 
 def _spare_cores() -> set[int] | None:
@@ -147,7 +190,11 @@ def _spare_cores() -> set[int] | None:
 
 
 class _Process:
-    """One process and the calls on their way to and from it."""
+    """One process and the calls on their way to and from it.
+
+    It is that process whose end counts: what it has started may live on, and hold its connection
+    and its output open.
+    """
 
     def __init__(
         self,
@@ -156,11 +203,14 @@ class _Process:
         environment: Mapping[str, str],
         printed: Callable[[str], None],
         died: Callable[[WorkerError], None],
+        costs: Costs,
     ) -> None:
         self._name = name
         self._timeout = timeout
         self._printed = printed
         self._died = died
+        self._costs = costs
+        self._looked = -math.inf  # at its memory, on `time.monotonic`
         self._calls: collections.deque[tuple[float, concurrent.futures.Future[Any]]] = (
             collections.deque()
         )
@@ -169,34 +219,39 @@ class _Process:
         self._error: WorkerError | None = None
         self._tail: collections.deque[str] = collections.deque(maxlen=20)
         ours, theirs = socket.socketpair()
+        limit = min(timeout, _LONGEST)
+        ours.setsockopt(
+            socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", int(limit) + 1, 0)
+        )
         files = anonymous_file(), anonymous_file()
         numbers = theirs.fileno(), *files
-        self._child = subprocess.Popen(  # noqa: S603  # our own module
-            [sys.executable, "-m", "runtime.worker_process", *map(str, numbers)],
-            pass_fds=numbers,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            process_group=0,  # so that a terminal's Ctrl-C does not reach it
-            env={**environment, "PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
-        )
-        theirs.close()
-        self._pipe = SharedPipe(Connection(ours.detach()), *files)
+        self._pipe = SharedPipe(ours, *files)
+        python = {"PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+        command = [sys.executable, "-m", "runtime.worker_process", *map(str, numbers)]
+        try:
+            self._child = subprocess.Popen(  # noqa: S603  # our own module
+                [*command, str(limit + _GRACE)],
+                pass_fds=numbers,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                process_group=0,  # so that a terminal's Ctrl-C does not reach it
+                env={**environment, **python},
+            )
+        except BaseException:
+            self._pipe.close()
+            raise
+        finally:
+            theirs.close()
         self._output = threading.Thread(target=self._read_output, name=name, daemon=True)
         self._reader = threading.Thread(target=self._read_answers, name=name, daemon=True)
 
-    def start(
-        self,
-        factory: Callable[..., Any],
-        args: tuple[Any, ...],
-        niceness: int,
-        cores: set[int] | None,
-    ) -> concurrent.futures.Future[Any]:
+    def start(self, to_make: Any) -> concurrent.futures.Future[Any]:
         """Have the object made; the future tells whether that went well."""
         self._output.start()
         with contextlib.suppress(OSError):  # if it is gone already, the request below says so
             self._pipe.send(sys.path)
-        started = self.request((factory, args, niceness, cores))
+        started = self.request(to_make)
         self._reader.start()
         return started
 
@@ -204,54 +259,74 @@ class _Process:
         return len(self._calls)
 
     def request(self, message: Any) -> concurrent.futures.Future[Any]:
-        """Send a message and return the future of its answer; from the loop's thread only."""
+        """Send a message and return the future of its answer; from the loop's thread only.
+
+        It never waits for the process to take it.
+        """
         work: concurrent.futures.Future[Any] = concurrent.futures.Future()
         work.set_running_or_notify_cancel()  # whoever stops waiting does not cancel it
+        try:
+            packed = self._pipe.pack(message)
+        except Exception as error:  # it cannot be pickled: the caller's mistake
+            work.set_exception(error)
+            return work
         with self._lock:
             if self._error is not None:
                 work.set_exception(self._error)
                 return work
             self._calls.append((time.monotonic() + self._timeout, work))
-        try:
-            self._pipe.send(message)
-        except OSError:  # the reader finds out why, and fails this call with the others
-            pass
-        except Exception as error:  # it cannot be pickled: the caller's mistake
-            with self._lock:
-                self._calls.pop()
-            work.set_exception(error)
+        with contextlib.suppress(OSError):  # the reader finds out why, and fails this call, too
+            self._pipe.post(packed)
         return work
 
     def _read_answers(self) -> None:
         try:
             while True:
-                if not self._pipe.poll(0.25):
-                    if self._calls and time.monotonic() > self._calls[0][0]:
-                        self._child.kill()
-                        raise WorkerTimeoutError(self._story(f"no answer in {self._timeout:g} s"))
-                    continue
-                succeeded, result = self._receive()
-                with self._lock:
-                    _, work = self._calls.popleft()
-                if succeeded:
-                    work.set_result(result)
+                if self._pipe.poll(_LOOK):
+                    self._read_answer()
+                elif self._child.poll() is not None and not self._pipe.poll(0):
+                    raise EOFError  # that a fork of it holds back
                 else:
-                    work.set_exception(result)
-                del result, work  # or the last arrays would live until the next answer
+                    self._check_limit()
+        except BlockingIOError:  # it stopped in the middle of an answer
+            error: WorkerError = self._hung()
         except (EOFError, OSError):
-            error: WorkerError = WorkerDiedError(self._story(self._exit()))
+            error = WorkerDiedError(self._story(self._exit()))
         except WorkerTimeoutError as hung:
             error = hung
+        except Exception as unexpected:  # such as a second answer, by a fork of it
+            self._child.kill()
+            error = WorkerDiedError(self._story(f"expected an answer, found {unexpected!r}"))
         self._fail(error)
 
-    def _receive(self) -> tuple[bool, Any]:
+    def _read_answer(self) -> None:
+        message = self._pipe.read()
         try:
-            answer: tuple[bool, Any] = self._pipe.receive()
-        except (EOFError, OSError):
-            raise
-        except Exception as error:  # it cannot be unpickled: this call fails, the next may not
-            return False, error
-        return answer
+            succeeded, result, wall, cpu = self._pipe.unpack(message)
+        except Exception as error:  # this call fails, the next may not
+            succeeded, result, wall, cpu = False, error, 0, 0
+        now = time.monotonic()
+        if now >= self._looked + 1:
+            self._looked = now
+            self._costs.look_at(self._child.pid)
+        if wall:  # making the object is no call
+            self._costs.add(wall, cpu)
+        with self._lock:
+            _, work = self._calls.popleft()
+        if succeeded:
+            work.set_result(result)
+        else:
+            work.set_exception(result)
+
+    def _check_limit(self) -> None:
+        with self._lock:
+            late = bool(self._calls) and time.monotonic() > self._calls[0][0]
+        if late:
+            raise self._hung()
+
+    def _hung(self) -> WorkerTimeoutError:
+        self._child.kill()
+        return WorkerTimeoutError(self._story(f"no answer in {self._timeout:g} s"))
 
     def _fail(self, error: WorkerError) -> None:
         expected = self._closing
@@ -276,25 +351,45 @@ class _Process:
         return f"worker {self._name}: {what}{tail}"
 
     def _read_output(self) -> None:
+        """Read what the process prints until it ends, even if others could still write there."""
         assert self._child.stdout is not None
-        with self._child.stdout as lines:
-            for line in lines:
-                text = line.decode(errors="replace").rstrip()
-                self._tail.append(text)
-                self._printed(text)
+        readable = select.poll()
+        readable.register(self._child.stdout, select.POLLIN)
+        begun = b""
+        with self._child.stdout as output:
+            while True:
+                ended = self._child.poll() is not None
+                if not readable.poll(0 if ended else _LOOK * 1e3):
+                    if ended:
+                        break
+                    continue
+                read = os.read(output.fileno(), 1 << 16)
+                if not read:
+                    break
+                *lines, begun = (begun + read).split(b"\n")
+                for line in lines:
+                    self._hear(line)
+        if begun:
+            self._hear(begun)
+
+    def _hear(self, line: bytes) -> None:
+        text = line.decode(errors="replace").rstrip()
+        self._tail.append(text)
+        self._printed(text)
 
     def close(self) -> None:
         """Tell the process to end."""
         self._closing = True
+        self._costs.look_at(self._child.pid)
         self._pipe.shut_down()
 
-    def join(self) -> None:
-        """Wait until it has ended, by force if need be."""
+    def join(self, until: float) -> None:
+        """Wait until it has ended, by force if it has not by a time of `time.monotonic`."""
         try:
-            self._child.wait(_GRACE)
+            self._child.wait(max(until - time.monotonic(), 0))
         except subprocess.TimeoutExpired:
             self._child.kill()
             self._child.wait()
         self._reader.join()
-        self._output.join()
+        self._output.join(_GRACE)
         self._pipe.close()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+import subprocess
 import sys
+import threading
 import time
 from typing import Any
 
@@ -82,6 +85,45 @@ class Plant:
 
     def say(self, text: str) -> None:
         print(text, flush=True)
+
+    def burn(self, seconds: float) -> None:
+        """Take processor time."""
+        end = time.thread_time() + seconds
+        while time.thread_time() < end:
+            pass
+
+    def burn_beside(self, seconds: float) -> None:
+        """Take processor time in a thread, and wait for it in the next `join`."""
+        self._thread = threading.Thread(target=self.burn, args=(seconds,))
+        self._thread.start()
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def loop(self) -> None:
+        """Never return."""
+        while True:
+            pass
+
+    def loop_in_c(self) -> None:
+        """Never return, nor let go of the interpreter's lock."""
+        re.match(r"(a+)+$", "a" * 100 + "b")
+
+    def start_a_program(self) -> int:
+        """Start a program that lives on and shares the output; return its number."""
+        return subprocess.Popen(["sleep", "60"]).pid
+
+    def exit_beside_a_fork(self, code: int) -> None:
+        """End, but for a fork that holds all that was open."""
+        if fork := os.fork():
+            print(fork, flush=True)
+            os._exit(code)
+        time.sleep(60)
+        os._exit(0)
+
+    def answer_twice(self) -> None:
+        """Have a fork that goes on with what this process does."""
+        os.fork()
 
 
 def plain() -> Plant:

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +29,8 @@ def pipes() -> tuple[SharedPipe, SharedPipe]:
     """Return both ends of a pipe, in this process."""
     ours, theirs = socket.socketpair()
     there, back = anonymous_file(), anonymous_file()
-    near = SharedPipe(Connection(ours.detach()), there, back)
-    far = SharedPipe(Connection(theirs.detach()), os.dup(back), os.dup(there))
+    near = SharedPipe(ours, there, back)
+    far = SharedPipe(theirs, os.dup(back), os.dup(there))
     return near, far
 
 
@@ -126,6 +125,45 @@ def test_memory_is_used_again_once_the_arrays_are_gone(
     assert arena_size(near) <= 3 * MEGABYTE
 
 
+def test_what_grows_takes_no_more_memory_than_it_is_large(
+    ends: tuple[SharedPipe, SharedPipe],
+) -> None:
+    """A cloud that grows with every message, up to 3 MB, both ways."""
+    near, far = ends
+    for count in range(1, 101):
+        near.send(np.full(30_000 * count, count, np.uint8))
+        far.send(far.receive())
+        assert near.receive()[-1] == count
+    assert arena_size(near) <= 4 * 3_000_000
+    assert arena_size(far) <= 4 * 3_000_000
+
+
+SIZES = [100, 3000, 300_000, 5_000_000]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.sampled_from(SIZES), max_size=12))
+def test_posting_never_waits_for_who_reads_and_keeps_the_order(sizes: list[int]) -> None:
+    near, far = pipes()
+    for number, size in enumerate(sizes):
+        near.post(near.pack((number, b"x" * size)))  # nobody reads, and nothing of it is an array
+    for number, size in enumerate(sizes):
+        assert far.receive() == (number, b"x" * size)
+    near.post(near.pack("after"))
+    assert far.receive() == "after"
+    near.close()
+    far.close()
+
+
+def test_what_was_posted_and_not_read_does_not_hold_up_the_end() -> None:
+    near, far = pipes()
+    near.post(near.pack(b"x" * 5_000_000))
+    near.close()
+    with pytest.raises((EOFError, OSError)):
+        far.receive()
+    far.close()
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 7), st.sampled_from([1, 5000, 70_000])), max_size=30))
 def test_a_held_array_stays_intact_while_others_come_and_go(
@@ -182,24 +220,39 @@ from runtime.realtime import RealClock
 from tests.runtime.samples_workers import Plant
 import numpy as np
 async def main():
-    worker = Worker("plant", RealClock(asyncio.get_running_loop()), Plant)
+    worker = Worker("plant", RealClock(asyncio.get_running_loop()), Plant, timeout=3)
     await worker.ready()
     await worker.call(Plant.keep, np.zeros(1 << 20, np.uint8))
     print(await worker.call(Plant.pid), flush=True)
+    if sys.argv[1:]:
+        worker._processes[0].request((sys.argv[1], (), {}))
+        print("asked", flush=True)
     await asyncio.sleep(1000)
 asyncio.run(main())
 """
 
 
-def test_a_killed_run_leaves_neither_processes_nor_memory() -> None:
+@pytest.mark.parametrize(
+    "call",
+    [
+        "",
+        pytest.param("loop", marks=pytest.mark.slow),
+        pytest.param("loop_in_c", marks=pytest.mark.slow),
+    ],
+)
+def test_a_killed_run_leaves_neither_processes_nor_memory(call: str) -> None:
+    """Not even one that is in an endless call."""
     shared = Path("/dev/shm")
     before = set(shared.iterdir())
-    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE) as parent:
+    command = [sys.executable, "-c", PARENT, *filter(None, [call])]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None
         pid = int(parent.stdout.readline())
         assert alive(pid)
+        if call:
+            parent.stdout.readline()
         parent.kill()
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + (20 if call else 5)
     while alive(pid) and time.monotonic() < deadline:
         time.sleep(0.02)  # another process's end; nothing here can be awaited
     assert not alive(pid)
