@@ -78,8 +78,11 @@ class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     Attributes:
         meet: A Zenoh endpoint at which they meet. Whichever process on its host comes first
             listens there; the others connect to it. By default on this machine only.
-        zenoh: A Zenoh configuration file, which then says where to listen and connect instead:
-            for TLS, access control, a router.
+        zenoh: A Zenoh configuration file, which then says where to listen and connect instead, and
+            who may: for TLS, access control, a router.
+        secret: Only who knows it may take part: ``env:NAME`` (of a variable), ``file:PATH``, or at
+            least 16 characters. Without it, a random key in a private file of this user, which
+            serves on one machine.
         shared: Whether large events to a process on this machine pass through memory that both
             see.
         lease: A process that is silent for so long is gone.
@@ -88,6 +91,7 @@ class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     meet: str = "tcp/127.0.0.1:7450"
     zenoh: str = ""
+    secret: str = ""
     shared: bool = True
     lease: Duration = Duration(0.8)  # immutable
     wait: Duration = Duration(60)
@@ -261,7 +265,7 @@ def convert(value: Any, type_: type[S], where: str) -> S:
 
 
 def to_builtins(config: Config) -> dict[str, Any]:
-    """Return all settings, defaults included, as `load` would read them."""
+    """Return all settings, defaults included, as `load` would read them; but no secret."""
     nodes = []
     for spec in config.nodes:
         head = {"name": spec.name, "type": spec.type_name, "on_error": spec.on_error}
@@ -272,7 +276,10 @@ def to_builtins(config: Config) -> dict[str, Any]:
         nodes.append(head | msgspec.to_builtins(spec.config, enc_hook=float))
     table: dict[str, Any] = {"run": msgspec.to_builtins(config.run, enc_hook=float)}
     if config.network != NetworkConfig():
-        table["network"] = msgspec.to_builtins(config.network, enc_hook=float)
+        network = msgspec.to_builtins(config.network, enc_hook=float)
+        if not network["secret"].startswith(("env:", "file:")):
+            del network["secret"]
+        table["network"] = network
     return _without_none(table | {"nodes": nodes})  # type: ignore[no-any-return]
 
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import msgspec
 
 from events import Event
-from runtime.errors import ChannelFullError, VisnavError
+from runtime.errors import ChannelFullError, PeerError, VisnavError
 from runtime.peers.memory import Outgoing
 from runtime.peers.messages import Message, encode
 from runtime.wire import Packed, pack
@@ -65,8 +65,7 @@ class Line:
         self._lock = threading.RLock()
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._closed = False
-        self._thread = threading.Thread(target=self._write, name=f"to {name}", daemon=True)
-        self._thread.start()
+        self._thread: threading.Thread | None = None
 
     def send(self, message: Message, event: Event | None = None, skip: str = "") -> None:
         """Send a message, or put it at the end of those that wait.
@@ -103,7 +102,8 @@ class Line:
         with self._lock:
             self._closed = True
             self._wake.put(None)
-        self._thread.join(timeout)
+        if self._thread is not None:
+            self._thread.join(timeout)
 
     def abandon(self) -> None:
         """Write no more: there is nobody."""
@@ -134,6 +134,8 @@ class Line:
             self._put(head, frame)
         except VisnavError as error:
             self._failed(error)
+        except Exception as error:  # whatever a library does, the line goes on
+            self._failed(PeerError(f"a message could not be sent: {_say(error)}"))
 
     def _wait(self, waiting: _Waiting) -> None:
         if waiting.packed is not None:
@@ -148,6 +150,9 @@ class Line:
             self._skippable[waiting.skip] = waiting
         self.peak = max(self.peak, len(self._queue))
         self._wake.put(None)
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._write, name=f"to {self.name}", daemon=True)
+            self._thread.start()
 
     def _write(self) -> None:
         while True:
@@ -162,12 +167,20 @@ class Line:
                 self._skippable.pop(waiting.skip, None)
                 if waiting.packed is not None:
                     self._events -= 1
-            parts = self._in_bytes(waiting.message, waiting.packed, now=False)
-            assert parts is not None
+            try:
+                parts = self._in_bytes(waiting.message, waiting.packed, now=False)
+                assert parts is not None
+            except Exception as error:  # the message goes without its event: others count it
+                parts = encode(waiting.message), b""
+                self._failed(PeerError(f"an event could not be sent: {_say(error)}"))
             self._put_now(*parts)
             self._writing = False
             if self._closed:
                 self._wake.put(None)  # look again whether anything is left
+
+
+def _say(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 class _Waiting:

@@ -32,6 +32,11 @@ def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:
             f"expected the process at {other.place} to run the same file, found {where} = "
             f"{there} there, {here} here"
         )
+    if not other.nodes or not set(other.nodes) <= set(nodes):
+        raise PeerError(
+            f"expected the process at {other.place} to run some of {', '.join(nodes)}, found "
+            f"{', '.join(other.nodes) or 'none'}"
+        )
     if twice := set(mine.nodes) & set(other.nodes):
         raise PeerError(
             f"expected each node to run in one process, found {_in_order(twice, nodes)} at "
@@ -55,7 +60,7 @@ def say_missing(absent: Sequence[str], seconds: float, meet: str) -> str:
     only = ",".join(absent)
     return (
         f"expected all nodes to be there within {seconds:g} s, found none of {', '.join(absent)} "
-        f"at {meet}: start them with --only {only}"
+        f"that knows our secret (network.secret) at {meet}: start them with --only {only}"
     )
 
 

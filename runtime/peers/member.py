@@ -8,9 +8,10 @@ from events import Event
 from runtime.errors import VisnavError, WireError
 from runtime.peers.line import Line, Put
 from runtime.peers.memory import Incoming, Outgoing
-from runtime.peers.messages import Ack, Announced, Begin, Hello, Said, Wanted
+from runtime.peers.messages import Ack, Announced, Begin, Hello, OfTheRun, Said, Wanted
 from runtime.peers.offsets import Exchanges
-from runtime.summary import ProcessSummary
+from runtime.peers.seal import Sealing
+from runtime.summary import ProcessSummary, Summary
 from runtime.wire import unpack
 
 ACK_EVERY = 8192
@@ -21,34 +22,47 @@ FREE_EVERY = 4
 
 
 class Member:
-    """Another process.
+    """Another process, for as long as a session with it lasts.
 
     Args:
         id_: By which it is known.
+        hello: Who it says it is.
+        sealing: What proves that a message is its own.
         put: Writes a message to it; may wait.
         failed: Told what could not be written.
 
     Attributes:
         number: Its number among the processes of the run, or -1 if it is none of them.
-        hello: Who it says it is.
-        unfit: Whether it runs another file, or nodes that run elsewhere.
+        over: Why the session has ended, if it has.
+        unfit: Whether it is no part of the run: it runs another file, or nodes that run elsewhere.
+        held: What it has said, while another process with its nodes is still in the run.
         exchanges: Of the time.
         drift_ppm: How much quicker that clock is than ours, in millionths, if we follow it.
         announced: What its nodes announced.
         ready: Whether its nodes can begin.
         begin: When the first update is, if it has said so.
         told: What it was told that nodes here hear.
-        parted: What it had to say of the run, as JSON.
+        parted: What it had to say of the run.
         outgoing: Memory that was offered to it.
         incoming: Memory of its own that we see.
         has_ours: Whether it has what we had to say of the run.
     """
 
-    def __init__(self, id_: str, put: Put, failed: Callable[[VisnavError], None]) -> None:
+    def __init__(
+        self,
+        id_: str,
+        hello: Hello,
+        sealing: Sealing,
+        put: Put,
+        failed: Callable[[VisnavError], None],
+    ) -> None:
         self.id = id_
+        self.hello = hello
+        self.sealing = sealing
         self.number = -1
-        self.hello: Hello | None = None
-        self.unfit = False
+        self.over = ""
+        self.unfit = True
+        self.held: list[tuple[OfTheRun, Event | None]] | None = None
         self.exchanges = Exchanges()
         self.drift_ppm: float | None = None
         self.announced: Announced | None = None
@@ -56,17 +70,19 @@ class Member:
         self.begin: Begin | None = None
         self.told: tuple[Wanted, ...] | None = None
         self._arrived = 0
-        self.parted: bytes | None = None
+        self.parted: Summary | None = None
         self.outgoing: Outgoing | None = None
         self.incoming: Incoming | None = None
         self.has_ours = False
-        self.line = Line(id_, put, failed)
+        self.line = Line(
+            id_, lambda message, payload: put(sealing.seal(message, payload), payload), failed
+        )
 
     def event(self, said: Said, payload: bytes) -> Event:
         """Return the event that it said.
 
         Raises:
-            WireError: There is none.
+            WireError: There is none that is known here.
         """
         if said.place is None:
             return unpack(payload)
@@ -92,12 +108,12 @@ class Member:
     @property
     def nodes(self) -> tuple[str, ...]:
         """Its nodes, in file order."""
-        return () if self.hello is None else self.hello.nodes
+        return self.hello.nodes
 
     @property
     def place(self) -> str:
         """Where it runs, for messages to people."""
-        return self.id if self.hello is None else self.hello.place
+        return self.hello.place
 
     def summary(self) -> ProcessSummary:
         """Return what the run's summary says of it."""

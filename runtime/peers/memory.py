@@ -48,6 +48,7 @@ class Outgoing:
         self._key = secrets.token_bytes(KEY)
         self._arena.put(memoryview(self._key))
         self._freed: collections.deque[int] = collections.deque()
+        self._taken: set[int] = set()
 
     def offer(self) -> Memory:
         """Return what the other process needs to find it."""
@@ -56,10 +57,13 @@ class Outgoing:
     def put(self, packed: Packed) -> tuple[int, int] | None:
         """Put a frame there, and return its place and size; `None` if there is no room."""
         while self._freed:
-            self._arena.free(self._freed.popleft())
+            if (freed := self._freed.popleft()) in self._taken:  # each once, and only ours
+                self._taken.remove(freed)
+                self._arena.free(freed)
         offset = self._arena.reserve(packed.size)
         if offset is None:
             return None
+        self._taken.add(offset)
         packed.write(self._arena.view(offset, packed.size))
         return offset, packed.size
 

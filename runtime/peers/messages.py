@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
@@ -12,6 +12,10 @@ Key = tuple[int, int, int]
 """When something is due: nanoseconds, kind (timers, then work, then the schedule), order."""
 
 NEVER: Key = (1 << 62, 3, 0)
+
+Count = Annotated[int, msgspec.Meta(ge=0)]
+AT_ONCE = -1
+"""The serial number of what is not taken in at a turn, but when it comes."""
 
 
 class Message(msgspec.Struct, frozen=True, tag=True, omit_defaults=True):
@@ -27,7 +31,9 @@ class Hello(Message, frozen=True):
         place: Host and process number, for messages to people.
         began: When the process began, in seconds since 1970: of two with one node, the later is
             wrong here.
-        knows_you: Whether it has had the other's hello.
+        nonce: New for each session.
+        seen: The nonce of the hello that this one answers.
+        session: The tag of the session that there is already.
         running: Whether the first update was already.
         left_out: Nodes that this run goes on without.
     """
@@ -36,7 +42,9 @@ class Hello(Message, frozen=True):
     config: dict[str, Any]
     place: str
     began: float
-    knows_you: bool = False
+    nonce: bytes = b""
+    seen: bytes = b""
+    session: bytes = b""
     running: bool = False
     left_out: tuple[str, ...] = ()
 
@@ -135,23 +143,31 @@ class Said(Message, frozen=True):
     """
 
     output: str
-    serial: int = 0
+    serial: int = AT_ONCE
     place: tuple[int, int] | None = None
 
 
 class Stop(Message, frozen=True):
-    """End the run; `error` says what went wrong, if anything did."""
+    """End the run.
+
+    Attributes:
+        reason: Why.
+        error: What went wrong, if anything did.
+        serial: Its place among the ordered messages.
+        apart: Whether I take no part in the turns: my first update was not yet, or I give up.
+    """
 
     reason: str
     error: str | None = None
-    serial: int = 0
+    serial: int = AT_ONCE
+    apart: bool = False
 
 
 class Retired(Message, frozen=True):
     """A node of mine has ended, and hears nothing any more."""
 
     node: str
-    serial: int = 0
+    serial: int = AT_ONCE
 
 
 class Parted(Message, frozen=True):
@@ -167,6 +183,10 @@ class Farewell(Message, frozen=True):
     """
 
 
+class Busy(Message, frozen=True):
+    """I am still at work on the end of a node of mine."""
+
+
 class Turn(Message, frozen=True):
     """It is your turn in lockstep.
 
@@ -179,19 +199,25 @@ class Turn(Message, frozen=True):
         sent: How many ordered messages each process (row) has sent to each other one.
     """
 
-    epoch: int
-    now: int
-    orders: tuple[int, int]
+    epoch: Count
+    now: Count
+    orders: tuple[Count, Count]
     keys: tuple[Key, ...]
-    unread: tuple[int, ...]
-    sent: tuple[tuple[int, ...], ...]
+    unread: tuple[Count, ...]
+    sent: tuple[tuple[Count, ...], ...]
+
+    def fits(self, count: int) -> bool:
+        """Tell whether it is a turn of so many processes."""
+        return len(self.keys) == len(self.sent) == count and all(
+            len(row) == count for row in self.sent
+        )
 
 
 class Ack(Message, frozen=True):
     """So many bytes have arrived, and these places in your memory are read no more."""
 
-    arrived: int
-    freed: tuple[int, ...] = ()
+    arrived: Count
+    freed: tuple[Count, ...] = ()
 
 
 class Call(Message, frozen=True):
@@ -211,18 +237,29 @@ class Standing(Message, frozen=True):
     """
 
     processes: tuple[str, ...]
-    epoch: int
-    now: int
-    orders: tuple[int, int]
+    epoch: Count
+    now: Count
+    orders: tuple[Count, Count]
     key: Key
-    sent: tuple[int, ...]
+    sent: tuple[Count, ...]
 
 
 Ordered = Said | Stop | Retired
-"""In lockstep these are taken in at one's turn, in the order of their serial numbers."""
+"""In lockstep these are taken in at one's turn, in the order of their serial numbers; but at once
+if they have none."""
 
 OfTheRun = (
-    Announced | Hearing | Ready | Begin | Ordered | Parted | Farewell | Turn | Call | Standing
+    Announced
+    | Hearing
+    | Ready
+    | Begin
+    | Ordered
+    | Parted
+    | Farewell
+    | Busy
+    | Turn
+    | Call
+    | Standing
 )
 AnyMessage = Hello | Ping | Pong | Ack | Memory | Mapped | OfTheRun
 
@@ -238,5 +275,5 @@ def decode(data: bytes) -> AnyMessage:
     """
     try:
         return _decoder.decode(data)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise WireError(f"expected a message of a process, found something else: {error}") from None

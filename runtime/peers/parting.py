@@ -43,7 +43,7 @@ async def part(roster: Roster, parted: Mapping[int, Member], mine: Summary) -> S
     for member in [*parted.values(), *roster.present()]:
         processes[member.number] = member.summary()
         if member.parted is not None:
-            parts[member.number] = msgspec.json.decode(member.parted, type=Summary)
+            parts[member.number] = member.parted
     return merged(
         [part for _, part in sorted(parts.items())], [p for _, p in sorted(processes.items())]
     )

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import threading
 import time
 from collections.abc import Iterable, Mapping
 from typing import Protocol
+
+import msgspec
 
 from events import Announcement, Event
 from runtime.clock import Clock
@@ -20,6 +24,7 @@ from runtime.peers.member import Member
 from runtime.peers.messages import (
     Announced,
     Begin,
+    Busy,
     Call,
     Farewell,
     Hearing,
@@ -47,6 +52,12 @@ log = logging.getLogger("visnav.runtime")
 
 LEAD = 50_000_000
 """Nanoseconds between the word to begin and the first update: it must reach everybody before."""
+
+BUSY_EVERY = 2.0
+"""Seconds after which those who wait for us in the end are told that we are still at it."""
+
+SILENCE = 8.0
+"""Seconds without a word in the end, after which it goes on without those who are silent."""
 
 
 class Run(Protocol):
@@ -79,8 +90,15 @@ class Peers:
         self._turns: Turns | None = None
         self._announced = Announced({})
         self._early: list[tuple[Member, OfTheRun, Event | None]] = []
-        self._begun = self._ending = False
+        self._ready = self._decided = self._begun = self._suspended = self._ending = False
+        self._decider: Member | None = None
+        self._lost_early: list[Member] = []
+        self._apart: set[int] = set()
         self._retired: set[str] = set()
+        self._retired_here: list[str] = []
+        self._at_work = False
+        self._heard_at = 0.0
+        self._timer: threading.Timer | None = None
         self._left_out: set[str] = set()
         self._parted: dict[int, Member] = {}
         self._following: Following | None = None
@@ -115,26 +133,34 @@ class Peers:
         for member in others():
             if member.announced is not None:
                 for name, frames in member.announced.said.items():
-                    everything[name] = [_announcement(frame) for frame in frames]
+                    try:
+                        everything[name] = [_announcement(frame) for frame in frames]
+                    except WireError as error:
+                        raise PeerError(f"{name}, at {member.place}: {error}") from None
         return [a for name in self._roster.nodes for a in everything.get(name, ())]
 
     async def begin(self) -> None:
         """Agree on when the first update is, and wait for it.
 
-        Who comes back to a run that goes on joins it where it is.
+        One process decides that the run has begun, once all are ready. A loss before that ends
+        the run; one after it is dealt with as in the run, also by those who hear of it before they
+        hear that the run has begun. Who comes back to a run that goes on joins it where it is.
         """
         roster = self._roster
-        reference = self._reference()
+        reference = self._decider = self._reference()
         if reference is not None and self._turns is None:
             await compare(reference, roster.until)
+        self._ready = True
         self._tell(Ready())
         if reference is None:
             await roster.until(lambda: all(m.ready for m in roster.present()))
+            self._decided = True
             origin = time.monotonic_ns() + LEAD
             self._tell(Begin(origin))
         else:
             await roster.until(lambda: reference.begin is not None)
             assert reference.begin is not None
+            self._decided = True
             best = reference.exchanges.best()
             origin = reference.begin.origin - (best.offset if best else 0)
             if self._loop is not None:
@@ -159,6 +185,8 @@ class Peers:
         early, self._early = self._early, []
         for item in early:
             self.heard(*item)
+        for member in self._lost_early:
+            self.lost(member)
 
     # During the run.
 
@@ -178,22 +206,42 @@ class Peers:
                 member.line.send(Hearing(wanted))
 
     def stopping(self, reason: str | None, error: Exception | None) -> None:
-        """Tell the others that the run ends, unless they know: then there is no reason."""
+        """Tell the others that the run ends; there is no reason if one of them said so."""
         self._ending = True
-        if reason is not None:
-            self._tell_in_order(Stop(reason, None if error is None else str(error)))
+        text = None if error is None else str(error)
+        stop = Stop(reason or "the run has ended", text, apart=not self._begun)
+        self._roster.ended = msgspec.structs.replace(stop, apart=True)
+        if not self._begun:  # also those who said so: they need not wait for our turn
+            self._tell(stop)
+            early, self._early = self._early, []
+            for member, message, _ in early:
+                if isinstance(message, Retired):
+                    self._do(member.number, message, None)
+        elif self._suspended:
+            self._tell(stop)
+            self._gather()
+        elif reason is not None:
+            self._tell_in_order(stop)
+        self._heard_at = time.monotonic()
+        self._watch()
 
     async def turn_to_end(self, node: str) -> None:
-        """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
+        """Wait until all nodes after this one have ended, wherever they are; "" is before all.
+
+        Those who are silent for long are not waited for any more.
+        """
         nodes = self._roster.nodes
         after = set(nodes[nodes.index(node) + 1 if node else 0 :])
         await self._roster.until(
             lambda: not any(after & {*m.nodes} - self._retired for m in self._roster.present()),
             despite=True,
         )
+        self._at_work = bool(node)
 
     def retired(self, node: str) -> None:
         """Tell the others that a node here has ended."""
+        self._at_work = False
+        self._retired_here.append(node)
         self._tell_in_order(Retired(node))
 
     # After the run.
@@ -205,6 +253,9 @@ class Peers:
     async def close(self) -> None:
         """Say the last words, and leave."""
         self._ending = True
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
         if self._following is not None:
             self._following.stop()
         self._turns = None
@@ -220,35 +271,54 @@ class Peers:
         Raises:
             WireError: It makes no sense.
         """
+        self._heard_at = time.monotonic()
         match message:
             case Said() if self._begun and self._turns is None:  # first, since there are many
                 self._do(member.number, message, event)
             case Announced():
+                if not message.said.keys() <= {*member.nodes}:
+                    raise WireError("expected announcements of its own nodes")
                 member.announced = message
                 if self._begun:  # it was gone, and needs ours again
                     member.line.send(self._announced)
             case Parted():
-                member.parted = message.part
+                try:
+                    member.parted = msgspec.json.decode(message.part, type=Summary)
+                except (msgspec.DecodeError, RecursionError) as error:
+                    raise WireError(f"expected a part of the summary, found: {error}") from None
                 self._parted[member.number] = member
                 member.line.send(Farewell())
             case Farewell():
                 member.has_ours = True
+            case Busy():
+                pass
             case Begin():
                 member.begin = message
-            case Ready():
+            case Ready() if not member.ready:
                 member.ready = True
                 if self._begun:
                     self._welcome(member)
+            case Ready():
+                pass
             case Hearing() if self._crossing is not None:
                 self._crossing.wants(member.number, message.wanted)
                 if self._begun:
                     self._run.connect()
-            case Stop() if not self._begun:
-                self._do(member.number, message, None)
             case Hearing():
                 pass
+            case Stop() if not self._begun or message.serial < 0:
+                if message.apart:
+                    self._go_on_without(member)
+                elif self._suspended:  # it is no use to wait for anybody's return
+                    self._gather()
+                self._do(member.number, message, None)
+            case Retired() if message.node not in member.nodes:
+                raise WireError(f"expected one of its nodes, found {message.node!r}")
+            case Retired() if message.serial < 0 or (self._ending and not self._begun):
+                self._do(member.number, message, None)
             case _ if not self._begun:
-                self._early.append((member, message, event))
+                if not self._ending:
+                    self._early.append((member, message, event))
             case _ if self._turns is not None:
                 self._turns.take(member.number, message, event)
             case Said() | Stop() | Retired():
@@ -258,14 +328,24 @@ class Peers:
 
     def lost(self, member: Member) -> None:
         """Deal with the loss of a process as its nodes' `on_error` says."""
+        if not (self._begun or self._ending) and (
+            self._decided or (self._ready and self._decider not in {None, member})
+        ):
+            self._lost_early.append(member)
+            return
         lost = set(member.nodes) - self._retired
         self._retired |= lost
         name = name_of(member.nodes)
-        gone = PeerError(f"{name}: their process is gone ({member.place})")
+        gone = PeerError(f"{name}: {member.over} ({member.place})")
         if not (self._begun or self._ending):
             self._roster.fail(gone)
             return
         if self._ending or not lost:
+            if lost:
+                log.warning("%s: the run ends without it", gone)
+                if self._begun and self._turns is not None and self._roster.ended is not None:
+                    # Others may wait for its return, and not for their turn.
+                    self._tell(msgspec.structs.replace(self._roster.ended, apart=False))
             self._gather()
             return
         if self._following is not None and self._following.member is member:
@@ -280,6 +360,7 @@ class Peers:
         elif "restart" in rules:
             log.error("%s: waiting for its return", gone)
             if self._turns is not None:
+                self._suspended = True
                 self._turns.suspend()
         else:
             log.error("%s: left out from here on", gone)
@@ -332,6 +413,7 @@ class Peers:
 
     def _take_back(self, member: Member) -> None:
         self._retired -= {*member.nodes}
+        self._apart.discard(member.number)
         self._gather(new=(member.number,))
         self._run.connect()
 
@@ -339,16 +421,59 @@ class Peers:
         """In lockstep, share the turns among those who are there."""
         if self._turns is None or self._loop is None or not self._begun:
             return
-        present = self._roster.present()
+        self._suspended = False
+        present = [m for m in self._roster.present() if m.number not in self._apart]
         self._loop.gate = self._turns if present else None
         if present:
             numbers = [self._roster.me, *(m.number for m in present)]
-            self._turns.gather(numbers, self._roster.ids(), new)
+            self._turns.gather(numbers, [self._roster.id, *(m.id for m in present)], new)
+
+    def _go_on_without(self, member: Member) -> None:
+        """Take a process out of the turns: it has not begun, or has given up."""
+        self._apart.add(member.number)
+        for node in self._retired_here:  # what was to be said at our turn is lost
+            member.line.send(Retired(node))
+        self._gather()
+
+    # While the run ends.
+
+    def _watch(self) -> None:
+        """Look after a while, in real time, whether the end goes on."""
+        loop = asyncio.get_running_loop()
+
+        def ring() -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(self._look)
+
+        self._timer = threading.Timer(BUSY_EVERY, ring)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _look(self) -> None:
+        if self._timer is None:
+            return
+        if self._at_work:
+            self._tell(Busy())
+        elif time.monotonic() - self._heard_at > SILENCE:
+            self._give_up()
+        self._watch()
+
+    def _give_up(self) -> None:
+        """End without those who say nothing."""
+        if silent := [m for m in self._roster.present() if not m.has_ours]:
+            names = "; ".join(name_of(m.nodes) for m in silent)
+            log.error("%s: expected a word within %g s; the run ends without it", names, SILENCE)
+            if self._roster.ended is not None:
+                self._tell(self._roster.ended)
+            for member in silent:
+                self._roster.forget(member)
+            self._gather()
+            self._roster.notify()
 
     def _reference(self) -> Member | None:
         """Return the process whose clock counts, or `None` if it is this one."""
         present = self._roster.present()
-        running = [m for m in present if m.hello is not None and m.hello.running]
+        running = [m for m in present if m.hello.running]
         first = min(running or present, key=lambda m: m.number, default=None)
         return first if first and (running or first.number < self._roster.me) else None
 
@@ -361,7 +486,7 @@ class Peers:
     def _tell_in_order(self, message: Ordered) -> None:
         """Send a message that others take in in its place among the events."""
         for member in self._roster.present():
-            if self._turns is not None and self._begun:
+            if self._turns is not None and self._begun and member.number not in self._apart:
                 self._turns.post(member.number, message)
             else:
                 member.line.send(message)

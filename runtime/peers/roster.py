@@ -1,5 +1,10 @@
 """Who is there: the processes that have met, those that come, and those that go.
 
+Two processes greet each other, each with a nonce; who answers ours with the seal of the run is
+there now, and knows the secret: then a session begins, and only what it seals is heard. A greeting
+that answers nothing may be an old one, and changes nothing. A new session ends the one before: the
+other process had lost us.
+
 What Zenoh's threads bring is handed to the loop here; nothing else in this room knows of threads,
 but the lines.
 """
@@ -10,6 +15,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import secrets
 import socket
 import threading
 import time
@@ -34,15 +40,22 @@ from runtime.peers.messages import (
     Ping,
     Pong,
     Said,
+    Stop,
     decode,
+    encode,
 )
 from runtime.peers.offsets import Exchange
-from runtime.peers.session import Session
+from runtime.peers.seal import NONCE, ForgedError, Sealing, derive, hello_seal, is_hello
+from runtime.peers.secret import secret_of
+from runtime.peers.session import Session, certified
 
 log = logging.getLogger("visnav.runtime")
 
 GREET_EVERY = 0.2
 """Seconds between two greetings of a process that has not answered."""
+
+STRANGERS = 256
+"""Processes without a session that are greeted; of more than these, the others are not seen."""
 
 
 class Told(Protocol):
@@ -68,6 +81,21 @@ class Told(Protocol):
         """Deal with what could not be sent to a process."""
 
 
+class Contact:
+    """A process that shows itself, whoever it may be.
+
+    Attributes:
+        nonce: In our greetings, until one is answered.
+        member: Who it is, while there is a session.
+        replied: When a greeting that is not fresh was last replied to, on `time.monotonic`.
+    """
+
+    def __init__(self) -> None:
+        self.nonce = secrets.token_bytes(NONCE)
+        self.member: Member | None = None
+        self.replied = 0.0
+
+
 class Roster:
     """The processes of a run.
 
@@ -82,6 +110,8 @@ class Roster:
         me: Number of this process. They are numbered by their first nodes, once all have met.
         count: How many processes there are in all.
         hello: Who we are.
+        ended: Once the run ends, what those are told who come anew.
+        refused: Messages that were left out, since nobody of the run wrote them.
     """
 
     def __init__(self, config: Config, only: Iterable[str], told: Told) -> None:
@@ -102,7 +132,11 @@ class Roster:
         self._loop = asyncio.get_running_loop()
         self._session: Session | None = None
         self._lock = threading.Lock()
-        self._members: dict[str, Member] = {}
+        self.ended: Stop | None = None
+        self.refused = 0
+        self._key = b""
+        self._contacts: dict[str, Contact] = {}
+        self._complained: set[str] = set()
         self._numbers: dict[tuple[str, ...], int] = {}
         self._numbered: dict[int, Member] = {}
         self._waiting: set[asyncio.Future[None]] = set()
@@ -116,7 +150,10 @@ class Roster:
             PeerError: They are not within the limit, or somebody runs another file or our nodes.
         """
         network = self._network
-        self._session = await asyncio.to_thread(Session, self._run, network)
+        by_certificate = not network.secret and certified(network)
+        secret = b"known by certificate" if by_certificate else secret_of(network.secret)
+        self._key = derive(secret, "run", self._run)
+        self._session = await asyncio.to_thread(Session, self._run, network, secret)
         await asyncio.to_thread(self._session.appear, self._hear, self._see)
         threading.Thread(target=self._greet, name="greet", daemon=True).start()
         if absent := self._missing():
@@ -149,22 +186,25 @@ class Roster:
         """Return the process with a number, if it is there."""
         return self._numbered.get(number)
 
-    def ids(self) -> list[str]:
-        """Return the ids of all that are there, this one's included."""
+    @property
+    def id(self) -> str:
+        """The id by which the others know this process."""
         assert self._session is not None
-        return [self._session.id, *(m.id for m in self.present())]
+        return self._session.id
+
+    def forget(self, member: Member) -> None:
+        """Go on as if a process were gone."""
+        member.unfit = True
+        self._numbered.pop(member.number, None)
 
     def settle(self, *, left_out: Iterable[str] = ()) -> None:
         """Say from now on that the run goes on, and without whom."""
-        self._enough.set()
         self.hello = msgspec.structs.replace(self.hello, running=True, left_out=tuple(left_out))
 
     async def close(self) -> None:
         """Say the last words, and leave."""
         self._enough.set()
-        with self._lock:
-            members = list(self._members.values())
-        for member in members:
+        for member in self._members():
             await asyncio.to_thread(member.line.close)
         if self._session is not None:
             await asyncio.to_thread(self._session.close)
@@ -206,15 +246,35 @@ class Roster:
 
     # In threads of Zenoh's and of lines.
 
-    def _hear(self, sender: str, head: bytes, payload: bytes) -> None:
+    def _hear(self, sender: str, sealed: bytes, payload: bytes) -> None:
         received = time.monotonic_ns()
-        member = self._member(sender)
+        contact = self._contacts.get(sender)
+        member = None if contact is None else contact.member
         try:
-            message = decode(head)
-            event = member.event(message, payload) if isinstance(message, Said) else None
-        except WireError as error:
-            log.warning("from %s: %s", member.place, error)
+            if member is None or is_hello(sealed):
+                self._greeted(sender, sealed)
+                return
+            data = member.sealing.open(sealed, payload)
+        except ForgedError as error:
+            self._complain(sender, error)
             return
+        except PeerError as error:  # another version
+            self._soon(self._misfit, error)
+            return
+        except WireError as error:
+            self._break(sender, error)
+            return
+        event = None
+        try:
+            message = decode(data)
+        except WireError as error:
+            self._break(sender, error)
+            return
+        if isinstance(message, Said):
+            try:
+                event = member.event(message, payload)
+            except Exception as error:  # it is counted all the same: in lockstep, all are awaited
+                log.warning("from %s: %s", member.place, error)
         if isinstance(message, Ack):
             member.acknowledged(message)
             return
@@ -227,6 +287,8 @@ class Roster:
                 late = message.now - self._told.now(ago=half)
                 member.exchanges.add(Exchange(received - message.sent, offset, late))
                 self._soon(self.notify)
+            case Hello():
+                pass
             case Memory():
                 member.incoming = Incoming.found(message) if self._network.shared else None
                 if member.incoming is not None:
@@ -235,32 +297,111 @@ class Roster:
                 member.line.memory = member.outgoing
             case _:
                 self._soon(self._take, member, message, event)
-        member.acknowledge(len(head) + len(payload))
+        member.acknowledge(len(data) + len(payload))
+
+    def _greeted(self, sender: str, sealed: bytes) -> None:
+        """Take in a greeting; begin a session if it is a fresh one."""
+        assert self._session is not None
+        seal = hello_seal(self._key, sender, self._session.id)
+        try:
+            hello = decode(seal.take_off(0, sealed))
+        except ForgedError:
+            raise
+        except WireError as error:
+            raise PeerError(f"expected a process that speaks as we do: {error}") from None
+        if not isinstance(hello, Hello):
+            raise ForgedError("expected a hello of a process without a session")
+        with self._lock:
+            contact = self._contact(sender)
+            if contact is None:
+                return
+            before = contact.member
+            if hello.seen == contact.nonce and (
+                before is None or hello.session != before.sealing.tag
+            ):
+                id_, put, failed = self._session.id, self._session.put, self._unsent
+                sealing = Sealing(self._key, (id_, contact.nonce), (sender, hello.nonce))
+                contact.member = member = Member(
+                    sender,
+                    hello,
+                    sealing,
+                    lambda message, payload: put(sender, message, payload),
+                    lambda error: failed(member, error),
+                )
+                contact.nonce = secrets.token_bytes(NONCE)
+                # Before anything that is sealed for the session, and so in this thread.
+                self._greet_one(sender, sealing.nonce, sealing.seen, sealing.tag)
+                if before is not None:
+                    self._soon(self._went, before, "their process had lost us")
+                self._soon(self._meet, member)
+            elif before is None:
+                self._greet_one(sender, contact.nonce, hello.nonce)
+            elif hello.session == before.sealing.tag:
+                pass  # all is well, or it is an old one
+            elif hello.nonce == before.sealing.seen:  # ours did not get there
+                mine = before.sealing
+                self._greet_one(sender, mine.nonce, mine.seen, mine.tag)
+            elif (now := time.monotonic()) > contact.replied + GREET_EVERY / 2:
+                contact.replied = now
+                self._greet_one(sender, contact.nonce, hello.nonce, before.sealing.tag)
 
     def _see(self, other: str, here: bool) -> None:
-        self._soon(self._came if here else self._went, self._member(other))
+        with self._lock:
+            contact = self._contact(other) if here else self._contacts.pop(other, None)
+            if not here:
+                self._complained.add(other)  # its last words may come late
+        if contact is None:
+            return
+        if here:
+            self._greet_one(other, contact.nonce)
+        elif contact.member is not None:
+            self._soon(self._went, contact.member)
 
     def _greet(self) -> None:
         while not self._enough.wait(GREET_EVERY):
             with self._lock:
-                members = list(self._members.values())
-            for member in members:
-                if member.hello is None:
-                    member.line.send(self.hello)
+                unknown = [(i, c.nonce) for i, c in self._contacts.items() if c.member is None]
+            for other, nonce in unknown:
+                self._greet_one(other, nonce)
 
-    def _member(self, other: str) -> Member:
+    def _greet_one(self, other: str, nonce: bytes, seen: bytes = b"", tag: bytes = b"") -> None:
+        assert self._session is not None
+        hello = msgspec.structs.replace(self.hello, nonce=nonce, seen=seen, session=tag)
+        seal = hello_seal(self._key, self._session.id, other)
+        with contextlib.suppress(PeerError):  # the session is closed
+            self._session.put(other, seal.put_on(0, encode(hello)), b"")
+
+    def _contact(self, other: str) -> Contact | None:
+        """Return what is known of a process, noted if it is new; `None` if too many are."""
+        if other not in self._contacts:
+            if sum(c.member is None for c in self._contacts.values()) >= STRANGERS:
+                return None
+            self._contacts[other] = Contact()
+        return self._contacts[other]
+
+    def _members(self) -> list[Member]:
         with self._lock:
-            if other not in self._members:
+            return [c.member for c in self._contacts.values() if c.member is not None]
 
-                def put(message: bytes, payload: bytes) -> None:
-                    assert self._session is not None
-                    self._session.put(other, message, payload)
+    def _complain(self, sender: str, error: VisnavError) -> None:
+        """Say, once of each of so many, who is not heard."""
+        self.refused += 1
+        if sender not in self._complained and len(self._complained) < STRANGERS:
+            self._complained.add(sender)
+            log.warning("from %s: %s (network.secret): left out", sender, error)
 
-                def failed(error: VisnavError) -> None:
-                    self._soon(self._told.unsent, self._member(other), error)
+    def _break(self, sender: str, error: WireError) -> None:
+        """End a session in which something went wrong; there may be another."""
+        with self._lock:
+            contact = self._contacts.get(sender)
+            member = None if contact is None else contact.member
+            if contact is None or member is None:
+                return
+            contact.member = None
+        self._soon(self._went, member, f"their process is not understood: {error}")
 
-                self._members[other] = Member(other, put, failed)
-            return self._members[other]
+    def _unsent(self, member: Member, error: VisnavError) -> None:
+        self._soon(self._told.unsent, member, error)
 
     def _soon(self, call: Callable[..., Any], *args: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed
@@ -268,11 +409,11 @@ class Roster:
 
     # On the loop.
 
-    def _take(self, member: Member, message: Hello | OfTheRun, event: Event | None) -> None:
+    def _take(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         try:
-            if isinstance(message, Hello):
-                self._meet(member, message)
-            elif member.unfit:
+            if member.held is not None:
+                member.held.append((message, event))
+            elif member.unfit or member.over:
                 log.debug("from %s, who is no part of this run: %s", member.place, message)
             else:
                 self._told.heard(member, message, event)
@@ -280,50 +421,61 @@ class Roster:
             log.warning("from %s: %s", member.place, error)
         self.notify()
 
-    def _meet(self, member: Member, hello: Hello) -> None:
-        """Take in who somebody is, and say who we are if they do not know yet."""
-        member.hello = hello
-        if not hello.knows_you:
-            member.line.send(msgspec.structs.replace(self.hello, knows_you=True))
+    def _misfit(self, error: PeerError) -> None:
+        """Deal with somebody with whom there can be no run."""
+        if self.hello.running:
+            log.warning("left alone: %s", error)
+        else:
+            self.fail(error)
+
+    def _meet(self, member: Member) -> None:
+        """Take in who somebody is."""
         try:
-            check_fits(self.hello, hello, self.nodes)
+            check_fits(self.hello, member.hello, self.nodes)
         except PeerError as error:
-            member.unfit = True
-            if self.hello.running or self.hello.began < hello.began:  # the newcomer gives up
+            if self.hello.began < member.hello.began:  # the newcomer gives up
                 log.warning("left alone: %s", error)
             else:
-                self.fail(error)
+                self._misfit(error)
+            return
+        if self.ended is not None:
+            member.line.send(self.ended)
             return
         if self._network.shared and member.outgoing is None:
             member.outgoing = Outgoing()
             member.line.send(member.outgoing.offer())
         if self._numbers:
-            number = self._numbers.get(hello.nodes, -1)
-            member.unfit = number < 0 or self._numbered.get(number, member) is not member
-            if not member.unfit and number not in self._numbered:
-                member.number = number
-                self._numbered[number] = member
-                if hello.running and self.hello.running:
-                    self._told.found_again(member)
+            number = self._numbers.get(member.nodes, -1)
+            if number in self._numbered:  # the one before has gone, but we do not know yet
+                member.held = member.held or []
+                return
+            if number < 0:
+                return
+            member.number = number
+            self._numbered[number] = member
+        member.unfit = False
+        if member.number >= 0 and member.hello.running and self.hello.running:
+            self._told.found_again(member)
+        held, member.held = member.held, None
+        for message, event in held or ():
+            self._take(member, message, event)
+        self.notify()
 
-    def _came(self, member: Member) -> None:
-        if member.hello is None:
-            member.line.send(self.hello)
-
-    def _went(self, member: Member) -> None:
+    def _went(self, member: Member, why: str = "their process is gone") -> None:
+        if member.over:
+            return
+        member.over = why
         member.line.abandon()
-        with self._lock:
-            self._members.pop(member.id, None)
         if self._numbered.get(member.number) is member:
             del self._numbered[member.number]
             self._told.lost(member)
+            for other in self._members():
+                if other.held is not None and other.nodes == member.nodes:
+                    self._meet(other)
         self.notify()
 
     def _fitting(self) -> list[Member]:
-        with self._lock:
-            members = list(self._members.values())
-        return [m for m in members if m.hello is not None and not m.unfit]
+        return [m for m in self._members() if not (m.unfit or m.over)]
 
     def _missing(self) -> list[str]:
-        hellos = [m.hello for m in self._fitting() if m.hello is not None]
-        return missing([self.hello, *hellos], self.nodes)
+        return missing([self.hello, *(m.hello for m in self._fitting())], self.nodes)

@@ -5,8 +5,12 @@ Zenoh has threads of its own and no asyncio: what it calls runs there, and must 
 
 from __future__ import annotations
 
+import ipaddress
 import json
+import logging
 import re
+import socket
+import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +20,9 @@ import zenoh
 
 from runtime.config import NetworkConfig
 from runtime.errors import PeerError
+from runtime.peers.seal import derive
+
+log = logging.getLogger("visnav.runtime")
 
 Heard = Callable[[str, bytes, bytes], None]
 """Called in Zenoh's thread with who sends, the message, and its payload."""
@@ -33,6 +40,7 @@ class Session:
     Args:
         run: The run's name; processes of other runs are not seen.
         network: Where processes meet, and how they talk.
+        secret: That they share. Without a Zenoh file, nobody else can connect.
 
     Raises:
         PeerError: The session cannot be opened.
@@ -41,9 +49,18 @@ class Session:
         id: By which the other processes know this one.
     """
 
-    def __init__(self, run: str, network: NetworkConfig) -> None:
+    def __init__(self, run: str, network: NetworkConfig, secret: bytes) -> None:
+        configuration = _configuration(network)
+        _warn_if_open(configuration)
         try:
-            self._session = zenoh.open(_configuration(network))
+            with tempfile.NamedTemporaryFile("w", suffix=".door") as door:  # its user's alone
+                if not network.zenoh:
+                    word = derive(secret, "door").hex()
+                    door.write(f"visnav:{word}\n")
+                    door.flush()
+                    known = {"user": "visnav", "password": word, "dictionary_file": door.name}
+                    configuration.insert_json5("transport/auth/usrpwd", json.dumps(known))
+                self._session = zenoh.open(configuration)
         except (zenoh.ZError, OSError) as error:
             raise PeerError(f"expected to meet at {network.meet}, found: {error}") from error
         self.id = str(self._session.info.zid())
@@ -115,13 +132,12 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
             raise PeerError(
                 f"network.zenoh: {network.zenoh}: expected a Zenoh configuration, found: {error}"
             ) from error
-    here = re.search(r"/(127\.|localhost)", network.meet)
     settings: dict[str, Any] = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
         # The first process on that host takes the address, and the others connect to it; each
         # tells the rest where else it listens.
-        "listen/endpoints": [network.meet, "tcp/127.0.0.1:0" if here else "tcp/0.0.0.0:0"],
+        "listen/endpoints": [network.meet, *_beside(network.meet)],
         "listen/exit_on_failure": False,
         "listen/timeout_ms": 0,
         "connect/endpoints": [network.meet],
@@ -132,6 +148,7 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
             "period_max_ms": 400,
             "period_increase_factor": 2,
         },
+        "transport/shared_memory/enabled": False,  # we have our own, and nothing is left behind
     }
     for key, value in settings.items():
         if configuration.get_json(key) == plain.get_json(key):
@@ -139,3 +156,56 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
     lease = round(float(network.lease) * 1000)
     configuration.insert_json5("transport/link/tx/lease", json.dumps(lease))
     return configuration
+
+
+def certified(network: NetworkConfig) -> bool:
+    """Tell whether a Zenoh file lets only those connect who have a certificate."""
+    configuration = _configuration(network)
+    ends = [*_endpoints(configuration, "listen"), *_endpoints(configuration, "connect")]
+    mutual = json.loads(configuration.get_json("transport/link/tls/enable_mtls"))
+    return bool(network.zenoh and mutual and all(e.startswith(("tls/", "quic/")) for e in ends))
+
+
+def _endpoints(configuration: zenoh.Config, way: str) -> list[str]:
+    found = json.loads(configuration.get_json(f"{way}/endpoints"))
+    return found if isinstance(found, list) else [e for each in found.values() for e in each]
+
+
+def _warn_if_open(configuration: zenoh.Config) -> None:
+    """Warn of an endpoint at which what is said can be read on the way."""
+    bare = [
+        endpoint
+        for endpoint in _endpoints(configuration, "listen")
+        if not (endpoint.startswith(("tls/", "quic/", "unix")) or _is_here(endpoint))
+    ]
+    if bare:
+        log.warning(
+            "%s can be reached from other machines, and what is said there is not encrypted: "
+            "for TLS, name a Zenoh file (network.zenoh)",
+            ", ".join(bare),
+        )
+
+
+def _beside(meet: str) -> list[str]:
+    """Return where to listen besides: a free port at the address by which `meet` is reached."""
+    if not (parts := re.fullmatch(r"(tcp|tls|quic)/\[?([^\]#?]+?)\]?:(\d+)([#?].*)?", meet)):
+        return []
+    protocol, host, port = parts[1], parts[2], int(parts[3])
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.connect(address)  # of datagrams: nothing is sent
+            mine = probe.getsockname()[0]
+    except OSError:  # no way there yet: Zenoh tries on
+        return []
+    return [f"{protocol}/[{mine}]:0" if ":" in mine else f"{protocol}/{mine}:0"]
+
+
+def _is_here(endpoint: str) -> bool:
+    """Tell whether only processes of this machine reach an endpoint."""
+    parts = re.match(r"\w+/\[?([^\]#?]+?)\]?:\d+", endpoint)
+    host = parts[1] if parts else ""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

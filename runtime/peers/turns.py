@@ -17,6 +17,7 @@ from typing import Protocol
 import msgspec
 
 from events import Event
+from runtime.errors import WireError
 from runtime.peers.messages import NEVER, Call, Key, Message, Ordered, Standing, Turn
 
 Send = Callable[[int, Message, Event | None], None]
@@ -136,14 +137,22 @@ class Turns:
     def take(
         self, other: int, message: Turn | Call | Standing | Ordered, event: Event | None
     ) -> None:
-        """Take in a message of another process."""
+        """Take in a message of another process.
+
+        Raises:
+            WireError: It is of another number of processes.
+        """
         match message:
             case Turn():
+                if not message.fits(len(self._keys)):
+                    raise WireError(f"expected a turn of {len(self._keys)} processes")
                 if message.epoch >= self._oldest:
                     self._next = message
             case Call():
                 self._calls.add(other)  # of all of us, since only one has the turn
             case Standing():
+                if len(message.sent) != len(self._keys):
+                    raise WireError(f"expected a standing of {len(self._keys)} processes")
                 self._standings[other] = message
                 self._resume()
             case _:
