@@ -234,7 +234,11 @@ class PoseRows:
         try:
             if self._file is None and not self._blocks:
                 self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
-            if self._blocks or self._file is None or self._file.write(block) != block.nbytes:
+            if (
+                self._blocks
+                or self._file is None
+                or self._file.write(block.tobytes()) != block.nbytes
+            ):
                 raise OSError
             self._written += len(block)
         except OSError:

@@ -1,0 +1,31 @@
+"""The page of figures names every figure and every threshold there is."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from nodes.evaluation.judging import Thresholds, judge
+from tests.nodes.report.folders import recorded, walk
+
+PAGE = (Path(__file__).parents[3] / "docs" / "figures.md").read_text(encoding="utf-8")
+
+
+def test_every_figure_and_threshold_is_explained() -> None:
+    truth = walk(12)
+    figures = {*judge(recorded(truth), truth).figures} | {"plan_rmse_m", "plan_max_m", "collisions"}
+    explained = set(re.findall(r"`(\w+)`", PAGE))
+    assert figures - {"method"} <= explained
+    assert {*Thresholds.__struct_fields__} <= explained
+
+
+def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
+    assert "`coverage_percent` at least 90;" in PAGE
+    given = {name: getattr(Thresholds(), name) for name in Thresholds.__struct_fields__}
+    assert {k: v for k, v in given.items() if v is not None} == {
+        "coverage_percent": 90.0,
+        "restarts": 0,
+        "repeated_stamps": 0,
+        "future_stamps": 0,
+        "collisions": 0,
+    }
