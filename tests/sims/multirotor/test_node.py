@@ -287,12 +287,11 @@ def test_it_runs_in_real_time() -> None:
     """At 400 Hz, whatever else the machine does: late ticks are counted, not lost."""
     outcome = supervise([spec(Multirotor, "drone", {"world": world})], clock="real", duration=1.0)
     assert outcome.error is None
-    ticker = outcome.supervisor.tickers["drone.control"]
-    assert 395 <= ticker.calls + ticker.missed <= 400 * outcome.supervisor.clock.now() / SECOND + 1
-    assert ticker.calls > 200
+    ticker, end = outcome.supervisor.tickers["drone.control"], outcome.supervisor.clock.now()
+    assert 395 <= ticker.calls + ticker.missed <= 400 * end / SECOND + 1
     stamps = [e.stamp for e in outcome.sent if isinstance(e, Odometry)]
-    assert stamps == sorted(stamps)
-    assert 0.9 < stamps[-1] / SECOND < 1.1
+    assert stamps == sorted(set(stamps))
+    assert 0.9 * SECOND < stamps[-1] <= end
 
 
 def test_cameras_announce_themselves_and_deliver() -> None:
