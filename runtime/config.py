@@ -30,7 +30,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
-from runtime.errors import ConfigError, VisnavError, suggest
+from runtime.errors import ConfigError, DeclarationError, VisnavError, suggest
 from runtime.explain import explain, show
 from runtime.links import LinkConfig
 from runtime.node import Node, NodeConfig
@@ -226,6 +226,12 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
         ) from None
     except ImportError as error:
         raise ConfigError(f"{where}: {module_name} cannot be imported: {error}") from error
+    except DeclarationError as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        here = str(Path(__file__).parent)
+        last = [frame for frame in frames if not frame.filename.startswith(here)][-1]
+        place = f"{last.filename}, line {last.lineno}"
+        raise ConfigError(f"{where}: {module_name}: {error} ({place})") from error
     except VisnavError:
         raise
     except Exception as error:  # whatever a module of the user's does

@@ -13,6 +13,7 @@ from runtime.errors import NodeError, NodeTimeoutError, RefusedError, VisnavErro
 from runtime.limits import real_time_limit
 from runtime.links import Link
 from runtime.node import Host, Node, make_node, streams
+from runtime.plain import plain
 from runtime.schedule import Ticker
 from runtime.worker import Worker
 
@@ -25,7 +26,7 @@ class Life:
     def __init__(self, spec: NodeSpec) -> None:
         self.spec = spec
         self.node: Node[Any] | None = None
-        self.tasks: set[asyncio.Task[None]] = set()
+        self.tasks: dict[asyncio.Task[None], None] = {}  # in the order in which they were made
         self.tickers: list[Ticker] = []
         self.workers: list[Worker[Any]] = []
         self.links: dict[str, Link] = {}
@@ -49,7 +50,9 @@ class Life:
         try:
             self.node = make_node(spec.node, spec.name, spec.config, host, spec.inputs, self.starts)
             self.links = {
-                port: Link(f"{spec.name}.{port}", config, host.clock, host.seed)
+                port: Link(
+                    f"{spec.name}.{port}", config, host.clock, host.seed, self.links.get(port)
+                )
                 for port, config in spec.links.items()
             }
             async with real_time_limit(limit):
@@ -68,15 +71,26 @@ class Life:
         """Return what the node announces.
 
         Raises:
-            NodeError: Something went wrong in it.
+            NodeError: Something went wrong in it, or it returns something else.
         """
         assert self.node is not None
+        name = self.spec.name
         try:
-            return list(self.node.announce())
+            said: Any = self.node.announce()
+            found: list[Any] = list(said) if isinstance(said, Iterable) else [said]
+            for each in found:
+                if not isinstance(each, Announcement):
+                    raise NodeError(
+                        name,
+                        "announce(): expected announcements, "
+                        f"found {each!r:.80} ({type(each).__name__})",
+                    )
+                plain(each, f"announce(): {type(each).__name__}")
+            return found
         except NodeError:
             raise
         except Exception as error:
-            raise wrap(self.spec.name, error) from error
+            raise wrap(name, error) from error
 
     def hear(self, announcements: Iterable[Announcement]) -> None:
         """Let the node hear all announcements.

@@ -51,12 +51,20 @@ class Link:
         config: What it does.
         clock: The run's clock.
         seed: Of the run.
+        before: The link that this one replaces, whose figures it carries on.
     """
 
-    def __init__(self, name: str, config: LinkConfig, clock: Clock, seed: int) -> None:
+    def __init__(
+        self,
+        name: str,
+        config: LinkConfig,
+        clock: Clock,
+        seed: int,
+        before: Link | None = None,
+    ) -> None:
         self.name = name
-        self.lost = 0
-        self.thinned = 0
+        self.lost: int = before.lost if before else 0
+        self.thinned: int = before.thinned if before else 0
         self._config = config
         self._clock = clock
         self._rng = np.random.default_rng([seed, zlib.crc32(name.encode()), zlib.crc32(b"link")])

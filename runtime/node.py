@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import functools
+import inspect
 import zlib
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ from runtime.bundles import Bundle, Matcher
 from runtime.clock import Clock
 from runtime.errors import DeclarationError
 from runtime.logs import NodeLogger
+from runtime.plain import plain
 from runtime.ports import Handles, Input, Output, Ticks
 from runtime.schedule import SECOND, Tick, Ticker
 from runtime.sender import Sender
@@ -266,8 +268,19 @@ class Node(Generic[C]):
             subject: What was judged: the source of an estimator.
             figures: Numbers and words about it.
             passed: Whether it met its thresholds; `None` if nothing was asked of it.
+
+        Raises:
+            TypeError: A figure is nothing that JSON knows (numpy's numbers and arrays are made
+                into such), or `passed` is neither a bool nor `None`.
         """
-        self._host.conclude(subject, figures, passed)
+        where = f"conclude({subject!r})"
+        if not isinstance(passed, bool | np.bool_ | None):
+            raise TypeError(
+                f"{where}: passed: expected True, False or None, "
+                f"found {passed!r:.80} ({type(passed).__name__})"
+            )
+        found = {str(name): plain(each, f"{where}: {name}") for name, each in figures.items()}
+        self._host.conclude(str(subject), found, None if passed is None else bool(passed))
 
     def after_run(self, call: Callable[[Path], Any]) -> None:
         """Have a function called with the run's folder once its summary is written.
@@ -328,6 +341,7 @@ def senders(node: Node[Any]) -> dict[str, Sender[Any]]:
 
 def _declared(cls: type[Node[Any]]) -> Declared:
     """Read the declarations of a class and its bases."""
+    _check_phases(cls)
     found = Declared({}, {}, {}, {}, {}, [])
     names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
     for name in names:
@@ -350,6 +364,24 @@ def _declared(cls: type[Node[Any]]) -> Declared:
         if name in found.inputs or name in found.bundles or name in found.handlers:
             found.listening.append(name)
     return found
+
+
+def _check_phases(cls: type[Node[Any]]) -> None:
+    """Raise `DeclarationError` for a phase that is a coroutine function and should not, or not."""
+    for phase, method in vars(cls).items():
+        meant = vars(Node).get(phase)
+        if not inspect.isfunction(method) or not inspect.isfunction(meant):
+            continue
+        awaited = inspect.iscoroutinefunction(meant)
+        if inspect.iscoroutinefunction(inspect.unwrap(method)) != awaited:
+            expected, found = f"async def {phase}", f"def {phase}"
+            if inspect.isasyncgenfunction(method):
+                found = f"async def {phase} with a yield in it"
+            if not awaited:
+                expected, found = f"def {phase}", f"async def {phase}"
+            raise DeclarationError(
+                f"{cls.__name__}.{phase}: expected `{expected}`, found `{found}`"
+            )
 
 
 _RESERVED = {*vars(Node), *Node.__annotations__}

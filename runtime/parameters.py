@@ -129,7 +129,7 @@ def _without_none(value: Any) -> Any:
 def _differences(before: Any, after: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield where two tables differ, and what is there in the second."""
     if isinstance(before, dict) and isinstance(after, dict):
-        for key in before.keys() | after.keys():
+        for key in dict.fromkeys([*before, *after]):
             for path, value in _differences(before.get(key), after.get(key)):
                 yield (key, *path), value
     elif _names(before) and _names(before) == _names(after):

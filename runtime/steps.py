@@ -333,4 +333,4 @@ def _task_factory(
 
 def install(loop: asyncio.AbstractEventLoop) -> None:
     """Make every task created on `loop` from now on one that streams can step."""
-    loop.set_task_factory(functools.partial(_task_factory, _Nesting()))  # type: ignore[arg-type]
+    loop.set_task_factory(functools.partial(_task_factory, _Nesting()))

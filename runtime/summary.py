@@ -14,6 +14,7 @@ import msgspec
 
 from runtime.digest import Digest, combined
 from runtime.node import matchers, senders, streams
+from runtime.plain import plain
 from runtime.schedule import SECOND
 from runtime.watchdog import Stall
 
@@ -94,8 +95,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         seed: Of the run's random numbers.
         reason: What ended it.
         error: What went wrong, or `None`.
-        sim_seconds: Seconds of the run's clock.
         wall_seconds: Real seconds, from the first update to when the end was asked for.
+        sim_seconds: The same time on the run's clock: what was sent, was sent in it.
         digest: Fingerprint of all events in order; equal for equal runs in lockstep. (Pixels
             depend on the graphics driver, so digests compare on one machine.) `None` if off.
         digests: Fingerprint of each output's events, of which that of the run is made.
@@ -201,7 +202,7 @@ def summarise(
         seed=supervisor.seed,
         reason=supervisor.reason,
         error=None if supervisor.error is None else str(supervisor.error),
-        sim_seconds=sim_ns / SECOND,
+        sim_seconds=(sim_ns if supervisor.ended_at is None else supervisor.ended_at) / SECOND,
         wall_seconds=round(ended - (supervisor.first_update or ended), 6),
         digest=digest.hexdigest() if digest else None,
         digests=digest.outputs() if digest else {},
@@ -218,7 +219,7 @@ def summarise(
         stalls=dict(stalls),
         longest_stalls=longest_stalls,
         announcements=[
-            {"type": type(a).__name__, **msgspec.to_builtins(a)} for a in supervisor.announcements
+            {"type": type(a).__name__, **plain(a, a.source)} for a in supervisor.announcements
         ],
         environment=environment(),
     )

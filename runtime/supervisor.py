@@ -19,7 +19,7 @@ import inspect
 import logging
 import time
 from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,6 +83,8 @@ class Supervisor:
         """When the first update was, on `time.monotonic`."""
         self.ended: float | None = None
         """When the end of the run was asked for, on `time.monotonic`."""
+        self.ended_at: int | None = None
+        """The same on the run's clock (ns)."""
         self.reason = ""
         self.error: Exception | None = None
         self.ever: list[Node[Any]] = []
@@ -113,7 +115,7 @@ class Supervisor:
         self._ended = asyncio.Event()
         self._begin: asyncio.Task[None] | None = None
         self._group = asyncio.TaskGroup()
-        self._recoveries: set[asyncio.Task[None]] = set()
+        self._recoveries: dict[asyncio.Task[None], None] = {}
 
     async def main(self) -> None:
         """Run until something ends the run; `reason` and `error` then say what did."""
@@ -140,7 +142,7 @@ class Supervisor:
             self.peers.stopping(None if told else reason, error)
         self.reason = reason
         self.error = error
-        self.ended = time.monotonic()
+        self.ended, self.ended_at = time.monotonic(), self.clock.now()
         self._ended.set()
         if self._begin is not None and not self._begin.done():
             self._begin.cancel()
@@ -159,17 +161,17 @@ class Supervisor:
         guarded = self._guard(node, coro)
         guarded.__qualname__ = getattr(coro, "__qualname__", guarded.__qualname__)  # type: ignore[attr-defined]
         task = self._group.create_task(guarded, name=node.name)
-        life.tasks.add(task)
+        life.tasks[task] = None
         self.probes.on_task(node.name, task)
-        task.add_done_callback(life.tasks.discard)
+        task.add_done_callback(lambda task: life.tasks.pop(task, None))
         # Cancelled before its first step, the task has not begun what it guards.
         task.add_done_callback(lambda _: coro.close())
 
     def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
         """Call a function of a node at a rate, from the first update on."""
+        full_name = self._ticker_name(node.name, name)
         if inspect.iscoroutinefunction(call):
-            call = self._in_background(node, call, name)
-        full_name = f"{node.name}.{name}"
+            call = self._in_background(node, call, full_name)
         fault = functools.partial(self.fault, node.name)
         ticker = Ticker(full_name, hz, call, fault, before=self.tickers.get(full_name))
         self.tickers[full_name] = ticker
@@ -229,8 +231,8 @@ class Supervisor:
         life = self._lives[name]
         life.recovering = True
         task = self._group.create_task(self._recover(life, anyway), name=f"recover {name}")
-        self._recoveries.add(task)
-        task.add_done_callback(self._recoveries.discard)
+        self._recoveries[task] = None
+        task.add_done_callback(lambda task: self._recoveries.pop(task, None))
 
     # Beginning.
 
@@ -317,11 +319,17 @@ class Supervisor:
         ticker.begin(self.clock.now())
         self.clock.schedule.add(ticker.due, ticker)
 
+    def _ticker_name(self, node: str, name: str) -> str:
+        """Return ``node.name``, with a number if the node has a ticker of this name already."""
+        taken = {ticker.name for ticker in self._lives[node].tickers if not ticker.stopped}
+        numbered = (f"{node}.{name}_{number}" for number in count(2))
+        return next(full for full in chain([f"{node}.{name}"], numbered) if full not in taken)
+
     def _in_background(
         self, node: Node[Any], call: Callable[[Tick], Any], name: str
     ) -> Callable[[Tick], None]:
         """Return a function that hands ticks to a coroutine, and skips those it is too busy for."""
-        ticks: Stream[Tick] = Stream(f"{node.name}.{name}", bound=1, overflow="drop_oldest")
+        ticks: Stream[Tick] = Stream(name, bound=1, overflow="drop_oldest")
 
         async def serve() -> None:
             async for tick in ticks:

@@ -11,7 +11,6 @@ from runtime.steps import DEPTH_LIMIT
 from runtime.streams import Stream
 from runtime.testing import run_in_lockstep
 
-
 RELAYS: list[asyncio.Task[None]] = []
 
 

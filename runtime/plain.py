@@ -1,0 +1,36 @@
+"""What nodes hand over for the summary, made into what JSON knows, where they hand it over."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+
+def plain(value: Any, where: str) -> Any:
+    """Return a value as what JSON knows: numpy's numbers as numbers, its arrays as lists.
+
+    Args:
+        value: Numbers, texts, lists, mappings, events, and what else msgspec knows.
+        where: Begins the message.
+
+    Raises:
+        TypeError: JSON knows nothing like it.
+    """
+    try:
+        found = msgspec.to_builtins(value, enc_hook=_without_numpy, str_keys=True)
+        msgspec.json.encode(found)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise TypeError(
+            f"{where}: expected what JSON knows, found {value!r:.80}: {error}"
+        ) from None
+    return found
+
+
+def _without_numpy(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} is none of it")
