@@ -14,7 +14,7 @@ import numpy.typing as npt
 import uvloop
 
 from bench.messages import Ping
-from events import Event, Image
+from events import Event, Image, PoseEstimate, Quaternion, Vector3
 from runtime import steps
 from runtime.realtime import RealClock
 from runtime.sender import Listener, Sender
@@ -44,6 +44,16 @@ BATCH = 256
 """Events of a burst: as many as a reader may take before the loop gets a turn."""
 
 
+class Unchecked(Event):
+    """A `PoseEstimate` that nobody checks."""
+
+    frame_id: str = "odom"
+    child_frame_id: str = "base_link"
+    position: Vector3
+    orientation: Quaternion
+    covariance: tuple[float, ...] = ()
+
+
 class Mirror:
     """Lives in a worker; gives back what it gets."""
 
@@ -66,6 +76,7 @@ async def _measure(bursts: int) -> list[ThroughputRow]:
     at_once = "events, stream, reader resumed by each"
     in_one_wake = "events, stream, all in one wake"
     return [
+        *_making_rows(bursts),
         _row("events, handler", BATCH, _by_handler(event, bursts), 0),
         _row(at_once, BATCH, await _by_stream(event, bursts, soon=False), 0),
         _row(in_one_wake, BATCH, await _by_stream(event, bursts, soon=True), 0),
@@ -76,6 +87,23 @@ async def _measure(bursts: int) -> list[ThroughputRow]:
             picture.nbytes,
         ),
         *await _worker_rows(picture),
+    ]
+
+
+def _making_rows(bursts: int) -> list[ThroughputRow]:
+    """Measure what making a pose costs, and what of it are its checks; in turns."""
+    place, turn = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
+    taken: dict[type[Event], list[float]] = {Unchecked: [], PoseEstimate: []}
+    for _ in range(bursts):
+        for event in (Unchecked, PoseEstimate):
+            begin = time.perf_counter_ns()
+            for stamp in range(BATCH):
+                event(stamp=stamp, source="one", position=place, orientation=turn)
+            taken[event].append((time.perf_counter_ns() - begin) / BATCH)
+    plain, checked = (float(np.median(each)) for each in taken.values())
+    return [
+        _row("poses made, without checks", BATCH, plain, 0),
+        _row("poses made, as they are", BATCH, checked, 0),
     ]
 
 

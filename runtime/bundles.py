@@ -4,11 +4,13 @@
         image: Image                 # the first field sets the stamp
         depth: DepthImage            # must be there
         pose: PoseStamped | None     # taken if it is there when the others are
-        imu: tuple[Imu, ...]         # all since the set before, up to this stamp
+        imu: tuple[Imu, ...]         # all since the set that was read before, up to this stamp
 
     frames = Bundle(Frame)           # async for image, depth, pose, imu in self.frames
 
-Declared with `Bundle`; what stands behind it at run time is a `Matcher`.
+Declared with `Bundle`; what stands behind it at run time is a `Matcher`. A set that does not come
+about, or that the reader skips, leaves its tuples to the next one. (One that a link before the
+bundle loses takes them along.)
 """
 
 from __future__ import annotations
@@ -41,6 +43,9 @@ Kind = Literal["one", "maybe", "all"]
 
 HISTORY = 256
 """Events of one field that wait for their partners at most; beyond it the oldest goes."""
+
+WAITING_BYTES = 64 << 20
+"""Bytes of their arrays at most, but at least one event: whatever comes first."""
 
 GATHERED = 16_384
 """The same for a field that gathers a tuple."""
@@ -138,6 +143,9 @@ class Matcher(Generic[B]):
         self._set_type = set_type
         self._tolerance = tolerance
         self._first, *self._others = self.slots.values()
+        self._tuples = [at for at, slot in enumerate(self.slots.values()) if slot.kind == "all"]
+        if self._tuples:
+            stream.merge = self._with_tuples_of
 
     def __aiter__(self) -> Stream[B]:
         return self.stream
@@ -167,32 +175,42 @@ class Matcher(Generic[B]):
             for slot in self._others:
                 part = slot.find(first[0].stamp, self._tolerance)
                 if part is _WAIT:
-                    if len(first) < HISTORY:
+                    if not self._first.is_full():
                         return
                     part = None
                 if part is None and slot.kind != "maybe":
                     missing = slot.field
                     break
                 parts.append(part)
-            stamp = first.popleft().stamp
+            stamp = self._first.pop().stamp
             for slot in self._others:
-                slot.forget(stamp, self._tolerance)
+                if missing is None or slot.kind != "all":
+                    slot.forget(stamp, self._tolerance)
             if missing is None:
                 self.deliver(self._set_type._make(parts))  # type: ignore[attr-defined]
             else:
                 self.missed[missing] += 1
 
+    def _with_tuples_of(self, skipped: B, following: B) -> B:
+        """Return a set with what a skipped one before it had gathered."""
+        parts = list(following)
+        for at in self._tuples:
+            parts[at] = (*skipped[at], *parts[at])[-GATHERED:]
+        return self._set_type._make(parts)  # type: ignore[attr-defined,no-any-return]
+
 
 class Slot:
     """The events of one field that wait for their partners."""
 
-    __slots__ = ("_matcher", "_source", "events", "field", "kind", "name")
+    __slots__ = ("_bytes", "_matcher", "_most", "_source", "events", "field", "kind", "name")
 
     def __init__(self, matcher: Matcher[Any], field: str, kind: Kind) -> None:
         self.name = f"{matcher.name}.{field}"
         self.field = field
         self.kind = kind
-        self.events: deque[Any] = deque(maxlen=GATHERED if kind == "all" else HISTORY)
+        self.events: deque[Any] = deque()
+        self._most = GATHERED if kind == "all" else HISTORY
+        self._bytes = 0
         self._matcher = matcher
         self._source: str | None = None
 
@@ -207,7 +225,21 @@ class Slot:
         if event.source != self._source and not self._changes_to(event.source):
             return
         self.events.append(event)
-        self._matcher.match()
+        self._bytes += _size(event)
+        self._matcher.match()  # which gives up what is first in the first field if that is full
+        while self.is_full():
+            self.pop()
+
+    def is_full(self) -> bool:
+        """Tell whether what comes next finds no room."""
+        count = len(self.events)
+        return count >= self._most or (self._bytes >= WAITING_BYTES and count > 1)
+
+    def pop(self) -> Any:
+        """Let go of the oldest."""
+        event = self.events.popleft()
+        self._bytes -= _size(event)
+        return event
 
     def _changes_to(self, source: str) -> bool:
         """Hear another source from now on, if it is the first or above the one heard so far."""
@@ -247,7 +279,13 @@ class Slot:
         events = self.events
         limit = stamp if self.kind == "all" else stamp - tolerance
         while events and events[0].stamp <= limit:
-            events.popleft()
+            self.pop()
+
+
+def _size(event: Event) -> int:
+    """Return how many bytes of arrays an event holds on to."""
+    fields = event.__struct_fields__
+    return sum(getattr(getattr(event, field), "nbytes", 0) for field in fields)
 
 
 _WAIT: Any = object()

@@ -10,6 +10,7 @@ import numpy as np
 import xxhash
 
 from events import Event
+from runtime.errors import ChannelTypeError
 from runtime.sender import Sender
 
 _CHUNK = 1 << 16
@@ -23,6 +24,9 @@ class Digest:
     different outputs at one time, is the same for a run in one process and in several, and names
     the output at which two runs differ.
 
+    What an event holds must be data: numbers, texts, lists, mappings and what else msgspec knows,
+    and arrays of numbers. Of any other object it cannot be told whether it is the same again.
+
     XXH3 (xxhash.com) takes 0.1 ms for a megabyte image; it guards against accidents, not
     against forgery.
     """
@@ -35,7 +39,11 @@ class Digest:
         self._outputs: dict[str, _Output] = {}
 
     def __call__(self, sender: Sender[Any] | None, event: Event) -> None:
-        """Take in one event; a tap on every sender."""
+        """Take in one event; a tap on every sender.
+
+        Raises:
+            ChannelTypeError: It holds an object that is no data.
+        """
         name = sender.name if sender else event.source.partition("/")[0] + ".announced"
         try:
             output = self._outputs[name]
@@ -43,7 +51,13 @@ class Digest:
             output = self._outputs[name] = _Output()
         pending = output.pending
         pending += type(event).__name__.encode()
-        self._encode_into(event, pending, -1)
+        try:
+            self._encode_into(event, pending, -1)
+        except (TypeError, OverflowError) as error:
+            raise ChannelTypeError(
+                f"{name}: expected {type(event).__name__} to hold data, which has a digest, "
+                f"found {error}; or run without one, digest = false under [run]"
+            ) from None
         if len(pending) > _CHUNK:  # one call of the hash for many small events
             output.take_in()
 
@@ -81,9 +95,10 @@ class _Output:
 
 
 def _encode_array(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         content = xxhash.xxh3_128_digest(np.ascontiguousarray(value).view(np.uint8).data)
         return (value.dtype.str, value.shape, content)
-    if isinstance(value, np.generic):
-        return value.item()
-    return repr(value)
+    if isinstance(value, np.generic) and not isinstance(found := value.item(), np.generic):
+        return found
+    shown = " ".join(f"{value!r:.80}".split())  # in one line
+    raise TypeError(f"{shown} ({type(value).__name__})")

@@ -74,6 +74,7 @@ class Stream(Generic[T]):
         "_taken",
         "bound",
         "dropped",
+        "merge",
         "name",
         "offer",
         "overflow",
@@ -93,6 +94,8 @@ class Stream(Generic[T]):
         self.dropped = 0
         self.offer: Callable[[T], None] = self.offer_soon if soon else self._offer_now
         self._buffer: deque[T] = deque()
+        self.merge: Callable[[T, T], T] | None = None
+        """Given what is dropped and what follows it, returns what is kept in place of both."""
         self.waiter: Waiter | None = None  # set by whoever a reader yielded this stream to
         self._taken = 0
         self._seen: T | None = None
@@ -203,8 +206,13 @@ class Stream(Generic[T]):
                     f"{self.name}: expected room for one more event, "
                     f"found {self.bound} unread: {hint}"
                 )
-            if buffer.popleft() is not self._seen:
+            oldest = buffer.popleft()
+            if oldest is not self._seen:
                 self.dropped += 1
+            buffer.append(event)
+            if self.merge is not None:
+                buffer[0] = self.merge(oldest, buffer[0])
+            return
         buffer.append(event)
         if len(buffer) > self.peak:
             self.peak = len(buffer)

@@ -119,7 +119,7 @@ def test_a_pose_is_made_exactly_if_it_is_one(position: Vector3, orientation: Qua
     for each in (orientation, scaled):
         right = abs(sum(n * n for n in each) ** 0.5 - 1.0) <= 1e-3
         try:
-            made = PoseEstimate(stamp=0, source="a", position=position, orientation=each)  # type: ignore[arg-type]
+            made = PoseEstimate(stamp=0, source="a", position=position, orientation=each)
         except ValueError:
             assert not right
         else:
@@ -132,6 +132,6 @@ def test_a_range_without_an_end_and_numbers_of_numpy_are_right() -> None:
     assert found.range == inf
     position = tuple(np.array([1.0, 2.0, 3.0]))
     turn = tuple(np.array([1.0, 0.0, 0.0, 0.0], np.float32))
-    assert PoseStamped(stamp=0, source="a", position=position, orientation=turn).position[1] == 2.0  # type: ignore[arg-type]
+    assert PoseStamped(stamp=0, source="a", position=position, orientation=turn).position[1] == 2.0
     huge = (1e308, 1e308, 1e308)  # whose norm is not finite, but they are
     PoseStamped(stamp=0, source="a", position=huge, orientation=(1.0, 0.0, 0.0, 0.0))

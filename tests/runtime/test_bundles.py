@@ -5,13 +5,14 @@ from __future__ import annotations
 import random
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from events import Event
 from runtime import Bundle, Input, Node, Output
-from runtime.bundles import HISTORY, Matcher
+from runtime.bundles import HISTORY, WAITING_BYTES, Matcher
 from runtime.errors import AmbiguousSourceError, ConfigError, DeclarationError, NodeError
 from runtime.testing import NodeResult, run_nodes, spec
 
@@ -241,3 +242,94 @@ def test_the_file_cannot_name_a_field_that_there_is_not() -> None:
     table = {"nodes": [{"name": "n", "type": f"{__name__}:Reader", "inputs": {"sets.z": "x"}}]}
     with pytest.raises(ConfigError, match=r"sets\.z.*did you mean"):
         parse(table, "c.toml")
+
+
+class Four(NamedTuple):
+    a: A
+    b: B
+    c: tuple[C, ...]
+
+
+class NewestRich(Newest):
+    """Skips sets, and must have what they had gathered."""
+
+    sets = Bundle(Four, keep="latest")  # type: ignore[assignment]
+
+
+class Strict(Reader):
+    """Takes all sets."""
+
+    sets = Bundle(Four)  # type: ignore[assignment]
+
+
+def gathered(result: NodeResult) -> list[tuple[int, ...]]:
+    return [tuple(c // MS for c in cs) for _, _, cs in found(result)]
+
+
+def test_a_set_that_does_not_come_about_leaves_its_tuples_to_the_next() -> None:
+    result = read(Strict, at(A, 10, 20, 30), at(B, 10, 30), at(C, *range(2, 32, 4)))
+    assert gathered(result) == [(2, 6, 10), (14, 18, 22, 26, 30)]
+    assert result.drops["n.sets"].missed == {"b": 1}
+
+
+def test_a_set_that_is_skipped_leaves_its_tuples_to_the_next() -> None:
+    result = read(NewestRich, at(A, 10, 20, 30), at(B, 10, 20, 30), at(C, *range(2, 32, 4)))
+    assert gathered(result) == [tuple(range(2, 32, 4))]
+    assert result.drops["n.sets"].dropped == 2
+
+
+@given(
+    st.sets(st.integers(1, 40)), st.sets(st.integers(1, 40)), st.sets(st.integers(1, 40)), st.data()
+)
+def test_each_event_of_a_tuple_is_read_once_whatever_is_lost_or_skipped(
+    a: set[int], b: set[int], c: set[int], data: st.DataObject
+) -> None:
+    matcher: Matcher[Four] = Bundle(Four, bound=2, overflow="drop_oldest").make("n")
+    stamps_of = {"a": a, "b": b, "c": c}
+    events = sorted((stamp, kind) for kind, each in stamps_of.items() for stamp in each)
+    kinds: dict[str, type[Event]] = {"a": A, "b": B, "c": C}
+    got: list[Four] = []
+    for stamp, kind in events:
+        matcher.slots[kind].take(kinds[kind](stamp=stamp, source="x"))
+        if matcher.statistics().buffered and data.draw(st.booleans()):
+            got.append(matcher.receive_nowait())
+    while matcher.statistics().buffered:
+        got.append(matcher.receive_nowait())
+    read_ = [each.stamp for every in got for each in every.c]
+    last = max((each.a.stamp for each in got), default=0)
+    assert read_ == sorted(stamp for stamp in c if stamp <= last)
+
+
+class Heavy(Event):
+    """Holds an array."""
+
+    data: Any
+
+
+class Pair(NamedTuple):
+    heavy: Heavy
+    b: B
+    also: Heavy | None
+
+
+def test_what_waits_is_bounded_in_bytes() -> None:
+    """The first field gives up its oldest, which is counted; so does any other."""
+    matcher: Matcher[Pair] = Bundle(Pair).make("n")
+    array = np.broadcast_to(np.uint8(0), (1 << 20, 10))  # of no memory: 10 MiB
+    for index in range(30):
+        for field in ("heavy", "also"):
+            matcher.slots[field].take(Heavy(stamp=index, source="x", data=array))
+    most = WAITING_BYTES // array.nbytes + 1
+    assert 1 <= len(matcher.slots["heavy"].events) <= most
+    assert 1 <= len(matcher.slots["also"].events) <= most
+    assert matcher.missed["b"] == 30 - len(matcher.slots["heavy"].events)
+    matcher.slots["b"].take(B(stamp=29, source="x"))
+    assert matcher.receive_nowait().heavy.stamp == 29
+
+
+def test_an_event_larger_than_all_that_may_wait_finds_its_partners() -> None:
+    matcher: Matcher[Pair] = Bundle(Pair).make("n")
+    array = np.broadcast_to(np.uint8(0), (WAITING_BYTES, 2))
+    matcher.slots["heavy"].take(Heavy(stamp=1, source="x", data=array))
+    matcher.slots["b"].take(B(stamp=1, source="x"))
+    assert matcher.receive_nowait().heavy.stamp == 1

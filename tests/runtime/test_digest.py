@@ -5,16 +5,24 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from events import Event
+from runtime import Duration, Node, Output
+from runtime.config import Config, RunConfig
 from runtime.digest import Digest
+from runtime.errors import ChannelTypeError, NodeError
+from runtime.execute import execute
+from runtime.testing import spec
 from tests.runtime.said import Said, Shouted, said
 
 DTYPES = ["uint8", "int32", ">i4", "float32", "float64", "bool"]
@@ -149,3 +157,40 @@ def test_an_event_has_its_place() -> None:
 
 def test_the_digest_has_32_hexadecimal_digits() -> None:
     assert len(bytes.fromhex(digest())) == 16
+
+
+class Opaque:
+    """An object of which nobody knows what is in it."""
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        Opaque(),
+        [1, Opaque()],
+        {"a": Opaque()},
+        np.array([Opaque()], object),
+        Fraction(1, 2),
+        1 << 80,
+        np.longdouble(1),
+    ],
+    ids=["object", "list", "mapping", "array", "fraction", "integer", "longdouble"],
+)
+def test_what_is_no_data_has_no_digest(extra: Any) -> None:
+    taken = Digest()
+    with pytest.raises(ChannelTypeError, match=r"expected Measured to hold data.*digest = false"):
+        taken(None, measured(np.zeros(1), extra))
+
+
+def test_a_node_that_sends_what_is_no_data_is_told_so(tmp_path: Path) -> None:
+    class Vague(Node):
+        out_ = Output(Measured)
+
+        async def run(self) -> None:
+            self.out_.send(measured(np.zeros(1), Opaque()))
+
+    node = spec(Vague, "vague")
+    with pytest.raises(NodeError, match=r"^vague: vague\.out_: expected Measured to hold data"):
+        execute(Config(run=RunConfig(duration=Duration(1)), nodes=(node,)), tmp_path)
+    free = Config(run=RunConfig(duration=Duration(1), digest=False), nodes=(node,))
+    assert execute(free, tmp_path).digest is None

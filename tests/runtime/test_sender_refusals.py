@@ -72,9 +72,7 @@ def test_an_event_of_another_type_is_refused_whenever_it_comes(
 
 def test_the_error_is_a_type_error_that_names_what_was_found() -> None:
     sender = connected("handler", Said, [])
-    with pytest.raises(
-        TypeError, match=r"n\.out: expected events of type Said, found Sung\(.*Sung"
-    ):
+    with pytest.raises(TypeError, match=r"n\.out: expected .* Said, found Sung\(.*\(Sung\)$"):
         sender.send(Sung(stamp=0, source="drone"))
 
 
@@ -159,9 +157,7 @@ class Hearing(Node):
 
 
 def test_what_an_offloaded_function_sends_runs_nobody_elses_code_in_its_thread() -> None:
-    with pytest.raises(
-        NodeError, match=r"^careless: careless\.loud: expected send\(\) in the loop"
-    ):
+    with pytest.raises(NodeError, match=r"^careless: careless\.loud: expected send"):
         run_nodes([spec(Careless, "careless"), spec(Hearing, "hearing")])
 
 
