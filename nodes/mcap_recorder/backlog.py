@@ -118,11 +118,14 @@ class Backlog:
         if not self._room.is_set() and self.bytes <= self.limit // 2:
             self._room.set()
 
-    def wait_for_room(self) -> None:
-        """Return when half of the room is free, or when `release` is called."""
+    def wait_for_room(self, patience: float | None = None) -> bool:
+        """Wait until half of the room is free, or `release` is called; tell whether that came.
+
+        Args:
+            patience: Real seconds to wait at most.
+        """
         self._room.clear()
-        if self.bytes > self.limit // 2:
-            self._room.wait()
+        return self.bytes <= self.limit // 2 or self._room.wait(patience)
 
     def release(self) -> None:
         """Let go of whoever waits: nothing will be written any more."""

@@ -11,13 +11,16 @@ from events import Announcement, Event
 from nodes.mcap_recorder.backlog import Backlog
 from nodes.mcap_recorder.disk import RecordingError
 from nodes.mcap_recorder.order import Order
-from nodes.mcap_recorder.recording import Recording, spare_cores
+from nodes.mcap_recorder.recording import STANDSTILL, Recording, spare_cores
 from nodes.mcap_recorder.settings import McapRecorderConfig
 from nodes.trajectory.growing import part_name
 from runtime import Input, Node
 
 _WAITING = 1 << 16
 """Events that may come while simulated time waits: more than are ever said at one moment."""
+
+_LOOK = 0.5
+"""Real seconds between two looks at a process that simulated time waits for."""
 
 _PATIENCE = 8.0
 """Real seconds that the run's end may take; `run.shutdown_limit` is 10 unless changed."""
@@ -179,7 +182,11 @@ class McapRecorder(Node[McapRecorderConfig]):
         self.log.fatal("%s", error)
 
     async def _wait(self) -> None:
-        """Have simulated time wait until there is room."""
+        """Have simulated time wait until there is room.
+
+        Raises:
+            FatalError: The process that writes stands still.
+        """
         if not self._waits:
             self.log.info(
                 "the disk is slower than the run: simulated time waits, now and again, with "
@@ -187,7 +194,11 @@ class McapRecorder(Node[McapRecorderConfig]):
                 self._backlog.bytes / 1e6,
             )
         began = time.monotonic()
-        await self.offload(self._backlog.wait_for_room)
+        assert self._recording is not None
+        self._recording.still_for()  # from now on
+        while not await self.offload(self._backlog.wait_for_room, _LOOK):
+            if self._recording.still_for() >= STANDSTILL:
+                self.log.fatal("%s", self._recording.standstill())
         self._waits += 1
         self._waited += time.monotonic() - began
 

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import math
 import os
+import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import msgspec
 from typing_extensions import Buffer
@@ -33,6 +36,13 @@ _AT_ONCE = 1 << 16
 
 _IN_A_ROW = 16
 """Events between two chances for the loop to run, which needs Python's lock too."""
+
+STANDSTILL = 10.0
+"""Real seconds without any sign of life after which the process is given up: it may be stopped or
+frozen, and then it would be waited for without end. A slow disk shows in the file's size."""
+
+_LOOK = 0.5
+"""Real seconds between two looks at it."""
 
 _PIPE = 1 << 20
 """Bytes that the pipe holds: Linux allows no more without privileges."""
@@ -67,6 +77,8 @@ class Recording:
         self.unwritten = 0
         """Events that are not in the file."""
         self._handed = 0
+        self._seen: tuple[object, ...] = ()
+        self._seen_at = time.monotonic()
         self._cores = order.cores
         self._failed = failed
         self._complain = complain
@@ -104,6 +116,9 @@ class Recording:
     def close(self, end: int, patience: float | None = None) -> bool:
         """Have what still waits written, and tell whether the file is closed. Not on a loop.
 
+        A process that somebody stopped is told to go on, and one that shows no sign of life for
+        `STANDSTILL` seconds is ended; `error` then says so.
+
         Args:
             end: Time of the run's clock (ns) at which it ends.
             patience: Real seconds to wait at most, after which it may be called again; if `None`,
@@ -111,15 +126,48 @@ class Recording:
         """
         self._end = end
         self._closing.set()
-        until = None if patience is None else time.monotonic() + patience
+        with contextlib.suppress(OSError):
+            self._child.send_signal(signal.SIGCONT)
+        until = math.inf if patience is None else time.monotonic() + patience
         for thread in (self._feeder, self._listener):
-            thread.join(None if until is None else max(until - time.monotonic(), 0.0))
-            if thread.is_alive():
-                return False
-        self._child.wait()
+            while thread.is_alive():
+                if (rest := until - time.monotonic()) <= 0.0:
+                    return False
+                thread.join(min(rest, _LOOK))
+                self._end_if_still()
+        try:
+            self._child.wait(STANDSTILL)
+        except subprocess.TimeoutExpired:  # it has said all there is to say
+            self._child.kill()
+            self._child.wait()
         if self.result.what in {"done", "error"}:  # one that was killed did not count
             self.unwritten += self._handed - self.result.written
         return True
+
+    def still_for(self) -> float:
+        """Return the real seconds for which the process has shown no sign of life."""
+        try:
+            size = Path(self.path).stat().st_size
+            fields = Path(f"/proc/{self._child.pid}/stat").read_text().rpartition(")")[2].split()
+            seen = self._handed, size, fields[11], fields[12]  # with the time of its threads
+        except (OSError, IndexError):  # gone, or another system
+            seen = self._handed, self._child.poll()  # type: ignore[assignment]
+        now = time.monotonic()
+        if seen != self._seen:
+            self._seen, self._seen_at = seen, now
+        return now - self._seen_at
+
+    def standstill(self) -> RecordingError:
+        """Return the error that says who stands still."""
+        return RecordingError(
+            f"{self.path}: the process that writes it ({self._child.pid}) has taken nothing for "
+            f"{STANDSTILL:g} s; what it had taken is kept"
+        )
+
+    def _end_if_still(self) -> None:
+        if self.still_for() >= STANDSTILL and self._child.poll() is None:
+            self.error = self.standstill()
+            self._child.kill()
 
     # The thread that feeds.
 
@@ -203,7 +251,7 @@ class Recording:
         self._answers.close()
         self.result = answer
         if answer.what != "done":
-            self.error = RecordingError(answer.text)
+            self.error = self.error or RecordingError(answer.text)
             self._failed(self.error)
 
     def _answer(self) -> Answer:

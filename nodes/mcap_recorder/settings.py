@@ -30,7 +30,8 @@ class McapRecorderConfig(NodeConfig):
         memory: Bytes of events that may wait to be written.
         when_full: What happens if more would wait. ``wait``: simulated time waits for the disk;
             real time cannot, and does as ``drop_images``: pictures and clouds are left out until
-            there is room. ``drop_oldest``: what has waited longest is left out. What is left out
+            there is room. A process that shows no sign of life for 10 s while it is waited for
+            ends the run. ``drop_oldest``: what has waited longest is left out. What is left out
             is counted among the run's drops, and logged. What the disk has not taken when the run
             ends is written afterwards, before the command returns.
         fsync: Wait for the disk at the end of each chunk. Without it, what is written survives

@@ -212,3 +212,56 @@ def test_a_run_that_is_killed_leaves_a_whole_file(tmp_path: Path) -> None:
     assert contents(path).complete
     assert len([r for r in read(path) if "kind" in r.metadata]) == len(said(5))
     recording.close(5)
+
+
+@pytest.mark.slow
+def test_a_recorder_that_is_stopped_ends_the_run_and_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run names it instead of waiting without end; then it is told to go on."""
+    monkeypatch.setattr("nodes.mcap_recorder.node.STANDSTILL", 1.0)
+    start = Recording.start
+
+    def stopped(recording: Recording) -> None:
+        start(recording)
+        os.kill(recording._child.pid, signal.SIGSTOP)
+
+    monkeypatch.setattr(Recording, "start", stopped)
+    events: list[Event] = [big(20_000_000 * k) for k in range(1, 30)]
+    begin = time.monotonic()
+    with pytest.raises(NodeError, match=r"recorder: .*recording\.mcap: the process that writes it"):
+        record([*announcements(), *events], tmp_path, memory=1 << 19)
+    assert time.monotonic() - begin < 30.0
+    path = tmp_path / "recording.mcap"
+    assert contents(path).complete
+    found = [e.event.stamp for e in Recorded(path).events(0, None, lambda _, __: True)]
+    assert found[:3] == [20_000_000, 40_000_000, 60_000_000]
+
+
+def test_a_process_that_cannot_be_woken_is_ended_and_what_it_had_written_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as one in a frozen group: closing takes no longer than the limit."""
+    monkeypatch.setattr("nodes.mcap_recorder.recording.STANDSTILL", 0.3)
+    path, failures = tmp_path / "a.mcap", list[RecordingError]()
+    config = McapRecorderConfig(chunk_size=1 << 16)
+    order = Order(path=str(path), config=config, attachment="", niceness=0, cores=())
+    recording = Recording(order, Backlog(1 << 30, "wait"), failures.append, lambda _: None)
+    recording.start()
+    recording.backlog.put(1, big(1))
+    while path.stat().st_size < 200_000:
+        time.sleep(0.01)  # for another process
+    os.kill(recording._child.pid, signal.SIGSTOP)
+    send = recording._child.send_signal
+    deaf = {signal.SIGCONT}
+    monkeypatch.setattr(recording._child, "send_signal", lambda s: s in deaf or send(s))
+    for stamp in range(2, 20):
+        recording.backlog.put(stamp, big(stamp))
+    assert not recording.close(20, 0.05)
+    assert recording.close(20)
+    (error,) = failures
+    assert error is recording.error
+    assert str(recording._child.pid) in str(error)
+    assert "has taken nothing for 0.3 s; what it had taken is kept" in str(error)
+    trouble: list[str] = []
+    assert {each.time for each in read(path, damaged=trouble.append)} == {1}
