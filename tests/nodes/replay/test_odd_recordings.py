@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -152,3 +154,29 @@ def test_a_recording_that_was_mended_does_not_know_when_it_ended(tmp_path: Path)
     assert recover_file(path).mended
     assert contents(path).complete
     assert Recorded(path).end() is None
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+@given(data=st.data())
+@settings(max_examples=25, deadline=None)
+def test_a_bag_with_wrong_bytes_is_read_or_an_error_of_one_line(
+    plugin: StoragePlugin, data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Whatever rosbags and the libraries below it make of them."""
+    folder = tmp_path_factory.getbasetemp() / f"wrong_{plugin.name}"
+    if not folder.exists():
+        folder.mkdir()
+        sets.bag(folder, plugin)
+    files = [each for each in folder.rglob("*") if each.is_file() and "wrong" not in each.name]
+    whole = next(file for file in files if file.suffix in {".db3", ".mcap"})
+    content = bytearray(whole.read_bytes())
+    for place in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=1, max_size=8)):
+        content[place] = data.draw(st.integers(0, 255))
+    path = folder / f"wrong{whole.suffix}"
+    path.write_bytes(content)
+    wrong = ""
+    try:
+        stamps(path)
+    except ReplayError as error:
+        wrong = str(error)
+    assert "\n" not in wrong

@@ -181,3 +181,37 @@ def test_a_long_line_is_shown_in_part(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="…") as error:
         read_tum(tmp_path / "t")
     assert len(str(error.value)) < 250
+
+
+@pytest.mark.parametrize(
+    ("write", "read"), [(write_tum, read_tum), (write_euroc, read_euroc), (write_kitti, read_kitti)]
+)
+@given(trajectory=trajectories(), data=st.data())
+@settings(max_examples=60, deadline=None)
+def test_damaged_files_are_errors_of_one_line(
+    write: Callable[[Path, Trajectory], None],
+    read: Callable[[Path], Any],
+    trajectory: Trajectory,
+    data: st.DataObject,
+) -> None:
+    """Cut anywhere, with any bytes changed."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "file"
+        write(path, trajectory)
+        content = bytearray(path.read_bytes())
+        del content[data.draw(st.integers(0, len(content))) :]
+        for place in data.draw(st.lists(st.integers(0, max(len(content) - 1, 0)), max_size=4)):
+            content[place : place + 1] = bytes([data.draw(st.integers(0, 255))])
+        path.write_bytes(content)
+        wrong = ""
+        try:
+            read(path)
+        except ValueError as error:
+            wrong = str(error)
+            assert_names(wrong, path)
+
+
+def assert_names(message: str, path: Path) -> None:
+    """Check that a message is of one line and begins with the file."""
+    assert message.startswith(str(path))
+    assert "\n" not in message
