@@ -21,6 +21,7 @@ from events import (
 )
 from nodes.estimation import WORKER_ENVIRONMENT, pose_matrix
 from nodes.mapping.mapper import Mapper
+from nodes.trajectory.growing import part_name
 from nodes.transforms import TransformError, TransformTree
 from runtime import Bundle, Duration, Node, NodeConfig, Output, on
 
@@ -198,6 +199,6 @@ class Mapping(Node[MappingConfig]):
             self.log.warning("no frame came: there is no cloud")
             return
         if self.out is not None:
-            path = self.out / (self.config.file or f"clouds/{self.name}.ply")
+            path = self.out / part_name(self, self.config.file or f"clouds/{self.name}.ply")
             await self._mapper.call_for(0.0, Mapper.write, path, self._frame_id)
         self.log.info("%d points from %d frames", await self._send(), self._used)

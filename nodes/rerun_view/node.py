@@ -26,6 +26,7 @@ from nodes.rerun_view.pictures import Thinning
 from nodes.rerun_view.recorder import Recorder
 from nodes.rerun_view.recording import Numbered
 from nodes.rerun_view.settings import RerunConfig
+from nodes.trajectory.growing import part_name
 from runtime import Node, Stream, on
 
 _PICTURES, _ROWS = 256, 16384
@@ -68,7 +69,7 @@ class RerunView(Node[RerunConfig]):
             if self.out is None:
                 self.log.warning("the run writes no files, so there is nothing to view")
                 return
-            file = self.out / config.file
+            file = self.out / part_name(self, config.file)
             self.out.mkdir(parents=True, exist_ok=True)
         name = self.name if self.out is None else self.out.name
         self._recorder = await self.worker(Recorder, config, name, file)
@@ -146,7 +147,7 @@ class RerunView(Node[RerunConfig]):
         if dropped:
             self.log.warning("%d of %d events dropped: the view was too slow", dropped, self._heard)
         if self.config.mode == "save" and self.out is not None:
-            self.log.info("%s: rerun opens it", self.out / self.config.file)
+            self.log.info("%s: rerun opens it", self.out / part_name(self, self.config.file))
 
     async def _begin(self) -> None:
         if not self._begun:

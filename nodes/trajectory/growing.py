@@ -22,8 +22,9 @@ def part_name(node: Node[Any], name: str) -> str:
 
     ``flight.png`` is followed by ``flight-2.png``, ``dataset`` by ``dataset-2``.
     """
-    stem, dot, suffix = name.partition(".")
-    return f"{stem}-{node.restarts + 1}{dot}{suffix}" if node.restarts else name
+    path = Path(name)
+    number = f"-{node.restarts + 1}" if node.restarts else ""
+    return str(path.with_name(f"{path.stem}{number}{path.suffix}"))
 
 
 class GrowingFile:
