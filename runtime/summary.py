@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from runtime.costs import Costs
 from runtime.digest import Digest, combined
 from runtime.node import matchers, senders, streams
 from runtime.plain import plain
@@ -50,6 +51,69 @@ class LinkSummary(msgspec.Struct, frozen=True):
 
     lost: int
     thinned: int
+
+
+class WorkerSummary(msgspec.Struct, frozen=True):
+    """What the calls of a worker cost this machine.
+
+    Attributes:
+        latency_ms: That the file declares, on the run's clock; `None` if it differs by call.
+        calls: That were answered.
+        wall_p50_ms: Real time of a call in the worker's process: median.
+        wall_p95_ms: 95th percentile.
+        wall_max_ms: Longest.
+        cpu_p50_ms: Processor time of all threads of that process from one call's end to the
+            next one's: median.
+        cpu_p95_ms: 95th percentile.
+        cpu_max_ms: Most.
+        peak_rss_mb: Most memory that one of the processes has had; `None` if unknown.
+        processes: How many there were at once.
+    """
+
+    latency_ms: float | None
+    calls: int
+    wall_p50_ms: float
+    wall_p95_ms: float
+    wall_max_ms: float
+    cpu_p50_ms: float
+    cpu_p95_ms: float
+    cpu_max_ms: float
+    peak_rss_mb: float | None
+    processes: int
+
+    @classmethod
+    def of(cls, costs: Costs) -> WorkerSummary:
+        """Sum up what there is."""
+        return cls(
+            latency_ms=None if costs.latency is None else round(costs.latency * 1e3, 6),
+            calls=costs.calls,
+            wall_p50_ms=costs.wall.quantile(0.5) / 1e6,
+            wall_p95_ms=costs.wall.quantile(0.95) / 1e6,
+            wall_max_ms=costs.wall.maximum / 1e6,
+            cpu_p50_ms=costs.cpu.quantile(0.5) / 1e6,
+            cpu_p95_ms=costs.cpu.quantile(0.95) / 1e6,
+            cpu_max_ms=costs.cpu.maximum / 1e6,
+            peak_rss_mb=costs.peak / 1e6 or None,
+            processes=costs.processes,
+        )
+
+    def row(self) -> list[str]:
+        """Return it as a table shows it, under `WORKER_COLUMNS`."""
+        wall = (self.wall_p50_ms, self.wall_p95_ms, self.wall_max_ms)
+        cpu = (self.cpu_p50_ms, self.cpu_p95_ms, self.cpu_max_ms)
+        return [
+            "varies" if self.latency_ms is None else f"{self.latency_ms:g}",
+            f"{self.calls}",
+            *(f"{each:.3g}" if each < 100 else f"{each:.0f}" for each in wall + cpu),
+            "" if self.peak_rss_mb is None else f"{self.peak_rss_mb:.0f}",
+            f"{self.processes}",
+        ]
+
+
+WORKER_COLUMNS = (
+    *("latency ms", "calls", "real p50 ms", "p95 ms", "max ms"),
+    *("CPU p50 ms", "p95 ms", "max ms", "peak MB", "processes"),
+)
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -113,6 +177,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         announcements: What nodes said they provide.
         environment: Machine and versions.
         processes: Where which nodes ran, if not all in one process.
+        workers: What workers cost, by ``node.Factory``.
     """
 
     name: str
@@ -137,6 +202,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     announcements: list[dict[str, Any]]
     environment: dict[str, str]
     processes: list[ProcessSummary] = []
+    workers: dict[str, WorkerSummary] = {}
 
 
 def count_events(supervisor: Supervisor) -> tuple[Counter[str], Counter[str]]:
@@ -222,6 +288,7 @@ def summarise(
             {"type": type(a).__name__, **plain(a, a.source)} for a in supervisor.announcements
         ],
         environment=environment(),
+        workers={name: WorkerSummary.of(each) for name, each in supervisor.costs.items()},
     )
 
 
@@ -264,7 +331,7 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
         stalls=dict(stalls),
         longest_stalls=of_all("longest_stalls"),
         processes=processes,
-        **{f: of_all(f) for f in ("outputs", "drops", "streams", "links", "ticks")},
+        **{f: of_all(f) for f in ("outputs", "drops", "streams", "links", "ticks", "workers")},
     )
 
 

@@ -10,7 +10,7 @@ import msgspec
 from nodes.evaluation.coverage import Interval
 from nodes.evaluation.judging import Errors
 from nodes.trajectory import Trajectory
-from runtime.summary import LinkSummary, StreamSummary, TickSummary
+from runtime.summary import LinkSummary, StreamSummary, TickSummary, WorkerSummary
 
 
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
@@ -30,6 +30,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     streams: dict[str, StreamSummary] = {}
     links: dict[str, LinkSummary] = {}
     ticks: dict[str, TickSummary] = {}
+    workers: dict[str, WorkerSummary] = {}
     stalls: dict[str, int] = {}
     announcements: list[dict[str, Any]] = []
     environment: dict[str, str] = {}

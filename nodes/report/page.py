@@ -18,6 +18,7 @@ from nodes.report.folder import read_run
 from nodes.report.frames import draw_frames, read_picture
 from nodes.report.paths import draw_paths
 from nodes.report.style import Picture, drawing
+from runtime.summary import WORKER_COLUMNS
 
 PAGE = "report.html"
 PLOTS = "plots"
@@ -87,6 +88,8 @@ def render(run: Run, curves: list[Picture], frames: list[Picture], clouds: list[
         others=tables.figures(run, main=False),
         facts=tables.facts(run),
         ticks=tables.ticks(run),
+        workers=tables.workers(run),
+        worker_columns=("worker", *WORKER_COLUMNS),
         outputs=tables.outputs(run),
         curves=[_embedded(p) for p in curves],
         frames=[_embedded(p) for p in frames],

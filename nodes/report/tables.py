@@ -168,6 +168,11 @@ def ticks(run: Run) -> list[list[str]]:
     ]
 
 
+def workers(run: Run) -> list[list[str]]:
+    """Return what estimators (and all else in processes of its own) cost."""
+    return [[name, *worker.row()] for name, worker in sorted(run.facts.workers.items())]
+
+
 def outputs(run: Run) -> list[list[str]]:
     """Return what was sent."""
     seconds = max(run.facts.sim_seconds or 0.0, 1e-9)

@@ -48,7 +48,8 @@ def sweep(
     """Run a file with every combination of some settings, and compare how well it went.
 
     Each run is a process of its own; one that fails is a row of the table. Results go to
-    sweeps/<name>: table.csv, summary.csv, timing.csv, plots/, and each run's folder in runs/.
+    sweeps/<name>: table.csv, summary.csv, plots/, each run's folder in runs/, and, since they
+    depend on the machine, timing.csv and what workers cost in costs.csv.
     Called again, only what is missing or has failed is run. Ends with 0 if every run came to its
     end, whether or not it met its thresholds; with 2 if one failed; with 130 after Ctrl-C.
     """

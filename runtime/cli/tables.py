@@ -7,11 +7,11 @@ from typing import Any
 
 from rich.table import Table
 
-from runtime.summary import Summary, Verdict
+from runtime.summary import WORKER_COLUMNS, Summary, Verdict
 
 
 def run_tables(summary: Summary) -> Iterator[Table]:
-    """Return what was sent, what was dropped, how late ticks were, and where the loop stood."""
+    """Return what was sent and dropped, how late ticks were, what workers cost, and more."""
     seconds = max(summary.sim_seconds, 1e-9)
     sent = Table("output", "events", "per second", title="sent")
     for output, count in sorted(summary.outputs.items()):
@@ -37,6 +37,11 @@ def run_tables(summary: Summary) -> Iterator[Table]:
         )
     if ticks.row_count:
         yield _numbers(ticks)
+    workers = Table("worker", *WORKER_COLUMNS, title="what calls of workers cost")
+    for name, worker in sorted(summary.workers.items()):
+        workers.add_row(name, *worker.row())
+    if workers.row_count:
+        yield _numbers(workers)
     stalls = Table("node", "times", "longest ms", "where", title="the loop stood still")
     for node, count in sorted(summary.stalls.items()):
         worst = summary.longest_stalls[node]

@@ -44,6 +44,7 @@ class Ended(msgspec.Struct, frozen=True):
     digest: str | None = None
     not_deterministic: list[str] = []
     verdict: Verdict | None = None
+    workers: dict[str, dict[str, float | None]] = {}
 
 
 def run_job(job: Job) -> Row:
@@ -145,6 +146,7 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
         row["error"] = unread
     if ended is not None:
         row["sim_seconds"], row["run_seconds"] = ended.sim_seconds, ended.wall_seconds
+        row["workers"] = ended.workers
         row["digest"] = None if ended.not_deterministic else ended.digest
         if ended.reason in _STOPPED:
             row["error"] = f"interrupted by {ended.reason}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 from pathlib import Path
-from typing import IO, Any, TypedDict
+from typing import IO, Any, NotRequired, TypedDict
 
 import msgspec
 
@@ -28,6 +28,7 @@ class Row(TypedDict):
         run_seconds: Real seconds from the first update to the end.
         wall_seconds: Real seconds of the whole process.
         estimators: Name to figures, as the run's verdict has them.
+        workers: Name to what its calls cost, as the run's summary has it.
     """
 
     id: str
@@ -41,6 +42,7 @@ class Row(TypedDict):
     run_seconds: float | None
     wall_seconds: float | None
     estimators: dict[str, dict[str, Any]]
+    workers: NotRequired[dict[str, dict[str, float | None]]]
 
 
 def failed(job: Job, error: str) -> Row:

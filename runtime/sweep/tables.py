@@ -1,7 +1,7 @@
-"""Rows as tables: ``table.csv``, ``timing.csv`` and ``summary.csv``.
+"""Rows as tables: ``table.csv``, ``summary.csv``, ``timing.csv`` and ``costs.csv``.
 
 ``table.csv`` and ``summary.csv`` hold nothing that differs between two equal sweeps in lockstep;
-whatever depends on the machine's speed is in ``timing.csv``.
+whatever depends on the machine is in ``timing.csv`` (runs) and ``costs.csv`` (their workers).
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
-    """Write the three tables into the plan's folder; rows of other plans are left out."""
+    """Write the four tables into the plan's folder; rows of other plans are left out."""
     paths = [p.path for p in plan.parameters]
     own = in_order(plan, rows)
     _write(plan.out / "table.csv", *_table(paths, own))
@@ -71,6 +71,15 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
         for job, row in own
     ]
     _write(plan.out / "timing.csv", header, times)
+    workers = [
+        (_head(job), name, costs)
+        for job, row in own
+        for name, costs in row.get("workers", {}).items()
+    ]
+    keys = list(dict.fromkeys(key for _, _, costs in workers for key in costs))
+    header = ["run", *paths, "seed", "worker", *keys]
+    costs_of_all = [[*h, name, *(costs.get(k) for k in keys)] for h, name, costs in workers]
+    _write(plan.out / "costs.csv", header, costs_of_all)
     header = [*paths, "estimator", "runs", "failed", "passed"]
     header += [f"{name}_{what}" for name in MAIN_FIGURES for what in ("median", "min", "max")]
     lines = []

@@ -55,6 +55,9 @@ class Plant:
     def cores(self) -> set[int]:
         return os.sched_getaffinity(0)
 
+    def count(self, *args: Any) -> int:
+        return len(args)
+
     def pid(self) -> int:
         return os.getpid()
 
@@ -85,6 +88,15 @@ class Plant:
 
     def say(self, text: str) -> None:
         print(text, flush=True)
+
+    def fill(self, size: int) -> int:
+        """Have so many bytes for a moment."""
+        return len(b"x" * size)
+
+    @classmethod
+    def again(cls) -> Plant:
+        """Make a plant, under another name."""
+        return cls()
 
     def burn(self, seconds: float) -> None:
         """Take processor time."""

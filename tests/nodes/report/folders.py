@@ -134,6 +134,20 @@ def summary(out: Path, verdict: dict[str, Any] | None = None, **changes: Any) ->
                 "missed": 1,
             }
         },
+        "workers": {
+            "vo.make_tracker": {
+                "latency_ms": 80.0,
+                "calls": 600,
+                "peak_rss_mb": 123.4,
+                "processes": 1,
+                "wall_p50_ms": 6.1,
+                "wall_p95_ms": 9.7,
+                "wall_max_ms": 131.0,
+                "cpu_p50_ms": 5.9,
+                "cpu_p95_ms": 8.8,
+                "cpu_max_ms": 77.7,
+            }
+        },
         "stalls": {},
         "longest_stalls": {},
         "announcements": [],

@@ -106,6 +106,7 @@ def test_every_section_has_its_title(page: Page) -> None:
         "The flight",
         "The run",
         "Warnings and errors",
+        "What the estimators cost on this machine",
         "Punctuality of the ticks",
         "Machine and versions",
         "Settings (config.toml)",
@@ -122,6 +123,7 @@ def test_the_runs_facts_are_there(page: Page) -> None:
         "5 without depth",
         "11 lost, 4 left out",
         "431",
+        "vo.make_tracker 80 600 6.1 9.7 131 5.9 8.8 77.7 123 1",
         "numpy",
         'name = "sample"',
     ):
