@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import socket
 import threading
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -185,3 +186,58 @@ class Process(threading.Thread):
 def apart(config: Config, *onlys: str) -> list[Summary]:
     """Run each group of nodes in a process of its own; return what each says in the end."""
     return [process.ended() for process in [Process(config, only) for only in onlys]]
+
+
+class FailerConfig(NodeConfig):
+    """When to fail."""
+
+    when: Literal["on_startup", "announce", "on_announcement", "run"]
+
+
+class Failer(Node[FailerConfig]):
+    """Fails in one of the phases."""
+
+    async def on_startup(self) -> None:
+        self._reach("on_startup")
+
+    def announce(self) -> Iterable[Announcement]:
+        self._reach("announce")
+        return []
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        self._reach("on_announcement")
+
+    async def run(self) -> None:
+        self._reach("run")
+
+    def _reach(self, phase: str) -> None:
+        if self.config.when == phase:
+            raise RefusedError(self.name, f"wrong world in {phase}")
+
+
+class Slowly(Node[Any]):
+    """Takes its time to start and to end; says where it is."""
+
+    async def on_startup(self) -> None:
+        self.log.info("phase start-up")
+        await asyncio.to_thread(time.sleep, 0.5)
+
+    def announce(self) -> Iterable[Announcement]:
+        self.log.info("phase begin")
+        return super().announce()
+
+    async def run(self) -> None:
+        self.log.info("phase run")
+        await super().run()
+
+    async def on_shutdown(self) -> None:
+        self.log.info("phase shut-down")
+        await asyncio.to_thread(time.sleep, 0.5)
+
+
+class Slow(Slowly, Asker):
+    """Asks, slowly."""
+
+
+class SlowAnswerer(Slowly, Answerer):
+    """Answers, slowly."""
