@@ -2,6 +2,8 @@
 
     messages   what processes say to each other
     session    how it gets there: Zenoh, in this module only
+    secret     who may take part: those who know it
+    seal       seals on messages, so that nobody else's are heard
     memory     what large events pass through between processes of one machine
     line       a thread that writes to one process, so that the loop never waits for a network
     meeting    who is there: nodes, equal files, and what is missing

@@ -128,7 +128,11 @@ class Peers:
         )
         self._tell(self._announced)
         others = self._roster.present
-        await self._roster.until(lambda: all(m.announced is not None for m in others()))
+        await self._roster.until(
+            lambda: all(m.announced is not None for m in others()),
+            whom=lambda m: m.announced is None,
+            limit=self._start_up_limit(),
+        )
         everything = dict(said)
         for member in others():
             if member.announced is not None:
@@ -153,12 +157,20 @@ class Peers:
         self._ready = True
         self._tell(Ready())
         if reference is None:
-            await roster.until(lambda: all(m.ready for m in roster.present()))
+            await roster.until(
+                lambda: all(m.ready for m in roster.present()),
+                whom=lambda m: not m.ready,
+                limit=self._start_up_limit(),
+            )
             self._decided = True
             origin = time.monotonic_ns() + LEAD
             self._tell(Begin(origin))
         else:
-            await roster.until(lambda: reference.begin is not None)
+            await roster.until(
+                lambda: reference.begin is not None,
+                whom=lambda m: not m.ready or m is reference,
+                limit=self._start_up_limit(),
+            )
             assert reference.begin is not None
             self._decided = True
             best = reference.exchanges.best()
@@ -169,6 +181,11 @@ class Peers:
             await asyncio.sleep(max(origin - time.monotonic_ns(), 0) / 1e9)
             self._clock.start_at(origin)
             self._follow(reference)
+
+    def _start_up_limit(self) -> float:
+        """Return the real seconds that all nodes of another process may take to start up."""
+        most = max((len(m.nodes) for m in self._roster.present()), default=1)
+        return float(self._config.run.startup_limit) * (most + 1)
 
     def _follow(self, member: Member | None) -> None:
         if member is not None and isinstance(self._clock, RealClock):
@@ -235,6 +252,7 @@ class Peers:
         await self._roster.until(
             lambda: not any(after & {*m.nodes} - self._retired for m in self._roster.present()),
             despite=True,
+            whom=lambda m: bool(after & {*m.nodes} - self._retired),
         )
         self._at_work = bool(node)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import os
 import secrets
 import socket
@@ -56,6 +57,9 @@ GREET_EVERY = 0.2
 
 STRANGERS = 256
 """Processes without a session that are greeted; of more than these, the others are not seen."""
+
+NAMED_EVERY = 5.0
+"""Real seconds after which those who are waited for are named, again and again."""
 
 
 class Told(Protocol):
@@ -211,16 +215,27 @@ class Roster:
 
     # Waiting for what others say.
 
-    async def until(self, condition: Callable[[], bool], *, despite: bool = False) -> None:
+    async def until(
+        self,
+        condition: Callable[[], bool],
+        *,
+        despite: bool = False,
+        whom: Callable[[Member], bool] | None = None,
+        limit: float = math.inf,
+    ) -> None:
         """Wait for something that others bring about.
 
         Args:
             condition: Looked at whenever something has come.
             despite: Go on waiting though something has failed: the run ends anyway.
+            whom: Tells who is waited for; they are named when it takes long.
+            limit: Real seconds after which it takes too long, if `whom` is given.
 
         Raises:
+            PeerError: It takes too long.
             VisnavError: It will not come; see `fail`.
         """
+        begin = time.monotonic()
         while True:
             if self._broken is not None and not despite:
                 raise self._broken
@@ -229,7 +244,18 @@ class Roster:
             future = self._loop.create_future()
             self._waiting.add(future)
             try:
-                await future
+                if whom is None:
+                    await future
+                else:
+                    async with real_time_limit(NAMED_EVERY):
+                        await future
+            except TimeoutError:
+                assert whom is not None
+                absent = [f"{name_of(m.nodes)} ({m.place})" for m in self.present() if whom(m)]
+                if time.monotonic() - begin > limit:
+                    text = f"expected a word within {limit:g} s of {'; '.join(absent)}, found none"
+                    raise PeerError(text) from None
+                log.info("still waiting for %s", "; ".join(absent))
             finally:
                 self._waiting.discard(future)
 
@@ -329,21 +355,21 @@ class Roster:
                     lambda error: failed(member, error),
                 )
                 contact.nonce = secrets.token_bytes(NONCE)
-                # Before anything that is sealed for the session, and so in this thread.
-                self._greet_one(sender, sealing.nonce, sealing.seen, sealing.tag)
+                # Before anything that the loop seals for the session.
+                self._soon(self._greet_one, sender, sealing.nonce, sealing.seen, sealing.tag)
                 if before is not None:
                     self._soon(self._went, before, "their process had lost us")
                 self._soon(self._meet, member)
             elif before is None:
-                self._greet_one(sender, contact.nonce, hello.nonce)
+                self._soon(self._greet_one, sender, contact.nonce, hello.nonce)
             elif hello.session == before.sealing.tag:
                 pass  # all is well, or it is an old one
             elif hello.nonce == before.sealing.seen:  # ours did not get there
                 mine = before.sealing
-                self._greet_one(sender, mine.nonce, mine.seen, mine.tag)
+                self._soon(self._greet_one, sender, mine.nonce, mine.seen, mine.tag)
             elif (now := time.monotonic()) > contact.replied + GREET_EVERY / 2:
                 contact.replied = now
-                self._greet_one(sender, contact.nonce, hello.nonce, before.sealing.tag)
+                self._soon(self._greet_one, sender, contact.nonce, hello.nonce, before.sealing.tag)
 
     def _see(self, other: str, here: bool) -> None:
         with self._lock:
@@ -353,7 +379,7 @@ class Roster:
         if contact is None:
             return
         if here:
-            self._greet_one(other, contact.nonce)
+            self._soon(self._greet_one, other, contact.nonce)
         elif contact.member is not None:
             self._soon(self._went, contact.member)
 
@@ -402,6 +428,8 @@ class Roster:
 
     def _unsent(self, member: Member, error: VisnavError) -> None:
         self._soon(self._told.unsent, member, error)
+
+    # Zenoh calls while it holds locks of its own: what asks it for something is left to the loop.
 
     def _soon(self, call: Callable[..., Any], *args: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed

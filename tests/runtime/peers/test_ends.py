@@ -37,7 +37,7 @@ speed = 1.0
 
 [network]
 meet = "tcp/127.0.0.1:{port}"
-wait = "8s"
+wait = "{wait}"
 
 [[nodes]]
 name = "asker"
@@ -134,7 +134,13 @@ class Trial:
 
     def write(self, clock: str, phase: str, on_error: str) -> None:
         duration = "0.3s" if phase == "shut-down" else "60s"
-        text = FILE.format(clock=clock, duration=duration, on_error=on_error, port=free_port())
+        text = FILE.format(
+            clock=clock,
+            duration=duration,
+            on_error=on_error,
+            port=free_port(),
+            wait="5s" if phase == "waiting" else "40s",
+        )
         (self.folder / "ends.toml").write_text(text, encoding="utf-8")
 
     def start(self, name: str) -> None:
@@ -153,7 +159,7 @@ class Trial:
         return (self.folder / f"{name}.txt").read_text(encoding="utf-8", errors="replace")
 
     def wait_for(self, name: str, text: str) -> None:
-        end = time.monotonic() + 30
+        end = time.monotonic() + 40
         while text not in self.said(name):
             assert time.monotonic() < end, self.said(name)
             assert self.processes[name].poll() is None, self.said(name)
@@ -203,6 +209,7 @@ TRIALS = [
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(120)
 @pytest.mark.parametrize(("how", "phase", "who", "clock"), TRIALS)
 def test_a_signal_to_one_process_ends_all_soon(
     trial: Trial, how: str, phase: str, who: str, clock: str
@@ -223,6 +230,8 @@ def test_a_signal_to_one_process_ends_all_soon(
         process.send_signal(signal.SIGCONT)
     if phase == "waiting":
         trial.start(other)
+        trial.wait_for(other, SIGNS[phase])
+        begin = time.monotonic()
     code, others = trial.ended(who, begin), trial.ended(other, begin)
     trial.check(other, others)
     if how in {"KILL", "INT twice"}:

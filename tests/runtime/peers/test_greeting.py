@@ -41,6 +41,7 @@ class Pair:
         self.said: list[tuple[str, bytes]] = []
         for name, roster in self.ends.items():
             roster._key = KEY
+            roster._soon = lambda call, *args: call(*args)  # type: ignore[method-assign]
             roster._session = End(self, name)  # type: ignore[assignment]
 
     def other(self, name: str) -> str:
