@@ -135,6 +135,10 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
     settings: dict[str, Any] = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
+        # Of two that hear of each other only one connects: if both do, with passwords, both may fail.
+        "scouting/gossip/autoconnect_strategy": {
+            "peer": {"to_router": "always", "to_peer": "greater-zid"}
+        },
         # The first process on that host takes the address, and the others connect to it; each
         # tells the rest where else it listens.
         "listen/endpoints": [network.meet, *_beside(network.meet)],
