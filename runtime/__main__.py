@@ -1,6 +1,11 @@
 """``python -m runtime``: see `runtime.cli`."""
 
-from runtime.cli import main
+import sys
 
 if __name__ == "__main__":
+    try:
+        from runtime.cli import main
+    except KeyboardInterrupt:  # importing takes a moment
+        print("error: interrupted", file=sys.stderr)
+        sys.exit(130)
     main()

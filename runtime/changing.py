@@ -66,7 +66,7 @@ class Changing:
         except ValueError as error:
             life.node.config = before
             raise ConfigError(f"{text}: {node} refuses: {error}") from None
-        except Exception as error:
+        except BaseException as error:
             self._supervisor.fault(node, error)
         life.spec = msgspec.structs.replace(life.spec, config=config)  # for when it restarts
         for key, value in values.items():

@@ -56,7 +56,10 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
             runs in real time are alike.
         stall: Real seconds without a turn of the loop that the watchdog reports; 0 for none.
         startup_limit: Real seconds a node's `on_startup` may take.
-        shutdown_limit: Real seconds a node's `on_shutdown` may take.
+        shutdown_limit: Real seconds a node's `on_shutdown` may take, and a twentieth of the run's
+            length more.
+        progress_limit: Real seconds without progress after which the log says who is waited for,
+            and again after twice, four times… as long; 0 for never.
         log: Least level that is logged: trace, debug, info, warning, error or fatal.
     """
 
@@ -69,6 +72,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     stall: Duration = Duration(0.02)
     startup_limit: Duration = Duration(60)
     shutdown_limit: Duration = Duration(10)
+    progress_limit: Duration = Duration(5)
     log: Literal["trace", "debug", "info", "warning", "error", "fatal"] = "info"
 
 
@@ -153,7 +157,9 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(f"{path}: expected UTF-8 text, found {error.reason}") from None
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise ConfigError(f"{path}: expected TOML, found brackets nested too deeply") from None
+    except ValueError as error:  # a TOMLDecodeError, or an integer too long for Python
         raise ConfigError(f"{path}: expected TOML, found: {error}") from None
     folder = str(path.resolve().parent)
     if folder not in sys.path:

@@ -16,6 +16,7 @@
     │   ├── ChannelThreadError `send` was called in another thread than the loop's
     │   └── AmbiguousSourceError  an input that matches stamps hears two sources
     ├── CommandError           a run cannot do what its monitor asked it to
+    ├── ResultsError           a run's folder is not ours, or cannot be written
     ├── PeerError              another process of the run is missing, gone, or of another mind
     ├── WireError              bytes from elsewhere that are no event, or an event that cannot leave
     └── WorkerError
@@ -58,6 +59,8 @@ class NodeError(VisnavError):
     def __init__(self, node: str, what: str) -> None:
         super().__init__(f"{node}: {what}")
         self.node = node
+        self.place = ""
+        """The line of the node that raised what is no error of ours, if known."""
 
 
 class FatalError(NodeError):
@@ -102,6 +105,10 @@ class AmbiguousSourceError(ChannelError):
 
 class CommandError(VisnavError):
     """A run cannot do what it was asked; the message says why."""
+
+
+class ResultsError(VisnavError):
+    """A run's folder is somebody else's, or results cannot be written into it."""
 
 
 class PeerError(VisnavError):

@@ -3,33 +3,40 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
 import functools
 import gc
 import logging
-import shutil
 import signal
 import threading
+import time
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-import tomli_w
 
 from events import Event
-from runtime import steps
+from runtime import driver, results, steps
 from runtime.clock import Clock
-from runtime.config import Config, RunConfig, to_builtins
+from runtime.config import Config, RunConfig
 from runtime.digest import Digest
+from runtime.errors import NodeError, VisnavError
+from runtime.life import log_error, with_place, wrap
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.logs import file_handler, logging_to
+from runtime.node import Node
 from runtime.realtime import RealClock
 from runtime.sender import Sender, Tap
+from runtime.standstill import Standstill
 from runtime.summary import Summary, summarise
 from runtime.supervisor import Supervisor
 from runtime.watchdog import Stall, Watchdog
+
+if TYPE_CHECKING:
+    from runtime.peers.peers import Peers
 
 log = logging.getLogger("visnav.runtime")
 events_log = logging.getLogger("visnav.events")
@@ -56,34 +63,22 @@ def execute(
         only: Nodes to run here; the others run in other processes. All, if empty.
 
     Raises:
-        VisnavError: Something went wrong; what was recorded until then is complete.
+        VisnavError: Something went wrong; what was recorded until then is complete, and what is to
+            be written after a run has been.
     """
     handlers = list(handlers or [])
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        _clear(out)
-        (out / "config.toml").write_text(tomli_w.dumps(to_builtins(config)), encoding="utf-8")
+        results.prepare(out, config)
         handlers.append(file_handler(out / "log.txt"))
-    loop = make_loop(config.run)
-    with asyncio.Runner(loop_factory=lambda: loop) as runner:
-        summary, after, error = runner.run(_run(config, out, handlers, log_events, watch, only))
-    if out is not None:
-        encoded = msgspec.json.format(msgspec.json.encode(summary), indent=2)
-        (out / "summary.json").write_bytes(encoded + b"\n")
-        for call in after:
-            call(out)
-    if error is not None:
-        raise error
+    run = _Run(config, out, log_events, watch, only)
+    with logging_to(handlers, config.run.log, run.now):
+        summary = driver.run_to_end(run.loop, run.main(), run.escaped)
+        if out is not None:
+            run.conclude(out, summary)
+    driver.LEFT.extend(run.supervisor.left)
+    if run.supervisor.error is not None:
+        raise run.supervisor.error
     return summary
-
-
-def _clear(out: Path) -> None:
-    """Remove what an earlier run has left, lest it pass for this one's; recordings stay."""
-    if (out / "config.toml").is_file():
-        for name in ("summary.json", "report.html"):
-            (out / name).unlink(missing_ok=True)
-        for name in ("evaluation", "trajectories", "frames", "plots"):
-            shutil.rmtree(out / name, ignore_errors=True)
 
 
 def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
@@ -93,8 +88,12 @@ def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
     try:
         import uvloop
     except ImportError:  # a platform that it does not serve
-        return asyncio.new_event_loop()
-    return uvloop.new_event_loop()
+        loop = asyncio.new_event_loop()
+    else:
+        loop = uvloop.new_event_loop()
+    # Named, so that the command line knows whose threads may be left behind.
+    loop.set_default_executor(concurrent.futures.ThreadPoolExecutor(thread_name_prefix="node"))
+    return loop
 
 
 def make_clock(run: RunConfig, loop: asyncio.AbstractEventLoop) -> Clock:
@@ -104,71 +103,147 @@ def make_clock(run: RunConfig, loop: asyncio.AbstractEventLoop) -> Clock:
     return RealClock(loop, speed=1.0 if run.speed in {None, "max"} else run.speed)  # type: ignore[arg-type]
 
 
-async def _run(
-    config: Config,
-    out: Path | None,
-    handlers: list[logging.Handler],
-    log_events: bool,
-    watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
-    only: Collection[str],
-) -> tuple[Summary, list[Callable[[Path], Any]], Exception | None]:
-    loop = asyncio.get_running_loop()
-    steps.install(loop)
-    clock = make_clock(config.run, loop)
-    wanted = config.run.clock == "lockstep" if config.run.digest is None else config.run.digest
-    digest = Digest() if wanted else None
-    taps: list[Tap] = [digest] if digest else []
-    if log_events:
-        taps.append(_log_event)
-    supervisor = Supervisor(config, clock, taps, out, only)
-    # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
-    level = logging.DEBUG if config.run.clock == "lockstep" else logging.WARNING
-    watchdog = Watchdog(loop, config.run.stall, functools.partial(_report_stall, level))
-    with (
-        logging_to(handlers, config.run.log, clock.now),
-        _signals_stop(supervisor, loop),
-        _no_long_collections(),
-        watch(supervisor) if watch else contextlib.nullcontext(),
-    ):
-        watchdog.start()
-        try:
-            await supervisor.main()
-        finally:
-            watchdog.stop()
-        summary = summarise(
-            supervisor,
-            name=config.run.name,
-            sim_ns=clock.now(),
-            digest=digest,
-            stalls=watchdog.stalls,
-            longest_stalls=watchdog.longest,
+class _Run:
+    """One run, from its loop to what is called when it is over; see `execute`."""
+
+    supervisor: Supervisor
+
+    def __init__(
+        self,
+        config: Config,
+        out: Path | None,
+        log_events: bool,
+        watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
+        only: Collection[str],
+    ) -> None:
+        self.loop = make_loop(config.run)
+        self._clock: Clock | None = None
+        self._config = config
+        self._out = out
+        self._watch = watch or contextlib.nullcontext
+        self._only = only
+        wanted = config.run.clock == "lockstep" if config.run.digest is None else config.run.digest
+        self._digest = Digest() if wanted else None
+        self._taps: list[Tap] = [self._digest] if self._digest else []
+        if log_events:
+            self._taps.append(_log_event)
+
+    def now(self) -> int:
+        """Return the time of the run's clock (ns); 0 before there is one."""
+        return self._clock.now() if self._clock is not None else 0
+
+    async def main(self) -> Summary:
+        """Run the nodes to their end, and put together what there is to say of it."""
+        loop, run = asyncio.get_running_loop(), self._config.run
+        steps.install(loop)
+        clock = self._clock = make_clock(run, loop)
+        self.supervisor = supervisor = Supervisor(
+            self._config, clock, self._taps, self._out, self._only
         )
-        if supervisor.peers is not None:
-            summary = await supervisor.peers.part(summary)
-            await supervisor.peers.close()
+        # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
+        level = logging.DEBUG if run.clock == "lockstep" else logging.WARNING
+        watchdog = Watchdog(loop, run.stall, functools.partial(_report_stall, level))
+        standstill = Standstill(supervisor, loop, run.progress_limit)
+        with (
+            _signals_stop(supervisor, loop),
+            _no_long_collections(),
+            standstill,
+            self._watch(supervisor),
+        ):
+            watchdog.start()
+            try:
+                await supervisor.main()
+            finally:
+                watchdog.stop()
+            summary = summarise(
+                supervisor,
+                name=run.name,
+                sim_ns=clock.now(),
+                digest=self._digest,
+                stalls=watchdog.stalls,
+                longest_stalls=watchdog.longest,
+            )
+            if supervisor.peers is not None:
+                summary = await self._parted(supervisor.peers, summary)
         clock.close()
-    return summary, supervisor.after, supervisor.error
+        return summary
+
+    async def _parted(self, peers: Peers, summary: Summary) -> Summary:
+        """Put the summary together with those of the other processes, if they can be had."""
+        try:
+            summary = await peers.part(summary)
+            await peers.close()
+        except Exception as error:
+            self.failed(wrap("the other processes", error))
+        return summary
+
+    def escaped(self, error: BaseException) -> None:
+        """Deal with what came out of the loop."""
+        if not hasattr(self, "supervisor"):  # a Ctrl-C before there was anything to end
+            raise error
+        self.supervisor.escaped(error)
+
+    def failed(self, error: Exception) -> None:
+        """Note an error; the first one counts."""
+        first = self.supervisor.error is None
+        if isinstance(error, NodeError):
+            log_error(error, last=first)
+        else:
+            log.error("%s", error, extra={"told": first})
+        if first:
+            self.supervisor.error = error
+
+    def conclude(self, out: Path, summary: Summary) -> None:
+        """Write the summary, and call what nodes want called after it, whatever goes wrong."""
+        if summary.error is None and self.supervisor.error is not None:
+            error = with_place(self.supervisor.error)
+            summary = msgspec.structs.replace(summary, error=error)
+        try:
+            results.write_summary(out, summary)
+        except VisnavError as error:
+            self.failed(error)
+        for call in self.supervisor.after:
+            owner = getattr(call, "__self__", None)
+            name = owner.name if isinstance(owner, Node) else getattr(call, "__module__", "runtime")
+            try:
+                call(out)
+            except BaseException as error:
+                self.failed(wrap(name, error))
 
 
 @contextlib.contextmanager
 def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> Iterator[None]:
-    """Let the first SIGINT or SIGTERM end the run in order, and the second end it at once."""
+    """Let the first SIGINT, SIGTERM or SIGHUP end the run in order, and the second at once.
+
+    One that is ignored (SIGHUP under nohup) stays so.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+    names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
 
     def stop(number: int, _: Any) -> None:
-        for each in names:
+        for each in before:
             signal.signal(each, signal.SIG_DFL)
+        supervisor.asked = time.monotonic()
         loop.call_soon_threadsafe(supervisor.stop, names[signal.Signals(number)])
 
-    before = {number: signal.signal(number, stop) for number in names}
+    def interrupt(*_: Any) -> None:  # whoever blocks the loop; see `runtime.standstill`
+        error, supervisor.interruption = supervisor.interruption, None
+        if error is not None:
+            raise error
+
+    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in names}
+    before = {number: how for number, how in before.items() if how is not signal.SIG_IGN}
+    for number in before:
+        signal.signal(number, stop)
+    usual = signal.signal(signal.SIGUSR2, interrupt)
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        signal.signal(signal.SIGUSR2, usual)
 
 
 @contextlib.contextmanager

@@ -8,7 +8,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
+from typing import Any
 
 
 @contextlib.asynccontextmanager
@@ -44,3 +45,17 @@ async def real_time_limit(seconds: float) -> AsyncIterator[None]:
         timer.cancel()
         if expired and task.uncancel() <= cancelled_before and cancelled:
             raise TimeoutError from None
+
+
+async def ended(tasks: Iterable[asyncio.Task[Any]], seconds: float) -> list[asyncio.Task[Any]]:
+    """Wait for so many real seconds at most until all tasks have ended.
+
+    Returns:
+        Those that have not.
+    """
+    tasks = [task for task in tasks if not task.done()]
+    if tasks:
+        with contextlib.suppress(TimeoutError):
+            async with real_time_limit(seconds):
+                await asyncio.wait(tasks)
+    return [task for task in tasks if not task.done()]

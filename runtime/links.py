@@ -69,12 +69,12 @@ class Link:
         self._clock = clock
         self._rng = np.random.default_rng([seed, zlib.crc32(name.encode()), zlib.crc32(b"link")])
         self._deliver: Callable[[Any], Any] | None = None
-        self._fault: Callable[[Exception], None] = _raise
+        self._fault: Callable[[BaseException], None] = _raise
         self._last_period: dict[str, int] = {}  # by source
         self._last_due = 0
 
     def to(
-        self, deliver: Callable[[Any], Any], fault: Callable[[Exception], None] | None = None
+        self, deliver: Callable[[Any], Any], fault: Callable[[BaseException], None] | None = None
     ) -> Callable[[Any], Any]:
         """Say what is at the far end; return what to call at this one."""
         self._deliver = deliver
@@ -108,7 +108,7 @@ class Link:
         try:
             if self._deliver is not None:
                 self._deliver(event)
-        except Exception as error:
+        except BaseException as error:
             self._fault(error)
 
     def _is_too_soon(self, event: Any) -> bool:
@@ -120,5 +120,5 @@ class Link:
         return False
 
 
-def _raise(error: Exception) -> None:
+def _raise(error: BaseException) -> None:
     raise error

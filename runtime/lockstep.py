@@ -144,6 +144,24 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         self.schedule.order = orders[0]
         self._orders = itertools.count(orders[1])
 
+    def waits_for(self) -> asyncio.Future[Any] | Literal["pace", "nothing"] | None:
+        """Return what time waits for: offloaded work, its pace, or nothing that is due ever.
+
+        `None` if it waits for nothing, and what is ready runs; called on the loop.
+        """
+        entry = self.schedule.next_due()
+        held = self._held[0][0] if self._held else _NEVER
+        timers: Any = self._scheduled  # type: ignore[attr-defined]
+        timer = round(timers[0].when() * SECOND) if timers else _NEVER
+        due = min(_NEVER if entry is None else entry, held, timer)
+        if self._ready:  # type: ignore[attr-defined]
+            return None
+        if due == _NEVER:
+            return "nothing"
+        if held == due < timer and not self._held[0][2].done():
+            return self._held[0][3]
+        return "pace" if self._pace and due > self.now else None
+
     def _wake_up(self) -> None:
         with contextlib.suppress(RuntimeError):  # closed: nobody waits any more
             self.call_soon_threadsafe(_nothing)

@@ -7,9 +7,11 @@ a logger, ``visnav.<node>``; lines carry the time of the run's clock.
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import logging.handlers
 import queue
+import sys
 from collections.abc import Callable, Iterator, MutableMapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -52,6 +54,43 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
         raise FatalError(self.node, msg % args if args else msg)
 
 
+class _Queued(logging.handlers.QueueHandler):
+    """Queues records; their tracebacks stay apart from their messages."""
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        """Make message and traceback while what they tell of is as it is."""
+        record = copy.copy(record)
+        record.msg, record.args = record.getMessage(), None
+        if record.exc_info:
+            record.exc_text = logging.Formatter().formatException(record.exc_info)
+            record.exc_info = None
+        return record
+
+
+class _OneLine(logging.Formatter):
+    """Leaves out tracebacks, which are for ``log.txt``."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        record = copy.copy(record)
+        record.exc_info = record.exc_text = None
+        return super().format(record)
+
+
+class _File(logging.FileHandler):
+    """Writes records to a file as long as that is possible."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802, ARG002
+        """Say once why it is not possible (any more)."""
+        error = sys.exc_info()[1]
+        self.setLevel(logging.CRITICAL + 1)
+        stream, self.stream = self.stream, None
+        with contextlib.suppress(Exception):  # what it still holds would fail again
+            if stream is not None:
+                stream.close()
+        what = getattr(error, "strerror", None) or error
+        print(f"warning: {self.baseFilename}: cannot be written: {what}", file=sys.stderr)
+
+
 @contextlib.contextmanager
 def logging_to(
     handlers: list[logging.Handler], level: str, now: Callable[[], int]
@@ -65,7 +104,7 @@ def logging_to(
     """
     logging.addLevelName(TRACE, "TRACE")
     records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
-    handler = logging.handlers.QueueHandler(records)
+    handler = _Queued(records)
 
     def stamp(record: logging.LogRecord) -> bool:
         record.seconds = now() / 1e9
@@ -92,7 +131,8 @@ def logging_to(
 def terminal_handler() -> logging.Handler:
     """Return a handler that prints to standard error, in colour where that is a terminal.
 
-    It leaves out what the command line says itself when the run is over (records with `told`).
+    It leaves out tracebacks, and what the command line says itself when the run is over (records
+    with `told`).
     """
     from rich.console import Console
     from rich.logging import RichHandler
@@ -100,14 +140,14 @@ def terminal_handler() -> logging.Handler:
     handler = RichHandler(
         console=Console(stderr=True), show_path=False, show_time=False, markup=False
     )
-    handler.setFormatter(logging.Formatter("%(seconds)9.3f %(speaker)s: %(message)s"))
+    handler.setFormatter(_OneLine("%(seconds)9.3f %(speaker)s: %(message)s"))
     handler.addFilter(lambda record: not getattr(record, "told", False))
     return handler
 
 
 def file_handler(path: Path) -> logging.Handler:
     """Return a handler that writes everything to a file."""
-    handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    handler = _File(path, mode="w", encoding="utf-8", delay=False)
     handler.setFormatter(
         logging.Formatter("%(seconds)12.6f %(levelname)-8s %(speaker)s: %(message)s")
     )

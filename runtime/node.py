@@ -225,7 +225,7 @@ class Node(Generic[C]):
         self._outside.add(call)
         for sender in senders(self).values():
             sender.watch()  # lest `call` sends something
-        work = self._host.executor.submit(call)
+        work = self._host.executor.submit(_without_stop_iteration, call)
         work.add_done_callback(lambda _: self._outside.discard(call))
         return await self.clock.beside(work, round(latency * SECOND))
 
@@ -321,6 +321,17 @@ def make_node(
         setattr(node, port, Sender(f"{name}.{port}", output.event, node._outside))
     node.__init__()  # type: ignore[misc]  # now that what it may use is there
     return node
+
+
+def _without_stop_iteration(call: Callable[[], R]) -> R:
+    """Call a function; its `StopIteration` becomes a `RuntimeError`, as in a coroutine.
+
+    No future takes one, and whoever awaited it would wait for ever.
+    """
+    try:
+        return call()
+    except StopIteration as error:
+        raise RuntimeError("the function raised StopIteration") from error
 
 
 def streams(node: Node[Any]) -> dict[str, Stream[Any]]:

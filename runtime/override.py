@@ -28,7 +28,7 @@ def override(table: dict[str, Any], change: str) -> None:
         raise ConfigError(f"{where}: expected node.key=value or run.key=value")
     try:
         found = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # not TOML, or too much of it
         found = {"value": text.strip()}
     if len(found) > 1:
         raise ConfigError(f"{where}: expected one setting, found more lines")

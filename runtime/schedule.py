@@ -139,7 +139,7 @@ class Ticker:
         name: str,
         hz: float,
         call: Callable[[Tick], Any],
-        fault: Callable[[Exception], None],
+        fault: Callable[[BaseException], None],
         before: Ticker | None = None,
     ) -> None:
         self.name = name
@@ -187,7 +187,7 @@ class Ticker:
         self.late.add(late)
         try:
             self._call(tick)
-        except Exception as error:
+        except BaseException as error:  # even that must not take the other ticks with it
             self._fault(error)
         return self.due
 

@@ -146,7 +146,7 @@ class Sender(Generic[T]):
             for deliver in listeners:
                 if deliver(event):
                     return True
-        except Exception as error:
+        except BaseException as error:  # none of it is the sender's
             return self._go_on(listeners, deliver, error, event)
         return False
 
@@ -161,7 +161,7 @@ class Sender(Generic[T]):
             for deliver in listeners:
                 if deliver(event):
                     return True
-        except Exception as error:
+        except BaseException as error:  # none of it is the sender's
             return self._go_on(listeners, deliver, error, event)
         return False
 
@@ -193,7 +193,7 @@ class Sender(Generic[T]):
         return +counts
 
     def _go_on(
-        self, listeners: tuple[Deliver, ...], failed: Deliver, error: Exception, event: T
+        self, listeners: tuple[Deliver, ...], failed: Deliver, error: BaseException, event: T
     ) -> bool:
         """Report the listener that raised, and deliver to those after it."""
         self._fault(failed, error)
@@ -201,7 +201,7 @@ class Sender(Generic[T]):
             try:
                 if deliver(event):
                     return True
-            except Exception as another:
+            except BaseException as another:
                 self._fault(deliver, another)
         return False
 
@@ -265,6 +265,6 @@ class Route:
         self.sent = 0
 
 
-def _raise(_: Deliver, error: Exception) -> None:
+def _raise(_: Deliver, error: BaseException) -> None:
     """Pass a listener's error on to the sender: the default outside a run."""
     raise error

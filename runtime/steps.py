@@ -26,7 +26,7 @@ DEPTH_LIMIT = 32
 """Resumptions nested deeper go through the loop: a relay of hundreds must not overflow the
 stack, nor keep the loop to itself."""
 
-Fault = Callable[[Callable[[Any], Any], Exception], None]
+Fault = Callable[[Callable[[Any], Any], BaseException], None]
 """Told which listener raised what; the delivery then goes on."""
 
 _NOTHING: Any = object()

@@ -6,7 +6,8 @@
     …
     cancel run(), on_shutdown: in reverse order, always, each with a time limit
 
-One task group owns every task. What an exception in a node does is up to the node's `on_error`.
+The run owns every task, and every wait for one has a limit: a node that does not end is named and
+left behind. What an exception in a node does is up to the node's `on_error`.
 Not here: loops, signals and files (`runtime.execute`).
 """
 
@@ -26,17 +27,17 @@ from typing import TYPE_CHECKING, Any
 from typing_extensions import TypeVar
 
 from events import Announcement, Event, Shutdown, WindowClosed
-from runtime import graph
+from runtime import graph, places
 from runtime.changing import Changing
 from runtime.clock import Clock
 from runtime.config import Config
 from runtime.costs import Costs
-from runtime.errors import FatalError, NodeError, PeerError
+from runtime.errors import FatalError, NodeError, PeerError, VisnavError
 from runtime.life import Life, log_error, wrap
 from runtime.links import Link
 from runtime.node import Node
 from runtime.probes import Probes
-from runtime.schedule import Once, Tick, Ticker
+from runtime.schedule import SECOND, Once, Tick, Ticker
 from runtime.sender import Deliver, Listener, Tap
 from runtime.streams import Stream
 from runtime.worker import Worker
@@ -50,7 +51,13 @@ log = logging.getLogger("visnav.runtime")
 
 FIRST_BACKOFF = 0.5
 LONGEST_BACKOFF = 30.0
-"""Seconds of the clock before a restart: doubled from the first at each failure."""
+"""Seconds of the clock before a restart: doubled from the first at each failure…"""
+HEALTHY = 60.0
+"""…until a node has run for so many without one."""
+
+LATER = 0.05
+"""Of a run's length, on the longer of the clock and real time, by which `shutdown_limit` grows:
+what a node has to finish grows with it."""
 
 
 class Supervisor:
@@ -87,6 +94,10 @@ class Supervisor:
         """The same on the run's clock (ns)."""
         self.reason = ""
         self.error: Exception | None = None
+        self.asked: float | None = None
+        """When somebody asked for the end of the run, whom the loop may not have heard yet."""
+        self.interruption: Exception | None = None
+        """What is to be raised in a node that blocks the loop."""
         self.ever: list[Node[Any]] = []
         """All nodes there have been, those restarted or dropped included."""
         self.tickers: dict[str, Ticker] = {}
@@ -98,13 +109,14 @@ class Supervisor:
         """What workers cost, by ``node.Factory``."""
         self.after: list[Callable[[Path], Any]] = []
         """What is to be called with the run's folder at the very end."""
+        self.left: list[asyncio.Task[Any]] = []
+        """Tasks that would not end."""
         self.probes = Probes(self)
         self.changing = Changing(self)
         self._config = config
         self._taps = tuple(taps)
-        self._lives = {
-            spec.name: Life(spec) for spec in config.nodes if not only or spec.name in only
-        }
+        here = [spec for spec in config.nodes if not only or spec.name in only]
+        self._lives = {spec.name: Life(spec, self._own) for spec in here}
         self.peers: Peers | None = None
         """The other processes of the run, if there are any."""
         if len(self._lives) < len(config.nodes):
@@ -114,17 +126,28 @@ class Supervisor:
         self._running = False
         self._ended = asyncio.Event()
         self._begin: asyncio.Task[None] | None = None
-        self._group = asyncio.TaskGroup()
-        self._recoveries: dict[asyncio.Task[None], None] = {}
+        self._tasks: dict[asyncio.Task[Any], None] = {}
+        self._recoveries: dict[asyncio.Task[Any], None] = {}
 
     async def main(self) -> None:
         """Run until something ends the run; `reason` and `error` then say what did."""
-        async with self._group:
-            self._begin = self._group.create_task(self._start_all(), name="start")
+        self._begin = self._own(self._start_all(), "start")
+        try:
             await self._ended.wait()
             await asyncio.wait([self._begin])
             await self._end_all()
-        self.executor.shutdown(wait=False, cancel_futures=True)
+        finally:  # of the tasks there are none left, unless this one was cancelled
+            self.left += [task for life in self._lives.values() for task in life.left]
+            for task in self._tasks:
+                task.cancel()
+            self.executor.shutdown(wait=False, cancel_futures=True)
+
+    def _own(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
+        """Make a task of the run."""
+        task = asyncio.get_running_loop().create_task(coro, name=name)
+        self._tasks[task] = None
+        task.add_done_callback(lambda _: self._tasks.pop(task, None))
+        return task
 
     # The host of the nodes.
 
@@ -160,12 +183,12 @@ class Supervisor:
         life = self._lives[node.name]
         guarded = self._guard(node, coro)
         guarded.__qualname__ = getattr(coro, "__qualname__", guarded.__qualname__)  # type: ignore[attr-defined]
-        task = self._group.create_task(guarded, name=node.name)
+        task = self._own(guarded, node.name)
         life.tasks[task] = None
         self.probes.on_task(node.name, task)
-        task.add_done_callback(lambda task: life.tasks.pop(task, None))
-        # Cancelled before its first step, the task has not begun what it guards.
-        task.add_done_callback(lambda _: coro.close())
+        task.add_done_callback(lambda _: life.tasks.pop(task, None))
+        if inspect.iscoroutine(coro):  # which is not begun if the task is cancelled before
+            task.add_done_callback(lambda _: coro.close())
 
     def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
         """Call a function of a node at a rate, from the first update on."""
@@ -206,13 +229,28 @@ class Supervisor:
         self.probes.on_worker(worker)
         return worker
 
-    def fault(self, name: str, error: Exception) -> None:
+    def escaped(self, error: BaseException) -> None:
+        """Deal with an exception that came out of the loop: some task or callback let it."""
+        name, place = places.of_error(error)
+        if name in self._lives:
+            self.fault(name, error)
+            return
+        wrapped = wrap("runtime", error)
+        log_error(wrapped, last=not self._ended.is_set())
+        self.error = self.error or wrapped
+        self.stop(f"failed at {place}", wrapped)
+
+    def fault(self, name: str, error: BaseException) -> None:
         """Deal with an exception in a node as its `on_error` says."""
         life = self._lives[name]
         if life.recovering:
             return
-        wrapped = error if isinstance(error, NodeError) else wrap(name, error)
-        fatal = isinstance(error, FatalError) or life.spec.on_error == "stop" or not self._running
+        wrapped = wrap(name, error)
+        fatal = (
+            isinstance(places.leaf(error), FatalError)
+            or life.spec.on_error == "stop"
+            or not self._running
+        )
         log_error(wrapped, last=fatal and not self._ended.is_set())
         if self._ended.is_set():
             self.error = self.error or wrapped
@@ -230,7 +268,9 @@ class Supervisor:
         """
         life = self._lives[name]
         life.recovering = True
-        task = self._group.create_task(self._recover(life, anyway), name=f"recover {name}")
+        if self.clock.now() - life.begun > HEALTHY * SECOND:
+            life.failures = 0
+        task = self._own(self._recover(life, anyway), f"recover {name}")
         self._recoveries[task] = None
         task.add_done_callback(lambda task: self._recoveries.pop(task, None))
 
@@ -256,9 +296,12 @@ class Supervisor:
             log.error("%s", error, extra={"told": True})
             self.stop("the processes of the run did not come together", error)
             return
-        except NodeError as error:
-            log_error(error, last=True)
-            self.stop("start-up failed", error)
+        except asyncio.CancelledError:  # the run is to end
+            raise
+        except BaseException as error:
+            failed = wrap("runtime", error)
+            log_error(failed, last=True)
+            self.stop("start-up failed", failed)
             return
         for announcement in mine:
             for tap in self._taps:
@@ -307,6 +350,7 @@ class Supervisor:
     def _begin_node(self, life: Life) -> None:
         node = life.node
         assert node is not None
+        life.begun = self.clock.now()
         for ticker in life.tickers:
             self._add(ticker)
         for method, ticks in node.declared.ticks.items():
@@ -347,13 +391,20 @@ class Supervisor:
     # Going wrong.
 
     async def _guard(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
+        life = self._lives[node.name]
+        me = asyncio.current_task()
         try:
             await coro
-        except Exception as error:
-            if self._lives[node.name].node is node:
+        except BaseException as error:
+            ours = life.closing or life.node is not node
+            if ours and isinstance(error, asyncio.CancelledError):
+                raise
+            if asyncio._get_running_loop() is None or asyncio.current_task() is not me:
+                raise  # a GeneratorExit: it is thrown away
+            if life.node is node:
                 self.fault(node.name, error)
 
-    def _listener_failed(self, deliver: Deliver, error: Exception) -> None:
+    def _listener_failed(self, deliver: Deliver, error: BaseException) -> None:
         owner: Any = deliver.__self__  # type: ignore[attr-defined]  # a node, or a stream of one
         self.fault(owner.name.partition(".")[0], error)
 
@@ -362,25 +413,27 @@ class Supervisor:
         self.stop(f"{event.source}: {reason}")
 
     async def _recover(self, life: Life, anyway: bool) -> None:
+        name = life.spec.name
         # Shielded: the end of the run ends this task, but must not cut an on_shutdown short.
-        await asyncio.shield(self._group.create_task(self._retire(life)))
+        await asyncio.shield(self._own(self._retire(life), name))
         if life.spec.on_error == "drop" and not anyway:
-            log.warning("%s: left out from here on", life.spec.name)
+            log.warning("%s: left out from here on", name)
             return
         while not self._ended.is_set():
-            pause = min(FIRST_BACKOFF * 2**life.failures, LONGEST_BACKOFF)
+            pause = min(FIRST_BACKOFF * 2 ** min(life.failures, 16), LONGEST_BACKOFF)
             life.failures += 1
-            log.warning("%s: restarts in %g s", life.spec.name, pause)
+            log.warning("%s: restarts in %g s", name, pause)
             await self.clock.sleep(pause)
             try:
                 await self._start_up(life)
                 life.hear(self.announcements)
             except NodeError as error:
-                if isinstance(error, FatalError):
-                    self.stop(f"{life.spec.name} failed", error)
+                if isinstance(places.leaf(error.__cause__ or error), FatalError):
+                    log_error(error, last=True)
+                    self.stop(f"{name} failed", error)
                     return
-                log.error("%s", error)
-                await asyncio.shield(self._group.create_task(self._retire(life)))
+                log_error(error, last=False)
+                await asyncio.shield(self._own(self._retire(life), name))
                 continue
             life.recovering = False
             self.connect()
@@ -399,17 +452,30 @@ class Supervisor:
         if not self._running:  # what has started may still send farewells to what has, too
             self.connect()
         for name, life in reversed(self._lives.items()):
-            if self.peers is not None:
-                await self.peers.turn_to_end(name)
+            await self._turn_to_end(name)
             await self._retire(life)
             if self.peers is not None:
                 self.peers.retired(name)
-        if self.peers is not None:
-            await self.peers.turn_to_end("")
+        await self._turn_to_end("")
+
+    async def _turn_to_end(self, name: str) -> None:
+        """Let the nodes after this one end first, in whichever process they are."""
+        try:
+            if self.peers is not None:
+                await self.peers.turn_to_end(name)
+        except VisnavError as error:
+            log.error("%s", error)
+            self.error = self.error or error
 
     async def _retire(self, life: Life) -> None:
         """End one node, unless that is done: it hears nothing afterwards."""
         async with life.ending:
-            for error in await life.end(self._config.run.shutdown_limit):
+            for error in await life.end(self.shutdown_limit()):
                 self.error = self.error or error
             self.connect()
+
+    def shutdown_limit(self) -> float:
+        """Return how many real seconds a node's end may take now."""
+        real = time.monotonic() - (self.first_update or time.monotonic())
+        length = max(real, self.clock.now() / SECOND)
+        return self._config.run.shutdown_limit + LATER * length

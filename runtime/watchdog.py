@@ -19,8 +19,7 @@ from types import FrameType
 
 import msgspec
 
-from runtime import lockstep
-from runtime.node import Node
+from runtime import lockstep, places
 
 _LONGEST_PAUSE = 0.05
 """Seconds between two looks at most; a run's end waits for the last of them."""
@@ -86,7 +85,7 @@ class Watchdog:
         while not self._end.is_set():
             time.sleep(pause)  # an `Event.wait` with a time-out costs five times as much
             frame = sys._current_frames().get(self._thread_id)
-            if frame is None or _idle(frame):
+            if frame is None or idle(frame):
                 continue
             del frame
             self._signed.clear()
@@ -99,21 +98,10 @@ class Watchdog:
                 return
             if self._signed.wait(self._limit) or self._end.is_set():
                 continue
-            node, line = self._where()
+            node, line = places.of_thread(sys._current_frames().get(self._thread_id))
             self._signed.wait()
             if not self._end.is_set():
                 self._count(Stall(node, line, time.monotonic() - asked))
-
-    def _where(self) -> tuple[str, str]:
-        """Return the node and the line of it that the loop's thread is in."""
-        frame = sys._current_frames().get(self._thread_id)
-        innermost = _place(frame) if frame is not None else "?"
-        while frame is not None:
-            owner = frame.f_locals.get("self") if "self" in frame.f_code.co_varnames else None
-            if isinstance(owner, Node) and not frame.f_code.co_filename.endswith("runtime/node.py"):
-                return owner.name, _place(frame)
-            frame = frame.f_back
-        return "runtime", innermost
 
     def _count(self, stall: Stall) -> None:
         self.stalls[stall.node] += 1
@@ -124,11 +112,8 @@ class Watchdog:
             self._report(stall)
 
 
-def _idle(frame: FrameType | None) -> bool:
+def idle(frame: FrameType | None) -> bool:
+    """Tell whether a loop whose thread has this frame has nothing to do."""
     while frame is not None and frame.f_code.co_filename in _WAITING:
         frame = frame.f_back
     return frame is None or frame.f_code.co_filename in _LOOPS
-
-
-def _place(frame: FrameType) -> str:
-    return f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_name}"

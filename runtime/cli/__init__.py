@@ -1,13 +1,15 @@
 """The command line: ``python -m runtime run config.toml`` and its companions.
 
 One module a command; what a command needs is imported when it runs, so that help comes at once.
-Errors that the project raises on purpose become one line on standard error and exit code 2.
+Every error becomes one line on standard error and exit code 2.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import sys
+from typing import NoReturn
 
 import typer
 
@@ -18,7 +20,7 @@ from runtime.cli.graph import graph
 from runtime.cli.nodes import nodes
 from runtime.cli.recover import recover
 from runtime.cli.report import report
-from runtime.cli.run import leave_threads_behind, run
+from runtime.cli.run import leave_behind, run
 from runtime.cli.set import set_
 from runtime.cli.sweep import sweep
 from runtime.cli.top import top
@@ -62,10 +64,27 @@ def main() -> None:
             stream.reconfigure(errors="replace")  # a terminal may lack an arrow
     try:
         app()
-    except VisnavError as error:
-        message = str(error)
-        print(f"error: {message}", file=sys.stderr)
-        leave_threads_behind(2)
-        sys.exit(2)
     except KeyboardInterrupt:
-        sys.exit(130)
+        interrupted()
+    except BrokenPipeError:  # whoever reads what we print has heard enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(2)
+    except Exception as error:
+        leave_behind(2, f"error: {_described(error)}")
+
+
+def interrupted() -> NoReturn:
+    """End the process after a Ctrl-C before or after a run."""
+    print("error: interrupted", file=sys.stderr)
+    sys.exit(130)
+
+
+def _described(error: Exception) -> str:
+    """Return an error as a line: one of ours says all; of others, type and place, too."""
+    from runtime.life import with_place, wrap
+
+    if isinstance(error, VisnavError):
+        return with_place(error)
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    return with_place(wrap("runtime", error))

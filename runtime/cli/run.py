@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import threading
+import time
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -25,6 +27,9 @@ _STATES = {
     False: "[red]failed[/red]",
     None: "[yellow]not judged: no thresholds were given[/yellow]",
 }
+
+_LAST_WAIT = 1.0
+"""Real seconds that all threads together get to end by themselves."""
 
 
 class Log(Enum):
@@ -75,9 +80,9 @@ def run(
     """Run the nodes of a file until they, its duration or Ctrl-C end the run.
 
     Results go to runs/<name> (with --only, to runs/<name>-<first node>): summary.json, log.txt,
-    the resolved config.toml, and whatever the nodes write. Ends with 0, also after Ctrl-C, SIGTERM
-    or a closed window (a second Ctrl-C is immediate); with 1 if a threshold of the run was not
-    met; with 2 if something failed.
+    the resolved config.toml, and whatever the nodes write. Ends with 0, also after Ctrl-C, SIGTERM,
+    SIGHUP or a closed window (a second Ctrl-C is immediate); with 1 if a threshold of the run was
+    not met; with 2 if something failed.
     """
     from runtime.cli.watching import Lookers
     from runtime.config import load
@@ -103,8 +108,7 @@ def run(
     if not quiet:
         report(summary, folder)
     code = 1 if summary.verdict is not None and summary.verdict.passed is False else 0
-    leave_threads_behind(code)
-    raise typer.Exit(code)
+    leave_behind(code)
 
 
 def chosen(settings: Config, only: str | None) -> list[str]:
@@ -171,13 +175,28 @@ def _judge(console: Console, verdict: Verdict) -> None:
         console.print(f"{name} {passed}{': ' + reasons if reasons else ''}", highlight=False)
 
 
-def leave_threads_behind(code: int) -> None:
-    """End the process if offloaded work of a node never returns; else Python would wait for it."""
+def leave_behind(code: int, last: str = "") -> NoReturn:
+    """End the process, even if work of a node never returns; Python would wait for it.
+
+    Args:
+        code: The exit code.
+        last: Printed at the end, to standard error.
+    """
+    from runtime import driver
+
     threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node"))]
+    until = time.monotonic() + _LAST_WAIT
     for thread in threads:
-        thread.join(1.0)
-    if stuck := [thread.name for thread in threads if thread.is_alive()]:
+        thread.join(max(until - time.monotonic(), 0.0))
+    stuck = [thread.name for thread in threads if thread.is_alive()]
+    stuck += [task.get_name() for task in driver.LEFT]
+    if stuck:
         print(f"warning: still busy, left behind: {', '.join(stuck)}", file=sys.stderr)
-        sys.stdout.flush()
-        sys.stderr.flush()
+    if last:
+        print(last, file=sys.stderr)
+    if stuck:
+        with contextlib.suppress(OSError):  # nobody reads it any more
+            sys.stdout.flush()
+            sys.stderr.flush()
         os._exit(code)
+    sys.exit(code)

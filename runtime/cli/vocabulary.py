@@ -32,7 +32,7 @@ def vocabulary(
     import msgspec
 
     from runtime.cli.progress import progress
-    from runtime.cli.run import leave_threads_behind
+    from runtime.cli.run import leave_behind
     from runtime.config import Config, NodeSpec, convert, find_node, load
     from runtime.errors import ConfigError
     from runtime.execute import execute
@@ -68,4 +68,4 @@ def vocabulary(
         print("ORB-SLAM3 nodes find it there by themselves")
     else:
         print(f'for an ORB-SLAM3 node to use it: vocabulary = "{options.file()}"')
-    leave_threads_behind(0)
+    leave_behind(0)

@@ -41,6 +41,9 @@ PERIOD = 0.2
 PARTING = 1.0
 """Real seconds within which those who watch must take the last snapshot."""
 
+_LISTENING = 5.0
+"""Real seconds within which the socket must be there."""
+
 BEHIND = 1 << 20
 """Bytes that may wait for one who watches; whoever is slower than that misses snapshots."""
 
@@ -66,10 +69,10 @@ class Server:
         self._last = b""
         self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
 
-    def start(self) -> None:
-        """Listen."""
+    def start(self) -> bool:
+        """Listen; tell whether that is possible."""
         self._thread.start()
-        self._ready.wait()
+        return self._ready.wait(_LISTENING) and self._thread.is_alive()
 
     def stop(self) -> None:
         """Send those who watch how it ended, and listen no more; on the run's loop."""
@@ -79,15 +82,16 @@ class Server:
             self._observer.end()
         except Exception:  # who looks on must not spoil a run's end
             log.exception("the monitor failed")
-        if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._end.set)
+        with contextlib.suppress(RuntimeError):  # its loop is closed: it could not listen
+            if self._loop is not None:
+                self._loop.call_soon_threadsafe(self._end.set)
         self._thread.join(5.0)
 
     def _run(self) -> None:
         try:
             asyncio.run(self._serve())
         except OSError as error:
-            log.warning("the monitor cannot listen at %s: %s", self._path, error)
+            log.warning("nobody can look at this run: no socket at %s: %s", self._path, error)
         finally:
             self._ready.set()
 
@@ -226,8 +230,7 @@ def serving(observer: Observer, run: str) -> Iterator[Path | None]:
         yield None
         return
     server = Server(observer, asyncio.get_running_loop(), path)
-    server.start()
     try:
-        yield path
+        yield path if server.start() else None
     finally:
         server.stop()

@@ -85,7 +85,7 @@ def read_trace(path: Path) -> Trace:
         if path.with_name(path.name + ".part").exists():
             found += ": its run goes on, or was killed and could not write it"
         raise ConfigError(f"{path}: expected a trace, found: {found}") from None
-    except (msgspec.DecodeError, EOFError, zlib.error, RecursionError) as error:
+    except (ValueError, EOFError, zlib.error, RecursionError) as error:  # msgspec's is a ValueError
         raise ConfigError(f"{path}: expected a trace, found: {error}") from None
     if trace.about.get("made by") != MADE_BY:
         raise ConfigError(f"{path}: expected a trace of ours, by {MADE_BY}; found another's")

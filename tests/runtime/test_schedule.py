@@ -16,7 +16,7 @@ MS = 1_000_000
 
 
 def a_ticker(hz: float, call: Callable[[Tick], Any] = lambda _: None) -> Ticker:
-    def fault(error: Exception) -> None:
+    def fault(error: BaseException) -> None:
         raise error
 
     return Ticker("n.tick", hz, call, fault)

@@ -61,7 +61,7 @@ def test_without_anybody_to_report_to_the_sender_gets_the_error(source: str | No
 
 def test_a_full_stream_is_a_fault_of_the_stream() -> None:
     stream = Stream[Said]("n.s", bound=1)
-    faults: list[tuple[Deliver, type[Exception]]] = []
+    faults: list[tuple[Deliver, type[BaseException]]] = []
     sender = Sender("n.p", Shouted)
     listener = Listener("n", stream.offer, (Said,), None, stream)
     sender.connect([listener], (), lambda who, error: faults.append((who, type(error))))
@@ -99,7 +99,7 @@ def test_a_fault_after_a_change_of_listeners_ends_the_old_delivery_in_order(
     old = handler(lambda _: log.append("old"))
     new = handler(lambda _: log.append("new"))
 
-    def report(deliver: Deliver, _: Exception) -> None:
+    def report(deliver: Deliver, _: BaseException) -> None:
         faults.append(deliver)
 
     def leave_and_fail(event: Event) -> None:
@@ -117,7 +117,7 @@ def test_a_nested_delivery_has_its_own_faults(source: str | None) -> None:
     log: list[str] = []
     outer, inner = Sender("n.outer", Shouted), Sender("n.inner", Shouted)
 
-    def report(deliver: Deliver, _: Exception) -> None:
+    def report(deliver: Deliver, _: BaseException) -> None:
         faults.append(deliver)
 
     def pass_on(event: Shouted) -> None:

@@ -25,7 +25,7 @@ def listener(stream: Stream[Shouted]) -> Listener:
 def connected(*streams: Stream[Shouted], faults: Faults | None = None) -> Sender[Shouted]:
     sender = Sender("n.p", Shouted)
 
-    def report(deliver: Callable[[object], object], error: Exception) -> None:
+    def report(deliver: Callable[[object], object], error: BaseException) -> None:
         task = asyncio.current_task()
         assert faults is not None
         assert isinstance(error, ChannelFullError)

@@ -1,0 +1,189 @@
+"""Says what a run waits for when nothing goes on: which node, which line, which wait.
+
+A thread looks at the run a few times per limit. When it finds that neither the run's time nor its
+phase has changed for half of it, it asks the loop to explain; a loop that does not answer is
+blocked, and the thread says where. A node that blocks the loop beyond the limit of its start or
+end is interrupted, for no task of the run could do that. Short stalls: `runtime.watchdog`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from runtime import places
+from runtime.errors import NodeTimeoutError
+from runtime.lockstep import LockstepLoop
+from runtime.watchdog import idle
+
+if TYPE_CHECKING:
+    from runtime.supervisor import Supervisor
+
+log = logging.getLogger("visnav.runtime")
+
+_LONGEST_PAUSE = 0.25
+_LOOK = 0.01
+"""Real seconds between two looks at where a busy loop is."""
+
+_MOST_NAMED = 3
+
+
+class Standstill:
+    """Watches a run of the thread that makes it; a context as long as the run.
+
+    Args:
+        supervisor: Of the run.
+        loop: Its loop.
+        limit: Real seconds without progress after which there is something to say; 0 for never.
+    """
+
+    def __init__(
+        self, supervisor: Supervisor, loop: asyncio.AbstractEventLoop, limit: float
+    ) -> None:
+        self._supervisor = supervisor
+        self._loop = loop
+        self._limit = limit
+        self._thread_id = threading.get_ident()
+        self._main = threading.current_thread() is threading.main_thread()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="standstill", daemon=True)
+
+    def __enter__(self) -> None:
+        if self._limit > 0:
+            self._thread.start()
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _watch(self) -> None:
+        mark: Any = None
+        since, due, interrupted = 0.0, 0.0, 0.0
+        while not self._end.wait(min(self._limit / 8, _LONGEST_PAUSE)):
+            found, now = self._mark(), time.monotonic()
+            if found != mark:
+                mark, since, due, interrupted = found, now, self._limit, now
+            if now - since < due / 2:
+                continue
+            seen: Counter[tuple[str, str]] = Counter()
+            answer = self._ask(min(since + due, now + 1.0), seen)
+            if self._end.is_set():
+                return
+            if answer == "" or self._mark() != mark:
+                since = now
+                continue
+            if time.monotonic() >= since + due:
+                log.warning("%s", self._told(answer, seen, time.monotonic() - since))
+                due *= 2
+            if self._main and answer is None and time.monotonic() - interrupted > self._patience():
+                interrupted = time.monotonic()
+                self._interrupt()
+
+    def _mark(self) -> tuple[Any, ...]:
+        """Return what is the same for as long as nothing goes on; in any thread."""
+        run = self._supervisor
+        now = self._loop.now if isinstance(self._loop, LockstepLoop) else 0
+        doing = tuple((life.starts, life.doing) for life in list(run._lives.values()))
+        return now, run.first_update, run.ended, run.asked, doing
+
+    def _ask(self, until: float, seen: Counter[tuple[str, str]]) -> str | None:
+        """Let the loop explain, and note where it is meanwhile; `None` if it does not answer."""
+        answers: list[str] = []
+        answered = threading.Event()
+
+        def explain() -> None:
+            answers.append(self._explain())
+            answered.set()
+
+        try:
+            self._loop.call_soon_threadsafe(explain)
+        except RuntimeError:  # closed
+            return ""
+        while not (self._end.is_set() or (answers and answers[0] != "busy")):
+            frame = sys._current_frames().get(self._thread_id)
+            if frame is not None and not idle(frame):
+                seen[places.of_thread(frame)] += 1
+            del frame
+            if time.monotonic() >= until:
+                break
+            self._end.wait(_LOOK)
+        return answers[0] if answers else None
+
+    def _explain(self) -> str:
+        """Say who is waited for; ``""`` if all is well, ``"busy"`` if nobody is; on the loop."""
+        run, loop = self._supervisor, self._loop
+        waiting = [life for life in run._lives.values() if life.doing]
+        if waiting:
+            return "; ".join(
+                f"{life.spec.name}: {life.doing}{_at([life.step] if life.step else life.tasks)}"
+                for life in waiting[:_MOST_NAMED]
+            )
+        if run.first_update is None or run.ended is not None:
+            return "the other processes of the run" if run.peers is not None else ""
+        return _explain_time(loop, run) if isinstance(loop, LockstepLoop) else ""
+
+    def _told(self, answer: str | None, seen: Counter[tuple[str, str]], seconds: float) -> str:
+        (node, line), _ = seen.most_common(1)[0] if seen else (("runtime", "?"), 0)
+        if answer is None:
+            return f"the loop has not turned for {seconds:.1f} s: {node}, at {places.short(line)}"
+        if answer == "busy":
+            nodes = dict.fromkeys(n for (n, _), _ in seen.most_common() if n != "runtime")
+            names = ", ".join(list(nodes)[:_MOST_NAMED]) or node
+            return (
+                f"no time has passed for {seconds:.1f} s, while these run again and again: "
+                f"{names}, at {places.short(line)}"
+            )
+        return f"for {seconds:.1f} s the run has waited for {answer}"
+
+    def _patience(self) -> float:
+        """Return how long a node may block the loop: as long as the step may take that it is in."""
+        run = self._supervisor
+        if run.ended is not None or run.asked is not None:
+            return run.shutdown_limit()
+        return run._config.run.startup_limit if run.first_update is None else float("inf")
+
+    def _interrupt(self) -> None:
+        """Raise an error in whatever blocks the loop, by a signal."""
+        node, line = places.of_thread(sys._current_frames().get(self._thread_id))
+        error = NodeTimeoutError(node, "expected it to give back the loop, found it blocking it")
+        error.place = line
+        self._supervisor.interruption = error
+        signal.pthread_kill(self._thread_id, signal.SIGUSR2)
+
+
+def _explain_time(loop: LockstepLoop, run: Supervisor) -> str:
+    """Say what simulated time waits for."""
+    if loop.gate is not None:
+        paused = getattr(loop.gate, "paused", False)
+        return "" if paused else "the other processes of the run"
+    if (wait := loop.waits_for()) is None:
+        return "busy"
+    if not isinstance(wait, asyncio.Future):
+        return "" if wait == "pace" else f"nothing: nothing is due any more{_all(run)}"
+    for task in asyncio.all_tasks(loop):
+        if places.waits_for(task, wait):
+            node, line = places.of_task(task)
+            return f"{node}: slow work, at {places.short(line)}"
+    return "slow work beside the loop"
+
+
+def _all(run: Supervisor) -> str:
+    """Return where all nodes wait, as far as there is room."""
+    found = [(life.spec.name, task) for life in run._lives.values() for task in life.tasks]
+    listed = ", ".join(f"{name}{_at([task])}" for name, task in found[:_MOST_NAMED])
+    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    return f" ({listed}{more})" if listed else ""
+
+
+def _at(tasks: Any) -> str:
+    """Return at which line the first of some tasks waits that has not ended."""
+    waiting = [task for task in tasks if not task.done()]
+    return f", at {places.short(places.of_task(waiting[0])[1])}" if waiting else ""
