@@ -65,7 +65,7 @@ def _close(loop: asyncio.AbstractEventLoop) -> None:
     if tasks:
         _run_for(loop, asyncio.wait(tasks), GRACE)
     _run_for(loop, loop.shutdown_asyncgens(), GRACE)
-    for task in asyncio.all_tasks(loop):
+    for task in [task for task in tasks if not task.done()]:
         task._log_destroy_pending = False  # type: ignore[attr-defined]
         LEFT.append(task)
     loop.close()
@@ -88,5 +88,10 @@ def _run_for(
     with contextlib.suppress(SystemExit, KeyboardInterrupt):
         loop.run_forever()
     timer.cancel()
-    if task.done() and not task.cancelled():
+    if not task.done():
+        task.cancel()
+        loop.call_soon(loop.stop)
+        with contextlib.suppress(SystemExit, KeyboardInterrupt):
+            loop.run_forever()
+    elif not task.cancelled():
         task.exception()

@@ -75,7 +75,6 @@ def execute(
         summary = driver.run_to_end(run.loop, run.main(), run.escaped)
         if out is not None:
             run.conclude(out, summary)
-    driver.LEFT.extend(run.supervisor.left)
     if run.supervisor.error is not None:
         raise run.supervisor.error
     return summary

@@ -41,7 +41,6 @@ class Life:
 
     Attributes:
         doing: The step that the run waits for, if it does: ``on_startup``, ``its tasks``…
-        left: Tasks that did not end within their limits, and are left to themselves.
     """
 
     def __init__(self, spec: NodeSpec, create: Create) -> None:
@@ -61,7 +60,6 @@ class Life:
         self.ending = asyncio.Lock()
         self.doing = ""
         self.step: asyncio.Task[Any] | None = None
-        self.left: list[asyncio.Task[Any]] = []
         self._create = create
         self._succeeded = False
 
@@ -186,7 +184,7 @@ class Life:
         finally:
             if not task.done():
                 task.cancel()
-                self.left += await ended([task], GRACE)
+                await ended([task], GRACE)
             self.doing, self.step = "", None
             self._succeeded = task.done() and not task.cancelled() and task.result() is None
         if late:
@@ -215,7 +213,6 @@ class Life:
         self.doing = what if tasks else ""
         late = await ended(tasks, max(seconds, 0.0))
         self.doing = ""
-        self.left += late
         wrong: list[NodeError] = [
             self._too_late(what, limit or seconds, places.of_task(task)[1]) for task in late[:1]
         ]
@@ -225,7 +222,7 @@ class Life:
 
     def _too_late(self, what: str, limit: float, place: str) -> NodeTimeoutError:
         late = NodeTimeoutError(
-            self.spec.name, f"expected {what} to end within {limit:g} s, found it still running"
+            self.spec.name, f"expected {what} to end within {limit:.3g} s, found it still running"
         )
         late.place = place
         return late

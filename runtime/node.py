@@ -221,11 +221,11 @@ class Node(Generic[C]):
         In lockstep it comes exactly then, however long this machine takes; in real time not
         before then.
         """
-        call = functools.partial(fn, *args, **kwargs)
+        call = _Call(fn, *args, **kwargs)
         self._outside.add(call)
         for sender in senders(self).values():
             sender.watch()  # lest `call` sends something
-        work = self._host.executor.submit(_without_stop_iteration, call)
+        work = self._host.executor.submit(call)
         work.add_done_callback(lambda _: self._outside.discard(call))
         return await self.clock.beside(work, round(latency * SECOND))
 
@@ -323,15 +323,17 @@ def make_node(
     return node
 
 
-def _without_stop_iteration(call: Callable[[], R]) -> R:
-    """Call a function; its `StopIteration` becomes a `RuntimeError`, as in a coroutine.
+class _Call(functools.partial[R]):
+    """A call whose `StopIteration` becomes a `RuntimeError`, as in a coroutine.
 
     No future takes one, and whoever awaited it would wait for ever.
     """
-    try:
-        return call()
-    except StopIteration as error:
-        raise RuntimeError("the function raised StopIteration") from error
+
+    def __call__(self, /, *args: Any, **kwargs: Any) -> R:
+        try:
+            return super().__call__(*args, **kwargs)
+        except StopIteration as error:
+            raise RuntimeError("the function raised StopIteration") from error
 
 
 def streams(node: Node[Any]) -> dict[str, Stream[Any]]:

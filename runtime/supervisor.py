@@ -109,8 +109,6 @@ class Supervisor:
         """What workers cost, by ``node.Factory``."""
         self.after: list[Callable[[Path], Any]] = []
         """What is to be called with the run's folder at the very end."""
-        self.left: list[asyncio.Task[Any]] = []
-        """Tasks that would not end."""
         self.probes = Probes(self)
         self.changing = Changing(self)
         self._config = config
@@ -136,8 +134,7 @@ class Supervisor:
             await self._ended.wait()
             await asyncio.wait([self._begin])
             await self._end_all()
-        finally:  # of the tasks there are none left, unless this one was cancelled
-            self.left += [task for life in self._lives.values() for task in life.left]
+        finally:  # there are none left but those that would not end, unless this was cancelled
             for task in self._tasks:
                 task.cancel()
             self.executor.shutdown(wait=False, cancel_futures=True)

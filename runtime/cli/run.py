@@ -189,7 +189,7 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
     for thread in threads:
         thread.join(max(until - time.monotonic(), 0.0))
     stuck = [thread.name for thread in threads if thread.is_alive()]
-    stuck += [task.get_name() for task in driver.LEFT]
+    stuck += dict.fromkeys(task.get_name() for task in driver.LEFT)
     if stuck:
         print(f"warning: still busy, left behind: {', '.join(stuck)}", file=sys.stderr)
     if last:

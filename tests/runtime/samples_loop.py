@@ -146,6 +146,15 @@ async def until_sent(supervisor: Supervisor, name: str, more: int) -> None:
 Body = Callable[[Supervisor], Coroutine[Any, Any, None]]
 
 
+async def after_start(supervisor: Supervisor, body: Body) -> None:
+    """Await a body once the nodes have started; they take a few turns of the loop each."""
+    for _ in range(100):
+        if supervisor.first_update is not None:
+            break
+        await asyncio.sleep(0)
+    await body(supervisor)
+
+
 def look(
     nodes: list[NodeSpec],
     body: Body | None = None,
@@ -167,7 +176,7 @@ def look(
     async def main() -> None:
         steps.install(loop)
         supervisor = Supervisor(config, make_clock(config.run, loop), [tap])
-        beside = loop.create_task(body(supervisor)) if body else None
+        beside = loop.create_task(after_start(supervisor, body)) if body else None
         with watch(supervisor) if watch else contextlib.nullcontext():
             await supervisor.main()
         if beside:

@@ -11,6 +11,7 @@ import pytest
 from runtime import Duration, Input, Node
 from runtime.cli.tables import run_tables
 from runtime.config import Config, RunConfig
+from runtime.errors import ResultsError
 from runtime.execute import execute
 from runtime.summary import Summary
 from runtime.testing import run_nodes, spec
@@ -79,7 +80,9 @@ def test_a_folder_that_no_run_has_written_is_left_as_it_is(tmp_path: Path) -> No
     file = tmp_path / "evaluation" / "mine.csv"
     file.parent.mkdir()
     file.touch()
-    run(tmp_path, Speaker)
+    with pytest.raises(ResultsError, match=r"expected a new or empty folder.*found 'evaluation'"):
+        run(tmp_path, Speaker)
+    assert [each.name for each in tmp_path.iterdir()] == ["evaluation"]
     assert file.exists()
 
 
