@@ -180,7 +180,7 @@ class _Run:
         """Deal with what came out of the loop."""
         if not hasattr(self, "supervisor"):  # a Ctrl-C before there was anything to end
             raise error
-        self.supervisor.escaped(error)
+        self.loop.call_soon(self.supervisor.escaped, error)
 
     def failed(self, error: Exception) -> None:
         """Note an error; the first one counts."""

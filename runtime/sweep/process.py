@@ -19,10 +19,11 @@ from typing import Any
 
 import msgspec
 
+from runtime.results import claim
 from runtime.sweep.plan import Job
 from runtime.sweep.rows import Row, failed
 
-_STOPPED = {"Ctrl-C", "SIGTERM"}
+_STOPPED = {"Ctrl-C", "SIGTERM", "SIGHUP"}
 """Reasons for a run's end that are no end of its own; see `runtime.execute`."""
 
 _LONGEST_ERROR = 300
@@ -72,7 +73,7 @@ class Children:
         out = Path(job.out)
         if out.exists():
             shutil.rmtree(out)
-        out.mkdir(parents=True)
+        claim(out)
         settings = out / "config.toml"
         settings.write_text(job.text, encoding="utf-8")
         command = [sys.executable, "-m", "runtime", "run", str(settings)]

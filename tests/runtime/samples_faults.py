@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -175,3 +176,59 @@ class Stubborn(Node[StubbornConfig]):
     async def threads(self) -> None:
         calls: list[Any] = [self.offload(threading.Event().wait) for _ in range(8)]
         await asyncio.gather(*calls)
+
+
+class Remover(Node):
+    """Removes the run's folder while it goes on."""
+
+    async def run(self) -> None:
+        assert self.out is not None
+        shutil.rmtree(self.out)
+
+
+class Replacer(Node):
+    """Puts a file in the place of the run's folder."""
+
+    async def run(self) -> None:
+        assert self.out is not None
+        shutil.rmtree(self.out)
+        self.out.touch()
+
+
+class PhasedConfig(NodeConfig):
+    """In which phase it stays for a while, or until the run ends."""
+
+    phase: str = "wait"
+
+
+class Phased(Node[PhasedConfig]):
+    """Says on standard output that it is in a phase, and stays there."""
+
+    def now_in(self, phase: str) -> bool:
+        if self.config.phase == phase:
+            print(phase, flush=True)
+        return self.config.phase == phase
+
+    async def on_startup(self) -> None:
+        if self.now_in("start"):
+            await asyncio.get_running_loop().create_future()
+
+    @every(hz=100)
+    def tick(self, tick: Tick) -> None:
+        if tick.index == 5:
+            self.now_in("tick")
+
+    async def run(self) -> None:
+        if self.config.phase == "shutdown":
+            self.stop("enough")
+        busy = self.now_in("busy")
+        while busy:
+            await asyncio.sleep(0.001)
+        if self.now_in("offload"):
+            await self.offload(time.sleep, 1.0)
+        if self.now_in("wait"):
+            await asyncio.get_running_loop().create_future()
+
+    async def on_shutdown(self) -> None:
+        if self.now_in("shutdown"):
+            await asyncio.to_thread(time.sleep, 0.5)

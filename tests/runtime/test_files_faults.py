@@ -1,0 +1,205 @@
+"""Folders and disks that go wrong: one line, exit code 2, and nothing of anybody else's is lost."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from runtime.config import Config, RunConfig
+from runtime.errors import ResultsError
+from runtime.execute import execute
+from runtime.results import MARKER, claim, write
+from runtime.testing import spec
+from runtime.units import Duration
+from tests.runtime.samples import Speaker
+from tests.runtime.samples_cli import ROOT, command_here, config_file, summary
+
+pytestmark = pytest.mark.timeout(90)
+
+
+def fly(out: Path) -> None:
+    run = RunConfig(duration=Duration(0.1))
+    execute(Config(run=run, nodes=(spec(Speaker, "speaker"),)), out)
+
+
+def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+    """Even if it holds a file of the runtime's names, as one's own settings."""
+    (tmp_path / "plots").mkdir()
+    mine = [tmp_path / "config.toml", tmp_path / "plots" / "mine.png"]
+    for file in mine:
+        file.write_text("mine", encoding="utf-8")
+    with pytest.raises(ResultsError, match=r"expected a new or empty folder.*found 'config\.toml'"):
+        fly(tmp_path)
+    assert [file.read_text(encoding="utf-8") for file in mine] == ["mine", "mine"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["config.toml", "plots"]
+
+
+def test_a_folder_of_a_run_is_used_again_and_cleared(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    fly(out)
+    assert (out / MARKER).is_file()
+    (out / "plots").mkdir()
+    fly(out)
+    assert not (out / "plots").exists()
+
+
+def test_a_folder_of_a_run_of_an_earlier_version_is_known_by_its_summary(tmp_path: Path) -> None:
+    fly(tmp_path)
+    (tmp_path / MARKER).unlink()
+    fly(tmp_path)
+    (tmp_path / MARKER).unlink()
+    (tmp_path / "summary.json").write_text('{"name": "mine"}', encoding="utf-8")
+    with pytest.raises(ResultsError, match="expected a new or empty folder"):
+        fly(tmp_path)
+
+
+def test_a_file_is_written_as_a_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "summary.json"
+    write(file, b"old")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(file, b"new and longer")
+    assert [each.name for each in tmp_path.iterdir()] == ["summary.json"]
+    assert file.read_bytes() == b"old"
+
+
+def test_claiming_twice_is_no_mistake(tmp_path: Path) -> None:
+    claim(tmp_path / "a" / "b")
+    claim(tmp_path / "a" / "b")
+
+
+def run_limited(
+    folder: Path, *arguments: str, limit: Callable[[], None] | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "runtime", "run", "sample.toml", "--quiet", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "300", "NO_COLOR": "1"}
+        | environment,
+        capture_output=True,
+        text=True,
+        preexec_fn=limit,
+        timeout=60,
+    )
+
+
+def no_file_longer_than(size: int) -> Callable[[], None]:
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+def fails_in_one_line(done: subprocess.CompletedProcess[str], *words: str) -> None:
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("error: ")
+    assert all(word in last for word in words), last
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("out", "words"),
+    [
+        ("x" * 300, ("expected to write a run's results", "File name too long")),
+        ("sample.toml", ("expected to write a run's results", "File exists")),
+        ("sample.toml/below", ("expected to write a run's results", "Not a directory")),
+        ("/proc/none", ("expected to write a run's results",)),
+        ("/dev/null", ("expected to write a run's results",)),
+        (".", ("expected a new or empty folder",)),
+        ("..", ("expected a new or empty folder",)),
+        ("loop/on", ("expected to write a run's results",)),
+    ],
+)
+def test_a_folder_that_cannot_be(out: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    folder = tmp_path / "here"
+    folder.mkdir()
+    config_file(folder, "Speaker", run="duration = 0.2")
+    (folder / "loop").symlink_to("loop")
+    fails_in_one_line(run_limited(folder, "--out", out), *words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [0, 10, 100, 400, 700, 1000, 1500])
+def test_a_full_disk_is_one_line_and_no_half_summary(size: int, tmp_path: Path) -> None:
+    """Files may have so many bytes: too few for the settings, the summary, or what nodes write."""
+    config_file(tmp_path, "Speaker", "Reader", run="duration = 200")
+    done = run_limited(tmp_path, limit=no_file_longer_than(size))
+    fails_in_one_line(done, "File too large")
+    results = tmp_path / "runs" / "sample"
+    assert not (results / "summary.json").exists() or summary(results)["error"]
+
+
+@pytest.mark.slow
+def test_a_full_disk_for_the_log_alone_loses_the_log_alone(tmp_path: Path) -> None:
+    config_file(tmp_path, "Failing", run="duration = 2")
+    results = tmp_path / "runs" / "sample"
+    claim(results)
+    (results / "log.txt").symlink_to("/dev/full")
+    done = run_limited(tmp_path)
+    fails_in_one_line(done, "failing: RuntimeError: out of order")
+    assert "log.txt: cannot be written: No space left on device" in done.stderr
+    assert summary(results)["error"] == "failing: RuntimeError: out of order"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("node", ["Remover", "Replacer"])
+def test_a_folder_that_goes_in_mid_run_is_made_again(node: str, tmp_path: Path) -> None:
+    path = config_file(tmp_path, run="duration = 0.5")
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"[[nodes]]\nname = 'n'\ntype = 'tests.runtime.samples_faults:{node}'\n")
+    done = run_limited(tmp_path)
+    results = tmp_path / "runs" / "sample"
+    if node == "Remover":
+        assert (done.returncode, done.stderr) == (0, "")
+        assert summary(results)["reason"] == "duration"
+    else:
+        fails_in_one_line(done, "runs/sample", "expected to write a run's results")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["x" * 120, "file", "/proc"])
+def test_a_run_that_cannot_be_looked_at_goes_on(where: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    config_file(tmp_path, "Speaker", run="duration = 0.2")
+    folder = where if where.startswith("/") else str(tmp_path / where)
+    done = run_limited(tmp_path, XDG_RUNTIME_DIR=folder)
+    assert done.returncode == 0
+    assert "nobody can look at this run" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert summary(tmp_path / "runs" / "sample")["reason"] == "duration"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"a = " + b"9" * 5000, "expected TOML, found: Exceeds the limit"),
+        (b"a = " + b"[" * 100_000, "expected TOML, found brackets nested too deeply"),
+        (b"a = '\xff'", "expected UTF-8 text"),
+    ],
+)
+def test_a_file_that_nobody_would_write_is_one_line(
+    content: bytes, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "a.toml").write_bytes(content)
+    done = command_here("check", "a.toml", folder=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert words in done.stderr
+
+
+def test_a_trace_that_is_not_text_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_bytes(b'{"traceEvents": [{"name": "\xff\xfe"}]}')
+    done = command_here("trace", "t.json", folder=tmp_path)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "expected a trace, found" in done.stderr
