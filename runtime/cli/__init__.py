@@ -66,6 +66,10 @@ def main() -> None:
         app()
     except KeyboardInterrupt:
         interrupted()
+    except SystemExit as end:
+        if isinstance(getattr(end.__context__, "__cause__", None), KeyboardInterrupt):
+            interrupted()  # typer has made it an exit without a word
+        raise
     except BrokenPipeError:  # whoever reads what we print has heard enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(2)

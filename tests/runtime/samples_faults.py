@@ -168,7 +168,7 @@ class Stubborn(Node[StubbornConfig]):
             sum(range(1000))
 
     async def sleep(self) -> None:
-        time.sleep(1000)
+        time.sleep(1000)  # noqa: ASYNC251  # that is the fault
 
     async def wait_for_thread(self) -> None:
         await self.offload(threading.Event().wait)
@@ -221,13 +221,17 @@ class Phased(Node[PhasedConfig]):
     async def run(self) -> None:
         if self.config.phase == "shutdown":
             self.stop("enough")
-        busy = self.now_in("busy")
-        while busy:
-            await asyncio.sleep(0.001)
+        if self.now_in("busy"):
+            await self.spin()
         if self.now_in("offload"):
             await self.offload(time.sleep, 1.0)
         if self.now_in("wait"):
             await asyncio.get_running_loop().create_future()
+
+    async def spin(self) -> None:
+        end = asyncio.get_running_loop().time() + 3600
+        while asyncio.get_running_loop().time() < end:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
 
     async def on_shutdown(self) -> None:
         if self.now_in("shutdown"):

@@ -269,3 +269,31 @@ def test_restart_works_on_the_real_clock() -> None:
     assert outcome.error is None
     assert len(Patient.lives) == 2
     assert 0.5 <= Patient.lives[1] - Patient.ends[0] < 10
+
+
+def test_two_thousand_restarts_overflow_nothing() -> None:
+    class Weak(Node):
+        async def run(self) -> None:
+            raise RuntimeError
+
+    outcome = supervise([spec(Weak, "w", on_error="restart")], duration=2000 * 30.0)
+    assert outcome.error is None
+    assert outcome.supervisor._lives["w"].starts > 1900
+
+
+def test_failures_are_forgotten_after_a_healthy_period() -> None:
+    class Weekly(Node):
+        starts: ClassVar[list[float]] = []
+
+        async def run(self) -> None:
+            self.starts.append(self.clock.now() / 1e9)
+            await self.clock.sleep(1.0 if len(self.starts) < 4 else 61.0)
+            raise RuntimeError
+
+    supervise([spec(Weekly, "w", on_error="restart")], duration=80.0)
+    assert Weekly.starts == [0.0, 1.5, 3.5, 6.5, 68.0]  # 0.5, 1 and 2 s; 0.5 s again
+
+
+def test_the_limit_of_a_node_s_end_grows_with_the_run() -> None:
+    outcome = supervise([spec(Speaker, "s")], duration=6000.0, shutdown_limit=10)
+    assert outcome.supervisor.shutdown_limit() >= 10 + 0.05 * 6000

@@ -10,6 +10,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -150,3 +151,20 @@ def test_a_run_survives_whatever_a_node_raises(
 ) -> None:
     """528 modes: 11 places, 8 ways, 2 clocks, 3 rules."""
     check(tmp_path, [(place, way, clock, rule) for place in places for way in WAYS])
+
+
+def test_the_page_of_what_happens_when_names_tests_and_messages_that_there_are() -> None:
+    """Each row names a file of tests, and quotes messages as the runtime has them."""
+    page = (ROOT / "docs" / "what-happens-when.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1:-1] for line in page.splitlines() if line.startswith("| ")][1:]
+    assert len(rows) >= 18
+    sources = "".join(
+        path.read_text(encoding="utf-8") for path in sorted((ROOT / "runtime").rglob("*.py"))
+    )
+    for row in rows:
+        assert len(row) == 5, row
+        tests = row[4].strip().strip("`")
+        assert (ROOT / "tests" / "runtime" / tests).is_file(), row
+        assert row[3].strip() in {"0", "2", "130", "signal", "as else", ""}, row
+        for quoted in re.findall(r"expected [a-z' ]+", row[2]):
+            assert quoted.removeprefix("expected ").split(" to end")[0].strip() in sources, quoted
