@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import shutil
 import threading
 import time
@@ -59,7 +60,7 @@ class Faulty(Node[FaultyConfig]):
         late = place not in {"on_startup", "announce", "on_announcement", "after_run"}
         if place != self.config.place or self.restarts or (late and self.clock.now() < 2e8):
             return
-        raise WAYS[self.config.way]()
+        raise WAYS[self.config.way]
 
     async def on_startup(self) -> None:
         self.after_run(self.afterwards)
@@ -151,17 +152,13 @@ class Stubborn(Node[StubbornConfig]):
 
     async def swallow(self) -> NoReturn:
         while True:
-            try:
+            with contextlib.suppress(asyncio.CancelledError):
                 await asyncio.get_running_loop().create_future()
-            except asyncio.CancelledError:
-                pass
 
     async def spin(self) -> NoReturn:
         while True:
-            try:
+            with contextlib.suppress(BaseException):
                 await asyncio.sleep(0)
-            except BaseException:
-                pass
 
     async def block(self) -> None:
         while True:
