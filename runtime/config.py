@@ -55,7 +55,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         digest: Whether to fingerprint all events; if not given, in lockstep only, since no two
             runs in real time are alike.
         stall: Real seconds without a turn of the loop that the watchdog reports; 0 for none.
-        startup_limit: Real seconds a node's `on_startup` may take.
+        startup_limit: Real seconds a node's `on_startup`, or `on_ready`, may take.
         shutdown_limit: Real seconds a node's `on_shutdown` may take, and a twentieth of the run's
             length more.
         progress_limit: Real seconds without progress after which the log says who is waited for,

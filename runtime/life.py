@@ -132,6 +132,28 @@ class Life:
             except BaseException as error:
                 raise wrap(name, error) from error
 
+    async def ready(self, limit: float) -> None:
+        """Let the node get ready with what it has heard.
+
+        Args:
+            limit: Real seconds that `on_ready` may take.
+
+        Raises:
+            NodeError: Something went wrong in it.
+        """
+        assert self.node is not None
+        name = self.spec.name
+        try:
+            async with real_time_limit(limit):
+                await self.node.on_ready()
+        except NodeError:
+            raise
+        except TimeoutError:
+            expected = f"expected on_ready to end within {limit:g} s"
+            raise NodeTimeoutError(name, f"{expected}, found it still running") from None
+        except Exception as error:
+            raise wrap(name, error) from error
+
     async def end(self, limit: float) -> list[NodeError]:
         """End ticks, tasks, node and workers; whatever goes wrong, the other steps follow.
 

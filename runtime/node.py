@@ -1,6 +1,7 @@
 """What an author of nodes writes: a class with ports, and the phases it needs.
 
-    construct → on_startup → announce, on_announcement → run, handlers, ticks → on_shutdown
+    construct → on_startup → announce, on_announcement → on_ready → run, handlers, ticks
+    → on_shutdown
 
 Every phase is optional. All that a node may use is there before its ``__init__`` (which takes no
 arguments and need not call ``super().__init__``).
@@ -175,6 +176,13 @@ class Node(Generic[C]):
 
         Raises:
             ValueError: This node cannot work with it; the message says why, and the run ends.
+        """
+
+    async def on_ready(self) -> None:
+        """Get ready with what was announced, such as a worker that needs a camera's calibration.
+
+        Called once all announcements are heard. The first event waits for every node's, so that
+        in real time, too, none is missed meanwhile. Nothing may be sent yet.
         """
 
     def narrow(self, port: str, source: str) -> None:

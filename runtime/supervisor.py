@@ -1,7 +1,7 @@
 """The life of a run's nodes: started in order, watched over, ended in reverse order.
 
     construct → on_startup, in file order
-    announce, heard by all
+    announce, heard by all; on_ready, in file order
     connect; ticks and run() begin: the first update
     …
     cancel run(), on_shutdown: in reverse order, always, each with a time limit
@@ -286,6 +286,10 @@ class Supervisor:
             self.announcements += await self.peers.announce(said) if self.peers else mine
             for life in self._lives.values():
                 life.hear(self.announcements)
+            for life in self._lives.values():
+                await life.ready(self._config.run.startup_limit)
+                if self._ended.is_set():
+                    return
             if self.peers is not None:
                 self.connect()  # so that each knows what the others hear
                 await self.peers.begin()
@@ -424,6 +428,7 @@ class Supervisor:
             try:
                 await self._start_up(life)
                 life.hear(self.announcements)
+                await life.ready(self._config.run.startup_limit)
             except NodeError as error:
                 if isinstance(places.leaf(error.__cause__ or error), FatalError):
                     log_error(error, last=True)

@@ -38,17 +38,20 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
 
     frames = Bundle(Frame, keep="latest")
 
-    async def run(self) -> None:
-        """Track each picture in a process of its own; say nothing until there is a map."""
-        odometry = await self.worker(
+    async def on_ready(self) -> None:
+        """Start the odometry, in a process of its own."""
+        self._odometry = await self.worker(
             make_odometry,
             self.the_camera().info,
             self.config.settings,
             latency=self.config.latency,
             env=WORKER_ENVIRONMENT,
         )
+
+    async def run(self) -> None:
+        """Track each image; say nothing until there is a map."""
         async for (image,) in self.frames:
-            tracked = await odometry.call(Odometry.track, image.stamp, image.data)
+            tracked = await self._odometry.call(Odometry.track, image.stamp, image.data)
             if tracked.initialised or tracked.lost:
                 self.publish(image, tracked)
 

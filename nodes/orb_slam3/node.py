@@ -72,23 +72,26 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         if "inertial" in self.config.mode:
             self._samples.append(event)
 
-    async def run(self) -> None:
-        """Track each picture; skip those that come meanwhile."""
+    async def on_ready(self) -> None:
+        """Start ORB-SLAM3, in a process of its own."""
         config = self.config
-        slam = await self.worker(
+        self._slam = await self.worker(
             OrbSlam3Process,
             make_settings(config.mode, self.the_camera(), self._imu, config.orb),
             self._vocabulary(),
             float(config.patience),
             latency=config.latency,
         )
+
+    async def run(self) -> None:
+        """Track each image; skip those that come meanwhile."""
         began = False
         async for image, depth in self.frames:
-            if ("rgbd" in config.mode) != (depth is not None):
+            if ("rgbd" in self.config.mode) != (depth is not None):
                 if depth is None:
                     continue
                 depth = None
-            said = await slam.call(
+            said = await self._slam.call(
                 OrbSlam3Process.track,
                 image.stamp,
                 image.data,
@@ -97,7 +100,7 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
             )
             began = began or not said.lost
             if began:
-                self.publish(image, said)
+                self.publish(image, said, origin=said.began if said.began >= 0 else None)
 
     def _vocabulary(self) -> Path:
         """Return the vocabulary's file.

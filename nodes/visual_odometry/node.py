@@ -39,18 +39,21 @@ class VisualOdometry(Estimator[VisualOdometryConfig]):
     def __init__(self) -> None:
         self.method = f"RGB-D odometry ({self.config.method})"
 
-    async def run(self) -> None:
-        """Track each picture in a process of its own; skip those that come meanwhile."""
-        tracker = await self.worker(
+    async def on_ready(self) -> None:
+        """Start the tracker, in a process of its own."""
+        self._tracker = await self.worker(
             make_tracker,
             self.config,
             self.the_camera().info,
             latency=self.config.latency,
             env=WORKER_ENVIRONMENT,
         )
+
+    async def run(self) -> None:
+        """Track each image; skip those that come meanwhile."""
         async for image, depth in self.frames:
             self.publish(
-                image, await tracker.call(Tracker.track, image.stamp, image.data, depth.data)
+                image, await self._tracker.call(Tracker.track, image.stamp, image.data, depth.data)
             )
 
 

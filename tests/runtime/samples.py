@@ -51,6 +51,9 @@ class Diarist(Node):
     def on_announcement(self, announcement: Announcement) -> None:
         DIARY.append(f"{self.name} heard of {announcement.source}")
 
+    async def on_ready(self) -> None:
+        DIARY.append(f"{self.name} is ready")
+
     @on(Ping)
     def heard(self, event: Ping) -> None:
         DIARY.append(f"{self.name} heard {event.source}")

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from events import Announcement, Event, Shutdown, WindowClosed
-from runtime import Node, NodeConfig, Output, RefusedError, Tick, every, on
+from runtime import Input, Node, NodeConfig, Output, RefusedError, Tick, every, on
 from runtime.config import NodeSpec
 from runtime.errors import NodeError, NodeTimeoutError
 from runtime.testing import run_node, run_nodes, spec
@@ -40,8 +40,8 @@ def test_phases_come_in_order_and_end_in_reverse(clock: str) -> None:
     hearing = ["a heard of a", "a heard of b", "b heard of a", "b heard of b"]
     living = {"a runs", "b runs", "a ticks 0", "b ticks 0"}
     ending = ["b down", "a heard b", "a down"]
-    assert DIARY[:10] == beginning + hearing
-    assert set(DIARY[10:-3]) == living
+    assert DIARY[:12] == [*beginning, *hearing, "a is ready", "b is ready"]
+    assert set(DIARY[12:-3]) == living
     assert DIARY[-3:] == ending
 
 
@@ -74,6 +74,52 @@ def test_a_start_that_takes_too_long_ends_the_run(clock: str) -> None:
     assert "s: expected on_startup to end within 0.1 s" in str(outcome.error)
     assert "z made" not in DIARY
     assert [line for line in DIARY if "down" in line] == ["a down"]
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_getting_ready_that_takes_too_long_or_fails_ends_the_run(clock: str) -> None:
+    class Sleepy(Diarist):
+        async def on_ready(self) -> None:
+            await asyncio.get_running_loop().create_future()
+
+    class Broken(Diarist):
+        async def on_ready(self) -> None:
+            raise OSError("no such camera")
+
+    for kind, said in (
+        (Sleepy, "s: expected on_ready to end within 0.1 s"),
+        (Broken, "s: OSError: no such camera"),
+    ):
+        DIARY.clear()
+        outcome = supervise([spec(Diarist, "a"), spec(kind, "s")], clock=clock, startup_limit=0.1)
+        assert said in str(outcome.error)
+        assert "a runs" not in DIARY
+        assert [line for line in DIARY if "down" in line] == ["s down", "a down"]
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_no_event_is_missed_by_who_gets_ready(clock: str) -> None:
+    """However long it takes: the clock starts after it."""
+    heard: list[int] = []
+
+    class Slow(Node):
+        pings = Input(Ping, keep="latest")
+
+        async def on_ready(self) -> None:
+            await self.offload(time.sleep, 0.3)  # real work beside the loop
+
+        async def run(self) -> None:
+            heard.append((await anext(self.pings)).stamp)
+
+    class Source(Node):
+        pings = Output(Ping)
+
+        @every(hz=100)
+        def tick(self, tick: Tick) -> None:
+            self.pings.send(Ping(stamp=tick.index, source=self.name))
+
+    supervise([spec(Source, "source"), spec(Slow, "slow")], clock=clock, duration=0.2)
+    assert heard == [0]
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
