@@ -7,7 +7,8 @@ Not here: how a pose is computed (`nodes.visual_odometry` and its neighbours), a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Protocol
 
 import msgspec
@@ -18,20 +19,23 @@ from typing_extensions import TypeVar
 
 from events import (
     Announcement,
+    Armed,
     CameraAnnouncement,
     DepthImage,
     EstimatorAnnouncement,
     Image,
     PoseEstimate,
     Quaternion,
+    TakenOff,
     TrackedFeatures,
     TrackingEvent,
     TrackingLost,
     TrackingRegained,
     Vector3,
     VehicleAnnouncement,
+    VehicleEvent,
 )
-from runtime import Duration, Node, NodeConfig, Output
+from runtime import Duration, Node, NodeConfig, Output, on
 
 Floats = npt.NDArray[np.float64]
 
@@ -79,8 +83,9 @@ class EstimatorConfig(NodeConfig):
 
     Attributes:
         origin: ``announced``: the estimates are in ``map``, and begin at the pose at which the
-            vehicle said it stands (if none did, as ``start``). ``start``: they are in ``odom``,
-            which is where the body is at the first picture.
+            vehicle said it stands, if that is known to be true (else as ``start``; see
+            `Estimator`). ``start``: they are in ``odom``, which is where the body is at the first
+            image with a pose.
         latency: Seconds on the run's clock that one estimate takes.
     """
 
@@ -95,7 +100,21 @@ class Estimator(Node[C], ABC):
     """Base of the nodes that turn pictures into poses.
 
     A subclass declares its input as ``frames`` (of one camera), names in `needs` what that camera
-    must give, and in `run` calls `publish` with what its tracker says.
+    must give, starts its tracker in `on_ready`, when `the_camera` is known, and in `run` calls
+    `publish` with what the tracker says.
+
+    The frame of the estimates is chosen once, with the first pose. It is ``map`` if the announced
+    pose of the vehicle was true for the image at which the tracker's own poses begin:
+
+    - the node was there when the run began: it is not a restarted one;
+    - the vehicle had not been armed (and had not taken off) at that image's stamp;
+    - the vehicle takes commands (its announced control rate is above 0), so that it stands until it
+      says `Armed`; or, for a recorded vehicle, which may move from the start on and say nothing,
+      the image is not later than a camera's period and latency after the announcement;
+    - the estimates are in metres: the estimator is not scale-free.
+
+    Otherwise it is ``odom``, whose origin is the body at that image, and after a restart
+    ``odom_1``, ``odom_2``, … A restarted node says `TrackingLost`, then `TrackingRegained`.
     """
 
     needs: frozenset[str] = frozenset()
@@ -111,6 +130,7 @@ class Estimator(Node[C], ABC):
     _vehicles: tuple[VehicleAnnouncement, ...] = ()
     _mount: Mount | None = None
     _lost = False
+    _moving: Mapping[str, int] = MappingProxyType({})
 
     def announce(self) -> Iterable[Announcement]:
         """Say that there will be estimates."""
@@ -138,9 +158,14 @@ class Estimator(Node[C], ABC):
         self.camera = announcement
         self.narrow("frames", announcement.source)
 
+    @on(Armed, TakenOff)
+    def vehicle_events(self, event: VehicleEvent) -> None:
+        """Note since when a vehicle may have left the pose that it announced."""
+        self._moving = {event.source: event.stamp, **self._moving}
+
     @abstractmethod
     async def run(self) -> None:
-        """Track the pictures."""
+        """Track the images."""
 
     def the_camera(self) -> CameraAnnouncement:
         """Return the camera to read.
@@ -158,8 +183,19 @@ class Estimator(Node[C], ABC):
         assert self.camera is not None
         return self.camera
 
-    def publish(self, image: Image, tracked: Tracked) -> None:
-        """Say what a tracker found in a picture."""
+    def publish(self, image: Image, tracked: Tracked, origin: int | None = None) -> None:
+        """Say what a tracker found in an image.
+
+        Args:
+            image: It.
+            tracked: What the tracker says of it.
+            origin: Stamp (ns) of the image at which the tracker's poses begin; if `None`, that of
+                the first image that is published with a pose.
+        """
+        if self.restarts and self._mount is None and not self._lost:
+            self._lost = True
+            reason = f"restarted: poses are in {self._odom()} from here on"
+            self.tracking.send(TrackingLost(stamp=image.stamp, source=self.name, reason=reason))
         self.features.send(
             TrackedFeatures(
                 stamp=image.stamp,
@@ -179,14 +215,37 @@ class Estimator(Node[C], ABC):
             self.tracking.send(TrackingRegained(stamp=image.stamp, source=self.name))
         self._lost = tracked.lost
         if not tracked.lost:
-            self._mount = self._mount or self._mounting()
+            if self._mount is None:
+                self._mount = self._mounting(image.stamp if origin is None else origin)
             self.estimates.send(self._mount.estimate(image.stamp, self.name, tracked.pose))
 
-    def _mounting(self) -> Mount:
+    def _mounting(self, origin: int) -> Mount:
+        """Return the mount for a tracker whose poses begin at an image of this stamp."""
         camera = self.the_camera()
         carriers = (v for v in self._vehicles if camera.source.startswith(f"{v.source}/"))
         vehicle = next(carriers, None) if self.config.origin == "announced" else None
-        return Mount.of(camera, vehicle)
+        if vehicle is not None and not self.scale_free and not self._stood(vehicle, origin):
+            self.log.warning(
+                "the announced pose of %s is not known to hold at %.3f s, where tracking begins: "
+                "estimates are in %s",
+                vehicle.source,
+                origin / 1e9,
+                self._odom(),
+            )
+            vehicle = None
+        return Mount.of(camera, None if self.scale_free else vehicle, self._odom())
+
+    def _stood(self, vehicle: VehicleAnnouncement, stamp: int) -> bool:
+        """Tell whether a vehicle is known to have been at its announced pose at a time (ns)."""
+        camera = self.the_camera()
+        if self.restarts or self._moving.get(vehicle.source, stamp) < stamp:
+            return False
+        first = camera.latency + (1.0 / camera.rate if camera.rate > 0 else 0.0)
+        return vehicle.control_rate > 0 or stamp - vehicle.stamp <= first * 1e9
+
+    def _odom(self) -> str:
+        """Return the frame of an estimator that does not know where it began."""
+        return f"odom_{self.restarts}" if self.restarts else "odom"
 
 
 class Mount(msgspec.Struct, frozen=True, eq=False):
@@ -205,10 +264,19 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
     camera: Floats
 
     @classmethod
-    def of(cls, camera: CameraAnnouncement, vehicle: VehicleAnnouncement | None) -> Mount:
-        """Make the mount of an announced camera; without a vehicle, the start is unknown."""
+    def of(
+        cls, camera: CameraAnnouncement, vehicle: VehicleAnnouncement | None, frame_id: str = "odom"
+    ) -> Mount:
+        """Make the mount of an announced camera.
+
+        Args:
+            camera: It.
+            vehicle: Whose announced pose the body had at the first image; if `None`, where that
+                was is unknown.
+            frame_id: Parent frame of the estimates if it is.
+        """
         return cls(
-            frame_id="odom" if vehicle is None else "map",
+            frame_id=frame_id if vehicle is None else "map",
             child_frame_id=camera.parent_frame_id,
             start=np.eye(4)
             if vehicle is None

@@ -196,7 +196,10 @@ class Replay(Node[ReplayConfig]):
         if not isinstance(event, Odometry):
             return announcement
         return msgspec.structs.replace(
-            announcement, position=event.position, orientation=event.orientation
+            announcement,
+            control_rate=0.0,  # in mid-recording, nobody knows whether it stands
+            position=event.position,
+            orientation=event.orientation,
         )
 
     def _nothing(self) -> str:

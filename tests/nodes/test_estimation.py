@@ -9,15 +9,20 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from events import (
+    Armed,
     CameraAnnouncement,
     CameraInfo,
     DepthImage,
     Event,
     Image,
     PoseEstimate,
+    TakenOff,
     TrackedFeatures,
+    TrackingEvent,
     TrackingLost,
     TrackingRegained,
     VehicleAnnouncement,
@@ -29,6 +34,7 @@ from runtime.testing import NodeResult, run_nodes, spec
 
 LOOKING_AHEAD = (0.5, 0.5, 0.5, 0.5)
 """Optical axes right, down, forward to body axes forward, right, down."""
+MS = 1_000_000
 INFO = CameraInfo.from_fov(8, 6, math.pi / 2)
 
 
@@ -51,11 +57,19 @@ class Scripted(Estimator):
         self.the_camera()
         count = 0
         async for image, _ in self.frames:
+            if image.data.max() > 250:
+                raise RuntimeError("dazzled")
             pose = np.eye(4)
             pose[2, 3] = count
             dark = not image.data.any()
             self.publish(image, Said(pose, dark, "dark" if dark else ""))
             count += 1
+
+
+class ScaleFree(Scripted):
+    """Has a unit of length of its own."""
+
+    scale_free = True
 
 
 def camera(source: str, *images: Literal["rgb", "grey", "depth"], **more: Any) -> Event:
@@ -74,20 +88,22 @@ def camera(source: str, *images: Literal["rgb", "grey", "depth"], **more: Any) -
     return CameraAnnouncement(**(fields | more))
 
 
-def vehicle(source: str = "drone") -> Event:
+def vehicle(source: str = "drone", control_rate: float = 400) -> Event:
     return VehicleAnnouncement(
         stamp=0,
         source=source,
         mass=1.0,
         max_thrust=20.0,
-        control_rate=400,
+        control_rate=control_rate,
         position=(1.0, 2.0, -0.1),
         orientation=(math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)),  # looks east
     )
 
 
-def picture(stamp: int, source: str = "drone/front", dark: bool = False) -> list[Event]:
-    data = np.full((6, 8), 0 if dark else 9, np.uint8)
+def picture(
+    stamp: int, source: str = "drone/front", dark: bool = False, grey: int = 9
+) -> list[Event]:
+    data = np.full((6, 8), 0 if dark else grey, np.uint8)
     depth = np.ones((6, 8), np.float32)
     frame = f"{source}_optical"
     return [
@@ -98,6 +114,13 @@ def picture(stamp: int, source: str = "drone/front", dark: bool = False) -> list
 
 def track(*events: Event, inputs: dict[str, str] | None = None, **config: Any) -> NodeResult:
     return run_nodes([spec(Scripted, "est", config, inputs=inputs)], inputs=events, duration=1.0)
+
+
+def begin(*events: Event, control_rate: float = 400) -> list[str]:
+    """Return the frames in which a vehicle's estimator speaks."""
+    seen = camera("drone/front", "rgb", "depth", latency=0.04)
+    result = track(vehicle(control_rate=control_rate), seen, *events)
+    return [each.frame_id for each in result.of(PoseEstimate)]
 
 
 def test_the_bodys_pose_is_in_map_from_where_the_vehicle_said_it_stands() -> None:
@@ -112,13 +135,68 @@ def test_the_bodys_pose_is_in_map_from_where_the_vehicle_said_it_stands() -> Non
 
 def test_without_a_vehicle_or_if_asked_it_is_in_odom() -> None:
     cases: list[tuple[list[Event], dict[str, Any]]] = [([], {}), ([vehicle()], {"origin": "start"})]
-    for given, config in cases:
+    for said, config in cases:
         seen = camera("drone/front", "rgb", "depth")
-        result = track(*given, seen, *picture(1), *picture(2), **config)
+        result = track(*said, seen, *picture(1), *picture(2), **config)
         first, second = result.of(PoseEstimate)
         assert first.frame_id == "odom"
         np.testing.assert_allclose(first.position, (0.0, 0.0, 0.0), atol=1e-12)
         np.testing.assert_allclose(second.position, (1.0, 0.0, 0.0), atol=1e-12)
+
+
+def armed(stamp: int, source: str = "drone") -> Event:
+    return Armed(stamp=stamp, source=source)
+
+
+def test_a_vehicle_that_takes_commands_stands_where_it_said_until_it_is_armed() -> None:
+    late = 500 * MS
+    assert begin(*picture(late)) == ["map"]
+    assert begin(armed(late), *picture(late)) == ["map"]
+    assert begin(armed(late - 1), *picture(late)) == ["odom"]
+    assert begin(TakenOff(stamp=late - 1, source="drone"), *picture(late)) == ["odom"]
+    assert begin(armed(late - 1, "another"), *picture(late)) == ["map"]
+
+
+def test_a_picture_that_shows_too_little_is_no_beginning() -> None:
+    """The tracker's poses begin later, when the vehicle is elsewhere."""
+    found = begin(*picture(0, dark=True), armed(100 * MS), *picture(300 * MS), *picture(400 * MS))
+    assert found == ["odom", "odom"]
+
+
+def test_a_frame_once_chosen_stays() -> None:
+    assert begin(*picture(0), armed(1), *picture(300 * MS), *picture(400 * MS)) == ["map"] * 3
+
+
+@pytest.mark.parametrize(("late", "frame"), [(0, "map"), (140 * MS, "map"), (141 * MS, "odom")])
+def test_of_a_recorded_vehicle_the_first_exposure_is_known_only(late: int, frame: str) -> None:
+    """A period of the camera's 10 Hz, and its latency: it may move from the start on."""
+    assert begin(*picture(late), control_rate=0.0) == [frame]
+
+
+def test_who_does_not_know_the_metre_is_not_in_map() -> None:
+    seen = camera("drone/front", "rgb", "depth")
+    result = run_nodes([spec(ScaleFree, "est")], inputs=[vehicle(), seen, *picture(1)])
+    assert [each.frame_id for each in result.of(PoseEstimate)] == ["odom"]
+
+
+def test_after_a_restart_it_is_in_a_frame_of_its_own_and_says_so() -> None:
+    """Brought up in mid-flight, it would say that the vehicle stands at the start."""
+    dazzling = [picture(at * MS, grey=255) for at in (100, 1500)]
+    frames = [*picture(0), *dazzling[0], *picture(900 * MS), *dazzling[1], *picture(3000 * MS)]
+    result = run_nodes(
+        [spec(Scripted, "est", on_error="restart")],
+        inputs=[vehicle(), camera("drone/front", "rgb", "depth"), *frames, *picture(3100 * MS)],
+        duration=4.0,
+    )
+    assert [(e.stamp // MS, e.frame_id) for e in result.of(PoseEstimate)] == [
+        *[(0, "map"), (900, "odom_1"), (3000, "odom_2"), (3100, "odom_2")]
+    ]
+    told = [(e.stamp // MS, type(e)) for e in result.sent if isinstance(e, TrackingEvent)]
+    assert told == [
+        *[(900, TrackingLost), (900, TrackingRegained)],
+        *[(3000, TrackingLost), (3000, TrackingRegained)],
+    ]
+    assert result.of(TrackingLost)[0].reason == "restarted: poses are in odom_1 from here on"
 
 
 def test_another_vehicles_place_is_not_taken_for_its_own() -> None:
@@ -172,3 +250,50 @@ def test_matrices_and_tuples_are_the_same_pose() -> None:
     position, orientation = pose_tuples(pose_matrix(*pose))
     assert position == pytest.approx(pose[0])
     assert orientation == pytest.approx(pose[1])
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 400), st.sampled_from(("lit", "dark", "dazzling")))),
+    st.integers(0, 2000),
+    st.sampled_from((0.0, 400.0)),
+)
+def test_whatever_happens_an_estimate_in_map_is_true(
+    shown: list[tuple[int, str]], moves: int, control_rate: float
+) -> None:
+    """From when it is armed on, the vehicle flies east at 1 m/s; images come at any time."""
+    flown = {}
+    events: list[Event] = [Armed(stamp=moves * MS, source="drone")] if control_rate else []
+    at = 0
+    for gap, kind in shown:
+        at += gap
+        flown[at * MS] = max(at - (moves if control_rate else 0), 0) / 1000
+        grey = {"lit": 9, "dark": 0, "dazzling": 255}[kind]
+        events += picture(at * MS, grey=grey)
+    events.sort(key=lambda event: event.stamp)
+
+    class Ideal(Scripted):
+        async def run(self) -> None:
+            first = None
+            async for image, _ in self.frames:
+                if image.data.max() > 250:
+                    raise RuntimeError("dazzled")
+                pose = np.eye(4)
+                if image.data.any():
+                    first = flown[image.stamp] if first is None else first
+                    pose[2, 3] = flown[image.stamp] - first
+                self.publish(image, Said(pose, lost=not image.data.any()))
+
+    seen = camera("drone/front", "rgb", "depth", rate=100.0)
+    result = run_nodes(
+        [spec(Ideal, "est", on_error="restart")],
+        inputs=[vehicle(control_rate=control_rate), seen, *events],
+        duration=at / 1000 + 1,
+    )
+    frames: list[str] = []
+    for estimate in result.of(PoseEstimate):
+        if estimate.frame_id == "map":
+            off = estimate.position[1] - 2.0 - flown[estimate.stamp]
+            assert abs(off) < 1e-9 if control_rate else abs(off) <= 0.01 + 1e-9
+        if estimate.frame_id not in frames[-1:]:
+            frames.append(estimate.frame_id)
+    assert len(set(frames)) == len(frames), "none is taken up again"
