@@ -74,6 +74,9 @@ class Pilot(Node[C], ABC):
     orders = Output(Command)
     end = Output(Shutdown)
 
+    outcome = "tour flown"
+    """Why the run ends, once it has landed."""
+
     def __init__(self) -> None:
         self.here: Odometry | PoseEstimate | None = None
         self._placed = asyncio.Event()
@@ -138,7 +141,7 @@ class Pilot(Node[C], ABC):
         self.log.info("landed")
         await clock.sleep(0.5)
         if self.config.end_run:
-            self.end.send(Shutdown(stamp=clock.now(), source=name, reason="tour flown"))
+            self.end.send(Shutdown(stamp=clock.now(), source=name, reason=self.outcome))
 
     def _plan(self, start: Odometry | PoseEstimate) -> Path | None:
         """Return the path from here; `None` if the only waypoint is where the vehicle is."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from typing import Annotated
 
@@ -25,12 +24,14 @@ class VisualPilotConfig(TourConfig):
         yaw_gain: Radians per second for each radian off the heading.
         catch_up: Metres per second that the correction never exceeds.
         patience: How old the newest estimate may be; then the vehicle stops and waits.
+        give_up: How long it waits; then it lands where it is, and the run ends.
     """
 
     gain: Changeable[Positive] = 1.0
     yaw_gain: Changeable[Positive] = 1.0
     catch_up: Changeable[Positive] = 0.5
     patience: Changeable[Duration] = Duration(0.5)  # immutable
+    give_up: Changeable[Duration] = Duration(10.0)
 
 
 class VisualPilot(Pilot[VisualPilotConfig]):
@@ -38,6 +39,10 @@ class VisualPilot(Pilot[VisualPilotConfig]):
 
     It asks for velocities along the vehicle's own heading, so whatever is wrong with the estimate,
     heading included, shows in the flight. (Attitude and velocity are held by the vehicle itself.)
+
+    The frame of the first estimate is the one it flies in, and that of its waypoints. Estimates in
+    another frame are none to it: those of a restarted estimator begin where the vehicle is then, in
+    ``odom_1``. It hovers, goes on when estimates in its frame come again, and else lands.
     """
 
     setpoints = Output(VelocitySetpoint)
@@ -45,13 +50,24 @@ class VisualPilot(Pilot[VisualPilotConfig]):
 
     def __init__(self) -> None:
         super().__init__()
-        self._fresh = asyncio.Event()
+        self._frame = ""
+        self._refused = ""
 
     @on(PoseEstimate)
     def estimated(self, event: PoseEstimate) -> None:
-        """Note where the vehicle seems to be."""
+        """Note where the vehicle seems to be, if that is in the frame of the flight."""
+        frame = self._frame = self._frame or event.frame_id
+        if event.frame_id != frame:
+            if event.frame_id != self._refused:
+                self._refused = event.frame_id
+                self.log.warning(
+                    "%s: expected estimates in %s, found %s: not followed",
+                    event.source,
+                    frame,
+                    event.frame_id,
+                )
+            return
         self.see(event)
-        self._fresh.set()
 
     async def follow(self, path: Path) -> None:
         """Ask for the path's velocity, and for more where the estimate is beside the path."""
@@ -60,7 +76,10 @@ class VisualPilot(Pilot[VisualPilotConfig]):
         begin = clock.now()
         for index in range(last + 1):
             await clock.sleep_until(begin + index * step)
-            begin += await self._wait_for_sight()
+            waited = await self._wait_for_sight()
+            if waited is None:
+                return
+            begin += waited
             now = clock.now()
             x, y, z = path.position[index].tolist()
             yaw = float(path.yaw[index])
@@ -88,17 +107,27 @@ class VisualPilot(Pilot[VisualPilotConfig]):
                 )
             )
 
-    async def _wait_for_sight(self) -> int:
-        """Stop while the newest estimate is too old; return how long that took (ns)."""
+    async def _wait_for_sight(self) -> int | None:
+        """Stop while the newest estimate is too old.
+
+        Returns:
+            How long that took (ns); `None` if it took so long that the flight is over.
+        """
         start = self.clock.now()
         assert self.here is not None
         if start - self.here.stamp <= self.config.patience * 1e9:
             return 0
-        self.log.warning("no estimate for %g s: waiting for one", self.config.patience)
+        self.log.warning(
+            "no estimate in %s for %g s: waiting for one", self._frame, self.config.patience
+        )
         self.orders.send(Hover(stamp=start, source=self.name))
-        while self.clock.now() - self.here.stamp > self.config.patience * 1e9:
-            self._fresh.clear()
-            await self._fresh.wait()
+        while (now := self.clock.now()) - self.here.stamp > self.config.patience * 1e9:
+            if now - start > self.config.give_up * 1e9:
+                missed = f"no estimate in {self._frame} for {self.config.give_up:g} s"
+                self.log.error("%s: landing", missed)
+                self.outcome = f"{missed}: landed"
+                return None
+            await self.clock.sleep(1 / self.config.rate)
         return self.clock.now() - start
 
 

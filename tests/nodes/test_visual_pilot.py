@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from events import Event, Hover, Odometry, PlannedPose, PoseEstimate, Vector3
+from events import Event, Hover, Land, Landed, Odometry, PlannedPose, PoseEstimate, Vector3
 from nodes.visual_pilot import VisualPilot
 from runtime import Node, NodeConfig, Output, on
 from runtime.testing import NodeResult, run_nodes, spec
@@ -26,10 +26,12 @@ class OracleConfig(NodeConfig):
     Attributes:
         shift: Metres that it is off, once the flight is under way.
         blind: Seconds from, and to, which it says nothing.
+        anew: Seconds from, and to, which it speaks in a frame that begins where it is then.
     """
 
     shift: Vector3 = (0.0, 0.0, 0.0)
     blind: tuple[float, float] = (0.0, 0.0)
+    anew: tuple[float, float] = (0.0, 0.0)
 
 
 class Oracle(Node[OracleConfig]):
@@ -45,11 +47,15 @@ class Oracle(Node[OracleConfig]):
             return
         x, y, z = event.position
         dx, dy, dz = self.config.shift if seconds > 4 else (0.0, 0.0, 0.0)
+        anew = self.config.anew[0] < seconds < self.config.anew[1]
+        if anew:
+            self._begin = getattr(self, "_begin", event.position)
+            dx, dy, dz = (-each for each in self._begin)
         self.estimates.send(
             PoseEstimate(
                 stamp=event.stamp,
                 source=self.name,
-                frame_id="map",
+                frame_id="odom_1" if anew else "map",
                 position=(x + dx, y + dy, z + dz),
                 orientation=event.orientation,
             )
@@ -107,6 +113,33 @@ def test_without_estimates_it_stops_and_waits(world: str) -> None:
     ]
     assert not while_blind
     assert result.reason == "pilot: tour flown"
+
+
+def off_its_place(result: NodeResult, start: float, end: float) -> float:
+    """Return how far the vehicle went, at most, from where it was at a time (seconds)."""
+    flown = [e.position for e in result.of(Odometry) if start <= e.stamp / SECOND <= end]
+    return float(np.linalg.norm(np.subtract(flown, flown[0]), axis=1).max())
+
+
+def test_estimates_in_another_frame_are_not_followed(world: str) -> None:
+    result = fly(world, anew=(5.0, 8.0))
+    waits = [event for event in result.of(Hover) if 5.0 < event.stamp / SECOND < 8.0]
+    assert len(waits) == 1
+    assert off_its_place(result, 6.5, 8.0) < 0.1
+    assert np.linalg.norm(beside_the_plan(result), axis=1).max() < 0.3
+    assert result.reason == "pilot: tour flown"
+
+
+@pytest.mark.parametrize("trouble", ["anew", "blind"])
+def test_when_no_estimates_come_any_more_it_lands_where_it_is(world: str, trouble: str) -> None:
+    oracle: dict[str, Any] = {trouble: (5.0, 99.0)}
+    result = fly(world, **oracle)
+    assert result.reason == "pilot: no estimate in map for 10 s: landed"
+    assert 15.5 < result.of(Land)[0].stamp / SECOND < 15.7
+    assert len(result.of(Landed)) == 1
+    begin = next(e.position for e in result.of(Odometry) if e.stamp == 5 * SECOND)
+    end = result.of(Odometry)[-1].position
+    assert np.hypot(end[0] - begin[0], end[1] - begin[1]) < 1.2  # it flew at 1 m/s
 
 
 @pytest.mark.parametrize("gain", [-1.0, 0.0])
