@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from runtime.config import load
+from sims.worlds import load_world
 from tests.runtime.peers.samples import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -33,6 +34,14 @@ def run(example: str, out: Path, *changes: str, code: int = 0) -> dict[str, Any]
 def test_is_a_right_file(path: Path) -> None:
     """Its nodes exist and its settings are valid."""
     assert load(path).nodes
+
+
+@pytest.mark.parametrize("scene", ["plain_room", "plain_field"])
+def test_a_plain_scene_is_one_to_fly_in(scene: str) -> None:
+    """MuJoCo reads it, and what is in it has a name that a collision can tell."""
+    model = load_world(ROOT / "examples" / f"{scene}.xml").compile()
+    assert model.ngeom >= 18
+    assert all(model.geom(number).name for number in range(model.ngeom))
 
 
 @pytest.mark.slow
@@ -127,6 +136,10 @@ def test_orb_slam3_takes_the_place_of_odometry(tmp_path: Path) -> None:
     summary = run("orb_slam3", tmp_path / "out", *settings, "evaluation.report=false")
     assert summary["not_deterministic"] == ["odometry"]
     assert summary["verdict"]["estimators"]["odometry"]["lost_seconds"] == 0.0
+    settings = [f'orb_slam3.vocabulary="{vocabulary}"', "run.duration=6s"]
+    summary = run("plain", tmp_path / "plain", *settings, "evaluation.report=false", code=1)
+    frames = {n: e["frame_id"] for n, e in summary["verdict"]["estimators"].items()}
+    assert frames == {"odometry": "map", "orb_slam3": "odom"}, "it begins in the air"
 
 
 @pytest.mark.slow
