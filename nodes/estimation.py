@@ -35,7 +35,8 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
-from runtime import Duration, Node, NodeConfig, Output, on
+from runtime import Node, NodeConfig, Output, on
+from runtime.units import Latency
 
 Floats = npt.NDArray[np.float64]
 
@@ -90,7 +91,7 @@ class EstimatorConfig(NodeConfig):
     """
 
     origin: Literal["announced", "start"] = "announced"
-    latency: Duration = Duration(0.015)  # immutable
+    latency: Latency = Latency(0.015)  # immutable
 
 
 C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)

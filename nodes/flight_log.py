@@ -18,6 +18,7 @@ from events import Collision, Image, Odometry
 from nodes.pictures import Thumbnail, draw_contact_sheet, draw_flight
 from nodes.trajectory.growing import GrowingFile, part_name
 from runtime import Duration, Node, NodeConfig, on
+from runtime.paths import OutputPath
 
 Count = Annotated[int, msgspec.Meta(ge=1, le=100)]
 
@@ -37,9 +38,9 @@ class FlightLogConfig(NodeConfig):
         pictures: How many pictures it holds.
     """
 
-    trajectory: str = "trajectory.tum"
-    plot: str = "flight.png"
-    sheet: str = "pictures.png"
+    trajectory: OutputPath = "trajectory.tum"
+    plot: OutputPath = "flight.png"
+    sheet: OutputPath = "pictures.png"
     interval: Duration = Duration(1)  # immutable
     pictures: Count = 20
 

@@ -35,8 +35,9 @@ from runtime.explain import explain, show
 from runtime.links import LinkConfig
 from runtime.node import Node, NodeConfig
 from runtime.override import override
+from runtime.paths import InputPath, resolve
 from runtime.ports import MAX_HZ
-from runtime.units import Duration
+from runtime.units import Duration, plain
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -94,7 +95,7 @@ class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
 
     meet: str = "tcp/127.0.0.1:7450"
-    zenoh: str = ""
+    zenoh: InputPath = ""
     secret: str = ""
     shared: bool = True
     lease: Duration = Duration(0.8)  # immutable
@@ -143,7 +144,8 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Config:
     """Read a file.
 
     Args:
-        path: The TOML file; its folder is where modules of its nodes are looked for, too.
+        path: The TOML file. Its folder is where relative paths in it start, and where modules of
+            its nodes are looked for, too.
         overrides: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word.
 
     Raises:
@@ -161,20 +163,30 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(f"{path}: expected TOML, found brackets nested too deeply") from None
     except ValueError as error:  # a TOMLDecodeError, or an integer too long for Python
         raise ConfigError(f"{path}: expected TOML, found: {error}") from None
-    folder = str(path.resolve().parent)
-    if folder not in sys.path:
-        sys.path.append(folder)
+    except ValueError as error:  # of Python's int()
+        raise ConfigError(f"{path}: expected numbers of a usual size, found: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: expected TOML, found brackets nested too deep") from None
+    folder = path.resolve().parent
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
     for change in overrides:
         override(table, change)
-    return parse(table, path.name)
+    return parse(table, path.name, folder)
 
 
-def parse(table: Mapping[str, Any], where: str) -> Config:
+def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> Config:
     """Turn a table, as `tomllib` gives it, into settings.
 
+    Args:
+        table: Of the whole file.
+        where: Begins the message of an error.
+        folder: Where relative paths start; the working directory if not given.
+
     Raises:
-        ConfigError: Something in it is wrong; `where` begins the message.
+        ConfigError: Something in it is wrong.
     """
+    folder = folder or Path.cwd()
     for key in table:
         if key not in {"run", "network", "nodes"}:
             raise ConfigError(
@@ -196,14 +208,16 @@ def parse(table: Mapping[str, Any], where: str) -> Config:
         raise ConfigError(f"{where}: nodes: expected at least one [[nodes]] table, found none")
     specs: list[NodeSpec] = []
     for index, entry in enumerate(nodes):
-        spec = _node(entry, f"{where}: nodes[{index}]")
+        spec = _node(entry, f"{where}: nodes[{index}]", folder)
         if spec.name in {other.name for other in specs}:
             raise ConfigError(
                 f"{where}: nodes[{index}].name: expected a name that no other node has, "
                 f"found {show(spec.name)} a second time"
             )
         specs.append(spec)
-    network = convert(table.get("network", {}), NetworkConfig, f"{where}: network")
+    network = convert(
+        resolve(table.get("network", {}), NetworkConfig, folder), NetworkConfig, f"{where}: network"
+    )
     if not re.fullmatch(r"\w+/.+", network.meet):
         raise ConfigError(
             f"{where}: network.meet: expected a Zenoh endpoint such as tcp/192.168.0.7:7450, "
@@ -284,11 +298,11 @@ def to_builtins(config: Config) -> dict[str, Any]:
         if spec.inputs:
             head["inputs"] = spec.inputs  # type: ignore[assignment]
         if spec.links:
-            head["links"] = msgspec.to_builtins(spec.links, enc_hook=float)
-        nodes.append(head | msgspec.to_builtins(spec.config, enc_hook=float))
-    table: dict[str, Any] = {"run": msgspec.to_builtins(config.run, enc_hook=float)}
+            head["links"] = msgspec.to_builtins(spec.links, enc_hook=plain)
+        nodes.append(head | msgspec.to_builtins(spec.config, enc_hook=plain))
+    table: dict[str, Any] = {"run": msgspec.to_builtins(config.run, enc_hook=plain)}
     if config.network != NetworkConfig():
-        network = msgspec.to_builtins(config.network, enc_hook=float)
+        network = msgspec.to_builtins(config.network, enc_hook=plain)
         if not network["secret"].startswith(("env:", "file:")):
             del network["secret"]
         table["network"] = network
@@ -304,7 +318,7 @@ def _without_none(value: Any) -> Any:
     return value
 
 
-def _node(entry: Any, where: str) -> NodeSpec:
+def _node(entry: Any, where: str, folder: Path) -> NodeSpec:
     if not isinstance(entry, dict):
         raise ConfigError(f"{where}: expected a table, found {show(entry)}")
     keys = {f.name for f in msgspec.structs.fields(_NodeHead)}
@@ -322,7 +336,7 @@ def _node(entry: Any, where: str) -> NodeSpec:
     where = f"{where} ({head.name})"
     cls = find_node(head.type, f"{where}: type")
     rest = {k: v for k, v in entry.items() if k not in keys}
-    config = convert(rest, cls.config_type, where)
+    config = convert(resolve(rest, cls.config_type, folder), cls.config_type, where)
     ports = [*cls.declared.listening, *cls.declared.bundle_fields()]
     for key, port in [("inputs", p) for p in head.inputs] + [("links", p) for p in head.links]:
         if port not in ports:
@@ -353,8 +367,8 @@ def _node(entry: Any, where: str) -> NodeSpec:
 
 
 def _decode(type_: type[Any], value: Any) -> Any:
-    if type_ is Duration:
-        return Duration.parse(value)
+    if issubclass(type_, Duration):
+        return type_.parse(value)
     raise NotImplementedError(f"settings of type {type_}")
 
 

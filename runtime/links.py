@@ -21,7 +21,7 @@ import numpy as np
 
 from runtime.clock import Clock
 from runtime.schedule import SECOND, Once
-from runtime.units import Duration
+from runtime.units import Latency
 
 
 class LinkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -34,8 +34,8 @@ class LinkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         rate: Events a second that pass at most, by their stamps; 0 for all.
     """
 
-    delay: Duration = Duration(0)  # immutable
-    jitter: Duration = Duration(0)
+    delay: Latency = Latency(0)  # immutable
+    jitter: Latency = Latency(0)
     loss: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
     rate: Annotated[float, msgspec.Meta(ge=0)] = 0.0
 

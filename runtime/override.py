@@ -8,6 +8,7 @@ from typing import Any
 
 from runtime.errors import ConfigError, suggest
 from runtime.explain import show
+from runtime.paths import GivenHere
 
 
 def override(table: dict[str, Any], change: str) -> None:
@@ -27,12 +28,9 @@ def override(table: dict[str, Any], change: str) -> None:
     if not equals or len(keys) < 2 or not all(keys):
         raise ConfigError(f"{where}: expected node.key=value or run.key=value")
     try:
-        found = tomllib.loads(f"value = {text}")
-    except (ValueError, RecursionError):  # not TOML, or too much of it
-        found = {"value": text.strip()}
-    if len(found) > 1:
-        raise ConfigError(f"{where}: expected one setting, found more lines")
-    value = found["value"]
+        value = given(text)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
     nodes = _by_name(table.get("nodes"))
     if keys[0] in {"run", "network"}:
         target = table.setdefault(keys[0], {})
@@ -53,6 +51,26 @@ def override(table: dict[str, Any], change: str) -> None:
             f"found {show(target)}"
         )
     target[keys[-1]] = value
+
+
+def given(text: str) -> Any:
+    """Return what a text of the command line means: its value in TOML, or itself.
+
+    Raises:
+        ValueError: It is no value that a file could have.
+    """
+    try:
+        found = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return GivenHere(text.strip())
+    except ValueError:  # of Python's int()
+        raise ValueError("expected a number of a usual size") from None
+    except RecursionError:
+        raise ValueError("expected a value, found brackets nested too deep") from None
+    if len(found) > 1:
+        raise ValueError("expected one setting, found more lines")
+    value = found["value"]
+    return GivenHere(value) if isinstance(value, str) else value
 
 
 def _part(nodes: dict[str, dict[str, Any]], name: str, where: str) -> dict[str, Any]:

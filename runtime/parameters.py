@@ -23,6 +23,7 @@ from runtime.config import convert
 from runtime.errors import ConfigError
 from runtime.node import NodeConfig
 from runtime.override import override
+from runtime.units import plain
 
 T = TypeVar("T")
 
@@ -114,7 +115,7 @@ def toml(value: Any) -> str:
 
 def _table(config: msgspec.Struct) -> dict[str, Any]:
     """Return settings as `tomllib` would read them; what is not set is left out."""
-    found: dict[str, Any] = _without_none(msgspec.to_builtins(config, enc_hook=float))
+    found: dict[str, Any] = _without_none(msgspec.to_builtins(config, enc_hook=plain))
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 # casefold() turns the micro sign µ into the Greek letter μ, which looks the same.
 _UNITS = {"ns": 1e-9, "us": 1e-6, "μs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
@@ -29,3 +30,37 @@ class Duration(float):
         if not 0 <= seconds < _LONGEST:
             raise ValueError('expected a duration such as 0.5, "80ms" or "2min"')
         return cls(seconds)
+
+
+class Latency(Duration):
+    """A duration that is short by nature: a latency, delay, jitter, exposure.
+
+    ``latency = 40`` is rarely meant as 40 s: a number without a unit is taken up to `LONGEST_BARE`
+    only. Whoever means 40 s writes ``"40s"``.
+    """
+
+    @classmethod
+    def parse(cls, value: object) -> Latency:
+        """Read a latency.
+
+        Raises:
+            ValueError: It is no duration, or a number above `LONGEST_BARE` without a unit.
+        """
+        latency = cls(super().parse(value))
+        if not isinstance(value, str) and latency > LONGEST_BARE:
+            raise ValueError(
+                f"expected a unit beside a number above {LONGEST_BARE:g}, since a number alone is "
+                f'in seconds (did you mean "{value}ms"? or "{value}s")'
+            )
+        return latency
+
+
+LONGEST_BARE = 1.0
+"""Seconds up to which a `Latency` may be a number without a unit."""
+
+
+def plain(value: Any) -> float | str:
+    """Return a duration as a file may have it, to be read back as it is; for `msgspec`."""
+    if isinstance(value, Latency) and value > LONGEST_BARE:
+        return f"{float(value)!r}s"
+    return float(value)

@@ -30,6 +30,7 @@ from events import (
     VelocitySetpoint,
 )
 from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
+from runtime.paths import InputPath, NameOrPath
 from sims.cameras import (
     CameraSpec,
     add_free_camera,
@@ -64,12 +65,12 @@ class FreeCameraConfig(NodeConfig):
         render_threads: Threads of the software renderer in each of them.
     """
 
-    world: str = "hall"
+    world: NameOrPath = "hall"
     position: Vector3 = (0.0, 0.0, -1.5)
     orientation: Vector3 = (0.0, 0.0, 0.0)
     rate: Rate = 30
     cameras: Annotated[tuple[CameraSpec, ...], msgspec.Meta(min_length=1)]
-    trajectory: str = ""
+    trajectory: InputPath = ""
     setpoint_timeout: Duration = Duration(0.5)  # immutable
     camera_processes: Count = 2
     render_threads: Count = 1

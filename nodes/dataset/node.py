@@ -19,6 +19,7 @@ from nodes.trajectory.growing import part_name
 from nodes.trajectory.table import EPOCH, epoch_of
 from runtime import Input, Node, NodeConfig, on
 from runtime.errors import ConfigError
+from runtime.paths import OutputPath
 
 _AT_ONCE = 4
 """Pictures that are being written."""
@@ -43,7 +44,7 @@ class DatasetConfig(NodeConfig):
     """
 
     format: Literal["euroc", "tum_rgbd"] = "euroc"
-    folder: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")] = "dataset"
+    folder: Annotated[OutputPath, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")] = "dataset"
     depth_factor: Annotated[float, msgspec.Meta(gt=0)] = 5000.0
     epoch: int | str = EPOCH
 

@@ -24,6 +24,8 @@ from nodes.mapping.mapper import Mapper
 from nodes.trajectory.growing import part_name
 from nodes.transforms import TransformError, TransformTree
 from runtime import Bundle, Duration, Node, NodeConfig, Output, on
+from runtime.paths import OutputPath
+from runtime.units import Latency
 
 
 class ColourDepthPose(NamedTuple):
@@ -56,9 +58,9 @@ class MappingConfig(NodeConfig):
     stride: Annotated[int, msgspec.Meta(ge=1)] = 2
     max_depth: Annotated[float, msgspec.Meta(gt=0)] = 10.0
     every: Duration = Duration(0.1)  # immutable
-    latency: Duration = Duration(0.03)
+    latency: Latency = Latency(0.03)
     rate: Annotated[float, msgspec.Meta(ge=0)] = 0.0
-    file: str = ""
+    file: OutputPath = ""
 
 
 class Mapping(Node[MappingConfig]):

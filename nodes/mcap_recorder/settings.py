@@ -10,6 +10,7 @@ from nodes.mcap_recorder.backlog import WhenFull
 from nodes.mcap_recorder.mcap_file import Compression
 from nodes.ros2_bridge.typestore import Distribution
 from runtime import NodeConfig
+from runtime.paths import OutputPath
 
 Bytes = Annotated[int, msgspec.Meta(ge=1 << 16)]
 ChunkBytes = Annotated[int, msgspec.Meta(ge=1 << 16, le=1 << 28)]
@@ -39,7 +40,7 @@ class McapRecorderConfig(NodeConfig):
         distribution: Of ROS 2, whose types the messages have.
     """
 
-    file: Annotated[str, msgspec.Meta(pattern=r"^[^/]+\.mcap$")] = "recording.mcap"
+    file: Annotated[OutputPath, msgspec.Meta(pattern=r"^[^/]+\.mcap$")] = "recording.mcap"
     images: Literal["raw", "png", "jpeg"] = "raw"
     depth: Literal["raw", "png"] = "raw"
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90

@@ -15,6 +15,7 @@ from nodes.orb_slam3.process import OrbSlam3Process
 from nodes.orb_slam3.settings import Mode, OrbSettings, make_settings
 from nodes.orb_slam3.vocabulary_file import find_vocabulary
 from runtime import Bundle, Duration, on
+from runtime.paths import InputPath
 
 
 class Frame(NamedTuple):
@@ -36,7 +37,7 @@ class OrbSlam3Config(EstimatorConfig):
     """
 
     mode: Mode = "rgbd"
-    vocabulary: str = ""
+    vocabulary: InputPath = ""
     orb: OrbSettings = OrbSettings()
     patience: Duration = Duration(0.02)  # immutable
 

@@ -29,7 +29,7 @@ class Replay(Node[ReplayConfig]):
         [[nodes]]
         name = "replay"
         type = "nodes.replay:Replay"
-        file = "runs/record/recording.mcap"
+        file = "../runs/record/recording.mcap"
 
     The run ends with the recording. While it goes on, ``python -m runtime set replay.paused=true``
     and ``replay.position=12s`` do what `pause` and `seek` do; these are for the loop's thread.

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from runtime import Changeable, Duration, NodeConfig
+from runtime.paths import InputPath
 
 Use = Literal["image", "depth", "imu", "odometry", "truth", "estimate", "camera"]
 
@@ -73,7 +74,7 @@ class ReplayConfig(NodeConfig):
         depth_factor: Steps of its depth pictures per metre.
     """
 
-    file: str
+    file: InputPath
     start: Duration = Duration(0)  # immutable
     end: Duration = Duration(0)
     linger: Duration = Duration(0.5)

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from runtime import NodeConfig
+from runtime.paths import OutputPath
 
 _Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 _Rate = Annotated[float, msgspec.Meta(ge=0, le=1000)]
@@ -41,7 +42,7 @@ class RerunConfig(NodeConfig):
     """
 
     mode: Literal["save", "spawn", "serve"] = "save"
-    file: Annotated[str, msgspec.Meta(pattern=r"^[\w.-]+\.rrd$")] = "flight.rrd"
+    file: Annotated[OutputPath, msgspec.Meta(pattern=r"^[\w.-]+\.rrd$")] = "flight.rrd"
     web_port: _Port = 9090
     port: _Port = 9876
     host: str = "127.0.0.1"

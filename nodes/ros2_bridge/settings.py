@@ -11,6 +11,7 @@ from nodes.ros2_bridge.incoming import READERS
 from nodes.ros2_bridge.keys import Qos, dds_type, topic_name
 from nodes.ros2_bridge.typestore import Distribution
 from runtime import NodeConfig
+from runtime.paths import InputPath
 
 Kind = Literal[
     "images",
@@ -193,7 +194,7 @@ class Ros2BridgeConfig(NodeConfig):
     keys: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
     connect: tuple[str, ...] | None = None
     listen: tuple[str, ...] | None = None
-    zenoh_config: str = ""
+    zenoh_config: InputPath = ""
     publish: tuple[Kind, ...] = EVERYTHING
     topics: dict[str, str] = msgspec.field(default_factory=dict)
     time: Literal["simulated", "wall"] = "simulated"
@@ -212,7 +213,7 @@ class Ros2BridgeConfig(NodeConfig):
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
     sensor_qos: Literal["best_effort", "reliable"] = "best_effort"
     largest: _Positive = 64 * 1024 * 1024
-    definitions: dict[str, str] = msgspec.field(default_factory=dict)
+    definitions: dict[str, InputPath] = msgspec.field(default_factory=dict)
     subscriptions: tuple[Subscription, ...] = ()
     publications: tuple[OwnPublication, ...] = ()
 

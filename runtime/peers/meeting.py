@@ -8,12 +8,15 @@ from typing import Any
 from runtime.config import Config, to_builtins
 from runtime.errors import PeerError
 from runtime.explain import show
+from runtime.paths import file_names
 from runtime.peers.messages import Hello
 
 
 def what_all_share(config: Config) -> dict[str, Any]:
-    """Return a file without what each process may have its own way: the network, and its log."""
+    """Return a file without what may differ in each process: network, log, folders of files."""
     table: dict[str, Any] = to_builtins(config)
+    types = [spec.node.config_type for spec in config.nodes]
+    table["nodes"] = [file_names(*each) for each in zip(table["nodes"], types, strict=True)]
     return {
         **{key: value for key, value in table.items() if key != "network"},
         "run": {key: value for key, value in table["run"].items() if key not in {"log", "stall"}},

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
 from runtime.errors import ConfigError
+from runtime.override import given
 from runtime.units import Duration
 
 _CLOSING = {"[": "]", "{": "}"}
@@ -98,8 +98,8 @@ def split(text: str, where: str) -> tuple[str, ...]:
 def value(text: str) -> Any:
     """Return what a text means: its value in TOML, or itself, as for ``--set``."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return given(text)
+    except ValueError:  # which reading the settings refuses
         return text.strip()
 
 

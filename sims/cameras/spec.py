@@ -14,8 +14,8 @@ import mujoco
 
 import events
 from events.base import Quaternion, Vector3
-from runtime import Duration
 from runtime.parameters import Changeable
+from runtime.units import Latency
 from sims.frames import from_euler, half_turn_quaternion, half_turn_vector, multiply
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
@@ -62,14 +62,14 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     position: Vector3 = (0.15, 0.0, 0.0)
     orientation: Vector3 = (0.0, 0.0, 0.0)
     light: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
-    exposure: Duration = Duration(0)  # immutable
+    exposure: Latency = Latency(0)  # immutable
     blur: NonNegative = 0.0
     noise: NonNegative = 0.0
     depth_noise: NonNegative = 0.0
-    latency: Duration = Duration(0.04)
-    jitter: Changeable[Duration] = Duration(0)
+    latency: Latency = Latency(0.04)
+    jitter: Changeable[Latency] = Latency(0)
     loss: Changeable[Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]] = 0.0
-    render_time: Duration = Duration(0)
+    render_time: Latency = Latency(0)
 
     def __post_init__(self) -> None:
         if not self.images or len(set(self.images)) != len(self.images):

@@ -29,6 +29,7 @@ from events import (
     VehicleEvent,
 )
 from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
+from runtime.paths import NameOrPath
 from sims.cameras import CameraSpec, add_camera, check_cameras
 from sims.cameras.rig import CameraOutputs, CameraRig
 from sims.frames import rotate_inverse
@@ -76,7 +77,7 @@ class MultirotorConfig(NodeConfig):
         limits: Of the controller.
     """
 
-    world: str = "hall"
+    world: NameOrPath = "hall"
     position: tuple[float, float] = (0.0, 0.0)
     height: float = 0.0
     yaw: float = 0.0

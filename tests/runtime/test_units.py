@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime import Duration
+from runtime.units import LONGEST_BARE, Latency, plain
 
 FACTORS = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -76,3 +77,19 @@ def test_anything_else_is_refused_with_examples(value: object) -> None:
 def test_no_text_raises_anything_else(text: str) -> None:
     with contextlib.suppress(ValueError):
         assert Duration.parse(text) >= 0.0
+
+
+@given(st.floats(0, 1e6) | st.integers(0, 10**6))
+def test_a_latency_is_a_number_up_to_a_second_and_has_a_unit_above(number: float) -> None:
+    if number <= LONGEST_BARE:
+        assert Latency.parse(number) == number
+    else:
+        with pytest.raises(ValueError, match=r'did you mean ".*ms"\? or ".*s"'):
+            Latency.parse(number)
+    assert Latency.parse(f"{float(number)!r}s") == number
+
+
+@given(st.floats(0, 1e9))
+def test_a_latency_that_is_written_is_read_as_it_was(seconds: float) -> None:
+    assert Latency.parse(plain(Latency(seconds))) == seconds
+    assert Duration.parse(plain(Duration(seconds))) == seconds

@@ -22,8 +22,9 @@ from events import (
     TransformStamped,
     VelocitySetpoint,
 )
-from runtime import Duration, Node, Output, on
+from runtime import Node, Output, on
 from runtime.testing import NodeResult, run_node, run_nodes, spec
+from runtime.units import Latency
 from sims.cameras import CameraSpec, optical_in_body
 from sims.cameras.delivery import delay_of
 from sims.computer_vision import FreeCamera
@@ -36,7 +37,7 @@ WORLD = """<mujoco><worldbody>
   <light pos="0 0 4"/><geom type="plane" size="9 9 1"/><geom type="box" size="1 1 1" pos="3 0 0"/>
 </worldbody></mujoco>"""
 
-SPOILT = CameraSpec(name="c", latency=Duration(0.04), jitter=Duration(0.09), loss=0.3)
+SPOILT = CameraSpec(name="c", latency=Latency(0.04), jitter=Latency(0.09), loss=0.3)
 TINY = {"width": 16, "height": 12}
 
 
@@ -102,7 +103,7 @@ def test_delays_are_spread_evenly_over_the_jitter() -> None:
 def test_loss_and_jitter_do_not_depend_on_each_other() -> None:
     """Of a camera that loses pictures, the others come when they would have come anyway."""
     whole = msgspec.structs.replace(SPOILT, loss=0.0)
-    prompt = msgspec.structs.replace(SPOILT, jitter=Duration(0))
+    prompt = msgspec.structs.replace(SPOILT, jitter=Latency(0))
     for stamp in range(0, 100 * PERIOD, PERIOD):
         delay = delay_of(SPOILT, 1, stamp)
         assert delay in (None, delay_of(whole, 1, stamp))

@@ -1,0 +1,101 @@
+"""Settings that name files: what the file reads, and what its nodes write into the run's folder.
+
+    class ReplayConfig(NodeConfig):
+        recording: InputPath
+        plot: OutputPath = "plot.png"
+
+A relative path in a configuration file starts at the folder of that file, one on the command line
+(``--set replay.recording=…``) at the folder in which the command runs. No two nodes of a process
+may write the same file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import msgspec
+
+Kind = Literal["input", "name", "output"]
+_MARK = "path"
+
+InputPath = Annotated[str, msgspec.Meta(extra={_MARK: "input"})]
+"""A file or folder that is read; empty for none."""
+
+NameOrPath = Annotated[str, msgspec.Meta(extra={_MARK: "name"})]
+"""A name; an `InputPath` if it contains a slash or ends with a suffix such as ``.xml``."""
+
+OutputPath = Annotated[str, msgspec.Meta(extra={_MARK: "output"})]
+"""A file or folder in the run's folder; empty for none, or for one of the node's own name."""
+
+
+class GivenHere(str):
+    """A text of the command line: if it names a file, then one beside the working directory."""
+
+    __slots__ = ()
+
+
+def resolve(table: Any, type_: Any, folder: Path) -> Any:
+    """Return settings, as `tomllib` gives them, with the files that they read as absolute paths.
+
+    Args:
+        table: Of a node or of the network; what is of the wrong type stays as it is.
+        type_: The type of its settings.
+        folder: Where relative paths start.
+    """
+
+    def absolute(kind: Kind, text: str) -> str:
+        if kind == "output" or not text:
+            return text
+        path = Path(text)
+        if kind == "name" and "/" not in text and not path.suffix:
+            return text
+        base = Path.cwd() if isinstance(text, GivenHere) else folder
+        return str(base / path.expanduser())
+
+    return _walk(table, type_, absolute)
+
+
+def file_names(table: Any, type_: Any) -> Any:
+    """Return settings with no more than the last part of the paths that they read.
+
+    For comparing the settings of two machines, whose folders may be elsewhere.
+    """
+    return _walk(table, type_, lambda kind, text: text if kind == "output" else Path(text).name)
+
+
+def written(config: msgspec.Struct) -> Iterator[str]:
+    """Yield the files and folders in the run's folder that a node's settings name."""
+    found: list[str] = []
+
+    def note(kind: Kind, text: str) -> str:
+        if kind == "output" and text:
+            found.append(text)
+        return text
+
+    _walk(msgspec.to_builtins(config, enc_hook=float), type(config), note)
+    yield from found
+
+
+def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
+    """Return a value with all texts changed that its type marks as paths."""
+    for meta in getattr(type_, "__metadata__", ()):
+        kind = (getattr(meta, "extra", None) or {}).get(_MARK)
+        if kind is not None and isinstance(value, str):
+            return change(kind, value)
+    if get_origin(type_) is Annotated:
+        return _walk(value, type_.__origin__, change)
+    if isinstance(type_, type) and issubclass(type_, msgspec.Struct):
+        if not isinstance(value, Mapping):
+            return value
+        types = {field.encode_name: field.type for field in msgspec.structs.fields(type_)}
+        return {key: _walk(each, types.get(key), change) for key, each in value.items()}
+    inner = [each for each in get_args(type_) if each is not type(None)]
+    if isinstance(value, list | tuple) and inner:
+        return [_walk(each, inner[0], change) for each in value]
+    if isinstance(value, Mapping) and get_origin(type_) is dict:
+        return {key: _walk(each, inner[1], change) for key, each in value.items()}
+    if len(inner) == 1:  # or None
+        return _walk(value, inner[0], change)
+    return value
