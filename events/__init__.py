@@ -10,6 +10,7 @@ from events.announcements import (
     CameraAnnouncement,
     EstimatorAnnouncement,
     ImuAnnouncement,
+    PathAnnouncement,
     VehicleAnnouncement,
 )
 from events.base import Category, Event, Quaternion, Vector3
@@ -84,6 +85,7 @@ __all__ = [
     "NavSatFix",
     "Odometry",
     "ParameterChanged",
+    "PathAnnouncement",
     "PlannedPose",
     "PointCloud",
     "PoseEstimate",

@@ -91,6 +91,17 @@ class ImuAnnouncement(Announcement):
     accelerometer_random_walk: float
 
 
+class PathAnnouncement(Announcement):
+    """Where a pilot is about to fly; a simulator refuses what is not free.
+
+    Attributes:
+        waypoints: Places to pass in this order, metres in ``map``; at first the vehicle climbs from
+            where it stands to the height of the first one.
+    """
+
+    waypoints: tuple[Vector3, ...]
+
+
 class EstimatorAnnouncement(Announcement):
     """Something that will send pose estimates; `source` is theirs.
 

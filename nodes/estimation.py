@@ -36,6 +36,7 @@ from events import (
     VehicleEvent,
 )
 from runtime import Node, NodeConfig, Output, on
+from runtime.errors import suggest
 from runtime.units import Latency
 
 Floats = npt.NDArray[np.float64]
@@ -129,6 +130,7 @@ class Estimator(Node[C], ABC):
 
     camera: CameraAnnouncement | None = None
     _vehicles: tuple[VehicleAnnouncement, ...] = ()
+    _cameras: tuple[str, ...] = ()
     _mount: Mount | None = None
     _lost = False
     _moving: Mapping[str, int] = MappingProxyType({})
@@ -145,6 +147,7 @@ class Estimator(Node[C], ABC):
             self._vehicles += (announcement,)
         if not isinstance(announcement, CameraAnnouncement) or self.camera is not None:
             return
+        self._cameras += (announcement.source,)
         named = self.sources.get("frames")
         if named is not None and named != announcement.source:
             return
@@ -164,6 +167,11 @@ class Estimator(Node[C], ABC):
         """Note since when a vehicle may have left the pose that it announced."""
         self._moving = {event.source: event.stamp, **self._moving}
 
+    def check(self) -> Iterable[str]:
+        """Say if no camera gives what is needed."""
+        if self.camera is None:
+            yield self._lacking()
+
     @abstractmethod
     async def run(self) -> None:
         """Track the images."""
@@ -175,14 +183,17 @@ class Estimator(Node[C], ABC):
             FatalError: No camera gives what is needed.
         """
         if self.camera is None:
-            named = self.sources.get("frames")
-            self.log.fatal(
-                "expected a camera with %s images%s, found none announced",
-                ", ".join(sorted(self.needs)),
-                f" called {named}" if named else "",
-            )
-        assert self.camera is not None
+            self.log.fatal("%s", self._lacking())
         return self.camera
+
+    def _lacking(self) -> str:
+        named = self.sources.get("frames")
+        called = f" called {named}" if named else ""
+        found = ", ".join(self._cameras) or "none"
+        return (
+            f"expected a camera with {', '.join(sorted(self.needs))} images{called}, "
+            f"found {found}{suggest(named or '', self._cameras)}"
+        )
 
     def publish(self, image: Image, tracked: Tracked, origin: int | None = None) -> None:
         """Say what a tracker found in an image.

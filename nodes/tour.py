@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import Annotated
 
 import msgspec
@@ -22,6 +23,7 @@ from events import (
     Land,
     Landed,
     Odometry,
+    PathAnnouncement,
     PoseEstimate,
     PositionSetpoint,
     Shutdown,
@@ -76,6 +78,10 @@ class Pilot(Node[C], ABC):
 
     outcome = "tour flown"
     """Why the run ends, once it has landed."""
+
+    def announce(self) -> Iterable[Announcement]:
+        """Say where it will fly."""
+        yield PathAnnouncement(stamp=0, source=self.name, waypoints=self.config.waypoints)
 
     def __init__(self) -> None:
         self.here: Odometry | PoseEstimate | None = None

@@ -35,7 +35,7 @@ from runtime.explain import explain, show
 from runtime.links import LinkConfig
 from runtime.node import Node, NodeConfig
 from runtime.override import override
-from runtime.paths import InputPath, resolve
+from runtime.paths import InputPath, resolve, unmarked
 from runtime.ports import MAX_HZ
 from runtime.units import Duration, plain
 
@@ -193,7 +193,7 @@ def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> C
                 f"{where}: expected tables [run], [network] and [[nodes]], found {key!r}"
                 + suggest(key, ["run", "network", "nodes"])
             )
-    run = convert(table.get("run", {}), RunConfig, f"{where}: run")
+    run = convert(unmarked(table.get("run", {})), RunConfig, f"{where}: run")
     if not run.name.strip() or "/" in run.name or "\0" in run.name or run.name.startswith("."):
         raise ConfigError(
             f"{where}: run.name: expected a name for a folder, without / and not beginning with "
@@ -322,7 +322,7 @@ def _node(entry: Any, where: str, folder: Path) -> NodeSpec:
     if not isinstance(entry, dict):
         raise ConfigError(f"{where}: expected a table, found {show(entry)}")
     keys = {f.name for f in msgspec.structs.fields(_NodeHead)}
-    head = convert({k: v for k, v in entry.items() if k in keys}, _NodeHead, where)
+    head = convert(unmarked({k: v for k, v in entry.items() if k in keys}), _NodeHead, where)
     if not re.fullmatch(r"[A-Za-z_][\w-]*", head.name):
         raise ConfigError(
             f"{where}.name: expected a letter, then letters, digits, _ and -, "

@@ -17,6 +17,7 @@
     │   └── AmbiguousSourceError  an input that matches stamps hears two sources
     ├── CommandError           a run cannot do what its monitor asked it to
     ├── ResultsError           a run's folder is not ours, or cannot be written
+    ├── UncheckableError       what a node will announce is known in a run only, not to `check`
     ├── PeerError              another process of the run is missing, gone, or of another mind
     ├── WireError              bytes from elsewhere that are no event, or an event that cannot leave
     └── WorkerError
@@ -109,6 +110,10 @@ class CommandError(VisnavError):
 
 class ResultsError(VisnavError):
     """A run's folder is somebody else's, or results cannot be written into it."""
+
+
+class UncheckableError(VisnavError):
+    """While a file is only checked, a node cannot tell what it will announce."""
 
 
 class PeerError(VisnavError):

@@ -116,10 +116,11 @@ class Life:
             raise wrap(name, error) from error
 
     def hear(self, announcements: Iterable[Announcement]) -> None:
-        """Let the node hear all announcements.
+        """Let the node hear all announcements, and ask what it lacks then.
 
         Raises:
-            NodeError: Something went wrong in it; a `RefusedError` if it cannot work with one.
+            NodeError: Something went wrong in it; a `RefusedError` if it cannot work with one, or
+                lacks something.
         """
         assert self.node is not None
         name = self.spec.name
@@ -131,6 +132,14 @@ class Life:
                 raise RefusedError(name, what) from error
             except BaseException as error:
                 raise wrap(name, error) from error
+        try:
+            lacks = list(self.node.check())
+        except NodeError:
+            raise
+        except Exception as error:
+            raise wrap(name, error) from error
+        if lacks:
+            raise RefusedError(name, "; ".join(lacks))
 
     async def ready(self, limit: float) -> None:
         """Let the node get ready with what it has heard.

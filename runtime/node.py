@@ -1,6 +1,6 @@
 """What an author of nodes writes: a class with ports, and the phases it needs.
 
-    construct → on_startup → announce, on_announcement → on_ready → run, handlers, ticks
+    construct → on_startup → announce, on_announcement → check → on_ready → run, handlers, ticks
     → on_shutdown
 
 Every phase is optional. All that a node may use is there before its ``__init__`` (which takes no
@@ -88,6 +88,7 @@ class Host(Protocol):
     clock: Clock
     executor: concurrent.futures.Executor
     out: Path | None
+    checking: bool
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as part of a node."""
@@ -135,10 +136,14 @@ class Node(Generic[C]):
         out: Folder for files, or `None` if the run writes none.
         sources: Ports narrowed to a source, by the file or by `narrow`.
         restarts: How often this node was brought up before in this run; 0 the first time.
+        checking: Whether ``python -m runtime check`` only looks whether the file is right: then
+            `on_startup` must leave alone what is outside the process (devices, ports, networks).
     """
 
     deterministic: ClassVar[bool] = True
     """Whether equal inputs give equal outputs; if not, no run with it promises its digest."""
+    files: ClassVar[tuple[str, ...]] = ()
+    """What it writes into the run's folder, besides what settings of type `OutputPath` name."""
     declared: ClassVar[Declared]
     config_type: ClassVar[type[NodeConfig]] = NodeConfig
 
@@ -150,6 +155,7 @@ class Node(Generic[C]):
     out: Path | None
     sources: dict[str, str]
     restarts: int
+    checking: bool
     _host: Host
     _outside: set[Any]
 
@@ -177,6 +183,13 @@ class Node(Generic[C]):
         Raises:
             ValueError: This node cannot work with it; the message says why, and the run ends.
         """
+
+    def check(self) -> Iterable[str]:
+        """Return what this node lacks, a sentence each; called when all announcements are heard.
+
+        With any, the run does not begin. What may be meant is for `log.warning`.
+        """
+        return ()
 
     async def on_ready(self) -> None:
         """Get ready with what was announced, such as a worker that needs a camera's calibration.
@@ -319,6 +332,7 @@ def make_node(
     node.out = host.out
     node.sources = dict(sources or {})
     node.restarts = restarts
+    node.checking = host.checking
     node._host = host
     node._outside = set()
     for port, declared in cls.declared.inputs.items():

@@ -23,6 +23,7 @@ from runtime.config import convert
 from runtime.errors import ConfigError
 from runtime.node import NodeConfig
 from runtime.override import override
+from runtime.paths import unmarked
 from runtime.units import plain
 
 T = TypeVar("T")
@@ -73,7 +74,7 @@ def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
         if table.pop("name") != name:
             raise ConfigError(f"{text}: expected node.key=value: a node's name cannot change")
         if table != before[name]:
-            return _checked(name, config, convert(table, type(config), name))
+            return _checked(name, config, convert(unmarked(table), type(config), name))
     return Change("", NodeConfig(), {})
 
 

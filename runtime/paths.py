@@ -17,6 +17,8 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
+from runtime.units import plain
+
 Kind = Literal["input", "name", "output"]
 _MARK = "path"
 
@@ -54,7 +56,16 @@ def resolve(table: Any, type_: Any, folder: Path) -> Any:
         base = Path.cwd() if isinstance(text, GivenHere) else folder
         return str(base / path.expanduser())
 
-    return _walk(table, type_, absolute)
+    return unmarked(_walk(table, type_, absolute))
+
+
+def unmarked(value: Any) -> Any:
+    """Return settings with nothing told any more of what came from the command line."""
+    if isinstance(value, dict):
+        return {key: unmarked(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [unmarked(each) for each in value]
+    return str(value) if isinstance(value, GivenHere) else value
 
 
 def file_names(table: Any, type_: Any) -> Any:
@@ -74,7 +85,7 @@ def written(config: msgspec.Struct) -> Iterator[str]:
             found.append(text)
         return text
 
-    _walk(msgspec.to_builtins(config, enc_hook=float), type(config), note)
+    _walk(msgspec.to_builtins(config, enc_hook=plain), type(config), note)
     yield from found
 
 

@@ -1,7 +1,7 @@
 """The life of a run's nodes: started in order, watched over, ended in reverse order.
 
     construct → on_startup, in file order
-    announce, heard by all; on_ready, in file order
+    announce, heard by all; check; on_ready, in file order
     connect; ticks and run() begin: the first update
     …
     cancel run(), on_shutdown: in reverse order, always, each with a time limit
@@ -70,6 +70,8 @@ class Supervisor:
         out: Folder for what nodes write, or `None`.
         only: Nodes that run here, if others run in other processes.
     """
+
+    checking = False
 
     def __init__(
         self,

@@ -112,7 +112,7 @@ class FreeCamera(Node[FreeCameraConfig]):
         await self._rig.start(await self.offload(self._build, specs))
 
     def _build(self, specs: tuple[CameraSpec, ...]) -> Any:
-        world = load_world(self.config.world)
+        world = load_world(self.config.world, bare=self.checking)
         add_free_camera(world, self.name, specs)
         return world.compile()
 

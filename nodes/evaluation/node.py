@@ -74,6 +74,7 @@ class Evaluation(Node[EvaluationConfig]):
     verdict put into the run's summary.
     """
 
+    files = ("trajectories", "evaluation", "frames", "plots", "report.html")
     scores = Output(Score)
 
     async def on_startup(self) -> None:

@@ -68,6 +68,8 @@ class FoxgloveServer(Node[FoxgloveConfig]):
             MissingDependencyError: foxglove is not installed.
             FatalError: The port cannot be had.
         """
+        if self.checking:
+            return
         loop, told = asyncio.get_running_loop(), set[str]()
 
         def refused(why: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Annotated, Literal, NamedTuple
 
 import msgspec
@@ -120,6 +121,11 @@ class Mapping(Node[MappingConfig]):
             )
         )
 
+    def check(self) -> Iterable[str]:
+        """Say if no camera gives what is needed."""
+        if self._camera is None:
+            yield self._lacking()
+
     @on(Odometry)
     def moved(self, event: Odometry) -> None:
         """Note where the vehicle that carries the camera is."""
@@ -152,6 +158,13 @@ class Mapping(Node[MappingConfig]):
                 cloud_due = image.stamp + between
                 await self._send()
 
+    def _lacking(self) -> str:
+        named = self.sources.get("frames")
+        return (
+            "expected a camera with depth and rgb (or grey) images"
+            f"{f' called {named}' if named else ''}, found none announced"
+        )
+
     def _the_camera(self) -> CameraAnnouncement:
         """Return the camera to map with.
 
@@ -159,12 +172,7 @@ class Mapping(Node[MappingConfig]):
             FatalError: None gives what is needed.
         """
         if self._camera is None:
-            named = self.sources.get("frames")
-            self.log.fatal(
-                "expected a camera with depth and rgb (or grey) images%s, found none announced",
-                f" called {named}" if named else "",
-            )
-        assert self._camera is not None
+            self.log.fatal("%s", self._lacking())
         return self._camera
 
     def _placed(

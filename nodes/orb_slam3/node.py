@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -66,6 +67,14 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         if isinstance(announcement, ImuAnnouncement) and self._imu is None:
             self._imu = announcement
             self.narrow("measured", announcement.source)
+
+    def check(self) -> Iterable[str]:
+        """Say if there is no camera, or no vocabulary."""
+        yield from super().check()
+        try:
+            find_vocabulary(self.config.vocabulary)
+        except ValueError as error:
+            yield str(error)
 
     @on(Imu)
     def measured(self, event: Imu) -> None:

@@ -67,7 +67,8 @@ class RerunView(Node[RerunConfig]):
         config, file = self.config, None
         if config.mode == "save":
             if self.out is None:
-                self.log.warning("the run writes no files, so there is nothing to view")
+                if not self.checking:
+                    self.log.warning("the run writes no files, so there is nothing to view")
                 return
             file = self.out / part_name(self, config.file)
             self.out.mkdir(parents=True, exist_ok=True)

@@ -45,7 +45,7 @@ from nodes.ros2_bridge.stamps import Stamps
 from nodes.ros2_bridge.telling import Telling, event_type
 from nodes.ros2_bridge.typestore import TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
-from runtime.errors import FatalError
+from runtime.errors import FatalError, UncheckableError
 from runtime.ports import Handles
 
 WAITING = 8
@@ -127,6 +127,10 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                 )
                 for each in config.publications
             ]
+            if self.checking:
+                if any(hearing.subscription.use == "camera" for hearing in self._hearings):
+                    raise UncheckableError("which cameras there are is known to ROS only")
+                return
             session = await self.offload(
                 Session,
                 NodeName(

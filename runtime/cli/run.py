@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Collection
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from runtime.config import Config
+    from runtime.preflight import Findings
     from runtime.summary import Summary, Verdict
 
 
@@ -92,8 +94,8 @@ def run(
     if log is not None and log is not Log.events:
         changes.append(f"run.log={log.value}")
     settings = load(config, changes)
-    warn_unconnected(settings)
     nodes_here = chosen(settings, only)
+    look_at(settings, nodes_here)
     name = "-".join([settings.run.name, *nodes_here[:1]])
     folder = out or Path("runs") / name
     lookers = Lookers(settings, name, quiet=quiet, trace=trace, top=top, web=web)
@@ -134,13 +136,25 @@ def chosen(settings: Config, only: str | None) -> list[str]:
     return [] if set(wanted) == set(names) else [name for name in names if name in wanted]
 
 
-def warn_unconnected(settings: Config) -> None:
-    """Print a line for each input that no node can send to."""
-    from runtime.graph import unconnected
+def look_at(settings: Config, only: Collection[str] = ()) -> None:
+    """Print what a look at the file makes one warn of.
 
-    nodes = [(spec.name, spec.node) for spec in settings.nodes]
-    for node, port, event in unconnected(nodes):
-        print(f"warning: {node}.{port}: expects {event}, and no node sends it", file=sys.stderr)
+    Raises:
+        ConfigError: The run could not do what the file says.
+    """
+    from runtime.errors import ConfigError
+    from runtime.preflight import of_file
+
+    found = of_file(settings, only)
+    warn(found)
+    if found.errors:
+        raise ConfigError("; ".join(found.errors))
+
+
+def warn(findings: Findings) -> None:
+    """Print a line for each warning."""
+    for warning in findings.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
 
 
 def report(summary: Summary, folder: Path) -> None:

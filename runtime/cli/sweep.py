@@ -58,13 +58,13 @@ def sweep(
     from rich.console import Console
 
     from runtime import sweep as sweeping
-    from runtime.cli.run import warn_unconnected
+    from runtime.cli.run import look_at
     from runtime.config import load
     from runtime.sweep.console import Display, summary_table
 
     plan = sweeping.make_plan(config, vary or [], overrides=overrides or [], seeds=seeds, out=out)
     changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
-    warn_unconnected(load(config, [*(overrides or []), *changes]))
+    look_at(load(config, [*(overrides or []), *changes]))
     children = sweeping.Children()
     display = Display(children, Console(stderr=True))
     try:

@@ -21,6 +21,7 @@ from events import (
     Imu,
     ImuAnnouncement,
     Odometry,
+    PathAnnouncement,
     PoseStamped,
     SegmentationImage,
     Setpoint,
@@ -45,6 +46,7 @@ from sims.multirotor import (
     State,
     attach_vehicle,
 )
+from sims.multirotor.clearance import FALL, Clearance, trouble_at_start, trouble_on_path
 from sims.multirotor.physics import Contact
 from sims.worlds import load_world
 
@@ -124,8 +126,11 @@ class Multirotor(Node[MultirotorConfig]):
             config.camera_processes,
             config.render_threads,
         )
+        north, east = config.position
+        self._start = (north, east, -config.height - STANDING_HEIGHT)
         model = await self.offload(self._build)
         self._physics = Physics(model, self.name)
+        self._clearance = Clearance(model, self.name)
         await self.offload(self._physics.settle)
         self._autopilot = Autopilot(
             self._physics.parameters,
@@ -150,10 +155,8 @@ class Multirotor(Node[MultirotorConfig]):
 
     def _build(self) -> Any:
         config = self.config
-        world = load_world(config.world)
-        north, east = config.position
-        start = (north, east, -config.height - STANDING_HEIGHT)
-        attach_vehicle(world, self.name, start, math.radians(config.yaw))
+        world = load_world(config.world, bare=self.checking)
+        attach_vehicle(world, self.name, self._start, math.radians(config.yaw))
         for camera in config.cameras:
             add_camera(world, f"{self.name}/{FRAME}", camera, f"{self.name}/")
         return world.compile()
@@ -191,7 +194,9 @@ class Multirotor(Node[MultirotorConfig]):
                     )
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Refuse to share a pilot with another vehicle, which would be steered by it, too."""
+        """Refuse a path that cannot be flown, and to share a pilot with another vehicle."""
+        if isinstance(announcement, PathAnnouncement):
+            self._refuse_path(announcement)
         if not isinstance(announcement, VehicleAnnouncement) or announcement.source == self.name:
             return
         if obeying_all := [port for port in ("command", "setpoint") if port not in self.sources]:
@@ -201,6 +206,23 @@ class Multirotor(Node[MultirotorConfig]):
                 f"{self.name} obeys them all: write inputs = {{ {line} }} into its entry, "
                 "with the name of that node in place of PILOT"
             )
+
+    def _refuse_path(self, announcement: PathAnnouncement) -> None:
+        """Raise `ValueError` if this vehicle is to fly a path and cannot."""
+        pilot = self.sources.get("setpoint", announcement.source)
+        if announcement.source != pilot and not announcement.source.startswith(f"{pilot}/"):
+            return
+        if trouble_at_start(self._clearance, self._start):  # which `check` tells
+            return
+        if trouble := trouble_on_path(self._clearance, self._start, announcement.waypoints):
+            raise ValueError(trouble)
+
+    def check(self) -> Iterable[str]:
+        """Say why it cannot stand where it is to start."""
+        if trouble := trouble_at_start(self._clearance, self._start):
+            yield f"position: {trouble}"
+        elif (fall := self._clearance.ground_below(self._start) or 0.0) > FALL:
+            self.log.warning("position, height: it starts %.2g m above the ground, and falls", fall)
 
     def on_change(self, before: MultirotorConfig) -> None:  # noqa: ARG002
         """Deliver pictures as the settings now say."""

@@ -18,11 +18,16 @@ PAINTS: tuple[Colour, ...] = (
 BRICKS = (materials.RED_BRICK, materials.YELLOW_BRICK, materials.GREY_STONE)
 
 
+def height_of(storeys: int) -> float:
+    """Return the height of a house front, metres."""
+    return storeys * STOREY + 1.0
+
+
 def house(
     width: float, storeys: int, random: np.random.Generator, density: float, number: int
 ) -> Picture:
     """Return a house front `width` metres wide at `density` pixels per metre."""
-    height = storeys * STOREY + 1.0
+    height = height_of(storeys)
     shape = (int(height * density), int(width * density))
     bare = materials.brick(shape, random, density, BRICKS[number % 3], (0.17, 0.42))
     front = bare

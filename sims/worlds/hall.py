@@ -7,6 +7,7 @@ ceiling in `hall_surfaces`; how they get into the model, in `builder`.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import mujoco
@@ -25,21 +26,21 @@ from sims.worlds.hall_surfaces import (
     WEST,
 )
 from sims.worlds.model import Material
+from sims.worlds.patterns import Picture
 from sims.worlds.shapes import quad
 
 
-def hall(seed: int = 0) -> Any:
+def hall(seed: int = 0, bare: bool = False) -> Any:
     """Return the hall as a `mujoco.MjSpec`; every seed has its own bricks, posters and crates."""
-    b = Builder("hall", seed)
+    b = Builder("hall", seed, bare)
     b.spec.visual.headlight.ambient = [0.62, 0.62, 0.64]
-    crates = b.material("crates", hall_surfaces.crates(b.random), 256.0)
-    posters = b.material("posters", hall_surfaces.posters(b.random), 128.0, glow=0.15)
-    red = b.material("brick", materials.brick((512, 1024), b.random, DENSITY), DENSITY, 0.12)
-    wood = b.material("wood", materials.planks((512, 768), b.random, 128.0), 128.0)
-    upright = materials.planks((384, 384), b.random, 128.0, width=0.14).transpose(1, 0, 2)
-    timber = b.material("timber", np.ascontiguousarray(upright), 128.0)
-    column = b.material("column", hall_surfaces.columns(b.random), 96.0)
-    steel = b.material("steel", hall_surfaces.steel(b.random), 128.0)
+    crates = b.material("crates", hall_surfaces.crates, 256.0)
+    posters = b.material("posters", hall_surfaces.posters, 128.0, glow=0.15)
+    red = b.material("brick", lambda r: materials.brick((512, 1024), r, DENSITY), DENSITY, 0.12)
+    wood = b.material("wood", lambda r: materials.planks((512, 768), r, 128.0), 128.0)
+    timber = b.material("timber", _upright, 128.0)
+    column = b.material("column", hall_surfaces.columns, 96.0)
+    steel = b.material("steel", hall_surfaces.steel, 128.0)
     _things(b, crates, steel)
     _structure(b, red, wood, timber, column)
     _partition(b, wood, posters)
@@ -50,6 +51,11 @@ def hall(seed: int = 0) -> Any:
     b.spec.stat.center = [0.0, 0.0, 2.0]
     b.spec.stat.extent = 10.0
     return b.spec
+
+
+def _upright(random: np.random.Generator) -> Picture:
+    boards = materials.planks((384, 384), random, 128.0, width=0.14)
+    return np.ascontiguousarray(boards.transpose(1, 0, 2))
 
 
 def _things(b: Builder, crates: Material, steel: Material) -> None:
@@ -108,7 +114,7 @@ def _shelf(b: Builder, wood: Material, crates: Material) -> None:
     for level, height in enumerate((0.35, 1.05, 1.75)):
         b.box(f"rack/board_{level}", wood, (3.7, 0.5, 0.06), (-1.8, 5.7, height), hidden=())
         for slot, x in enumerate((-3.1, -2.4, -1.3, -0.5)):
-            if b.random.uniform() < 0.75:
+            if b.random.uniform() < 0.75 and not b.bare:
                 edge = float(b.random.uniform(0.3, 0.46))
                 windows = {
                     face: decals.tile(int(b.random.integers(9)), 3, 3)
@@ -142,9 +148,9 @@ def _shell(b: Builder, posters: Material) -> None:
                 facing,
             )
             count += 1
-        picture = hall_surfaces.wall(b.random, width)
-        b.wall(name, b.material(name, picture, DENSITY), (width, HEIGHT), (*place, 0.0), facing)
-    floor = b.material("floor", hall_surfaces.floor(b.random), DENSITY)
+        brick = b.material(name, functools.partial(hall_surfaces.wall, width=width), DENSITY)
+        b.wall(name, brick, (width, HEIGHT), (*place, 0.0), facing)
+    floor = b.material("floor", hall_surfaces.floor, DENSITY)
     surface = quad(
         np.array([NORTH, WEST, 0.0]),
         np.array([0.0, -2 * WEST, 0.0]),
@@ -170,7 +176,7 @@ def _roof(b: Builder, wood: Material, steel: Material) -> None:
                 windows=dict.fromkeys(("left", "right", "top", "bottom"), bare),
                 hidden=("front", "back"),
             )
-    ceiling = b.material("ceiling", hall_surfaces.ceiling(b.random), CEILING_DENSITY)
+    ceiling = b.material("ceiling", hall_surfaces.ceiling, CEILING_DENSITY)
     surface = quad(
         np.array([-NORTH, WEST, 0.0]),
         np.array([0.0, -2 * WEST, 0.0]),

@@ -14,15 +14,15 @@ from runtime import VisnavError
 from sims.worlds.hall import hall
 from sims.worlds.yard import yard
 
-WORLDS: dict[str, Callable[[int], Any]] = {"hall": hall, "yard": yard}
-"""The worlds that are built in: name to the function that makes one from a seed."""
+WORLDS: dict[str, Callable[[int, bool], Any]] = {"hall": hall, "yard": yard}
+"""The worlds that are built in: name to the function that makes one from a seed, bare or not."""
 
 
 class WorldError(VisnavError, ValueError):
     """The world that was asked for isn't there, or isn't one."""
 
 
-def load_world(name_or_path: str | Path, seed: int = 0) -> mujoco.MjSpec:
+def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> mujoco.MjSpec:
     """Return a world, ready for vehicles and cameras to be added.
 
     What MuJoCo warns of from then on goes to the log.
@@ -32,6 +32,8 @@ def load_world(name_or_path: str | Path, seed: int = 0) -> mujoco.MjSpec:
             contains a slash, or is a `Path`).
         seed: Of a built-in world's looks; its geometry is the same for every seed, but for
             what lies on shelves. A file has none.
+        bare: Leave out a built-in world's pictures, and what has a random place in it: the rest
+            is there in a tenth of the time.
 
     Raises:
         WorldError: No such name or file, or the file is no MJCF that compiles.
@@ -49,7 +51,7 @@ def load_world(name_or_path: str | Path, seed: int = 0) -> mujoco.MjSpec:
         raise WorldError(
             f'world: expected one of {known}, or a path to an .xml file, found "{text}"{hint}'
         )
-    return WORLDS[text](seed)
+    return WORLDS[text](seed, bare)
 
 
 def _from_file(path: Path) -> Any:

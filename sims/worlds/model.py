@@ -7,7 +7,7 @@ The world here is MuJoCo's: x north, y **west**, z up (NWU), metres. What is put
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -43,9 +43,11 @@ class Model:
     Args:
         name: The model's.
         seed: Everything random follows from it.
+        bare: Leave out the pictures, which take seconds to draw, and what has a random place.
     """
 
-    def __init__(self, name: str, seed: int) -> None:
+    def __init__(self, name: str, seed: int, bare: bool = False) -> None:
+        self.bare = bare
         self.random = np.random.default_rng([seed, len(name), *name.encode()])
         self.spec = mujoco.MjSpec()
         self.spec.modelname = name
@@ -56,17 +58,23 @@ class Model:
         self.spec.visual.quality.offsamples = 0
 
     def material(
-        self, name: str, picture: Picture, density: float, module: float = 0.0, glow: float = 0.0
+        self,
+        name: str,
+        draw: Callable[[np.random.Generator], Picture],
+        density: float,
+        module: float = 0.0,
+        glow: float = 0.0,
     ) -> Material:
         """Add a material drawn at `density` pixels per metre.
 
         Args:
             name: Its name and its texture's.
-            picture: Shape (h, w, 3).
+            draw: Returns its picture, shape (h, w, 3), given a source of random numbers.
             density: Pixels per metre.
             module: See `Material`.
             glow: How much it shines by itself, 0..1.
         """
+        picture = np.zeros((64, 64, 3), np.float32) if self.bare else draw(self.random)
         height, width = picture.shape[:2]
         texture = self.spec.add_texture(
             name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3

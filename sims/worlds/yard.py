@@ -7,6 +7,8 @@ things are made of is in `materials`, `facades` and `decals`; how they get into 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -30,25 +32,23 @@ SIDES = {  # the houses' line, how they are turned, widths and storeys from the 
 }
 
 
-def yard(seed: int = 0) -> Any:
+def yard(seed: int = 0, bare: bool = False) -> Any:
     """Return the yard as a `mujoco.MjSpec`; every seed has its own houses, ground and trees."""
-    b = Builder("yard", seed)
+    b = Builder("yard", seed, bare)
     b.spec.visual.headlight.ambient = [0.56, 0.59, 0.66]
-    red = b.material("brick", materials.brick((384, 768), b.random, 80.0), 80.0, 0.12)
-    stone = materials.brick((512, 768), b.random, 96.0, materials.GREY_STONE, (0.22, 0.46))
-    ashlar = b.material("ashlar", stone, 96.0, 0.22)
-    cast = b.material("concrete", materials.concrete((512, 512), b.random, 96.0), 96.0)
-    wood = b.material("wood", materials.planks((256, 512), b.random, 96.0), 96.0)
-    faces = decals.sheets([decals.crate_face(192, b.random, n) for n in range(9)], 3)
-    crates = b.material("crates", faces, 192.0)
-    steel = b.material("steel", _containers(b.random), 80.0)
+    red = b.material("brick", lambda r: materials.brick((384, 768), r, 80.0), 80.0, 0.12)
+    ashlar = b.material("ashlar", _stone, 96.0, 0.22)
+    cast = b.material("concrete", lambda r: materials.concrete((512, 512), r, 96.0), 96.0)
+    wood = b.material("wood", lambda r: materials.planks((256, 512), r, 96.0), 96.0)
+    crates = b.material("crates", _crate_faces, 192.0)
+    steel = b.material("steel", _containers, 80.0)
     _containers_and_crates(b, steel, crates)
     _masonry(b, red, ashlar, cast)
     _furniture(b, wood, cast)
     _trees(b)
     _walls(b, red)
     _houses(b)
-    ground = b.material("ground", yard_ground.picture(b.random, SUN), yard_ground.DENSITY)
+    ground = b.material("ground", lambda r: yard_ground.picture(r, SUN), yard_ground.DENSITY)
     half = yard_ground.HALF
     surface = quad(
         np.array([half, half, 0.0]),
@@ -125,20 +125,34 @@ def _furniture(b: Builder, wood: Material, cast: Material) -> None:
 
 
 def _trees(b: Builder) -> None:
-    picture = materials.planks((192, 384), b.random, 96.0, width=0.07, palette=(
-        (0.40, 0.31, 0.23), (0.33, 0.26, 0.20), (0.46, 0.38, 0.29),
-    ))  # fmt: skip
-    bark = b.material("bark", np.ascontiguousarray(picture.transpose(1, 0, 2)), 96.0)
-    green = b.material("leaves", materials.leaves((512, 768), b.random, 72.0), 72.0)
+    bark = b.material("bark", _bark, 96.0)
+    green = b.material("leaves", lambda r: materials.leaves((512, 768), r, 72.0), 72.0)
     for number, (x, y, height, radius) in enumerate(TREES):
         b.cylinder(f"tree_{number}/trunk", bark, 0.17, height, (x, y, 0.0))
         flat = 0.85 * radius
         b.crown(f"tree_{number}/crown", green, (radius, radius, flat), (x, y, height + 0.8 * flat))
+        if b.bare:
+            continue
         off = b.random.uniform(-0.5, 0.5, 2) * radius
         small = 0.66 * radius
         top = height + 1.6 * flat
         b.crown(f"tree_{number}/top", green, (small, small, 0.8 * small),
                 (x + float(off[0]), y + float(off[1]), top))  # fmt: skip
+
+
+def _bark(random: np.random.Generator) -> Picture:
+    picture = materials.planks((192, 384), random, 96.0, width=0.07, palette=(
+        (0.40, 0.31, 0.23), (0.33, 0.26, 0.20), (0.46, 0.38, 0.29),
+    ))  # fmt: skip
+    return np.ascontiguousarray(picture.transpose(1, 0, 2))
+
+
+def _stone(random: np.random.Generator) -> Picture:
+    return materials.brick((512, 768), random, 96.0, materials.GREY_STONE, (0.22, 0.46))
+
+
+def _crate_faces(random: np.random.Generator) -> Picture:
+    return decals.sheets([decals.crate_face(192, random, n) for n in range(9)], 3)
 
 
 def _walls(b: Builder, red: Material) -> None:
@@ -151,22 +165,17 @@ def _walls(b: Builder, red: Material) -> None:
 def _houses(b: Builder) -> None:
     """Add four rows of houses, each with one texture for its fronts."""
     for side, (line, turn, row) in SIDES.items():
-        fronts = [
-            facades.house(width, storeys, b.random, HOUSE_DENSITY, number + len(side))
-            for number, (width, storeys) in enumerate(row)
-        ]
-        tall = max(len(front) for front in fronts)
-        sheet = np.concatenate(
-            [np.pad(front, ((tall - len(front), 0), (0, 0), (0, 0)), "edge") for front in fronts], 1
-        )
-        material = b.material(f"houses_{side}", sheet, HOUSE_DENSITY)
+        heights = [int(facades.height_of(storeys) * HOUSE_DENSITY) for _, storeys in row]
+        tall = max(heights)
+        draw = functools.partial(_fronts, row=row, side=side)
+        material = b.material(f"houses_{side}", draw, HOUSE_DENSITY)
         angle = np.radians(turn)
         total = sum(width for width, _ in row)
         left = 0.0
-        for number, ((width, _), front) in enumerate(zip(row, fronts, strict=True)):
-            high = len(front) / HOUSE_DENSITY
+        for number, ((width, _), pixels) in enumerate(zip(row, heights, strict=True)):
+            high = pixels / HOUSE_DENSITY
             window = (
-                left / total + 1e-3, 1.0 - len(front) / tall, (left + width) / total - 1e-3, 1.0,
+                left / total + 1e-3, 1.0 - pixels / tall, (left + width) / total - 1e-3, 1.0,
             )  # fmt: skip
             # In the box's own axes the front looks to -x, and the left is +y.
             x, y = line + 2.0, total / 2.0 - left - width / 2.0
@@ -179,6 +188,17 @@ def _houses(b: Builder) -> None:
                   windows={"front": window, "left": window, "right": window},
                   hidden=("bottom", "back", "top"))  # fmt: skip
             left += width
+
+
+def _fronts(random: np.random.Generator, row: Sequence[tuple[float, int]], side: str) -> Picture:
+    """Return the fronts of a row of houses, side by side."""
+    fronts = [
+        facades.house(width, storeys, random, HOUSE_DENSITY, number + len(side))
+        for number, (width, storeys) in enumerate(row)
+    ]
+    tall = max(len(front) for front in fronts)
+    padded = [np.pad(f, ((tall - len(f), 0), (0, 0), (0, 0)), "edge") for f in fronts]
+    return np.concatenate(padded, 1)
 
 
 def _containers(random: np.random.Generator) -> Picture:

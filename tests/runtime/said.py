@@ -50,6 +50,7 @@ class NoHost:
         with_loop.close()
         self.executor: concurrent.futures.Executor = concurrent.futures.ThreadPoolExecutor()
         self.out: Path | None = None
+        self.checking = False
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         raise NotImplementedError

@@ -1,0 +1,294 @@
+"""What can be said of a run before it begins, by its file and by its nodes.
+
+`of_file` looks at classes and settings only, and is quick enough for every run. `of_nodes` also
+goes through all phases before the first update, and then through the last one:
+
+    construct → on_startup → announce → on_announcement → check → on_shutdown
+
+Meanwhile no worker is started, no file is written, and `Node.checking` tells the nodes to leave
+alone what is outside the process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import logging
+import posixpath
+from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import CodeType
+from typing import Any, NoReturn
+
+import msgspec
+
+from events import Announcement
+from runtime import steps
+from runtime.clock import Clock
+from runtime.config import Config, NodeSpec
+from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
+from runtime.execute import make_clock, make_loop
+from runtime.graph import heard_types, unconnected
+from runtime.life import Life
+from runtime.node import Node
+from runtime.paths import written
+from runtime.schedule import Tick, Ticker
+from runtime.sender import Listener
+
+RUN_FILES = ("config.toml", "log.txt", "summary.json")
+"""What the run itself writes into its folder."""
+
+
+class Findings(msgspec.Struct, frozen=True):
+    """What was found.
+
+    Attributes:
+        errors: With any of these the run cannot do what the file says: a line each.
+        warnings: What is odd, and may be meant.
+    """
+
+    errors: list[str]
+    warnings: list[str]
+
+
+def of_file(config: Config, only: Collection[str] = ()) -> Findings:
+    """Look at what the file says, and at the classes of its nodes.
+
+    Args:
+        config: The file.
+        only: Nodes that run in this process; all, if empty.
+    """
+    here = [spec for spec in config.nodes if not only or spec.name in only]
+    warnings = [
+        f"{node}.{port}: expects {event}, and no node sends it"
+        for node, port, event in unconnected([(spec.name, spec.node) for spec in config.nodes])
+    ]
+    warnings += [
+        f"{spec.name}.{port}: no method of {spec.type_name} reads it"
+        for spec in here
+        for port in _unread(spec.node)
+    ]
+    return Findings(list(_clashes(here)), warnings)
+
+
+def of_nodes(config: Config) -> Findings:
+    """Bring all nodes up to where their first update would be, and take them down again."""
+    errors: list[str] = []
+    announced: dict[str, list[Announcement]] = {}
+    loop = make_loop(config.run)
+    with asyncio.Runner(loop_factory=lambda: loop) as runner, _warnings() as warnings:
+        runner.run(_rehearse(config, errors, announced, warnings))
+    return Findings(errors, warnings)
+
+
+async def _rehearse(
+    config: Config,
+    errors: list[str],
+    announced: dict[str, list[Announcement]],
+    warnings: list[str],
+) -> None:
+    loop = asyncio.get_running_loop()
+    steps.install(loop)
+    clock = make_clock(config.run, loop)
+    host = _DryHost(config.run.seed, clock)
+    lives = [Life(spec) for spec in config.nodes]
+    cut_short: set[str] = set()
+    uncertain = False
+    try:
+        for life in lives:
+            try:
+                await life.begin(host, config.run.startup_limit)
+            except NodeError as error:
+                cut_short.add(life.spec.name)
+                if isinstance(error.__cause__, UncheckableError):
+                    uncertain = True
+                elif not isinstance(error.__cause__, _NoWorkerError):
+                    errors.append(str(error))
+        if errors:  # what others then miss is of no interest
+            return
+        for life in lives:
+            try:
+                announced[life.spec.name] = life.announced()
+            except NodeError as error:
+                if life.spec.name not in cut_short:
+                    errors.append(str(error))
+        everything = [each for said in announced.values() for each in said]
+        errors += _said_twice(announced)
+        warnings += _unknown_sources(config.nodes, everything)
+        for life in lives:
+            try:
+                life.hear(everything)
+            except NodeError as error:
+                (warnings if uncertain else errors).append(str(error))
+    finally:
+        before = len(warnings)
+        for life in reversed(lives):
+            await life.end(config.run.shutdown_limit)
+        del warnings[before:]  # that nothing came is no news
+        host.executor.shutdown(wait=False, cancel_futures=True)
+        clock.close()
+
+
+class _NoWorkerError(VisnavError):
+    """A node asked a worker that a check has not started."""
+
+
+class _Absent:
+    """Stands for a worker."""
+
+    async def call(self, *_: Any, **__: Any) -> NoReturn:
+        raise _NoWorkerError("not while the file is only checked")
+
+    call_for = call
+
+    def outstanding(self) -> int:
+        return 0
+
+
+class _DryHost:
+    """What a check does for its nodes: as little as it can."""
+
+    checking = True
+    out: Path | None = None
+
+    def __init__(self, seed: int, clock: Clock) -> None:
+        self.seed = seed
+        self.clock = clock
+        self.executor: concurrent.futures.Executor = concurrent.futures.ThreadPoolExecutor(
+            max_workers=2, thread_name_prefix="offload"
+        )
+
+    def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:  # noqa: ARG002
+        coro.close()
+
+    def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
+        return Ticker(f"{node.name}.{name}", hz, call, lambda _: None)
+
+    async def worker(self, *_: Any, **__: Any) -> Any:
+        return _Absent()
+
+    def stop(self, reason: str) -> None:
+        pass
+
+    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool) -> None:
+        pass
+
+    def after_run(self, call: Callable[[Path], Any]) -> None:
+        pass
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """Collect what nodes warn of, instead of printing it."""
+    found: list[str] = []
+
+    class Collect(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if record.levelno == logging.WARNING:
+                found.append(f"{record.name.removeprefix('visnav.')}: {record.getMessage()}")
+
+    ours, handler = logging.getLogger("visnav"), Collect()
+    before, ours.propagate = ours.propagate, False
+    ours.addHandler(handler)
+    try:
+        yield found
+    finally:
+        ours.removeHandler(handler)
+        ours.propagate = before
+
+
+def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:
+    """Say which nodes would write the same file."""
+    writers = dict.fromkeys(RUN_FILES, "the run itself")
+    for spec in nodes:
+        files = dict.fromkeys(
+            posixpath.normpath(file) for file in (*spec.node.files, *written(spec.config))
+        )
+        for file in files:
+            if file in writers:
+                yield (
+                    f"{spec.name}: expected files of its own in the run's folder, found {file}, "
+                    f"which {writers[file]} writes, too"
+                )
+            writers.setdefault(file, spec.name)
+
+
+def _unread(cls: type[Node[Any]]) -> list[str]:
+    """Return the inputs that no method of a class mentions."""
+    mentioned: set[Any] = set()
+
+    def look(code: CodeType) -> None:
+        mentioned.update(code.co_names)
+        for constant in code.co_consts:
+            if isinstance(constant, CodeType):
+                look(constant)
+            else:
+                mentioned.add(constant if isinstance(constant, str) else "")
+
+    for base in cls.__mro__[: cls.__mro__.index(Node)]:
+        for value in vars(base).values():
+            function = getattr(value, "fget", None) or getattr(value, "__func__", value)
+            if isinstance(code := getattr(function, "__code__", None), CodeType):
+                look(code)
+    return [port for port in (*cls.declared.inputs, *cls.declared.bundles) if port not in mentioned]
+
+
+def _said_twice(announced: Mapping[str, Iterable[Announcement]]) -> Iterator[str]:
+    """Say what two nodes announce, or one twice."""
+    first: dict[tuple[type[Announcement], str], str] = {}
+    for node, said in announced.items():
+        for each in said:
+            key = type(each), each.source
+            if key in first:
+                yield (
+                    f"{node}: expected to announce what nobody else does, found "
+                    f"{type(each).__name__} of {each.source} by {first[key]}, too"
+                )
+            first.setdefault(key, node)
+
+
+def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement]) -> Iterator[str]:
+    """Say which `inputs` name a source from which nothing will come.
+
+    A node may send what it has not announced, so these are warnings.
+    """
+    specs = {spec.name: spec for spec in nodes}
+    sources = dict.fromkeys([*specs, *(each.source for each in announced)])
+    for spec in specs.values():
+        for port, source in spec.inputs.items():
+            where = f"{spec.name}: inputs.{port}"
+            events = _types(spec.node, port)
+            owner = source.partition("/")[0]
+            below = [each for each in sources if each.startswith(f"{owner}/")]
+            if owner in specs and not _may_send(specs[owner].node, events):
+                names = " or ".join(event.__name__ for event in events)
+                yield f"{where}: expected a source of {names}, found {source}: {owner} sends none"
+            elif not (
+                source in specs
+                or (owner in specs and not below)
+                or any(
+                    f"{each}/".startswith(f"{source}/")
+                    or ("/" in each and source.startswith(f"{each}/"))
+                    for each in sources
+                )
+            ):
+                known = ", ".join(below or sources)
+                yield (
+                    f"{where}: expected one of {known}, found {source}{suggest(source, sources)}"
+                )
+
+
+def _types(cls: type[Node[Any]], port: str) -> tuple[Any, ...]:
+    """Return the types of event that a port hears, or that a bundle's fields do."""
+    return tuple(
+        event
+        for name, events in heard_types(cls).items()
+        if name == port or name.startswith(f"{port}.")
+        for event in events
+    )
+
+
+def _may_send(cls: type[Node[Any]], events: tuple[Any, ...]) -> bool:
+    listener = Listener("", lambda _: None, events)
+    return any(listener.may_hear(output.event) for output in cls.declared.outputs.values())

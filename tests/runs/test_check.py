@@ -1,0 +1,147 @@
+"""`check` on whole files: mistakes that a colleague would see are one line each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.runtime.samples_cli import ROOT, command_here
+
+ROOM = """
+<mujoco><worldbody>
+  <geom name="floor" type="plane" size="5 5 .1"/>
+  <geom name="north" type="box" size=".1 5 2" pos="5 0 2"/>
+  <geom name="south" type="box" size=".1 5 2" pos="-5 0 2"/>
+  <geom name="east" type="box" size="5 .1 2" pos="0 -5 2"/>
+  <geom name="west" type="box" size="5 .1 2" pos="0 5 2"/>
+  <geom name="ceiling" type="box" size="5 5 .1" pos="0 0 4"/>
+  <geom name="pillar" type="cylinder" size=".5 2" pos="2 0 2"/>
+  <geom name="curtain" type="box" size=".1 4 2" pos="-2 0 2" contype="0" conaffinity="0"/>
+</worldbody></mujoco>
+"""
+FILE = """
+[run]
+name = "check"
+[[nodes]]
+name = "drone"
+type = "sims.multirotor:Multirotor"
+world = "room.xml"
+[[nodes.cameras]]
+name = "front"
+[[nodes.cameras]]
+name = "down"
+images = ["grey"]
+[[nodes]]
+name = "tour"
+type = "nodes.tour:Tour"
+waypoints = [[0, 0, -1], [-3, 0, -1], [-3, 3, -1]]
+[[nodes]]
+name = "odometry"
+type = "nodes.visual_odometry:VisualOdometry"
+[[nodes]]
+name = "log"
+type = "nodes.flight_log:FlightLog"
+"""
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    (tmp_path / "room.xml").write_text(ROOM)
+    path = tmp_path / "room.toml"
+    path.write_text(FILE.replace("sims.multirotor:", "sims.multirotor.node:"))
+    return path
+
+
+def check(path: Path, *changes: str) -> tuple[int, list[str]]:
+    words = [word for change in changes for word in ("--set", change)]
+    done = command_here("check", path, *words, folder=path.parent)
+    return done.returncode, [*done.stderr.splitlines(), *done.stdout.splitlines()]
+
+
+def test_a_right_file_is_right_from_anywhere(room: Path) -> None:
+    for folder in (room.parent, ROOT):
+        done = command_here("check", room, folder=folder)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.endswith("4 nodes, 10 connections: right\n")
+    assert sorted(each.name for each in room.parent.iterdir()) == ["room.toml", "room.xml"]
+
+
+TYPE = "nodes.flight_log:FlightLog"
+MISTAKES = [
+    ("drone.world=none.xml", "drone: world: ", "none.xml: expected an MJCF file, found nothing"),
+    ("drone.world=hal", "drone: world: ", 'found "hal"; did you mean hall?'),
+    ("down.name=front", "(drone): cameras: front: expected a name of its own", "found two"),
+    ('front.images=["rgb"]', "odometry: expected a camera with depth", "drone/front, drone/down"),
+    ('odometry.inputs={frames="drone/frnt"}', "odometry: expected a camera", "'drone/front'"),
+    ('odometry.inputs={frames="drone/down"}', "odometry: cannot work with drone/down", "depth"),
+    ("drone.position=[9.0,0.0]", "drone: position: expected ground", "[9, 0, -0.1]: outside"),
+    ("drone.position=[2.0,0.0]", "drone: position: expected a free place", "in pillar"),
+    ("drone.height=-1", "drone: position: expected a free place", "in the ground (floor)"),
+    ("tour.waypoints=[[0,0,1.5]]", "waypoints[0]: expected a free", "heights are negative"),
+    ("tour.waypoints=[[0,0,-1],[9,0,-1]]", "waypoints[1]: expected a free way", "found pillar"),
+    ("tour.waypoints=[[-9,0,-1]]", "waypoints[0]: expected a free way", "found south between"),
+    ("tour.waypoints=[[0,0,-9]]", "waypoints[0]", "ceiling"),
+    ("tour.waypoints=[[2,0,-1]]", "waypoints[0]: expected a free place", "in pillar"),
+    ("front.latency=40", "cameras[0].latency: expected a unit", 'did you mean "40ms"'),
+    ("odometry.latency=15", "latency: expected a unit", 'did you mean "15ms"'),
+    ("log.plot=trajectory.tum", "log: expected files of its own", ""),
+    ("log.plot=summary.json", "log: expected files of its own", "summary.json, which the run"),
+    ("log.name=tour", "nodes[3].name: expected a name that no other node has", '"tour"'),
+    ("log.plt=x.png", "nodes[3] (log): expected one of", "'plt' (did you mean 'plot'?)"),
+]
+
+
+@pytest.mark.parametrize(("change", "expected", "found"), MISTAKES, ids=lambda text: str(text)[:40])
+def test_each_mistake_is_one_line(room: Path, change: str, expected: str, found: str) -> None:
+    if change.startswith("log.plot=trajectory"):
+        room.write_text(f'{room.read_text()}\n[[nodes]]\nname="more"\ntype="{TYPE}"\n')
+        change, expected = "log.plot=more.png", "more: expected files of its own"
+    code, lines = check(room, change)
+    errors = [line for line in lines if line.startswith("error: ")]
+    assert code == 2
+    assert errors == [line for line in lines if not line.startswith("warning: ")]
+    assert len(errors) == 1 or "more" in expected
+    assert expected in errors[0]
+    assert found in errors[0]
+
+
+def test_a_vehicle_that_starts_in_the_air_is_odd(room: Path) -> None:
+    code, lines = check(room, "drone.height=1")
+    assert code == 0
+    assert lines[0] == "warning: drone: position, height: it starts 1 m above the ground, and falls"
+
+
+def test_an_input_that_names_what_is_not_there_is_odd(room: Path) -> None:
+    code, lines = check(room, 'tour.inputs={moved="dron"}')
+    assert code == 0
+    assert lines[0].startswith("warning: tour: inputs.moved: expected one of drone, tour, ")
+
+
+def test_a_recording_is_looked_for_beside_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "again.toml"
+    path.write_text('[[nodes]]\nname = "r"\ntype = "nodes.replay:Replay"\nfile = "flight.mcap"\n')
+    code, lines = check(path)
+    file = tmp_path / "flight.mcap"
+    assert code == 2
+    assert lines == [
+        f"error: again.toml: r: {file}: expected a recording, found no such file",
+    ]
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize(
+    "path",
+    [ROOT / "config.toml", *sorted((ROOT / "examples").glob("*.toml"))],
+    ids=lambda path: path.stem,
+)
+def test_our_own_files_are_right(path: Path) -> None:
+    """Those that need a recording, or a vocabulary, say so and nothing else."""
+    code, lines = check(path)
+    if code:
+        assert path.stem in {"replay", "orb_slam3"}
+        assert len(lines) == 1
+        assert "expected a recording" in lines[0] or "expected a vocabulary" in lines[0]
+    else:
+        assert lines[-1].endswith(": right")
+        assert len(lines) == 1, lines
