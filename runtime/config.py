@@ -187,6 +187,7 @@ def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> C
         ConfigError: Something in it is wrong.
     """
     folder = folder or Path.cwd()
+    _refuse_extremes(table, where)
     for key in table:
         if key not in {"run", "network", "nodes"}:
             raise ConfigError(
@@ -224,6 +225,26 @@ def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> C
             f"found {show(network.meet)}"
         )
     return Config(run=run, nodes=tuple(specs), network=network)
+
+
+def _refuse_extremes(table: Mapping[str, Any], where: str) -> None:
+    """Refuse what TOML does not promise to hold, and nothing after this expects."""
+    left: list[tuple[Any, int]] = [(table, 0)]
+    while left:
+        value, depth = left.pop()
+        if isinstance(value, Mapping):
+            left += [(each, depth + 1) for each in value.values()]
+        elif isinstance(value, list):
+            left += [(each, depth + 1) for each in value]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ConfigError(f"{where}: expected whole numbers of 64 bits, found a larger one")
+        if depth > _DEEPEST:
+            raise ConfigError(
+                f"{where}: expected tables and lists at most {_DEEPEST} deep, found deeper ones"
+            )
+
+
+_DEEPEST = 32
 
 
 def find_node(type_: str, where: str) -> type[Node[Any]]:

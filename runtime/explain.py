@@ -9,6 +9,9 @@ import msgspec
 
 from runtime.errors import suggest
 
+_LONGEST_TEXT = 300
+"""Letters of a text that a message shows."""
+
 _NAMES = {
     "float": "a number",
     "int": "a whole number",
@@ -90,9 +93,10 @@ def _struct_in(type_: Any) -> type[msgspec.Struct] | None:
 
 
 def show(value: Any) -> str:
-    """Return a value as it would stand in the file, shortened."""
+    """Return a value as it would stand in the file, in one line, shortened."""
     if isinstance(value, str):
-        return f'"{value}"'
+        text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in value[:_LONGEST_TEXT])
+        return f'"{text}"' if len(value) <= _LONGEST_TEXT else f'"{text}..."'
     if isinstance(value, bool):
         return str(value).lower()
     text = str(value)

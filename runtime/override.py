@@ -24,7 +24,7 @@ def override(table: dict[str, Any], change: str) -> None:
     """
     path, equals, text = change.partition("=")
     keys = path.strip().split(".")
-    where = f"--set {change}"
+    where = f"--set {show(change)[1:-1]}"
     if not equals or len(keys) < 2 or not all(keys):
         raise ConfigError(f"{where}: expected node.key=value or run.key=value")
     try:
