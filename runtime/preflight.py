@@ -171,7 +171,7 @@ class _DryHost:
     def stop(self, reason: str) -> None:
         pass
 
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool) -> None:
+    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         pass
 
     def after_run(self, call: Callable[[Path], Any]) -> None:
