@@ -233,7 +233,9 @@ def test_a_named_camera_that_lacks_something_is_refused() -> None:
 
 
 def test_no_camera_at_all_is_an_error_that_says_so() -> None:
-    with pytest.raises(NodeError, match="expected a camera with depth, grey images, found none"):
+    with pytest.raises(
+        NodeError, match="expected a camera with depth, grey images, found drone/front"
+    ):
         track(camera("drone/front", "rgb"))
 
 

@@ -22,7 +22,7 @@ from events import (
 )
 from nodes.mapping import Mapping
 from nodes.report.ply import read_ply
-from runtime.errors import FatalError, NodeError, RefusedError
+from runtime.errors import NodeError, RefusedError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 
 MS = 1_000_000
@@ -185,7 +185,7 @@ def test_one_camera_is_chosen_and_grey_will_do() -> None:
 
 @pytest.mark.usefixtures("in_process")
 def test_without_a_camera_that_will_do_there_is_an_error() -> None:
-    with pytest.raises(FatalError, match=r"expected a camera with depth and rgb .* found none"):
+    with pytest.raises(RefusedError, match=r"expected a camera with depth and rgb .* found none"):
         run_node(Mapping, inputs=[camera(images=("rgb",))], duration=0.1)
     named = spec(Mapping, "m", inputs={"frames": "drone/front"})
     with pytest.raises(RefusedError, match=r"drone/front: expected .* found one with rgb$"):
