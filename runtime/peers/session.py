@@ -135,7 +135,7 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
     settings: dict[str, Any] = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
-        # Of two that hear of each other only one connects: if both do, with passwords, both may fail.
+        # Of two that hear of each other only one connects: with passwords, both may fail else.
         "scouting/gossip/autoconnect_strategy": {
             "peer": {"to_router": "always", "to_peer": "greater-zid"}
         },
