@@ -159,9 +159,7 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(f"{path}: expected UTF-8 text, found {error.reason}") from None
     try:
         table = tomllib.loads(text)
-    except RecursionError:
-        raise ConfigError(f"{path}: expected TOML, found brackets nested too deeply") from None
-    except ValueError as error:  # a TOMLDecodeError, or an integer too long for Python
+    except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: expected TOML, found: {error}") from None
     except ValueError as error:  # of Python's int()
         raise ConfigError(f"{path}: expected numbers of a usual size, found: {error}") from None

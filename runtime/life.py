@@ -134,9 +134,7 @@ class Life:
                 raise wrap(name, error) from error
         try:
             lacks = list(self.node.check())
-        except NodeError:
-            raise
-        except Exception as error:
+        except BaseException as error:
             raise wrap(name, error) from error
         if lacks:
             raise RefusedError(name, "; ".join(lacks))
@@ -151,17 +149,7 @@ class Life:
             NodeError: Something went wrong in it.
         """
         assert self.node is not None
-        name = self.spec.name
-        try:
-            async with real_time_limit(limit):
-                await self.node.on_ready()
-        except NodeError:
-            raise
-        except TimeoutError:
-            expected = f"expected on_ready to end within {limit:g} s"
-            raise NodeTimeoutError(name, f"{expected}, found it still running") from None
-        except Exception as error:
-            raise wrap(name, error) from error
+        await self._within(limit, "on_ready", self.node.on_ready())
 
     async def end(self, limit: float) -> list[NodeError]:
         """End ticks, tasks, node and workers; whatever goes wrong, the other steps follow.

@@ -92,7 +92,14 @@ async def _rehearse(
     steps.install(loop)
     clock = make_clock(config.run, loop)
     host = _DryHost(config.run.seed, clock)
-    lives = [Life(spec) for spec in config.nodes]
+    tasks: set[asyncio.Task[Any]] = set()
+
+    def create(coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
+        task = loop.create_task(coro, name=name)
+        tasks.add(task)
+        return task
+
+    lives = [Life(spec, create) for spec in config.nodes]
     cut_short: set[str] = set()
     uncertain = False
     try:

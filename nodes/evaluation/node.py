@@ -103,6 +103,8 @@ class Evaluation(Node[EvaluationConfig]):
     @on(Odometry)
     def moved(self, event: Odometry) -> None:
         """Note the truth."""
+        if self._closed:
+            return
         self._truth.add(event.stamp, event.position, event.orientation)
         self._recent.add(event.stamp, event.position, event.orientation)
         self._append("truth", event)
@@ -117,6 +119,8 @@ class Evaluation(Node[EvaluationConfig]):
     @on(PoseEstimate)
     def estimated(self, event: PoseEstimate) -> None:
         """Note an estimate, and say how good it is."""
+        if self._closed:
+            return
         name, now = event.source, self.clock.now()
         record = self._records.setdefault(name, EstimatorRecord())
         if not record.add(event, now):
@@ -157,7 +161,7 @@ class Evaluation(Node[EvaluationConfig]):
 
     async def on_shutdown(self) -> None:
         """Judge, and write what came of it."""
-        self._closed = True  # what comes from now on is judged, too, but too late for the files
+        self._closed = True  # while it judges, beside the loop, nothing may change
         for file in self._files.values():
             file.close()
         if not self._records and self.clock.now() > 0:
@@ -238,7 +242,7 @@ class Evaluation(Node[EvaluationConfig]):
 
     def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
         """Add a pose to a file: should the run be killed, what was said until then is there."""
-        if self.out is None or self._closed:
+        if self.out is None:
             return
         file = self._files.get(name)
         if file is None:

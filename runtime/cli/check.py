@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 
-import typer
-
 from runtime.cli.common import ConfigFile, Overrides
 
 
@@ -20,7 +18,7 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     with 0, or with 2 if there is a mistake; what may be meant is a warning.
     """
     from runtime import preflight
-    from runtime.cli.run import leave_threads_behind, warn
+    from runtime.cli.run import leave_behind, warn
     from runtime.config import load
     from runtime.graph import edges
 
@@ -37,6 +35,4 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     if not errors:
         connections = edges([(spec.name, spec.node) for spec in settings.nodes])
         print(f"{config}: {len(settings.nodes)} nodes, {len(connections)} connections: right")
-    code = 2 if errors else 0
-    leave_threads_behind(code)
-    raise typer.Exit(code)
+    leave_behind(2 if errors else 0)
