@@ -74,7 +74,7 @@ class Standstill:
             if now - since < due / 2:
                 continue
             seen: Counter[tuple[str, str]] = Counter()
-            answer = self._ask(min(since + due, now + 1.0), seen)
+            answer = self._ask(max(min(since + due, now + 1.0), now + self._limit / 4), seen)
             if self._end.is_set():
                 return
             if answer == "" or self._mark() != mark:
@@ -115,6 +115,8 @@ class Standstill:
             if time.monotonic() >= until:
                 break
             self._end.wait(_LOOK)
+        if not answers and not seen:  # it has nothing to do, and is only slow to wake up
+            return ""
         return answers[0] if answers else None
 
     def _explain(self) -> str:
@@ -153,6 +155,8 @@ class Standstill:
     def _interrupt(self) -> None:
         """Raise an error in whatever blocks the loop, by a signal."""
         node, line = places.of_thread(sys._current_frames().get(self._thread_id))
+        if node == "runtime":  # it is not a node that blocks, or does no more
+            return
         error = NodeTimeoutError(node, "expected it to give back the loop, found it blocking it")
         error.place = line
         self._supervisor.interruption = error

@@ -22,6 +22,8 @@ PLACES = (
     "on_startup",
     "announce",
     "on_announcement",
+    "check",
+    "on_ready",
     "run",
     "handler",
     "tick",
@@ -57,10 +59,11 @@ class Faulty(Node[FaultyConfig]):
     pings = Output(Ping)
 
     def trouble(self, place: str) -> None:
-        late = place not in {"on_startup", "announce", "on_announcement", "after_run"}
+        late = PLACES.index("run") <= PLACES.index(place) < PLACES.index("after_run")
         if place != self.config.place or self.restarts or (late and self.clock.now() < 2e8):
             return
-        raise WAYS[self.config.way]
+        error = WAYS[self.config.way]()
+        raise error
 
     async def on_startup(self) -> None:
         self.after_run(self.afterwards)
@@ -72,6 +75,13 @@ class Faulty(Node[FaultyConfig]):
 
     def on_announcement(self, announcement: Announcement) -> None:
         self.trouble("on_announcement")
+
+    def check(self) -> Iterable[str]:
+        self.trouble("check")
+        return ()
+
+    async def on_ready(self) -> None:
+        self.trouble("on_ready")
 
     @on(Ping)
     def listen(self, _: Ping) -> None:
@@ -125,7 +135,7 @@ class Witness(Node):
 class StubbornConfig(NodeConfig):
     """What it does instead of ending."""
 
-    place: Literal["on_startup", "run", "on_shutdown", "started late"] = "run"
+    place: Literal["on_startup", "on_ready", "run", "on_shutdown", "started late"] = "run"
     way: str = "swallow"
 
 
@@ -134,6 +144,9 @@ class Stubborn(Node[StubbornConfig]):
 
     async def on_startup(self) -> None:
         await self.stay("on_startup")
+
+    async def on_ready(self) -> None:
+        await self.stay("on_ready")
 
     async def run(self) -> None:
         await self.clock.sleep(0.1)

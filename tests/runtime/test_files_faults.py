@@ -183,8 +183,8 @@ def test_a_run_that_cannot_be_looked_at_goes_on(where: str, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"a = " + b"9" * 5000, "expected TOML, found: Exceeds the limit"),
-        (b"a = " + b"[" * 100_000, "expected TOML, found brackets nested too deeply"),
+        (b"a = " + b"9" * 5000, "expected numbers of a usual size, found: Exceeds the limit"),
+        (b"a = " + b"[" * 100_000, "expected TOML, found brackets nested too deep"),
         (b"a = '\xff'", "expected UTF-8 text"),
     ],
 )

@@ -25,9 +25,13 @@ from tests.runtime.samples_faults import PLACES, WAYS
 
 CLOCKS = ("lockstep", "real")
 RULES = ("stop", "restart", "drop")
-COROUTINES = {"on_startup", "run", "started", "task_group", "on_shutdown"}
-EARLY = {"on_startup", "announce", "on_announcement"}
-QUICK = [("run", "SystemExit", "lockstep", "stop"), ("handler", "BaseException", "real", "drop")]
+COROUTINES = {"on_startup", "on_ready", "run", "started", "task_group", "on_shutdown"}
+EARLY = {"on_startup", "announce", "on_announcement", "check", "on_ready"}
+QUICK = [
+    ("run", "SystemExit", "lockstep", "stop"),
+    ("handler", "BaseException", "real", "drop"),
+    ("on_ready", "CancelledError", "lockstep", "restart"),
+]
 
 SAID = {
     "RuntimeError": "RuntimeError: out of order",
@@ -145,11 +149,11 @@ def test_a_run_survives_what_a_node_raises(tmp_path: Path) -> None:
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("clock", CLOCKS)
-@pytest.mark.parametrize("places", [PLACES[:4], PLACES[4:8], PLACES[8:]], ids=lambda p: p[0])
+@pytest.mark.parametrize("places", [PLACES[:5], PLACES[5:9], PLACES[9:]], ids=lambda p: p[0])
 def test_a_run_survives_whatever_a_node_raises(
     places: tuple[str, ...], clock: str, rule: str, tmp_path: Path
 ) -> None:
-    """528 modes: 11 places, 8 ways, 2 clocks, 3 rules."""
+    """624 modes: 13 places, 8 ways, 2 clocks, 3 rules."""
     check(tmp_path, [(place, way, clock, rule) for place in places for way in WAYS])
 
 

@@ -72,6 +72,8 @@ MODES = [
     ("on_startup", "spin", r"on_startup to end within 0\.3 s", "spin"),
     ("on_startup", "block", "it to give back the loop", "block"),
     ("on_startup", "sleep", "it to give back the loop", "sleep"),
+    ("on_ready", "swallow", r"on_ready to end within 0\.3 s", "swallow"),
+    ("on_ready", "block", "it to give back the loop", "block"),
     ("run", "swallow", r"its tasks to end within [\d.]+ s", "swallow"),
     ("run", "spin", r"its tasks to end within [\d.]+ s", "spin"),
     ("on_shutdown", "swallow", r"on_shutdown to end within [\d.]+ s", "swallow"),
