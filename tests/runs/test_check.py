@@ -63,7 +63,7 @@ def test_a_right_file_is_right_from_anywhere(room: Path) -> None:
     for folder in (room.parent, ROOT):
         done = command_here("check", room, folder=folder)
         assert (done.returncode, done.stderr) == (0, "")
-        assert done.stdout.endswith("4 nodes, 10 connections: right\n")
+        assert done.stdout.endswith("4 nodes, 11 connections: right\n")
     assert sorted(each.name for each in room.parent.iterdir()) == ["room.toml", "room.xml"]
 
 

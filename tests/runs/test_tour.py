@@ -54,7 +54,7 @@ def test_a_short_flight_leaves_everything(tmp_path: Path) -> None:
     fly(tmp_path, "out", *SHORT)
     out = tmp_path / "out"
     assert {p.name for p in out.iterdir()} == {
-        *("summary.json", "config.toml", "log.txt"),
+        *("summary.json", "config.toml", "log.txt", ".visnav-run"),
         *("trajectory.tum", "flight.png", "pictures.png"),
     }
     found = summary(out)
