@@ -85,7 +85,7 @@ def test_the_command_leaves_orb_slam3_out_and_puts_the_file_where_it_looks(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     config = tmp_path / "config.toml"
     config.write_text(CONFIG, encoding="utf-8")
-    with pytest.raises(SystemExit, match="^0$"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         vocabulary(config, quiet=True)
     [path] = (tmp_path / "cache" / "visnav-runtime").iterdir()
     assert read_vocabulary(path).leaves.sum() > 100
@@ -99,7 +99,7 @@ def test_the_command_writes_where_it_is_told(
     monkeypatch.chdir(tmp_path)
     config = tmp_path / "config.toml"
     config.write_text(CONFIG, encoding="utf-8")
-    with pytest.raises(SystemExit, match="^0$"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         vocabulary(config, out=Path("own.txt"), quiet=True)
     assert read_vocabulary(tmp_path / "own.txt").leaves.any()
     assert f'vocabulary = "{tmp_path / "own.txt"}"' in capsys.readouterr().out
