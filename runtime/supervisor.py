@@ -179,6 +179,9 @@ class Supervisor:
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as part of a node."""
+        self._start(node, coro)
+
+    def _start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         life = self._lives[node.name]
         guarded = self._guard(node, coro)
         guarded.__qualname__ = getattr(coro, "__qualname__", guarded.__qualname__)  # type: ignore[attr-defined]
@@ -188,6 +191,7 @@ class Supervisor:
         task.add_done_callback(lambda _: life.tasks.pop(task, None))
         if inspect.iscoroutine(coro):  # which is not begun if the task is cancelled before
             task.add_done_callback(lambda _: coro.close())
+        return task
 
     def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
         """Call a function of a node at a rate, from the first update on."""
@@ -360,7 +364,14 @@ class Supervisor:
             hz = getattr(node.config, ticks.hz) if isinstance(ticks.hz, str) else ticks.hz
             self.every(node, hz, getattr(node, method), method)
         if type(node).run is not Node.run:
-            self.start(node, node.run())
+            self._start(node, node.run()).add_done_callback(lambda _: self._has_run(node))
+
+    def _has_run(self, node: Node[Any]) -> None:
+        """Say so if a node has stopped reading its inputs: it looks alive, and is not."""
+        life, ports = self._lives[node.name], [*node.declared.inputs, *node.declared.bundles]
+        if ports and not (self._ended.is_set() or life.closing or life.recovering):
+            unread = ", ".join(ports)
+            log.warning("%s: run() has returned: nobody reads %s any more", node.name, unread)
 
     def _add(self, ticker: Ticker) -> None:
         ticker.begin(self.clock.now())

@@ -298,3 +298,23 @@ def test_a_nodes_random_numbers_depend_on_seed_and_name_only() -> None:
     assert roll("a", seed=1) != roll("a", seed=2)
     first, second = roll("a", "b", seed=1)
     assert first != second
+
+
+class Short(Node):
+    """Reads but two events."""
+
+    pings = Input(Ping)
+
+    async def run(self) -> None:
+        async for ping in self.pings:
+            if ping.count:
+                return
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_a_node_that_stops_reading_is_named(clock: str, caplog: pytest.LogCaptureFixture) -> None:
+    nodes = [spec(Speaker, "speaker"), spec(Short, "short"), *diarists("a")]
+    outcome = supervise(nodes, clock=clock, duration=0.3)
+    assert outcome.error is None
+    told = [record.getMessage() for record in caplog.records if "nobody reads" in record.message]
+    assert told == ["short: run() has returned: nobody reads pings any more"]
