@@ -28,6 +28,7 @@ digest = true
 [[nodes]]
 name = "drone"
 type = "sims.multirotor.node:Multirotor"
+control_rate = 100
 
 [[nodes]]
 name = "echo"
