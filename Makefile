@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check fix peers bench bench-quick orbslam3 pictures clean
+.PHONY: help setup demo test test-slow test-all check fix peers bench bench-quick orbslam3 pictures clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -38,9 +38,13 @@ test: $(READY)  ## Run the quick tests.
 	@sh tools/system_packages.sh display
 	$(BIN)/python -m pytest -n 3 --dist loadfile -m 'not slow'
 
-test-all: $(READY)  ## Run all tests.
+test-slow: $(READY)  ## Run the slow tests; what fails is repeated once, alone.
 	@sh tools/system_packages.sh display
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow || { \
+		echo "Repeated once, alone, is what failed above:"; \
+		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m slow; }
+
+test-all: test test-slow  ## Run all tests.
 
 check: $(READY)  ## Check style and types.
 	$(BIN)/ruff check .

@@ -51,7 +51,7 @@ def done(words: str, tmp_path: Path, a_run: Path | None = None) -> CompletedProc
     if parts[0] in {"run", "sweep", "export"}:
         parts += ["--out", str(tmp_path)]
     if parts[0] in {"run", "sweep"}:
-        return command(*parts, folder=ROOT, limit=200)
+        return command(*parts, folder=ROOT, limit=500)
     return command_here(*parts, folder=ROOT)
 
 
@@ -72,7 +72,7 @@ def test_the_run_leaves_a_summary(a_run: Path) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        pytest.param(c, marks=[pytest.mark.slow, pytest.mark.timeout(300)])
+        pytest.param(c, marks=[pytest.mark.slow, pytest.mark.timeout(600)])
         if c.startswith("sweep") or c in FLIGHTS
         else c
         for c in COMMANDS

@@ -21,7 +21,7 @@ SMALLER = ["--set", "drone.cameras.front.width=96", "--set", "drone.cameras.fron
 def test_held_keys_move_the_drone_on_both_axes(display: Display, tmp_path: Path) -> None:
     """Take off with t, hold w and d: it flies ahead and to the right; closing the window ends."""
     log = tmp_path / "log.txt"
-    out = tmp_path / "stdout"
+    out = tmp_path.with_name(f"{tmp_path.name}.txt")  # a run takes an empty folder only
     with out.open("w") as output:
         process = subprocess.Popen(
             [*COMMAND, "--out", str(tmp_path), *SMALLER],

@@ -90,6 +90,6 @@ def test_a_flight_that_is_killed_is_read_but_for_its_last_second(tmp_path: Path)
     assert found[-1] / 1e9 > last - 1.0
     done = subprocess.run(command("recover", str(path)), cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert f"{len(found)} messages, complete" in done.stdout
+    assert f"{len(found)} messages, now with an index" in done.stdout
     assert contents(path).complete
     assert [record.time for record in read(path)] == found

@@ -74,7 +74,7 @@ def bridged_run(
 ) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """Start a run with the talker and the bridge; yield it and the port that it listens on."""
     port = free_port()
-    file = folder / "run.toml"
+    file = folder.with_name(f"{folder.name}.toml")  # a run takes an empty folder only
     connect = [] if router is None else [f"tcp/127.0.0.1:{router}"]
     settings = {"seconds": seconds, "enough": enough, "port": port, "more": more}
     file.write_text(RUN.format(connect=json.dumps(connect), **settings))
