@@ -35,7 +35,7 @@ from runtime.explain import explain, show
 from runtime.links import LinkConfig
 from runtime.node import Node, NodeConfig
 from runtime.override import override
-from runtime.paths import InputPath, resolve, unmarked
+from runtime.paths import InputPath, Secret, resolve, unmarked
 from runtime.ports import MAX_HZ
 from runtime.units import Duration, plain
 
@@ -96,7 +96,7 @@ class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     meet: str = "tcp/127.0.0.1:7450"
     zenoh: InputPath = ""
-    secret: str = ""
+    secret: Secret = ""
     shared: bool = True
     lease: Duration = Duration(0.8)  # immutable
     wait: Duration = Duration(60)

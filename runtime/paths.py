@@ -19,7 +19,7 @@ import msgspec
 
 from runtime.units import plain
 
-Kind = Literal["input", "name", "output"]
+Kind = Literal["input", "name", "output", "secret"]
 _MARK = "path"
 
 InputPath = Annotated[str, msgspec.Meta(extra={_MARK: "input"})]
@@ -27,6 +27,9 @@ InputPath = Annotated[str, msgspec.Meta(extra={_MARK: "input"})]
 
 NameOrPath = Annotated[str, msgspec.Meta(extra={_MARK: "name"})]
 """A name; an `InputPath` if it contains a slash or ends with a suffix such as ``.xml``."""
+
+Secret = Annotated[str, msgspec.Meta(extra={_MARK: "secret"})]
+"""A text; an `InputPath` if ``file:`` stands before it."""
 
 OutputPath = Annotated[str, msgspec.Meta(extra={_MARK: "output"})]
 """A file or folder in the run's folder; empty for none, or for one of the node's own name."""
@@ -50,6 +53,9 @@ def resolve(table: Any, type_: Any, folder: Path) -> Any:
     def absolute(kind: Kind, text: str) -> str:
         if kind == "output" or not text:
             return text
+        if kind == "secret":
+            file = type(text)(text[5:])
+            return f"file:{absolute('input', file)}" if text.startswith("file:") else text
         path = Path(text)
         if kind == "name" and "/" not in text and not path.suffix:
             return text
@@ -73,7 +79,9 @@ def file_names(table: Any, type_: Any) -> Any:
 
     For comparing the settings of two machines, whose folders may be elsewhere.
     """
-    return _walk(table, type_, lambda kind, text: text if kind == "output" else Path(text).name)
+    return _walk(
+        table, type_, lambda kind, text: Path(text).name if kind in {"input", "name"} else text
+    )
 
 
 def written(config: msgspec.Struct) -> Iterator[str]:

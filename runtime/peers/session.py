@@ -33,6 +33,9 @@ Seen = Callable[[str, bool], None]
 CLOSING = 3.0
 """Seconds; a peer that stands still keeps Zenoh waiting for longer."""
 
+_ENDPOINT = re.compile(r"(\w+)/\[?([^\]#?]+?)\]?:(\d+)([#?].*)?")
+"""Protocol, host and port."""
+
 
 class Session:
     """A place among the processes of a run.
@@ -192,7 +195,8 @@ def _warn_if_open(configuration: zenoh.Config) -> None:
 
 def _beside(meet: str) -> list[str]:
     """Return where to listen besides: a free port at the address by which `meet` is reached."""
-    if not (parts := re.fullmatch(r"(tcp|tls|quic)/\[?([^\]#?]+?)\]?:(\d+)([#?].*)?", meet)):
+    parts = _ENDPOINT.fullmatch(meet)
+    if parts is None or parts[1] not in {"tcp", "tls", "quic"}:
         return []
     protocol, host, port = parts[1], parts[2], int(parts[3])
     try:
@@ -207,8 +211,8 @@ def _beside(meet: str) -> list[str]:
 
 def _is_here(endpoint: str) -> bool:
     """Tell whether only processes of this machine reach an endpoint."""
-    parts = re.match(r"\w+/\[?([^\]#?]+?)\]?:\d+", endpoint)
-    host = parts[1] if parts else ""
+    parts = _ENDPOINT.fullmatch(endpoint)
+    host = parts[2] if parts else ""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

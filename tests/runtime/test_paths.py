@@ -44,6 +44,7 @@ class Reading(Node[ReadingConfig]):
 TEXT = """
 [network]
 zenoh = "net/zenoh.json5"
+secret = "file:net/secret"
 
 [[nodes]]
 name = "reading"
@@ -90,7 +91,9 @@ def test_paths_start_at_the_file_wherever_the_command_runs(
         assert found.parts == (Part(str(folder / "h.txt"), "h.txt"),)
         assert found.world == str(folder / "worlds/room.xml")
         assert (found.plot, found.word) == ("plot.png", "a.txt")
-        assert load(path).network.zenoh == str(folder / "net/zenoh.json5")
+        network = load(path).network
+        assert network.zenoh == str(folder / "net/zenoh.json5")
+        assert network.secret == f"file:{folder / 'net/secret'}"
 
 
 def test_paths_of_the_command_line_start_where_it_runs(
@@ -104,6 +107,14 @@ def test_paths_of_the_command_line_start_where_it_runs(
     assert settings(path, "reading.file=").file == ""
     assert settings(path, "reading.word=a.txt").word == "a.txt"
     assert settings(path, "reading.world=yard").world == "yard"
+    for secret, found in (
+        ("file:s", f"file:{tmp_path / 's'}"),
+        ("file:/s", "file:/s"),
+        ("env:S", "env:S"),
+        ("sixteen letters/.", "sixteen letters/."),
+        ("file:", "file:"),
+    ):
+        assert load(path, [f"network.secret={secret}"]).network.secret == found
 
 
 def test_what_a_run_writes_down_reads_the_same_files_from_anywhere(tmp_path: Path) -> None:
