@@ -135,7 +135,8 @@ class Node(Generic[C]):
         rng: Random numbers that depend on the run's seed and the node's name only.
         out: Folder for files, or `None` if the run writes none.
         sources: Ports narrowed to a source, by the file or by `narrow`.
-        restarts: How often this node was brought up before in this run; 0 the first time.
+        restarts: How often this node was brought up before in this run, in this process or in one
+            that was lost; 0 the first time.
         checking: Whether ``python -m runtime check`` only looks whether the file is right: then
             `on_startup` must leave alone what is outside the process (devices, ports, networks).
     """

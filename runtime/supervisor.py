@@ -282,7 +282,9 @@ class Supervisor:
     async def _start_all(self) -> None:
         try:
             if self.peers is not None:
-                await self.peers.meet()
+                before = await self.peers.meet()
+                for life in self._lives.values():
+                    life.starts = before
             for life in self._lives.values():
                 await self._start_up(life)
                 if self._ended.is_set():  # it stopped the run and did not wait for anything after

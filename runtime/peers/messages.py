@@ -36,6 +36,7 @@ class Hello(Message, frozen=True):
         session: The tag of the session that there is already.
         running: Whether the first update was already.
         left_out: Nodes that this run goes on without.
+        lost: Nodes whose process was lost, each as often as it was.
     """
 
     nodes: tuple[str, ...]
@@ -47,6 +48,7 @@ class Hello(Message, frozen=True):
     session: bytes = b""
     running: bool = False
     left_out: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
 
 
 class Announced(Message, frozen=True):

@@ -99,27 +99,30 @@ class Peers:
         self._at_work = False
         self._heard_at = 0.0
         self._timer: threading.Timer | None = None
-        self._left_out: set[str] = set()
         self._parted: dict[int, Member] = {}
         self._following: Following | None = None
         self._followed = -1
 
     # Before the run.
 
-    async def meet(self) -> None:
+    async def meet(self) -> int:
         """Wait until all nodes of the file are there.
+
+        Returns:
+            How often the nodes here were in this run before, in a process that was lost.
 
         Raises:
             PeerError: They are not within the limit, or somebody runs another file or our nodes.
         """
         roster = self._roster
-        await roster.meet()
+        before = await roster.meet()
         self._crossing = Crossing(self._config.nodes, roster.owners(), roster.me, self._leave)
         if isinstance(self._clock, LockstepClock):
             loop = asyncio.get_running_loop()
             assert isinstance(loop, LockstepLoop)
             self._loop = loop
             self._turns = Turns(roster.me, roster.count, loop, self._send_to, self._do)
+        return before
 
     async def announce(self, said: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Tell the others what the nodes here announce; return what all do, in file order."""
@@ -377,13 +380,13 @@ class Peers:
             self._run.stop(f"{name} lost", gone)
         elif "restart" in rules:
             log.error("%s: waiting for its return", gone)
+            self._roster.settle(lost=member.nodes)
             if self._turns is not None:
                 self._suspended = True
                 self._turns.suspend()
         else:
             log.error("%s: left out from here on", gone)
-            self._left_out |= lost
-            self._roster.settle(left_out=self._left_out)
+            self._roster.settle(left_out=lost)
             self._gather()
         self._run.connect()
 

@@ -91,13 +91,13 @@ class Contact:
     Attributes:
         nonce: In our greetings, until one is answered.
         member: Who it is, while there is a session.
-        replied: When a greeting that is not fresh was last replied to, on `time.monotonic`.
+        doubt: Nonce of a greeting of another session than ours, until it is replied to.
     """
 
     def __init__(self) -> None:
         self.nonce = secrets.token_bytes(NONCE)
         self.member: Member | None = None
-        self.replied = 0.0
+        self.doubt = b""
 
 
 class Roster:
@@ -147,8 +147,11 @@ class Roster:
         self._broken: VisnavError | None = None
         self._enough = threading.Event()
 
-    async def meet(self) -> None:
+    async def meet(self) -> int:
         """Wait until all nodes of the file are there, and number their processes.
+
+        Returns:
+            How often a process with our nodes was in this run before.
 
         Raises:
             PeerError: They are not within the limit, or somebody runs another file or our nodes.
@@ -168,6 +171,10 @@ class Roster:
         except TimeoutError:
             text = say_missing(self._missing(), float(network.wait), network.meet)
             raise PeerError(text) from None
+        return self.number()
+
+    def number(self) -> int:
+        """Give the processes that are there numbers; return how often ours was there before."""
         others = self._fitting()
         everybody = sorted(
             [self.here, *(m.nodes for m in others)], key=lambda nodes: self.nodes.index(nodes[0])
@@ -177,6 +184,8 @@ class Roster:
         for member in others:
             member.number = self._numbers[member.nodes]
             self._numbered[member.number] = member
+        running = [m.hello for m in others if m.hello.running]
+        return max((max(h.lost.count(self.here[0]), 1) for h in running), default=0)
 
     def owners(self) -> dict[str, int]:
         """Return the number of the process that has each node."""
@@ -201,9 +210,10 @@ class Roster:
         member.unfit = True
         self._numbered.pop(member.number, None)
 
-    def settle(self, *, left_out: Iterable[str] = ()) -> None:
-        """Say from now on that the run goes on, and without whom."""
-        self.hello = msgspec.structs.replace(self.hello, running=True, left_out=tuple(left_out))
+    def settle(self, *, lost: Iterable[str] = (), left_out: Iterable[str] = ()) -> None:
+        """Say from now on that the run goes on, that these are lost, and that it left these out."""
+        lost, left_out = (*self.hello.lost, *lost), (*self.hello.left_out, *left_out)
+        self.hello = msgspec.structs.replace(self.hello, running=True, lost=lost, left_out=left_out)
 
     async def close(self) -> None:
         """Say the last words, and leave."""
@@ -367,9 +377,8 @@ class Roster:
             elif hello.nonce == before.sealing.seen:  # ours did not get there
                 mine = before.sealing
                 self._soon(self._greet_one, sender, mine.nonce, mine.seen, mine.tag)
-            elif (now := time.monotonic()) > contact.replied + GREET_EVERY / 2:
-                contact.replied = now
-                self._soon(self._greet_one, sender, contact.nonce, hello.nonce, before.sealing.tag)
+            else:
+                contact.doubt = hello.nonce
 
     def _see(self, other: str, here: bool) -> None:
         with self._lock:
@@ -385,10 +394,21 @@ class Roster:
 
     def _greet(self) -> None:
         while not self._enough.wait(GREET_EVERY):
-            with self._lock:
-                unknown = [(i, c.nonce) for i, c in self._contacts.items() if c.member is None]
-            for other, nonce in unknown:
-                self._greet_one(other, nonce)
+            self._greet_again()
+
+    def _greet_again(self) -> None:
+        """Greet those who have not answered, and those who may be in another session than we."""
+        due = []
+        with self._lock:
+            for other, contact in self._contacts.items():
+                if contact.member is None:
+                    due.append((other, contact.nonce, b"", b""))
+                elif contact.doubt:
+                    tag = contact.member.sealing.tag
+                    due.append((other, contact.nonce, contact.doubt, tag))
+                contact.doubt = b""
+        for each in due:
+            self._greet_one(*each)
 
     def _greet_one(self, other: str, nonce: bytes, seen: bytes = b"", tag: bytes = b"") -> None:
         assert self._session is not None

@@ -47,6 +47,9 @@ class Asker(Node):
     pictures = Output(Image)
     answers = Input(Answered)
 
+    async def on_startup(self) -> None:
+        self.log.info("was here %d times", self.restarts)
+
     def announce(self) -> Iterable[Announcement]:
         return [Offer(stamp=0, source=self.name, rate=50.0)]
 
@@ -81,6 +84,9 @@ class Answerer(Node[AnswererConfig]):
     def __init__(self) -> None:
         self.heard: list[str] = []
         self.offers: list[str] = []
+
+    async def on_startup(self) -> None:
+        self.log.info("was here %d times", self.restarts)
 
     def on_announcement(self, announcement: Announcement) -> None:
         self.offers.append(f"{announcement.source}: {announcement}")

@@ -6,12 +6,12 @@ import asyncio
 from collections import deque
 from typing import Any
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from runtime.config import Config
 from runtime.errors import VisnavError
-from runtime.peers.roster import GREET_EVERY, Roster
+from runtime.peers.roster import Roster
 from runtime.peers.seal import derive
 from tests.runtime.peers.samples import settings
 
@@ -58,11 +58,9 @@ class Pair:
         """Let everything arrive; who is not known greets again and again."""
         for _ in range(5):
             for name, roster in self.ends.items():
-                contact = roster._contacts.get(self.other(name))
-                for each in roster._contacts.values():
-                    each.replied -= GREET_EVERY
-                if contact is None or contact.member is None:
+                if self.other(name) not in roster._contacts:
                     self.show(name, True)
+                roster._greet_again()
             while any(self.under_way.values()):
                 for name in self.ends:
                     self.deliver(name)
@@ -112,9 +110,17 @@ def run(pair: Pair, ops: list[tuple[str, Any]]) -> None:
                 pair.ends[to]._hear(pair.other(to), message, b"")
 
 
+CROSSED: list[tuple[str, Any]] = [
+    *[("meet", "asker"), ("deliver", "one"), ("part", "one"), ("meet", "asker")],
+    *[("deliver", "one"), ("meet", "asker"), ("meet", "asker"), ("again", 15), ("lose", "one")],
+]
+"""Of two greetings that cross, each end begins a session with another one."""
+
+
 @given(OPS)
+@example(CROSSED)
 def test_both_end_in_one_session_that_nothing_old_can_end(ops: list[tuple[str, Any]]) -> None:
-    async def example() -> None:
+    async def main() -> None:
         pair = Pair()
         run(pair, ops)
         pair.settle()
@@ -124,6 +130,20 @@ def test_both_end_in_one_session_that_nothing_old_can_end(ops: list[tuple[str, A
             pair.ends[to]._hear(pair.other(to), message, b"")
             pair.settle()
         assert pair.tags() == [here, there]
+
+    asyncio.run(main())
+
+
+def test_who_comes_back_hears_how_often_it_was_lost() -> None:
+    async def example() -> None:
+        for lost, times in (((), 1), (("one",), 1), (("one", "other", "one"), 2)):
+            pair = Pair()
+            pair.ends["asker"].settle(lost=lost)
+            for name in pair.ends:
+                pair.show(name, True)
+            pair.settle()
+            assert pair.ends["one"].number() == times
+            assert pair.ends["asker"].number() == 0
 
     asyncio.run(example())
 

@@ -130,7 +130,10 @@ def test_without_a_process_that_may_be_missed_the_run_goes_on(rig: Rig, clock: s
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 @pytest.mark.parametrize("lost", ["asker", "one"])
 def test_a_process_that_comes_back_takes_part_again(rig: Rig, clock: str, lost: str) -> None:
-    """Also the one that the others found their way by; what time it is, it hears from them."""
+    """Also the one that the others found their way by; what time it is, it hears from them.
+
+    And its nodes know that they do not begin with the run.
+    """
     rig.write(clock=clock, on_error="restart", duration="8s")
     rig.file.write_text(
         rig.file.read_text().replace('Asker"', 'Asker"\non_error = "restart"'), encoding="utf-8"
@@ -145,6 +148,8 @@ def test_a_process_that_comes_back_takes_part_again(rig: Rig, clock: str, lost: 
     assert here.returncode == 0, rest
     last, _ = back.communicate(timeout=20)
     assert back.returncode == 0, last
+    assert "was here 1 times" in last
+    assert "was here 1 times" not in rest
     summary = rig.summary("back")
     assert summary.reason == "duration"
     assert summary.outputs["asker.questions"] > 100
