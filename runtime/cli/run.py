@@ -198,7 +198,7 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
     """
     from runtime import driver
 
-    threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node"))]
+    threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node", "zenoh"))]
     until = time.monotonic() + _LAST_WAIT
     for thread in threads:
         thread.join(max(until - time.monotonic(), 0.0))
