@@ -11,6 +11,7 @@
     following  real time: keeping our clock with another machine's
     turns      lockstep: one process at a time goes on, the one with the next thing due
     crossing   outputs here that are heard there, and the other way round
+    greeting   how two processes that see each other come to a session
     roster     who is there, who comes and who goes
     member     one of them, and what is known of it
     parting    the end: nobody leaves before all know what each has to say

@@ -1,12 +1,7 @@
 """Who is there: the processes that have met, those that come, and those that go.
 
-Two processes greet each other, each with a nonce; who answers ours with the seal of the run is
-there now, and knows the secret: then a session begins, and only what it seals is heard. A greeting
-that answers nothing may be an old one, and changes nothing. A new session ends the one before: the
-other process had lost us.
-
-What Zenoh's threads bring is handed to the loop here; nothing else in this room knows of threads,
-but the lines.
+What Zenoh's threads bring is handed to the loop here; of the rest of this room only greetings and
+lines know of threads.
 """
 
 from __future__ import annotations
@@ -16,9 +11,7 @@ import contextlib
 import logging
 import math
 import os
-import secrets
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
@@ -29,6 +22,7 @@ from events import Event
 from runtime.config import Config
 from runtime.errors import PeerError, VisnavError, WireError
 from runtime.limits import real_time_limit
+from runtime.peers.greeting import Greeting
 from runtime.peers.meeting import check_fits, missing, name_of, say_missing, what_all_share
 from runtime.peers.member import Member
 from runtime.peers.memory import Incoming, Outgoing
@@ -43,20 +37,13 @@ from runtime.peers.messages import (
     Said,
     Stop,
     decode,
-    encode,
 )
 from runtime.peers.offsets import Exchange
-from runtime.peers.seal import NONCE, ForgedError, Sealing, derive, hello_seal, is_hello
+from runtime.peers.seal import ForgedError, derive, is_hello
 from runtime.peers.secret import secret_of
 from runtime.peers.session import Session, certified
 
 log = logging.getLogger("visnav.runtime")
-
-GREET_EVERY = 0.2
-"""Seconds between two greetings of a process that has not answered."""
-
-STRANGERS = 256
-"""Processes without a session that are greeted; of more than these, the others are not seen."""
 
 NAMED_EVERY = 5.0
 """Real seconds after which those who are waited for are named, again and again."""
@@ -85,21 +72,6 @@ class Told(Protocol):
         """Deal with what could not be sent to a process."""
 
 
-class Contact:
-    """A process that shows itself, whoever it may be.
-
-    Attributes:
-        nonce: In our greetings, until one is answered.
-        member: Who it is, while there is a session.
-        doubt: Nonce of a greeting of another session than ours, until it is replied to.
-    """
-
-    def __init__(self) -> None:
-        self.nonce = secrets.token_bytes(NONCE)
-        self.member: Member | None = None
-        self.doubt = b""
-
-
 class Roster:
     """The processes of a run.
 
@@ -115,7 +87,6 @@ class Roster:
         count: How many processes there are in all.
         hello: Who we are.
         ended: Once the run ends, what those are told who come anew.
-        refused: Messages that were left out, since nobody of the run wrote them.
     """
 
     def __init__(self, config: Config, only: Iterable[str], told: Told) -> None:
@@ -134,18 +105,12 @@ class Roster:
         self._network = config.network
         self._told = told
         self._loop = asyncio.get_running_loop()
-        self._session: Session | None = None
-        self._lock = threading.Lock()
+        self._greeting: Greeting | None = None
         self.ended: Stop | None = None
-        self.refused = 0
-        self._key = b""
-        self._contacts: dict[str, Contact] = {}
-        self._complained: set[str] = set()
         self._numbers: dict[tuple[str, ...], int] = {}
         self._numbered: dict[int, Member] = {}
         self._waiting: set[asyncio.Future[None]] = set()
         self._broken: VisnavError | None = None
-        self._enough = threading.Event()
 
     async def meet(self) -> int:
         """Wait until all nodes of the file are there, and number their processes.
@@ -159,10 +124,9 @@ class Roster:
         network = self._network
         by_certificate = not network.secret and certified(network)
         secret = b"known by certificate" if by_certificate else secret_of(network.secret)
-        self._key = derive(secret, "run", self._run)
-        self._session = await asyncio.to_thread(Session, self._run, network, secret)
-        await asyncio.to_thread(self._session.appear, self._hear, self._see)
-        threading.Thread(target=self._greet, name="greet", daemon=True).start()
+        session = await asyncio.to_thread(Session, self._run, network, secret)
+        self._greeting = Greeting(derive(secret, "run", self._run), session, self)
+        await asyncio.to_thread(self._greeting.begin, self._hear)
         if absent := self._missing():
             log.info("waiting for %s at %s", name_of(absent), network.meet)
         try:
@@ -202,8 +166,8 @@ class Roster:
     @property
     def id(self) -> str:
         """The id by which the others know this process."""
-        assert self._session is not None
-        return self._session.id
+        assert self._greeting is not None
+        return self._greeting.id
 
     def forget(self, member: Member) -> None:
         """Go on as if a process were gone."""
@@ -217,11 +181,8 @@ class Roster:
 
     async def close(self) -> None:
         """Say the last words, and leave."""
-        self._enough.set()
-        for member in self._members():
-            await asyncio.to_thread(member.line.close)
-        if self._session is not None:
-            await asyncio.to_thread(self._session.close)
+        if self._greeting is not None:
+            await self._greeting.close()
 
     # Waiting for what others say.
 
@@ -284,28 +245,25 @@ class Roster:
 
     def _hear(self, sender: str, sealed: bytes, payload: bytes) -> None:
         received = time.monotonic_ns()
-        contact = self._contacts.get(sender)
-        member = None if contact is None else contact.member
+        greeting = self._greeting
+        assert greeting is not None
+        member = greeting.member(sender)
         try:
             if member is None or is_hello(sealed):
-                self._greeted(sender, sealed)
+                greeting.hear(sender, sealed)
                 return
             data = member.sealing.open(sealed, payload)
+            message = decode(data)
         except ForgedError as error:
-            self._complain(sender, error)
+            greeting.refuse(sender, error)
             return
         except PeerError as error:  # another version
-            self._soon(self._misfit, error)
+            self.soon(self._misfit, error)
             return
         except WireError as error:
-            self._break(sender, error)
+            greeting.end(sender, error)
             return
         event = None
-        try:
-            message = decode(data)
-        except WireError as error:
-            self._break(sender, error)
-            return
         if isinstance(message, Said):
             try:
                 event = member.event(message, payload)
@@ -322,7 +280,7 @@ class Roster:
                 offset = message.here - message.sent - half
                 late = message.now - self._told.now(ago=half)
                 member.exchanges.add(Exchange(received - message.sent, offset, late))
-                self._soon(self.notify)
+                self.soon(self.notify)
             case Hello():
                 pass
             case Memory():
@@ -332,128 +290,17 @@ class Roster:
             case Mapped():
                 member.line.memory = member.outgoing
             case _:
-                self._soon(self._take, member, message, event)
+                self.soon(self._take, member, message, event)
         member.acknowledge(len(data) + len(payload))
 
-    def _greeted(self, sender: str, sealed: bytes) -> None:
-        """Take in a greeting; begin a session if it is a fresh one."""
-        assert self._session is not None
-        seal = hello_seal(self._key, sender, self._session.id)
-        try:
-            hello = decode(seal.take_off(0, sealed))
-        except ForgedError:
-            raise
-        except WireError as error:
-            raise PeerError(f"expected a process that speaks as we do: {error}") from None
-        if not isinstance(hello, Hello):
-            raise ForgedError("expected a hello of a process without a session")
-        with self._lock:
-            contact = self._contact(sender)
-            if contact is None:
-                return
-            before = contact.member
-            if hello.seen == contact.nonce and (
-                before is None or hello.session != before.sealing.tag
-            ):
-                id_, put, failed = self._session.id, self._session.put, self._unsent
-                sealing = Sealing(self._key, (id_, contact.nonce), (sender, hello.nonce))
-                contact.member = member = Member(
-                    sender,
-                    hello,
-                    sealing,
-                    lambda message, payload: put(sender, message, payload),
-                    lambda error: failed(member, error),
-                )
-                contact.nonce = secrets.token_bytes(NONCE)
-                # Before anything that the loop seals for the session.
-                self._soon(self._greet_one, sender, sealing.nonce, sealing.seen, sealing.tag)
-                if before is not None:
-                    self._soon(self._went, before, "their process had lost us")
-                self._soon(self._meet, member)
-            elif before is None:
-                self._soon(self._greet_one, sender, contact.nonce, hello.nonce)
-            elif hello.session == before.sealing.tag:
-                pass  # all is well, or it is an old one
-            elif hello.nonce == before.sealing.seen:  # ours did not get there
-                mine = before.sealing
-                self._soon(self._greet_one, sender, mine.nonce, mine.seen, mine.tag)
-            else:
-                contact.doubt = hello.nonce
-
-    def _see(self, other: str, here: bool) -> None:
-        with self._lock:
-            contact = self._contact(other) if here else self._contacts.pop(other, None)
-            if not here:
-                self._complained.add(other)  # its last words may come late
-        if contact is None:
-            return
-        if here:
-            self._soon(self._greet_one, other, contact.nonce)
-        elif contact.member is not None:
-            self._soon(self._went, contact.member)
-
-    def _greet(self) -> None:
-        while not self._enough.wait(GREET_EVERY):
-            self._greet_again()
-
-    def _greet_again(self) -> None:
-        """Greet those who have not answered, and those who may be in another session than we."""
-        due = []
-        with self._lock:
-            for other, contact in self._contacts.items():
-                if contact.member is None:
-                    due.append((other, contact.nonce, b"", b""))
-                elif contact.doubt:
-                    tag = contact.member.sealing.tag
-                    due.append((other, contact.nonce, contact.doubt, tag))
-                contact.doubt = b""
-        for each in due:
-            self._greet_one(*each)
-
-    def _greet_one(self, other: str, nonce: bytes, seen: bytes = b"", tag: bytes = b"") -> None:
-        assert self._session is not None
-        hello = msgspec.structs.replace(self.hello, nonce=nonce, seen=seen, session=tag)
-        seal = hello_seal(self._key, self._session.id, other)
-        with contextlib.suppress(PeerError):  # the session is closed
-            self._session.put(other, seal.put_on(0, encode(hello)), b"")
-
-    def _contact(self, other: str) -> Contact | None:
-        """Return what is known of a process, noted if it is new; `None` if too many are."""
-        if other not in self._contacts:
-            if sum(c.member is None for c in self._contacts.values()) >= STRANGERS:
-                return None
-            self._contacts[other] = Contact()
-        return self._contacts[other]
-
-    def _members(self) -> list[Member]:
-        with self._lock:
-            return [c.member for c in self._contacts.values() if c.member is not None]
-
-    def _complain(self, sender: str, error: VisnavError) -> None:
-        """Say, once of each of so many, who is not heard."""
-        self.refused += 1
-        if sender not in self._complained and len(self._complained) < STRANGERS:
-            self._complained.add(sender)
-            log.warning("from %s: %s (network.secret): left out", sender, error)
-
-    def _break(self, sender: str, error: WireError) -> None:
-        """End a session in which something went wrong; there may be another."""
-        with self._lock:
-            contact = self._contacts.get(sender)
-            member = None if contact is None else contact.member
-            if contact is None or member is None:
-                return
-            contact.member = None
-        self._soon(self._went, member, f"their process is not understood: {error}")
-
-    def _unsent(self, member: Member, error: VisnavError) -> None:
-        self._soon(self._told.unsent, member, error)
-
-    # Zenoh calls while it holds locks of its own: what asks it for something is left to the loop.
-
-    def _soon(self, call: Callable[..., Any], *args: Any) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop is closed
+    def soon(self, call: Callable[..., Any], *args: Any) -> None:
+        """Have something called on the loop, if it is not closed."""
+        with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(call, *args)
+
+    def unsent(self, member: Member, error: VisnavError) -> None:
+        """Hand on what could not be sent."""
+        self.soon(self._told.unsent, member, error)
 
     # On the loop.
 
@@ -476,7 +323,7 @@ class Roster:
         else:
             self.fail(error)
 
-    def _meet(self, member: Member) -> None:
+    def met(self, member: Member) -> None:
         """Take in who somebody is."""
         try:
             check_fits(self.hello, member.hello, self.nodes)
@@ -509,7 +356,8 @@ class Roster:
             self._take(member, message, event)
         self.notify()
 
-    def _went(self, member: Member, why: str = "their process is gone") -> None:
+    def went(self, member: Member, why: str = "their process is gone") -> None:
+        """Do without somebody with whom the session has ended."""
         if member.over:
             return
         member.over = why
@@ -517,13 +365,14 @@ class Roster:
         if self._numbered.get(member.number) is member:
             del self._numbered[member.number]
             self._told.lost(member)
-            for other in self._members():
+            for other in self._greeting.members() if self._greeting else ():
                 if other.held is not None and other.nodes == member.nodes:
-                    self._meet(other)
+                    self.met(other)
         self.notify()
 
     def _fitting(self) -> list[Member]:
-        return [m for m in self._members() if not (m.unfit or m.over)]
+        members = self._greeting.members() if self._greeting else []
+        return [m for m in members if not (m.unfit or m.over)]
 
     def _missing(self) -> list[str]:
         return missing([self.hello, *(m.hello for m in self._fitting())], self.nodes)

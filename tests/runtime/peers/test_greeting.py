@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from runtime.config import Config
 from runtime.errors import VisnavError
+from runtime.peers.greeting import Greeting
 from runtime.peers.roster import Roster
 from runtime.peers.seal import derive
 from tests.runtime.peers.samples import settings
@@ -37,12 +38,13 @@ class Pair:
 
     def __init__(self) -> None:
         self.ends = {name: Roster(CONFIG, [name], Told()) for name in ("asker", "one")}
+        self.greetings: dict[str, Greeting] = {}
         self.under_way: dict[str, deque[bytes]] = {name: deque() for name in self.ends}
         self.said: list[tuple[str, bytes]] = []
         for name, roster in self.ends.items():
-            roster._key = KEY
-            roster._soon = lambda call, *args: call(*args)  # type: ignore[method-assign]
-            roster._session = End(self, name)  # type: ignore[assignment]
+            roster.soon = lambda call, *args: call(*args)  # type: ignore[method-assign]
+            greeting = Greeting(KEY, End(self, name), roster)  # type: ignore[arg-type]
+            self.greetings[name] = roster._greeting = greeting
 
     def other(self, name: str) -> str:
         return "one" if name == "asker" else "asker"
@@ -52,21 +54,21 @@ class Pair:
             self.ends[to]._hear(self.other(to), self.under_way[to].popleft(), b"")
 
     def show(self, to: str, here: bool) -> None:
-        self.ends[to]._see(self.other(to), here)
+        self.greetings[to].see(self.other(to), here)
 
     def settle(self) -> None:
         """Let everything arrive; who is not known greets again and again."""
         for _ in range(5):
-            for name, roster in self.ends.items():
-                if self.other(name) not in roster._contacts:
+            for name, greeting in self.greetings.items():
+                if self.other(name) not in greeting._contacts:
                     self.show(name, True)
-                roster._greet_again()
+                greeting.greet_again()
             while any(self.under_way.values()):
                 for name in self.ends:
                     self.deliver(name)
 
     def tags(self) -> list[bytes]:
-        members = [r._contacts[self.other(n)].member for n, r in self.ends.items()]
+        members = [g.member(self.other(n)) for n, g in self.greetings.items()]
         return [b"" if m is None else m.sealing.tag for m in members]
 
 
@@ -151,12 +153,12 @@ def test_who_comes_back_hears_how_often_it_was_lost() -> None:
 def test_who_has_another_secret_is_not_met_and_is_named(caplog: Any) -> None:
     async def example() -> None:
         pair = Pair()
-        pair.ends["one"]._key = derive(b"another secret", "run", "test")
+        pair.greetings["one"]._key = derive(b"another secret", "run", "test")
         for name in pair.ends:
             pair.show(name, True)
         pair.settle()
         assert pair.tags() == [b"", b""]
-        assert pair.ends["asker"].refused > 0
+        assert pair.greetings["asker"].refused > 0
 
     asyncio.run(example())
     assert caplog.text.count("from one: expected a message of this run, found another seal") == 1
@@ -164,12 +166,13 @@ def test_who_has_another_secret_is_not_met_and_is_named(caplog: Any) -> None:
 
 def test_of_a_flood_of_strangers_few_are_remembered() -> None:
     async def example() -> None:
-        roster = Pair().ends["asker"]
-        roster._session.put = lambda *_: None  # type: ignore[method-assign, union-attr]
+        pair = Pair()
+        greeting = pair.greetings["asker"]
+        greeting._session.put = lambda *_: None  # type: ignore[method-assign]
         for number in range(10_000):
-            roster._see(f"stranger{number}", True)
-            roster._hear(f"other{number}", b"\1" * 40, b"")
-        assert len(roster._contacts) <= 256
-        assert len(roster._complained) <= 256
+            greeting.see(f"stranger{number}", True)
+            pair.ends["asker"]._hear(f"other{number}", b"\1" * 40, b"")
+        assert len(greeting._contacts) <= 256
+        assert len(greeting._complained) <= 256
 
     asyncio.run(example())
