@@ -14,7 +14,7 @@
     greeting   how two processes that see each other come to a session
     roster     who is there, who comes and who goes
     member     one of them, and what is known of it
-    parting    the end: nobody leaves before all know what each has to say
+    ending     the end: in order, and nobody leaves before all know what each has to say
     peers      all of it together, for the supervisor
 
 An event that crosses is heard once its sender's process has nothing more to do at that instant.

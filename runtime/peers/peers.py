@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-import threading
 import time
 from collections.abc import Iterable, Mapping
 from typing import Protocol
@@ -18,6 +16,7 @@ from runtime.config import Config
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.peers.crossing import Crossing, hearing
+from runtime.peers.ending import Ending
 from runtime.peers.following import Following, compare
 from runtime.peers.meeting import name_of
 from runtime.peers.member import Member
@@ -39,7 +38,6 @@ from runtime.peers.messages import (
     Stop,
     Turn,
 )
-from runtime.peers.parting import part
 from runtime.peers.roster import Roster
 from runtime.peers.turns import Turns
 from runtime.realtime import RealClock
@@ -52,12 +50,6 @@ log = logging.getLogger("visnav.runtime")
 
 LEAD = 50_000_000
 """Nanoseconds between the word to begin and the first update: it must reach everybody before."""
-
-BUSY_EVERY = 2.0
-"""Seconds after which those who wait for us in the end are told that we are still at it."""
-
-SILENCE = 8.0
-"""Seconds without a word in the end, after which it goes on without those who are silent."""
 
 
 class Run(Protocol):
@@ -85,21 +77,17 @@ class Peers:
         self._clock = clock
         self._run = run
         self._roster = Roster(config, only, self)
+        self._ending = Ending(self._roster, self._gather)
         self._crossing: Crossing | None = None
         self._loop: LockstepLoop | None = None
         self._turns: Turns | None = None
         self._announced = Announced({})
         self._early: list[tuple[Member, OfTheRun, Event | None]] = []
-        self._ready = self._decided = self._begun = self._suspended = self._ending = False
+        self._ready = self._decided = self._begun = self._suspended = self._ends = False
         self._decider: Member | None = None
         self._lost_early: list[Member] = []
         self._apart: set[int] = set()
-        self._retired: set[str] = set()
         self._retired_here: list[str] = []
-        self._at_work = False
-        self._heard_at = 0.0
-        self._timer: threading.Timer | None = None
-        self._parted: dict[int, Member] = {}
         self._following: Following | None = None
         self._followed = -1
 
@@ -129,7 +117,7 @@ class Peers:
         self._announced = Announced(
             {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in said.items()}
         )
-        self._tell(self._announced)
+        self._roster.tell(self._announced)
         others = self._roster.present
         await self._roster.until(
             lambda: all(m.announced is not None for m in others()),
@@ -158,7 +146,7 @@ class Peers:
         if reference is not None and self._turns is None:
             await compare(reference, roster.until)
         self._ready = True
-        self._tell(Ready())
+        self._roster.tell(Ready())
         if reference is None:
             await roster.until(
                 lambda: all(m.ready for m in roster.present()),
@@ -167,7 +155,7 @@ class Peers:
             )
             self._decided = True
             origin = time.monotonic_ns() + LEAD
-            self._tell(Begin(origin))
+            self._roster.tell(Begin(origin))
         else:
             await roster.until(
                 lambda: reference.begin is not None,
@@ -227,41 +215,33 @@ class Peers:
 
     def stopping(self, reason: str | None, error: Exception | None) -> None:
         """Tell the others that the run ends; there is no reason if one of them said so."""
-        self._ending = True
+        self._ends = True
         text = None if error is None else str(error)
         stop = Stop(reason or "the run has ended", text, apart=not self._begun)
         self._roster.ended = msgspec.structs.replace(stop, apart=True)
         if not self._begun:  # also those who said so: they need not wait for our turn
-            self._tell(stop)
+            self._roster.tell(stop)
             early, self._early = self._early, []
             for member, message, _ in early:
                 if isinstance(message, Retired):
                     self._do(member.number, message, None)
         elif self._suspended:
-            self._tell(stop)
+            self._roster.tell(stop)
             self._gather()
         elif reason is not None:
             self._tell_in_order(stop)
-        self._heard_at = time.monotonic()
-        self._watch()
+        self._ending.begin()
 
     async def turn_to_end(self, node: str) -> None:
         """Wait until all nodes after this one have ended, wherever they are; "" is before all.
 
         Those who are silent for long are not waited for any more.
         """
-        nodes = self._roster.nodes
-        after = set(nodes[nodes.index(node) + 1 if node else 0 :])
-        await self._roster.until(
-            lambda: not any(after & {*m.nodes} - self._retired for m in self._roster.present()),
-            despite=True,
-            whom=lambda m: bool(after & {*m.nodes} - self._retired),
-        )
-        self._at_work = bool(node)
+        await self._ending.turn(node)
 
     def retired(self, node: str) -> None:
         """Tell the others that a node here has ended."""
-        self._at_work = False
+        self._ending.at_work = False
         self._retired_here.append(node)
         self._tell_in_order(Retired(node))
 
@@ -269,14 +249,12 @@ class Peers:
 
     async def part(self, mine: Summary) -> Summary:
         """Exchange what each process has to say of the run; return all of it together."""
-        return await part(self._roster, self._parted, mine)
+        return await self._ending.part(mine)
 
     async def close(self) -> None:
         """Say the last words, and leave."""
-        self._ending = True
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+        self._ends = True
+        self._ending.close()
         if self._following is not None:
             self._following.stop()
         self._turns = None
@@ -292,7 +270,7 @@ class Peers:
         Raises:
             WireError: It makes no sense.
         """
-        self._heard_at = time.monotonic()
+        self._ending.heard_at = time.monotonic()
         match message:
             case Said() if self._begun and self._turns is None:  # first, since there are many
                 self._do(member.number, message, event)
@@ -304,28 +282,23 @@ class Peers:
                     member.line.send(self._announced)
             case Parted():
                 try:
-                    member.parted = msgspec.json.decode(message.part, type=Summary)
+                    part = msgspec.json.decode(message.part, type=Summary)
                 except (msgspec.DecodeError, RecursionError) as error:
                     raise WireError(f"expected a part of the summary, found: {error}") from None
-                self._parted[member.number] = member
-                member.line.send(Farewell())
+                self._ending.parted(member, part)
             case Farewell():
                 member.has_ours = True
-            case Busy():
-                pass
             case Begin():
                 member.begin = message
             case Ready() if not member.ready:
                 member.ready = True
                 if self._begun:
                     self._welcome(member)
-            case Ready():
-                pass
             case Hearing() if self._crossing is not None:
                 self._crossing.wants(member.number, message.wanted)
                 if self._begun:
                     self._run.connect()
-            case Hearing():
+            case Busy() | Ready() | Hearing():
                 pass
             case Stop() if not self._begun or message.serial < 0:
                 if message.apart:
@@ -335,38 +308,38 @@ class Peers:
                 self._do(member.number, message, None)
             case Retired() if message.node not in member.nodes:
                 raise WireError(f"expected one of its nodes, found {message.node!r}")
-            case Retired() if message.serial < 0 or (self._ending and not self._begun):
+            case Retired() if message.serial < 0 or (self._ends and not self._begun):
                 self._do(member.number, message, None)
             case _ if not self._begun:
-                if not self._ending:
+                if not self._ends:
                     self._early.append((member, message, event))
             case _ if self._turns is not None:
                 self._turns.take(member.number, message, event)
             case Said() | Stop() | Retired():
                 self._do(member.number, message, event)
-            case Turn() | Call() | Standing() if not self._ending:
+            case Turn() | Call() | Standing() if not self._ends:
                 raise WireError("expected the run to be in lockstep there, too")
 
     def lost(self, member: Member) -> None:
         """Deal with the loss of a process as its nodes' `on_error` says."""
-        if not (self._begun or self._ending) and (
+        if not (self._begun or self._ends) and (
             self._decided or (self._ready and self._decider not in {None, member})
         ):
             self._lost_early.append(member)
             return
-        lost = set(member.nodes) - self._retired
-        self._retired |= lost
+        lost = set(member.nodes) - self._ending.retired
+        self._ending.retired |= lost
         name = name_of(member.nodes)
         gone = PeerError(f"{name}: {member.over} ({member.place})")
-        if not (self._begun or self._ending):
+        if not (self._begun or self._ends):
             self._roster.fail(gone)
             return
-        if self._ending or not lost:
+        if self._ends or not lost:
             if lost:
                 log.warning("%s: the run ends without it", gone)
                 if self._begun and self._turns is not None and self._roster.ended is not None:
                     # Others may wait for its return, and not for their turn.
-                    self._tell(msgspec.structs.replace(self._roster.ended, apart=False))
+                    self._roster.tell(msgspec.structs.replace(self._roster.ended, apart=False))
             self._gather()
             return
         if self._following is not None and self._following.member is member:
@@ -404,7 +377,7 @@ class Peers:
 
     def unsent(self, member: Member, error: VisnavError) -> None:
         """Say what could not be sent; that a process has gone is noticed elsewhere."""
-        if not self._ending:
+        if not self._ends:
             log.warning("to %s: %s", name_of(member.nodes), error)
 
     def _do(self, number: int, message: Ordered, event: Event | None) -> None:
@@ -419,7 +392,7 @@ class Peers:
                     failed = PeerError(f"at {where}: {message.error}") if message.error else None
                     self._run.stop(message.reason, failed, told=True)
                 case Retired():
-                    self._retired.add(message.node)
+                    self._ending.retired.add(message.node)
         except WireError as error:
             log.warning("from process %d: %s", number, error)
         self._roster.notify()
@@ -433,7 +406,7 @@ class Peers:
         self._take_back(member)
 
     def _take_back(self, member: Member) -> None:
-        self._retired -= {*member.nodes}
+        self._ending.retired -= {*member.nodes}
         self._apart.discard(member.number)
         self._gather(new=(member.number,))
         self._run.connect()
@@ -456,41 +429,6 @@ class Peers:
             member.line.send(Retired(node))
         self._gather()
 
-    # While the run ends.
-
-    def _watch(self) -> None:
-        """Look after a while, in real time, whether the end goes on."""
-        loop = asyncio.get_running_loop()
-
-        def ring() -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(self._look)
-
-        self._timer = threading.Timer(BUSY_EVERY, ring)
-        self._timer.daemon = True
-        self._timer.start()
-
-    def _look(self) -> None:
-        if self._timer is None:
-            return
-        if self._at_work:
-            self._tell(Busy())
-        elif time.monotonic() - self._heard_at > SILENCE:
-            self._give_up()
-        self._watch()
-
-    def _give_up(self) -> None:
-        """End without those who say nothing."""
-        if silent := [m for m in self._roster.present() if not m.has_ours]:
-            names = "; ".join(name_of(m.nodes) for m in silent)
-            log.error("%s: expected a word within %g s; the run ends without it", names, SILENCE)
-            if self._roster.ended is not None:
-                self._tell(self._roster.ended)
-            for member in silent:
-                self._roster.forget(member)
-            self._gather()
-            self._roster.notify()
-
     def _reference(self) -> Member | None:
         """Return the process whose clock counts, or `None` if it is this one."""
         present = self._roster.present()
@@ -499,10 +437,6 @@ class Peers:
         return first if first and (running or first.number < self._roster.me) else None
 
     # Sending.
-
-    def _tell(self, message: Message) -> None:
-        for member in self._roster.present():
-            member.line.send(message)
 
     def _tell_in_order(self, message: Ordered) -> None:
         """Send a message that others take in in its place among the events."""

@@ -31,6 +31,7 @@ from runtime.peers.messages import (
     Hello,
     Mapped,
     Memory,
+    Message,
     OfTheRun,
     Ping,
     Pong,
@@ -168,6 +169,11 @@ class Roster:
         """The id by which the others know this process."""
         assert self._greeting is not None
         return self._greeting.id
+
+    def tell(self, message: Message) -> None:
+        """Send a message to all other processes of the run that are there."""
+        for member in self.present():
+            member.line.send(message)
 
     def forget(self, member: Member) -> None:
         """Go on as if a process were gone."""
