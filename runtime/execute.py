@@ -170,7 +170,7 @@ class _Run:
     async def _parted(self, peers: Peers, summary: Summary) -> Summary:
         """Put the summary together with those of the other processes, if they can be had."""
         try:
-            summary = await peers.part(summary)
+            summary = await peers.ending.part(summary)
             await peers.close()
         except Exception as error:
             self.failed(wrap("the other processes", error))

@@ -479,7 +479,7 @@ class Supervisor:
         """Let the nodes after this one end first, in whichever process they are."""
         try:
             if self.peers is not None:
-                await self.peers.turn_to_end(name)
+                await self.peers.ending.turn(name)
         except VisnavError as error:
             log.error("%s", error)
             self.error = self.error or error

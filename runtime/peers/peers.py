@@ -70,6 +70,9 @@ class Peers:
         only: Nodes that run here.
         clock: The run's clock here.
         run: The run here.
+
+    Attributes:
+        ending: Our part in the end of it.
     """
 
     def __init__(self, config: Config, only: Iterable[str], clock: Clock, run: Run) -> None:
@@ -77,7 +80,7 @@ class Peers:
         self._clock = clock
         self._run = run
         self._roster = Roster(config, only, self)
-        self._ending = Ending(self._roster, self._gather)
+        self.ending = Ending(self._roster, self._gather)
         self._crossing: Crossing | None = None
         self._loop: LockstepLoop | None = None
         self._turns: Turns | None = None
@@ -230,31 +233,20 @@ class Peers:
             self._gather()
         elif reason is not None:
             self._tell_in_order(stop)
-        self._ending.begin()
-
-    async def turn_to_end(self, node: str) -> None:
-        """Wait until all nodes after this one have ended, wherever they are; "" is before all.
-
-        Those who are silent for long are not waited for any more.
-        """
-        await self._ending.turn(node)
+        self.ending.begin()
 
     def retired(self, node: str) -> None:
         """Tell the others that a node here has ended."""
-        self._ending.at_work = False
+        self.ending.at_work = False
         self._retired_here.append(node)
         self._tell_in_order(Retired(node))
 
     # After the run.
 
-    async def part(self, mine: Summary) -> Summary:
-        """Exchange what each process has to say of the run; return all of it together."""
-        return await self._ending.part(mine)
-
     async def close(self) -> None:
         """Say the last words, and leave."""
         self._ends = True
-        self._ending.close()
+        self.ending.close()
         if self._following is not None:
             self._following.stop()
         self._turns = None
@@ -270,7 +262,7 @@ class Peers:
         Raises:
             WireError: It makes no sense.
         """
-        self._ending.heard_at = time.monotonic()
+        self.ending.heard_at = time.monotonic()
         match message:
             case Said() if self._begun and self._turns is None:  # first, since there are many
                 self._do(member.number, message, event)
@@ -285,7 +277,7 @@ class Peers:
                     part = msgspec.json.decode(message.part, type=Summary)
                 except (msgspec.DecodeError, RecursionError) as error:
                     raise WireError(f"expected a part of the summary, found: {error}") from None
-                self._ending.parted(member, part)
+                self.ending.parted(member, part)
             case Farewell():
                 member.has_ours = True
             case Begin():
@@ -327,8 +319,8 @@ class Peers:
         ):
             self._lost_early.append(member)
             return
-        lost = set(member.nodes) - self._ending.retired
-        self._ending.retired |= lost
+        lost = set(member.nodes) - self.ending.retired
+        self.ending.retired |= lost
         name = name_of(member.nodes)
         gone = PeerError(f"{name}: {member.over} ({member.place})")
         if not (self._begun or self._ends):
@@ -392,7 +384,7 @@ class Peers:
                     failed = PeerError(f"at {where}: {message.error}") if message.error else None
                     self._run.stop(message.reason, failed, told=True)
                 case Retired():
-                    self._ending.retired.add(message.node)
+                    self.ending.retired.add(message.node)
         except WireError as error:
             log.warning("from process %d: %s", number, error)
         self._roster.notify()
@@ -406,7 +398,7 @@ class Peers:
         self._take_back(member)
 
     def _take_back(self, member: Member) -> None:
-        self._ending.retired -= {*member.nodes}
+        self.ending.retired -= {*member.nodes}
         self._apart.discard(member.number)
         self._gather(new=(member.number,))
         self._run.connect()

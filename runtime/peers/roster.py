@@ -14,7 +14,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -44,33 +44,13 @@ from runtime.peers.seal import ForgedError, derive, is_hello
 from runtime.peers.secret import secret_of
 from runtime.peers.session import Session, certified
 
+if TYPE_CHECKING:
+    from runtime.peers.peers import Peers
+
 log = logging.getLogger("visnav.runtime")
 
 NAMED_EVERY = 5.0
 """Real seconds after which those who are waited for are named, again and again."""
-
-
-class Told(Protocol):
-    """Who is told of what happens, on the loop."""
-
-    def heard(self, member: Member, message: OfTheRun, event: Event | None) -> None:
-        """Take in a message of a process of the run.
-
-        Raises:
-            WireError: It makes no sense.
-        """
-
-    def lost(self, member: Member) -> None:
-        """Do without a process of the run."""
-
-    def found_again(self, member: Member) -> None:
-        """Go on with a process that went on without us, too."""
-
-    def now(self, ago: int = 0) -> int:
-        """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
-
-    def unsent(self, member: Member, error: VisnavError) -> None:
-        """Deal with what could not be sent to a process."""
 
 
 class Roster:
@@ -79,7 +59,7 @@ class Roster:
     Args:
         config: The whole file.
         only: Nodes that run here.
-        told: Told of messages and losses.
+        peers: Told, on the loop, of messages and losses.
 
     Attributes:
         nodes: Of the whole file, in order.
@@ -90,7 +70,7 @@ class Roster:
         ended: Once the run ends, what those are told who come anew.
     """
 
-    def __init__(self, config: Config, only: Iterable[str], told: Told) -> None:
+    def __init__(self, config: Config, only: Iterable[str], peers: Peers) -> None:
         chosen = set(only)
         self.nodes = [spec.name for spec in config.nodes]
         self.here = tuple(name for name in self.nodes if name in chosen)
@@ -104,7 +84,7 @@ class Roster:
         )
         self._run = config.run.name
         self._network = config.network
-        self._told = told
+        self._peers = peers
         self._loop = asyncio.get_running_loop()
         self._greeting: Greeting | None = None
         self.ended: Stop | None = None
@@ -280,11 +260,11 @@ class Roster:
             return
         match message:
             case Ping():  # answered here: a detour by the loop would take time
-                member.line.send(Pong(message.sent, received, self._told.now()))
+                member.line.send(Pong(message.sent, received, self._peers.now()))
             case Pong():
                 half = (received - message.sent) // 2
                 offset = message.here - message.sent - half
-                late = message.now - self._told.now(ago=half)
+                late = message.now - self._peers.now(ago=half)
                 member.exchanges.add(Exchange(received - message.sent, offset, late))
                 self.soon(self.notify)
             case Hello():
@@ -306,7 +286,7 @@ class Roster:
 
     def unsent(self, member: Member, error: VisnavError) -> None:
         """Hand on what could not be sent."""
-        self.soon(self._told.unsent, member, error)
+        self.soon(self._peers.unsent, member, error)
 
     # On the loop.
 
@@ -317,7 +297,7 @@ class Roster:
             elif member.unfit or member.over:
                 log.debug("from %s, who is no part of this run: %s", member.place, message)
             else:
-                self._told.heard(member, message, event)
+                self._peers.heard(member, message, event)
         except WireError as error:
             log.warning("from %s: %s", member.place, error)
         self.notify()
@@ -356,7 +336,7 @@ class Roster:
             self._numbered[number] = member
         member.unfit = False
         if member.number >= 0 and member.hello.running and self.hello.running:
-            self._told.found_again(member)
+            self._peers.found_again(member)
         held, member.held = member.held, None
         for message, event in held or ():
             self._take(member, message, event)
@@ -370,7 +350,7 @@ class Roster:
         member.line.abandon()
         if self._numbered.get(member.number) is member:
             del self._numbered[member.number]
-            self._told.lost(member)
+            self._peers.lost(member)
             for other in self._greeting.members() if self._greeting else ():
                 if other.held is not None and other.nodes == member.nodes:
                     self.met(other)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from typing import Any
+from typing import Any, cast
 
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from runtime.config import Config
 from runtime.errors import VisnavError
 from runtime.peers.greeting import Greeting
+from runtime.peers.peers import Peers
 from runtime.peers.roster import Roster
 from runtime.peers.seal import derive
 from tests.runtime.peers.samples import settings
@@ -20,8 +21,8 @@ CONFIG: Config = settings(("asker", "Asker", {}), ("one", "Answerer", {}), share
 KEY = derive(b"secret", "run", "test")
 
 
-class Told:
-    """Nobody."""
+class Nobody:
+    """In the place of `Peers`."""
 
     def __init__(self) -> None:
         self.lost = self.found_again = self.heard = lambda *_: None
@@ -37,7 +38,9 @@ class Pair:
     """Two rosters, and a wire that remembers all that was ever said."""
 
     def __init__(self) -> None:
-        self.ends = {name: Roster(CONFIG, [name], Told()) for name in ("asker", "one")}
+        self.ends = {
+            name: Roster(CONFIG, [name], cast("Peers", Nobody())) for name in ("asker", "one")
+        }
         self.greetings: dict[str, Greeting] = {}
         self.under_way: dict[str, deque[bytes]] = {name: deque() for name in self.ends}
         self.said: list[tuple[str, bytes]] = []
