@@ -5,7 +5,8 @@ import sys
 if __name__ == "__main__":
     try:
         from runtime.cli import main
+
+        main()
     except KeyboardInterrupt:  # importing takes a moment
         print("error: interrupted", file=sys.stderr)
         sys.exit(130)
-    main()

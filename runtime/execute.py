@@ -10,7 +10,6 @@ import gc
 import logging
 import signal
 import threading
-import time
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -224,8 +223,8 @@ def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> It
     def stop(number: int, _: Any) -> None:
         for each in before:
             signal.signal(each, signal.SIG_DFL)
-        supervisor.asked = time.monotonic()
-        loop.call_soon_threadsafe(supervisor.stop, names[signal.Signals(number)])
+        supervisor.asked = names[signal.Signals(number)]
+        loop.call_soon_threadsafe(supervisor.stop, supervisor.asked)
 
     def interrupt(*_: Any) -> None:  # whoever blocks the loop; see `runtime.standstill`
         error, supervisor.interruption = supervisor.interruption, None

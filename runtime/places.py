@@ -40,6 +40,13 @@ def of_task(task: asyncio.Task[Any]) -> tuple[str, str]:
     return _innermost(list(_awaiting(task))[::-1])
 
 
+def ready_on(loop: asyncio.AbstractEventLoop) -> list[tuple[str, str]]:
+    """Return node and line of each task that a loop of asyncio's own is about to go on with."""
+    callbacks = [handle._callback for handle in list(loop._ready)]  # type: ignore[attr-defined]
+    owners = [getattr(callback, "__self__", None) for callback in callbacks]
+    return [of_task(owner) for owner in owners if isinstance(owner, asyncio.Task)]
+
+
 def of_error(error: BaseException) -> tuple[str, str]:
     """Return the node and the line of it that raised an exception; else ``runtime`` and a line."""
     frames = []

@@ -1,9 +1,10 @@
 """Says what a run waits for when nothing goes on: which node, which line, which wait.
 
 A thread looks at the run a few times per limit. When it finds that neither the run's time nor its
-phase has changed for half of it, it asks the loop to explain; a loop that does not answer is
-blocked, and the thread says where. A node that blocks the loop beyond the limit of its start or
-end is interrupted, for no task of the run could do that. Short stalls: `runtime.watchdog`.
+phase has changed for half of it, it asks the loop to explain. A loop that runs without time
+passing says whose tasks are ready, again and again; one that does not answer is blocked, and the
+thread says where. A node that blocks the loop beyond the limit of its start or end is interrupted,
+for no task of the run could do that. Short stalls: `runtime.watchdog`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ log = logging.getLogger("visnav.runtime")
 
 _LONGEST_PAUSE = 0.25
 _LOOK = 0.01
-"""Real seconds between two looks at where a busy loop is."""
+"""Real seconds between two looks at what a busy loop does."""
 
 _MOST_NAMED = 3
 
@@ -96,28 +97,35 @@ class Standstill:
 
     def _ask(self, until: float, seen: Counter[tuple[str, str]]) -> str | None:
         """Let the loop explain, and note where it is meanwhile; `None` if it does not answer."""
-        answers: list[str] = []
-        answered = threading.Event()
+        answers: list[tuple[str, list[tuple[str, str]]]] = []
+        asked = known = 0
 
         def explain() -> None:
-            answers.append(self._explain())
-            answered.set()
+            answer = self._explain()
+            answers.append((answer, places.ready_on(self._loop) if answer == "busy" else []))
 
-        try:
-            self._loop.call_soon_threadsafe(explain)
-        except RuntimeError:  # closed
-            return ""
-        while not (self._end.is_set() or (answers and answers[0] != "busy")):
+        while not self._end.is_set():
+            for _, running in answers[known:]:
+                known += 1
+                seen.update(running)
+            if known and answers[-1][0] != "busy":
+                break
+            if known == asked:
+                asked += 1
+                try:  # a turn later: by then what has woken the loop to ask it is done
+                    self._loop.call_soon_threadsafe(self._loop.call_soon, explain)
+                except RuntimeError:  # closed
+                    return ""
             frame = sys._current_frames().get(self._thread_id)
-            if frame is not None and not idle(frame):
+            if not known and frame is not None and not idle(frame):
                 seen[places.of_thread(frame)] += 1
             del frame
             if time.monotonic() >= until:
                 break
             self._end.wait(_LOOK)
-        if not answers and not seen:  # it has nothing to do, and is only slow to wake up
+        if not seen and (not known or answers[-1][0] == "busy"):  # idle, and only slow to wake up
             return ""
-        return answers[0] if answers else None
+        return answers[-1][0] if known else None
 
     def _explain(self) -> str:
         """Say who is waited for; ``""`` if all is well, ``"busy"`` if nobody is; on the loop."""
@@ -133,22 +141,23 @@ class Standstill:
         return _explain_time(loop, run) if isinstance(loop, LockstepLoop) else ""
 
     def _told(self, answer: str | None, seen: Counter[tuple[str, str]], seconds: float) -> str:
-        (node, line), _ = seen.most_common(1)[0] if seen else (("runtime", "?"), 0)
+        places_seen = [place for place, _ in seen.most_common()] or [("runtime", "?")]
+        node, line = places_seen[0]
         if answer is None:
             return f"the loop has not turned for {seconds:.1f} s: {node}, at {places.short(line)}"
         if answer == "busy":
-            nodes = dict.fromkeys(n for (n, _), _ in seen.most_common() if n != "runtime")
-            names = ", ".join(list(nodes)[:_MOST_NAMED]) or node
+            of_nodes = [place for place in places_seen if place[0] != "runtime"] or places_seen[:1]
+            names = ", ".join(list(dict(of_nodes))[:_MOST_NAMED])
             return (
                 f"no time has passed for {seconds:.1f} s, while these run again and again: "
-                f"{names}, at {places.short(line)}"
+                f"{names}, at {places.short(of_nodes[0][1])}"
             )
         return f"for {seconds:.1f} s the run has waited for {answer}"
 
     def _patience(self) -> float:
         """Return how long a node may block the loop: as long as the step may take that it is in."""
         run = self._supervisor
-        if run.ended is not None or run.asked is not None:
+        if run.ended is not None or run.asked:
             return run.shutdown_limit()
         return run._config.run.startup_limit if run.first_update is None else float("inf")
 

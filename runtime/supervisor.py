@@ -96,8 +96,8 @@ class Supervisor:
         """The same on the run's clock (ns)."""
         self.reason = ""
         self.error: Exception | None = None
-        self.asked: float | None = None
-        """When somebody asked for the end of the run, whom the loop may not have heard yet."""
+        self.asked = ""
+        """Why somebody asked for the end of the run, whom the loop may not have heard yet."""
         self.interruption: Exception | None = None
         """What is to be raised in a node that blocks the loop."""
         self.ever: list[Node[Any]] = []
@@ -160,6 +160,7 @@ class Supervisor:
         """
         if self._ended.is_set():
             return
+        reason = self.asked or reason
         if self.peers is not None:
             self.peers.stopping(None if told else reason, error)
         self.reason = reason

@@ -59,10 +59,10 @@ app.command(  # the arguments, --help among them, are the benchmarks' own
 
 def main() -> None:
     """Run the command line; the process ends here."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal may lack an arrow
     try:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="replace")  # a terminal may lack an arrow
         app()
     except KeyboardInterrupt:
         interrupted()
