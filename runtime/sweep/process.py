@@ -32,7 +32,7 @@ _LONGEST_ERROR = 300
 class Verdict(msgspec.Struct, frozen=True):
     """The part of a run's summary that says how well it went."""
 
-    passed: bool
+    passed: bool | None
     estimators: dict[str, dict[str, Any]] = {}
 
 

@@ -125,6 +125,8 @@ def test_the_error_of_a_run_is_its_last_error_or_its_last_line() -> None:
 
 
 VERDICT = {"passed": False, "estimators": {"vo": {"passed": False}}}
+FIGURES = {"estimators": {"vo": {"passed": None, "ate_percent": 0.5}}}
+NOT_JUDGED = {"passed": None} | FIGURES
 SUMMARY = {"reason": "done", "sim_seconds": 1.5, "wall_seconds": 0.1, "digest": "abc"}
 
 
@@ -136,6 +138,7 @@ SUMMARY = {"reason": "done", "sim_seconds": 1.5, "wall_seconds": 0.1, "digest": 
         (0, {}, {"error": "summary.json: Object missing required field `reason`"}),
         (0, None, {"error": "expected a summary.json, found: No such file or directory"}),
         (1, SUMMARY | {"verdict": VERDICT}, {"error": "", "passed": False}),
+        (0, SUMMARY | {"verdict": NOT_JUDGED}, {"error": "", "passed": None} | FIGURES),
         (1, SUMMARY, {"error": "no runs/ID/file at 0x…", "passed": None}),
         (2, SUMMARY | {"verdict": VERDICT}, {"passed": None, "estimators": {}, "exit_code": 2}),
         (0, SUMMARY | {"reason": "SIGTERM"}, {"error": "interrupted by SIGTERM"}),
