@@ -40,7 +40,7 @@ def start(arguments: Sequence[str | Path], folder: Path) -> subprocess.Popen[str
 
 
 def command(
-    *arguments: str | Path, folder: Path, limit: float = 30
+    *arguments: str | Path, folder: Path, limit: float = 100
 ) -> subprocess.CompletedProcess[str]:
     """Run `python -m runtime` to its end."""
     with start(arguments, folder) as process:

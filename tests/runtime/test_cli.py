@@ -14,7 +14,7 @@ import pytest
 from runtime.summary import Summary, TickSummary
 from tests.runtime.samples_cli import ROOT, command, command_here, config_file, summary
 
-pytestmark = pytest.mark.timeout(60)
+pytestmark = pytest.mark.timeout(180)
 
 
 def processor_time(*arguments: str) -> float:

@@ -20,7 +20,7 @@ from runtime.units import Duration
 from tests.runtime.samples import Speaker
 from tests.runtime.samples_cli import ROOT, command_here, config_file, summary
 
-pytestmark = pytest.mark.timeout(90)
+pytestmark = pytest.mark.timeout(180)
 
 
 def fly(out: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from tests.runtime.samples_cli import config_file, start, summary
 
-pytestmark = pytest.mark.timeout(30)
+pytestmark = pytest.mark.timeout(120)
 CLOCKS = ["lockstep", "real"]
 PACED = {
     "lockstep": "clock = 'lockstep'\nspeed = 1.0\nstall = 0",
@@ -35,7 +35,7 @@ def running(folder: Path, path: Path, word: str) -> Iterator[subprocess.Popen[st
 
 def ends(process: subprocess.Popen[str]) -> tuple[int, str]:
     """Wait for the end; return exit code and standard error."""
-    _, err = process.communicate(timeout=10)
+    _, err = process.communicate(timeout=60)
     return process.returncode, err
 
 

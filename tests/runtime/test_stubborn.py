@@ -14,10 +14,10 @@ import pytest
 
 from tests.runtime.samples_cli import start, summary
 
-pytestmark = pytest.mark.timeout(90)
+pytestmark = pytest.mark.timeout(180)
 CLOCKS = ["lockstep", "real"]
 HERE = r"runtime/samples_faults\.py:\d+ in "
-LONGEST = 15.0
+LONGEST = 30.0
 """Seconds from when a run should end to when it has, limits and a busy machine included."""
 
 FILE = """[run]
@@ -134,7 +134,7 @@ def test_eight_stuck_threads_share_one_limit(clock: str, tmp_path: Path) -> None
     ended = Ended(tmp_path, "run", "threads", clock, signal.SIGTERM)
     assert ended.code == 0
     assert ended.last.startswith("warning: still busy, left behind: offload_0, offload_1")
-    assert ended.seconds < 6
+    assert ended.seconds < 8  # one each is eight
 
 
 @pytest.mark.slow

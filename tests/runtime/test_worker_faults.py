@@ -15,7 +15,7 @@ from tests.runtime.samples_runs import supervise
 from tests.runtime.samples_workers import Plant
 from tests.runtime.test_worker import alive
 
-pytestmark = pytest.mark.timeout(30)
+pytestmark = pytest.mark.timeout(120)
 
 
 class Gardener(Node):

@@ -21,6 +21,7 @@ import pytest
 
 from tests.runtime.samples_cli import ROOT, command, config_file, start, summary
 
+pytestmark = pytest.mark.timeout(240)
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
 LOOP = """
 [[nodes]]
@@ -44,7 +45,7 @@ def running(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.send_signal(signal.SIGINT)
-            process.communicate(timeout=20)
+            process.communicate(timeout=60)
 
 
 @pytest.mark.slow
@@ -69,7 +70,7 @@ def test_a_parameter_is_set_from_another_terminal(tmp_path: Path, sockets: Path)
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
 def test_the_page_shows_a_run_in_a_browser(tmp_path: Path, sockets: Path) -> None:
     assert BROWSER is not None
-    with running(tmp_path, "--web", "0", "--set", "run.duration=5") as process:
+    with running(tmp_path, "--web", "0", "--set", "run.duration=8") as process:
         assert process.stdout is not None
         url = process.stdout.readline().split()[-1]
         shown = subprocess.run(
@@ -83,12 +84,12 @@ def test_the_page_shows_a_run_in_a_browser(tmp_path: Path, sockets: Path) -> Non
             ],
             capture_output=True,
             text=True,
-            timeout=50,
+            timeout=100,
             check=True,
         ).stdout
     # The browser's virtual time waits for the stream, which ends with the run.
     assert re.search(
-        r"<h1[^>]*>the run is over: duration \(last seen: sample   [3-5]\.\d+ of", shown
+        r"<h1[^>]*>the run is over: duration \(last seen: sample   [5-8]\.\d+ of", shown
     )
     assert re.search(r"<td[^>]*>drone.images</td><td[^>]*>Image</td><td[^>]*>\d+</td>", shown)
     assert 'value="pilot.gain=1.0"' in shown
@@ -144,7 +145,7 @@ def test_a_trace_is_written_and_read(tmp_path: Path, sockets: Path) -> None:
 
 
 def _wait_for(sockets: Path, process: subprocess.Popen[str]) -> None:
-    for _ in range(200):
+    for _ in range(1000):
         if sockets.exists() and list(sockets.glob("*.sock")):
             return
         assert process.poll() is None
@@ -169,7 +170,7 @@ def test_a_screen_needs_a_terminal_that_can_show_it(tmp_path: Path, sockets: Pat
                 stdout=inside,
                 stderr=inside,
                 start_new_session=True,
-                timeout=20,
+                timeout=60,
                 check=False,
             )
             assert refused.returncode == 2
