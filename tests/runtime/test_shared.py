@@ -220,7 +220,7 @@ from runtime.realtime import RealClock
 from tests.runtime.samples_workers import Plant
 import numpy as np
 async def main():
-    worker = Worker("plant", RealClock(asyncio.get_running_loop()), Plant, timeout=3)
+    worker = Worker("plant", RealClock(asyncio.get_running_loop()), Plant, timeout=8)
     await worker.ready()
     await worker.call(Plant.keep, np.zeros(1 << 20, np.uint8))
     print(await worker.call(Plant.pid), flush=True)
