@@ -26,7 +26,7 @@ class Gardener(Node):
     answers: ClassVar[list[int]] = []
 
     async def on_startup(self) -> None:
-        self.plant = await self.worker(Plant, timeout=1.5 if self.fate == "hang" else 60.0)
+        self.plant = await self.worker(Plant, timeout=6.0 if self.fate == "hang" else 60.0)
         self.pids.append(await self.plant.call(Plant.pid))
 
     async def run(self) -> None:
@@ -54,7 +54,7 @@ FATES = [
     ("die", "lockstep", WorkerDiedError, "worker g.Plant: ended with exit code 7; .*\ngoodbye"),
     ("die", "real", WorkerDiedError, "worker g.Plant: ended with exit code 7; .*\ngoodbye"),
     pytest.param(
-        *("hang", "lockstep", WorkerTimeoutError, "worker g.Plant: no answer in 1.5 s"),
+        *("hang", "lockstep", WorkerTimeoutError, "worker g.Plant: no answer in 6 s"),
         marks=pytest.mark.slow,
     ),
     ("idle", "real", WorkerDiedError, "worker g.Plant: killed by signal 9; it said nothing"),
