@@ -271,6 +271,7 @@ def test_restart_works_on_the_real_clock() -> None:
     assert 0.5 <= Patient.lives[1] - Patient.ends[0] < 10
 
 
+@pytest.mark.slow
 def test_two_thousand_restarts_overflow_nothing() -> None:
     class Weak(Node):
         async def run(self) -> None:

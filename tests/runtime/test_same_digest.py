@@ -62,7 +62,7 @@ def digest(file: Path, seed: int) -> tuple[str, dict[str, int]]:
     "runs",
     [
         pytest.param(4, marks=pytest.mark.timeout(120)),
-        pytest.param(12, marks=[pytest.mark.slow, pytest.mark.timeout(900)]),
+        pytest.param(20, marks=[pytest.mark.slow, pytest.mark.timeout(900)]),
     ],
 )
 def test_equal_runs_have_equal_digests(tmp_path: Path, runs: int) -> None:
