@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
 Thumbnail = tuple[int, str, npt.NDArray[np.uint8]]
 """Stamp (ns), source, picture (h, w, 1 or 3)."""
@@ -24,6 +23,8 @@ def draw_flight(rows: npt.ArrayLike, hits: Sequence[tuple[float, float]], out: P
         hits: Places of collisions, x and y (m).
         out: The PNG to write.
     """
+    from matplotlib.figure import Figure  # half a second, which no flight should wait for
+
     data = np.array(rows)
     seconds, (x, y, z) = data[:, 0] / 1e9, data[:, 1:4].T
     speed = np.linalg.norm(data[:, 4:7], axis=1)
@@ -56,6 +57,8 @@ def draw_flight(rows: npt.ArrayLike, hits: Sequence[tuple[float, float]], out: P
 
 def draw_contact_sheet(thumbnails: Sequence[Thumbnail], out: Path) -> None:
     """Draw small pictures in rows, each with its time and camera."""
+    from matplotlib.figure import Figure
+
     columns = math.ceil(math.sqrt(len(thumbnails)))
     rows = math.ceil(len(thumbnails) / columns)
     figure = Figure(figsize=(2.5 * columns, 2.75 * rows), layout="constrained")

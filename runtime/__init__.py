@@ -3,9 +3,11 @@
 Read in this order: `node` (what an author writes), `ports` and `bundles` (what it declares),
 `sender`, `streams` and `links` (how an event gets from one node to another), `steps` (why that is
 quick), `schedule`, `clock`, `lockstep` and `realtime` (time), `worker` and `shared` (slow work),
-`graph`, `supervisor`, `execute` and `summary` (a run), `config` (the file), `wire` and `peers` (a
-run in several processes). `parameters` and `changing` (settings that change in a run), `probes`,
-`tracing` and `monitor` (looking on) can wait. `testing` is for tests of nodes.
+`graph`, `life`, `supervisor`, `execute`, `driver`, `results` and `summary` (a run, its end, its
+folder), `config` and `paths` (the file), `preflight` (what `check` says of it), `wire` and `peers`
+(a run in several processes). `parameters` and `changing` (settings that change in a run),
+`watchdog`, `standstill` and `places` (who holds it up), `costs`, `probes`, `tracing` and `monitor`
+(looking on) can wait. `testing` is for tests of nodes.
 """
 
 from runtime.bundles import Bundle
