@@ -213,7 +213,7 @@ class _Run:
 def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> Iterator[None]:
     """Let the first SIGINT, SIGTERM or SIGHUP end the run in order, and the second at once.
 
-    One that is ignored (SIGHUP under nohup) stays so.
+    An ignored SIGHUP stays so: the run was begun under nohup.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -232,7 +232,9 @@ def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> It
             raise error
 
     before = {number: signal.getsignal(number) or signal.SIG_DFL for number in names}
-    before = {number: how for number, how in before.items() if how is not signal.SIG_IGN}
+    # Not so the others: a shell has what it puts in the background ignore SIGINT, too.
+    if before[signal.SIGHUP] is signal.SIG_IGN:
+        del before[signal.SIGHUP]
     for number in before:
         signal.signal(number, stop)
     usual = signal.signal(signal.SIGUSR2, interrupt)

@@ -6,8 +6,14 @@ Threads of OpenBLAS and OpenCV that wait for work keep a core busy, which anothe
 from __future__ import annotations
 
 import os
+import signal
 
 from hypothesis import settings
+
+# Whoever runs the tests under nohup does not mean the runs that they start and interrupt.
+for number in (signal.SIGHUP, signal.SIGINT):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, signal.SIG_DFL)
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")

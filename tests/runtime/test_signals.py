@@ -107,3 +107,18 @@ def test_ctrl_c_wakes_an_idle_run(tmp_path: Path) -> None:
         line = err.splitlines()[-1]
         assert line.startswith("error: slowend: expected on_shutdown to end within 0.2")
         assert "found it still running (runtime/samples.py:" in line
+
+
+def test_what_a_shell_put_into_the_background_can_be_interrupted(tmp_path: Path) -> None:
+    """Shells have background processes ignore SIGINT; who sends one nevertheless means it."""
+    path = config_file(tmp_path, "Reader", "Lively", run=PACED["lockstep"])
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        run = running(tmp_path, path, "running")
+        process = run.__enter__()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    process.send_signal(signal.SIGINT)
+    assert ends(process) == (0, "")
+    run.__exit__(None, None, None)
+    assert summary(tmp_path / "runs" / "sample")["reason"] == "Ctrl-C"
