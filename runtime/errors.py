@@ -32,13 +32,24 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_LONGEST = 1500
+"""Characters of a message."""
+
 
 class VisnavError(Exception):
     """Base of every error below."""
 
 
 class ConfigError(VisnavError):
-    """The configuration is wrong; the message says where, what was expected and found."""
+    """The configuration is wrong; the message says where, what was expected and found.
+
+    What was found may be of any length, and is cut in the middle.
+    """
+
+    def __init__(self, message: str) -> None:
+        if len(message) > _LONGEST:
+            message = f"{message[: _LONGEST // 2]} … {message[-_LONGEST // 4 :]}"
+        super().__init__(message)
 
 
 class DeclarationError(VisnavError):

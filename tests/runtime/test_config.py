@@ -183,3 +183,10 @@ def test_a_run_is_named_as_a_folder_can_be(name: str) -> None:
     table = {"run": {"name": name}, "nodes": [node]}
     with pytest.raises(ConfigError, match=r"c: run\.name: expected a name for a folder"):
         parse(table, "c")
+
+
+def test_a_key_of_any_length_gives_one_line_that_can_be_read() -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse({"run": {"x" * 100_000: 1}, "nodes": []}, "c.toml")
+    assert len(str(caught.value)) < 1500
+    assert str(caught.value).startswith("c.toml: run")
