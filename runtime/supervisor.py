@@ -162,7 +162,7 @@ class Supervisor:
             return
         reason = self.asked or reason
         if self.peers is not None:
-            self.peers.stopping(None if told else reason, error)
+            self.peers.stopping(reason, error, told=told)
         self.reason = reason
         self.error = error
         self.ended, self.ended_at = time.monotonic(), self.clock.now()

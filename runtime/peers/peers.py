@@ -216,11 +216,14 @@ class Peers:
                 member.told = wanted
                 member.line.send(Hearing(wanted))
 
-    def stopping(self, reason: str | None, error: Exception | None) -> None:
-        """Tell the others that the run ends; there is no reason if one of them said so."""
+    def stopping(self, reason: str, error: Exception | None, *, told: bool) -> None:
+        """Tell the others that the run ends, and why; also where one of them `told` us.
+
+        They may hear it from us first.
+        """
         self._ends = True
         text = None if error is None else str(error)
-        stop = Stop(reason or "the run has ended", text, apart=not self._begun)
+        stop = Stop(reason, text, apart=not self._begun)
         self._roster.ended = msgspec.structs.replace(stop, apart=True)
         if not self._begun:  # also those who said so: they need not wait for our turn
             self._roster.tell(stop)
@@ -231,7 +234,7 @@ class Peers:
         elif self._suspended:
             self._roster.tell(stop)
             self._gather()
-        elif reason is not None:
+        elif not told:
             self._tell_in_order(stop)
         self.ending.begin()
 
