@@ -1,10 +1,10 @@
-"""``python -m runtime``: see `runtime.cli`."""
+"""``python -m runtime``: see `runtime.tools.cli`."""
 
 import sys
 
 if __name__ == "__main__":
     try:
-        from runtime.cli import main
+        from runtime.tools.cli import main
 
         main()
     except KeyboardInterrupt:  # importing takes a moment

@@ -3,8 +3,8 @@
 A *probe* is put around every call by which the loop gets into a node: a handler, a tick, a step
 of a coroutine. All three take one argument, so one function serves for them. Attaching a probe
 connects the run anew and exchanges what tickers and tasks call; detaching puts back what was
-there. What a probe does with what it sees is its own business (`runtime.tracing`,
-`runtime.monitor`).
+there. What a probe does with what it sees is its own business (`runtime.tools.tracing`,
+`runtime.tools.monitor`).
 """
 
 from __future__ import annotations

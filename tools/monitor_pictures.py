@@ -43,10 +43,10 @@ def main() -> None:
 
 
 async def _look(folder: Path, browser: str) -> None:
-    from runtime.monitor.address import runs
-    from runtime.monitor.client import Client
-    from runtime.monitor.command import Set
-    from runtime.monitor.screen import Screen
+    from runtime.tools.monitor.address import runs
+    from runtime.tools.monitor.client import Client
+    from runtime.tools.monitor.command import Set
+    from runtime.tools.monitor.screen import Screen
 
     deadline = time.monotonic() + 60
     while not (found := runs()):

@@ -15,7 +15,7 @@ import socket
 import threading
 from collections.abc import Callable, Collection
 
-from runtime.monitor.http import LONGEST_HEAD, HttpError, host_of, parse_head, response
+from runtime.tools.monitor.http import LONGEST_HEAD, HttpError, host_of, parse_head, response
 
 MOST = 64
 """Viewers at a time, those included that have yet to say what they want."""

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 from runtime.errors import CommandError, PeerError
-from runtime.monitor.address import folder
+from runtime.tools.monitor.address import folder
 
 SHORTEST = 16
 """Characters of a secret at least."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runtime.samples_cli import ROOT, command_here
+from tests.runtime.tools.samples_cli import ROOT, command_here
 
 ROOM = """
 <mujoco><worldbody>

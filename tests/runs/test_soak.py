@@ -12,7 +12,7 @@ import pytest
 
 from events import Announcement, EstimatorAnnouncement, Odometry, PoseEstimate
 from runtime import Node, Output, Tick, every, on
-from tests.runtime.samples_cli import command
+from tests.runtime.tools.samples_cli import command
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

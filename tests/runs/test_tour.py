@@ -18,7 +18,7 @@ from runtime.config import load
 from runtime.execute import execute
 from runtime.testing import spec
 from tests.runs.witness import Witness
-from tests.runtime.samples_cli import ROOT, command, start, summary
+from tests.runtime.tools.samples_cli import ROOT, command, start, summary
 
 pytestmark = pytest.mark.timeout(120)
 CONFIG = ROOT / "config.toml"

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.runtime.samples_cli import ROOT, command
+from tests.runtime.tools.samples_cli import ROOT, command
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 CONFIG = ROOT / "config.toml"

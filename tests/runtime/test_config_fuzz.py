@@ -13,9 +13,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runtime.cli import main
 from runtime.config import load, to_builtins
 from runtime.errors import ConfigError
+from runtime.tools.cli import main
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "config.toml").read_text(encoding="utf-8")

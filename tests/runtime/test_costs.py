@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 
 from nodes.report.contents import Facts
 from runtime import Duration, Node
-from runtime.cli.tables import run_tables
 from runtime.config import Config, RunConfig
 from runtime.costs import Costs
 from runtime.execute import execute
 from runtime.summary import WORKER_COLUMNS, Summary, WorkerSummary
-from runtime.sweep import write_tables
 from runtime.testing import spec
+from runtime.tools.cli.tables import run_tables
+from runtime.tools.sweep import write_tables
 from tests.runtime.samples_workers import Plant
-from tests.runtime.sweep.samples import plan_in, pretend
 from tests.runtime.test_worker import worker
+from tests.runtime.tools.sweep.samples import plan_in, pretend
 
 pytestmark = pytest.mark.timeout(60)
 

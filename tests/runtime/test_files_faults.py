@@ -18,7 +18,7 @@ from runtime.results import MARKER, claim, write
 from runtime.testing import spec
 from runtime.units import Duration
 from tests.runtime.samples import Speaker
-from tests.runtime.samples_cli import ROOT, command_here, config_file, summary
+from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, summary
 
 pytestmark = pytest.mark.timeout(180)
 

@@ -20,9 +20,9 @@ from unittest import mock
 
 import pytest
 
-from runtime.cli import main
-from tests.runtime.samples_cli import ROOT
+from runtime.tools.cli import main
 from tests.runtime.samples_faults import PLACES, WAYS
+from tests.runtime.tools.samples_cli import ROOT
 
 COMBINATIONS = list(itertools.product(("lockstep", "real"), ("stop", "restart", "drop")))
 COROUTINES = {"on_startup", "on_ready", "run", "started", "task_group", "on_shutdown"}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runtime.samples_cli import config_file, start, summary
+from tests.runtime.tools.samples_cli import config_file, start, summary
 
 pytestmark = pytest.mark.timeout(120)
 CLOCKS = ["lockstep", "real"]

@@ -17,8 +17,8 @@ from unittest import mock
 
 import pytest
 
-from runtime.cli import main
-from tests.runtime.samples_cli import ROOT, start, summary
+from runtime.tools.cli import main
+from tests.runtime.tools.samples_cli import ROOT, start, summary
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 CLOCKS = ["lockstep", "real"]

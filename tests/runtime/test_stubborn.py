@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runtime.samples_cli import start, summary
+from tests.runtime.tools.samples_cli import start, summary
 
 pytestmark = pytest.mark.timeout(180)
 CLOCKS = ["lockstep", "real"]

@@ -9,12 +9,12 @@ import msgspec
 import pytest
 
 from runtime import Duration, Input, Node
-from runtime.cli.tables import run_tables
 from runtime.config import Config, RunConfig
 from runtime.errors import ResultsError
 from runtime.execute import execute
 from runtime.summary import Summary
 from runtime.testing import run_nodes, spec
+from runtime.tools.cli.tables import run_tables
 from tests.runtime.samples import Diarist, Failing, Painter, Ping, Reader, Speaker
 
 

@@ -16,7 +16,7 @@ from nodes.foxglove_server import gate
 from nodes.foxglove_server.gate import Gate, hidden_host
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
-from runtime.monitor.http import HttpError
+from runtime.tools.monitor.http import HttpError
 from tests.nodes.foxglove_server.client import Viewer
 
 PROTOCOL = [Subprotocol("foxglove.sdk.v1")]

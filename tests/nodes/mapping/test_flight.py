@@ -17,7 +17,7 @@ from runtime.testing import run_nodes, spec
 from sims.multirotor.node import Multirotor
 from sims.worlds import TOURS
 from tests.nodes.mapping.surfaces import distances
-from tests.runtime.samples_cli import ROOT, start, summary
+from tests.runtime.tools.samples_cli import ROOT, start, summary
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 

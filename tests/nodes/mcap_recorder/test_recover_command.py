@@ -8,8 +8,8 @@ import pytest
 
 from nodes.mcap_recorder import layout
 from nodes.mcap_recorder.mcap_file import read
-from runtime.cli.recover import recover
 from runtime.errors import VisnavError
+from runtime.tools.cli.recover import recover
 from tests.nodes.mcap_recorder.test_mcap_file import write
 
 

@@ -8,9 +8,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-import runtime.cli
-from runtime.cli.report import report
+import runtime.tools.cli
 from runtime.errors import ConfigError
+from runtime.tools.cli.report import report
 from tests.nodes.report.folders import summary
 
 app = typer.Typer()
@@ -35,7 +35,7 @@ def test_a_folder_that_is_no_run_gives_one_line_and_exit_code_2(
 ) -> None:
     monkeypatch.setattr("sys.argv", ["runtime", "report", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
-        runtime.cli.main()
+        runtime.tools.cli.main()
     assert ended.value.code == 2
     said = capsys.readouterr()
     assert said.out == ""

@@ -9,8 +9,8 @@ import typer
 from typer.testing import CliRunner
 
 from nodes.trajectory.formats import write_tum
-from runtime.cli.export import export
 from runtime.errors import ConfigError
+from runtime.tools.cli.export import export
 from tests.nodes.trajectory.samples import walk
 
 app = typer.Typer()

@@ -1,0 +1,216 @@
+"""``run``: from a file to a folder of results."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+import time
+from collections.abc import Collection
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+from runtime.tools.cli.common import ConfigFile, Overrides
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from runtime.config import Config
+    from runtime.summary import Summary, Verdict
+    from runtime.tools.preflight import Findings
+
+
+_STATES = {
+    True: "[green]passed[/green]",
+    False: "[red]failed[/red]",
+    None: "[yellow]not judged: no thresholds were given[/yellow]",
+}
+
+_LAST_WAIT = 1.0
+"""Real seconds that all threads together get to end by themselves."""
+
+
+class Log(Enum):
+    """What ``--log`` takes: a level, or ``events``."""
+
+    trace = "trace"
+    debug = "debug"
+    info = "info"
+    warning = "warning"
+    error = "error"
+    events = "events"
+
+
+def run(
+    config: ConfigFile,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for results; runs/<name> if not given.")
+    ] = None,
+    overrides: Overrides = None,
+    log: Annotated[
+        Log | None,
+        typer.Option(help='Least level to print, or "events" for every event that is sent.'),
+    ] = None,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NODE,…",
+            help="Run just these nodes here; other processes, also elsewhere, run the others.",
+        ),
+    ] = None,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
+    ] = False,
+    trace: Annotated[
+        Path | None,
+        typer.Option(help="Write a trace for ui.perfetto.dev; compressed if it ends with .gz."),
+    ] = None,
+    top: Annotated[
+        bool, typer.Option("--top", help="Show the monitor's screen instead of a progress bar.")
+    ] = False,
+    web: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, metavar="PORT", help="Show the monitor as a page, on this port."
+        ),
+    ] = None,
+) -> None:
+    """Run the nodes of a file until they, its duration or Ctrl-C end the run.
+
+    Results go to runs/<name> (with --only, to runs/<name>-<first node>): summary.json, log.txt,
+    the resolved config.toml, and whatever the nodes write. Ends with 0, also after Ctrl-C, SIGTERM,
+    SIGHUP or a closed window (a second Ctrl-C is immediate); with 1 if a threshold of the run was
+    not met; with 2 if something failed.
+    """
+    from runtime.config import load
+    from runtime.execute import execute
+    from runtime.tools.cli.watching import Lookers
+
+    changes = list(overrides or [])
+    if log is not None and log is not Log.events:
+        changes.append(f"run.log={log.value}")
+    settings = load(config, changes)
+    nodes_here = chosen(settings, only)
+    look_at(settings, nodes_here)
+    name = "-".join([settings.run.name, *nodes_here[:1]])
+    folder = out or Path("runs") / name
+    lookers = Lookers(settings, name, quiet=quiet, trace=trace, top=top, web=web)
+    summary = execute(
+        settings,
+        folder,
+        handlers=lookers.handlers,
+        log_events=log is Log.events,
+        watch=lookers.watch,
+        only=nodes_here,
+    )
+    if not quiet:
+        report(summary, folder)
+    code = 1 if summary.verdict is not None and summary.verdict.passed is False else 0
+    leave_behind(code)
+
+
+def chosen(settings: Config, only: str | None) -> list[str]:
+    """Return the nodes that ``--only`` names, in file order; none if all run here.
+
+    Raises:
+        ConfigError: It names a node that there is not, or none.
+    """
+    from runtime.errors import ConfigError, suggest
+
+    if only is None:
+        return []
+    names = [spec.name for spec in settings.nodes]
+    wanted = [name.strip() for name in only.split(",") if name.strip()]
+    for name in wanted:
+        if name not in names:
+            raise ConfigError(
+                f"--only {only}: expected nodes of the file ({', '.join(names)}), found {name}"
+                + suggest(name, names)
+            )
+    if not wanted:
+        raise ConfigError("--only: expected names of nodes with commas between, found none")
+    return [] if set(wanted) == set(names) else [name for name in names if name in wanted]
+
+
+def look_at(settings: Config, only: Collection[str] = ()) -> None:
+    """Print what a look at the file makes one warn of.
+
+    Raises:
+        ConfigError: The run could not do what the file says.
+    """
+    from runtime.errors import ConfigError
+    from runtime.tools.preflight import of_file
+
+    found = of_file(settings, only)
+    warn(found)
+    if found.errors:
+        raise ConfigError("; ".join(found.errors))
+
+
+def warn(findings: Findings) -> None:
+    """Print a line for each warning."""
+    for warning in findings.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+def report(summary: Summary, folder: Path) -> None:
+    """Print the table at the end of a run."""
+    from rich.console import Console
+
+    from runtime.tools.cli.tables import run_tables
+
+    console = Console()
+    for table in run_tables(summary):
+        console.print(table)
+    speed = summary.sim_seconds / max(summary.wall_seconds, 1e-9)
+    digest = summary.digest or "off"
+    if summary.digest and summary.not_deterministic:
+        digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
+    if summary.verdict is not None:
+        _judge(console, summary.verdict)
+    page = ": open report.html" if (folder / "report.html").is_file() else ""
+    console.print(
+        f"{summary.sim_seconds:.1f} s on the {summary.clock} clock in "
+        f"{summary.wall_seconds:.1f} s ({speed:.1f} × real time), ended by: {summary.reason}\n"
+        f"digest {digest}   results in [bold]{folder}[/bold]{page}",
+        highlight=False,
+    )
+
+
+def _judge(console: Console, verdict: Verdict) -> None:
+    """Print who passed, and what those failed that did not."""
+    for name, figures in verdict.estimators.items():
+        passed = _STATES[figures["passed"]]
+        reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
+        console.print(f"{name} {passed}{': ' + reasons if reasons else ''}", highlight=False)
+
+
+def leave_behind(code: int, last: str = "") -> NoReturn:
+    """End the process, even if work of a node never returns; Python would wait for it.
+
+    Args:
+        code: The exit code.
+        last: Printed at the end, to standard error.
+    """
+    from runtime import driver
+
+    threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node", "zenoh"))]
+    until = time.monotonic() + _LAST_WAIT
+    for thread in threads:
+        thread.join(max(until - time.monotonic(), 0.0))
+    stuck = [thread.name for thread in threads if thread.is_alive()]
+    stuck += dict.fromkeys(task.get_name() for task in driver.LEFT)
+    if stuck:
+        print(f"warning: still busy, left behind: {', '.join(stuck)}", file=sys.stderr)
+    if last:
+        print(last, file=sys.stderr)
+    if stuck:
+        with contextlib.suppress(OSError):  # nobody reads it any more
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)

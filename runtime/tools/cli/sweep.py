@@ -1,0 +1,115 @@
+"""``sweep``: from a file and what to vary to tables and plots."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from runtime.tools.cli.common import ConfigFile, Overrides
+
+if TYPE_CHECKING:
+    from runtime.tools.sweep import Children
+
+_WIDTH = 160
+"""Of the table where there is no terminal, in letters; 80 would break its words."""
+
+
+def sweep(
+    config: ConfigFile,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PATH=V1,V2,…",
+            help="Values of a setting to run with (paths as for --set). May be repeated: then "
+            "every combination is run.",
+        ),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Run each combination with so many seeds, from the file's.")
+    ] = 1,
+    overrides: Overrides = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for results; sweeps/<name> if not given.")
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Runs at the same time; half the cores if not given."),
+    ] = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Run everything, also what is finished already.")
+    ] = False,
+) -> None:
+    """Run a file with every combination of some settings, and compare how well it went.
+
+    Each run is a process of its own; one that fails is a row of the table. Results go to
+    sweeps/<name>: table.csv, summary.csv, plots/, each run's folder in runs/, and, since they
+    depend on the machine, timing.csv and what workers cost in costs.csv.
+    Called again, only what is missing or has failed is run. Ends with 0 if every run came to its
+    end, whether or not it met its thresholds; with 2 if one failed; with 130 after Ctrl-C.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    from rich.console import Console
+
+    from runtime.config import load
+    from runtime.tools import sweep as sweeping
+    from runtime.tools.cli.run import look_at
+    from runtime.tools.sweep.console import Display, summary_table
+
+    plan = sweeping.make_plan(config, vary or [], overrides=overrides or [], seeds=seeds, out=out)
+    changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
+    look_at(load(config, [*(overrides or []), *changes]))
+    children = sweeping.Children()
+    display = Display(children, Console(stderr=True))
+    try:
+        with (
+            _signals_interrupt(children),
+            display,
+            ThreadPoolExecutor(jobs or max(_cores() // 2, 1), "run") as executor,
+        ):
+            rows = sweeping.sweep(plan, executor, run=children.run, watch=display, fresh=fresh)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted; the same command runs what is missing in {plan.out}", err=True)
+        raise typer.Exit(130) from None
+    sweeping.write_tables(plan, rows)
+    sweeping.draw_plots(plan, rows)
+    console = Console()
+    if not console.is_terminal:
+        console.width = _WIDTH
+    console.print(summary_table(plan, sweeping.summarise(plan, rows)))
+    console.print(f"{len(rows)} runs   results in [bold]{plan.out}[/bold]", highlight=False)
+    if display.failed:
+        typer.echo(f"error: {display.failed} of {len(rows)} runs failed", err=True)
+        raise typer.Exit(2)
+
+
+@contextlib.contextmanager
+def _signals_interrupt(children: Children) -> Iterator[None]:
+    """Let Ctrl-C, SIGTERM and a closed terminal end the runs, and the sweep; unless ignored."""
+
+    def stop(*_: object) -> None:
+        first = not children.ending
+        children.interrupt()
+        if first:  # what follows it is not to be interrupted itself
+            raise KeyboardInterrupt
+
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    heard = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
+    for number in heard:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in heard:
+            signal.signal(number, before[number])
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))

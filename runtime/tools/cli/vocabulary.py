@@ -1,0 +1,71 @@
+"""The command ``vocabulary``: what ORB-SLAM3 recognises places with, made from a file's images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from runtime.tools.cli.common import ConfigFile, Overrides
+
+_TRAINER = "nodes.orb_slam3.training:VocabularyTrainer"
+_SHUTDOWN_LIMIT = 300.0
+"""Seconds; the training is done as the node shuts down."""
+
+
+def vocabulary(
+    config: ConfigFile,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File to write; where ORB-SLAM3 nodes look by themselves if not given."),
+    ] = None,
+    overrides: Overrides = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.")] = False,
+) -> None:
+    """Train ORB-SLAM3's vocabulary from what the cameras of a file see.
+
+    Runs the file without its ORB-SLAM3 nodes and without a folder of results; once done, the
+    file's ORB-SLAM3 nodes find the vocabulary by themselves. One made from one world serves in
+    others, and best in its own.
+    """
+    import msgspec
+
+    from runtime.config import Config, NodeSpec, convert, find_node, load
+    from runtime.errors import ConfigError
+    from runtime.execute import execute
+    from runtime.logs import terminal_handler
+    from runtime.tools.cli.progress import progress
+    from runtime.tools.cli.run import leave_behind
+    from runtime.units import Duration
+
+    if out is not None and out.suffix != ".txt":  # ORB-SLAM3 would read it as binary
+        raise ConfigError(f"--out: expected a name that ends with .txt, found {out}")
+    settings = load(config, overrides or [])
+    trainer = find_node(_TRAINER, "vocabulary")
+    given = {} if out is None else {"path": str(out.resolve())}
+    options: Any = convert(given, trainer.config_type, "vocabulary")
+    spec = NodeSpec(
+        name="vocabulary_trainer",
+        type_name=_TRAINER,
+        on_error="stop",
+        inputs={},
+        links={},
+        node=trainer,
+        config=options,
+    )
+    others = (s for s in settings.nodes if not s.type_name.startswith("nodes.orb_slam3"))
+    run = msgspec.structs.replace(
+        settings.run, shutdown_limit=Duration(_SHUTDOWN_LIMIT), digest=False
+    )
+    execute(
+        Config(run=run, nodes=(*others, spec)),
+        handlers=[terminal_handler()],
+        watch=None if quiet else progress(run),
+    )
+    print(f"vocabulary: {options.file()}")
+    if out is None:
+        print("ORB-SLAM3 nodes find it there by themselves")
+    else:
+        print(f'for an ORB-SLAM3 node to use it: vocabulary = "{options.file()}"')
+    leave_behind(0)

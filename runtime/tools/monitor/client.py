@@ -1,0 +1,129 @@
+"""The end of the monitor that is not in the run: snapshots in, commands out."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import socket
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+from runtime.errors import CommandError
+from runtime.tools.monitor.command import (
+    LONGEST_LINE,
+    UNREADABLE,
+    Answer,
+    Asked,
+    Command,
+    Watch,
+    decode_from_run,
+    encode,
+)
+from runtime.tools.monitor.snapshot import Snapshot
+
+PATIENCE = 10.0
+"""Real seconds that a run gets to answer a command."""
+
+
+class Client:
+    """A connection to a run."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._numbers = itertools.count()
+        self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        self._over = False
+
+    @classmethod
+    async def connect(cls, path: Path) -> Client:
+        """Connect to a run.
+
+        Raises:
+            CommandError: Nobody listens there.
+        """
+        try:
+            reader, writer = await asyncio.open_unix_connection(path, limit=LONGEST_LINE)
+        except OSError as error:
+            raise _nobody(path, error) from None
+        return cls(reader, writer)
+
+    async def snapshots(self) -> AsyncIterator[Snapshot]:
+        """Yield snapshots until the run is over; answers come only while somebody iterates.
+
+        Raises:
+            CommandError: What comes is not to be understood.
+        """
+        self._writer.write(encode(Watch()) + b"\n")
+        try:
+            async for line in self._reader:
+                message = decode_from_run(line)
+                if isinstance(message, Snapshot):
+                    yield message
+                else:
+                    self._settle(message)
+        except OSError:
+            pass
+        except UNREADABLE as error:
+            raise CommandError(f"expected a run of this version: {error}") from None
+        finally:
+            self._over = True
+            for number in list(self._waiting):
+                self._settle(_gone(number))
+            self.close()
+
+    def _settle(self, answer: Answer) -> None:
+        waiting = self._waiting.pop(answer.number, None)
+        if waiting is not None and not waiting.done():  # else nobody waits any more
+            waiting.set_result(answer)
+
+    async def ask(self, command: Command) -> Answer:
+        """Ask the run to do something, and return what came of it."""
+        number = next(self._numbers)
+        if self._over:
+            return _gone(number)
+        waiting: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._waiting[number] = waiting
+        self._writer.write(encode(Asked(number=number, command=command)) + b"\n")
+        try:
+            async with asyncio.timeout(PATIENCE):
+                return await waiting
+        except TimeoutError:
+            self._waiting.pop(number, None)
+            return Answer(number=number, done=False, text="the run does not answer")
+
+    def close(self) -> None:
+        """Hang up."""
+        self._writer.close()
+
+
+def ask(path: Path, command: Command) -> str:
+    """Ask a run to do something, from outside any loop, and return what was done.
+
+    Raises:
+        CommandError: Nobody listens there, or it was not done.
+    """
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(PATIENCE)
+        try:
+            connection.connect(str(path))
+            connection.sendall(encode(Asked(number=0, command=command)) + b"\n")
+            line = connection.makefile("rb").readline(LONGEST_LINE)
+            answer = decode_from_run(line)
+        except TimeoutError:
+            raise CommandError("the run does not answer") from None
+        except (OSError, *UNREADABLE) as error:
+            raise _nobody(path, error) from None
+    assert isinstance(answer, Answer)
+    if not answer.done:
+        raise CommandError(answer.text)
+    return answer.text
+
+
+def _gone(number: int) -> Answer:
+    return Answer(number=number, done=False, text="the run is over")
+
+
+def _nobody(path: Path, error: Exception) -> CommandError:
+    reason = getattr(error, "strerror", None) or "it ended"
+    return CommandError(f"expected a run that listens at {path}: {reason}")

@@ -1,0 +1,251 @@
+"""Making snapshots of a run, and doing what it is asked; all on the run's loop."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from typing import Any
+
+import msgspec
+
+from runtime.config import Config
+from runtime.errors import CommandError, suggest
+from runtime.life import Life
+from runtime.node import NodeConfig, senders, streams
+from runtime.parameters import settings
+from runtime.schedule import SECOND
+from runtime.summary import count_drops
+from runtime.supervisor import Supervisor
+from runtime.tools.monitor.command import Command, Pause, Restart, Resume, Set, Speed, Step, Stop
+from runtime.tools.monitor.meter import Meter
+from runtime.tools.monitor.records import LastRecords
+from runtime.tools.monitor.snapshot import (
+    ClockState,
+    InputState,
+    LinkState,
+    NodeCondition,
+    NodeState,
+    OutputState,
+    Snapshot,
+    TickState,
+)
+from runtime.tools.monitor.timekeeping import Timekeeper
+from runtime.tools.monitor.window import Sample, Window
+
+
+class Observer:
+    """Looks at one run.
+
+    Args:
+        supervisor: Of the run.
+        config: Of the run.
+        records: Its log.
+    """
+
+    def __init__(self, supervisor: Supervisor, config: Config, records: LastRecords) -> None:
+        self._supervisor = supervisor
+        self._config = config
+        self._records = records
+        self._keeper = Timekeeper(supervisor.clock, over=lambda: bool(supervisor.reason))
+        self._meter: Meter | None = None
+        self._window = Window(self._sample())
+        self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}
+        """Of each node, and how they were shown: they seldom change."""
+        self._number = 0
+
+    def begin(self) -> None:
+        """Begin to measure: somebody looks."""
+        if self._meter is None:
+            self._meter = Meter(self._supervisor.clock)
+            self._supervisor.probes.attach(self._meter)
+            self._window = Window(self._sample())
+
+    def end(self) -> None:
+        """Measure no more: nobody looks."""
+        if self._meter is not None:
+            self._supervisor.probes.detach(self._meter)
+            self._meter = None
+            self._window = Window(self._sample())
+
+    # Seeing.
+
+    def take(self) -> Snapshot:
+        """Return what there is to see now, and of the last second or so."""
+        supervisor = self._supervisor
+        self._number += 1
+        sample = self._sample()
+        self._window.add(sample)
+        now = sample.run
+        return Snapshot(
+            run=self._config.run.name,
+            pid=os.getpid(),
+            number=self._number,
+            ended=supervisor.reason,
+            clock=ClockState(
+                kind=supervisor.clock.kind,
+                now=now / SECOND,
+                duration=float(self._config.run.duration),
+                speed=self._window.run / self._window.real,
+                asked=self._keeper.asked,
+                paused=self._keeper.paused,
+                fixed=self._keeper.fixed(),
+            ),
+            nodes=[self._node(life) for life in supervisor._lives.values()],
+            outputs=self._outputs(sample),
+            inputs=[
+                InputState(
+                    name=stream.name,
+                    buffered=stream.statistics().buffered,
+                    peak=found.peak,
+                    bound=found.bound,
+                    dropped=found.dropped,
+                )
+                for stream, found in self._inputs()
+            ],
+            links=[
+                LinkState(name=link.name, lost=link.lost, thinned=link.thinned)
+                for link in supervisor.links.values()
+            ],
+            ticks=[
+                TickState(
+                    name=name,
+                    hz=ticker.hz,
+                    calls=ticker.calls,
+                    missed=ticker.missed,
+                    late_p99_us=ticker.late.quantile(0.99) / 1e3,
+                    late_max_us=ticker.late.maximum / 1e3,
+                )
+                for name, ticker in supervisor.tickers.items()
+            ],
+            log=self._records.lines(),
+        )
+
+    def _sample(self) -> Sample:
+        """Return what has been added up since the last time."""
+        sent: Counter[str] = Counter()
+        for node in self._supervisor.ever:
+            for sender in senders(node).values():
+                sent[sender.name] += sender.sent().total()
+        meter = self._meter
+        return Sample(
+            time.perf_counter(),
+            self._supervisor.clock.now(),
+            sent,
+            {} if meter is None else {name: sum_.take() for name, sum_ in meter.nodes.items()},
+            {} if meter is None else {name: sum_.take() for name, sum_ in meter.outputs.items()},
+        )
+
+    def _node(self, life: Life) -> NodeState:
+        steps, real = self._window.node(life.spec.name), self._window.real
+        return NodeState(
+            name=life.spec.name,
+            type=life.spec.type_name,
+            condition=self._condition(life),
+            failures=life.failures,
+            share=steps.total / 1e9 / real,
+            steps=steps.times / real,
+            longest_ms=steps.longest / 1e6,
+            calls=sum(worker.outstanding() for worker in life.workers),
+            settings=self._shown(life),
+        )
+
+    def _shown(self, life: Life) -> dict[str, str]:
+        config = life.node.config if life.node else life.spec.config
+        known = self._settings.get(life.spec.name)
+        if known is None or known[0] is not config:
+            known = self._settings[life.spec.name] = config, settings(config)
+        return known[1]
+
+    def _condition(self, life: Life) -> NodeCondition:
+        if life.recovering:
+            return "left out" if life.spec.on_error == "drop" else "restarting"
+        if self._supervisor.reason and not life.started:
+            return "over"
+        if life.node is None:
+            return "waiting"
+        if not life.started:
+            return "starting"
+        return "running" if self._supervisor._running else "ready"
+
+    def _outputs(self, sample: Sample) -> list[OutputState]:
+        events = {
+            sender.name: sender.event.__name__
+            for node in self._supervisor.ever
+            for sender in senders(node).values()
+        }
+        last = self._meter.outputs if self._meter is not None else {}
+        found = []
+        for name, event in events.items():
+            flow = self._window.output(name)
+            found.append(
+                OutputState(
+                    name=name,
+                    event=event,
+                    count=sample.sent[name],
+                    rate=self._window.rate(name),
+                    age=(sample.run - last[name].last) / SECOND if name in last else None,
+                    latency_ms=flow.total / flow.times / 1e6 if flow.times else None,
+                    latency_max_ms=flow.longest / 1e6 if flow.times else None,
+                )
+            )
+        return found
+
+    def _inputs(self) -> list[tuple[Any, Any]]:
+        drops = count_drops(self._supervisor)
+        return [
+            (stream, drops[stream.name])
+            for life in self._supervisor._lives.values()
+            if life.node is not None
+            for stream in streams(life.node).values()
+        ]
+
+    # Doing.
+
+    def do(self, command: Command) -> str:
+        """Do what was asked, and return what was done.
+
+        Raises:
+            VisnavError: It cannot be done; the message says why.
+        """
+        keeper = self._keeper
+        match command:
+            case Pause():
+                keeper.pause()
+                return "paused"
+            case Resume():
+                keeper.resume()
+                return "runs"
+            case Step(seconds=None):
+                keeper.step(None)
+                return "one step"
+            case Step(seconds=seconds):
+                keeper.step(seconds)
+                return f"runs for {seconds:g} s"
+            case Speed(factor=factor):
+                keeper.pace(factor)
+                return "as fast as it can" if factor is None else f"{factor:g} × real time"
+            case Stop():
+                self._supervisor.stop("stopped by hand")
+                return "ends"
+            case Restart(node=node):
+                return self._restart(node)
+            case Set(text=text):
+                values = self._supervisor.changing.set(text)
+                return ", ".join(f"{key} = {value}" for key, value in values.items()) or "as it was"
+
+    def _restart(self, name: str) -> str:
+        lives = self._supervisor._lives
+        if name not in lives:
+            raise CommandError(f"expected the name of a node, found {name!r}{suggest(name, lives)}")
+        condition = self._condition(lives[name])
+        if condition not in {"running", "left out"}:
+            raise CommandError(f"expected a node that runs, and {name} is {condition}")
+        self._supervisor.restart(name, anyway=True)
+        return f"{name} restarts"
+
+
+def told(command: Command) -> str:
+    """Return a command in words, for the log."""
+    words = [str(v) for v in msgspec.structs.astuple(command) if v is not None]
+    return " ".join([type(command).__name__.lower(), *words])

@@ -1,0 +1,275 @@
+"""The monitor in a terminal, with Textual.
+
+The only module that imports it; what is shown comes from `runtime.tools.monitor.rows`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import AsyncIterator
+from typing import Any, ClassVar, Protocol
+
+import msgspec
+from rich.text import Text
+
+from runtime.errors import MissingDependencyError, VisnavError
+from runtime.tools.monitor.command import (
+    QUICKEST,
+    SLOWEST,
+    Answer,
+    Command,
+    Pause,
+    Restart,
+    Resume,
+    Set,
+    Speed,
+    Step,
+    Stop,
+)
+from runtime.tools.monitor.rows import COLUMNS, LEFT, RIGHT, aim, headline, is_number, rows
+from runtime.tools.monitor.snapshot import LogLine, Snapshot
+
+try:
+    from textual.app import App, ComposeResult
+    from textual.binding import Binding
+    from textual.containers import Horizontal, Vertical
+    from textual.suggester import SuggestFromList
+    from textual.widgets import DataTable, Footer, Input, RichLog, Static
+except ImportError:
+    raise MissingDependencyError(
+        "the monitor's screen needs textual: pip install 'visnav-runtime[monitor]'"
+    ) from None
+
+CONFIRM = 3.0
+"""Seconds within which the key that ends a run must be pressed again."""
+
+_COLOURS = {"WARNING": "yellow", "ERROR": "red", "CRITICAL": "red bold"}
+
+
+class Connection(Protocol):
+    """A `runtime.tools.monitor.client.Client`, or what stands for one in a test."""
+
+    def snapshots(self) -> AsyncIterator[Snapshot]:
+        """Yield snapshots until the run is over."""
+
+    async def ask(self, command: Command) -> Answer:
+        """Ask the run to do something."""
+
+
+class Screen(App[str]):
+    """Nodes, channels, clock and log of a run.
+
+    Args:
+        connection: To the run.
+        leave: Whether to go when the run is over, instead of showing how it ended.
+    """
+
+    CSS = """
+    #head { background: $primary; color: $text; height: 1; padding: 0 1; text-style: bold; }
+    #tables { height: 1fr; }
+    #left { width: 5fr; }
+    #right { width: 7fr; }
+    DataTable, RichLog { border: round $primary-darken-2; scrollbar-size: 1 1; }
+    DataTable { height: auto; max-height: 50%; }
+    DataTable#outputs { height: 1fr; max-height: 100%; }
+    DataTable.none { display: none; }
+    RichLog { height: 30%; }
+    #prompt { display: none; }
+    #prompt.asking { display: block; }
+    """
+    BINDINGS: ClassVar[list[Any]] = [
+        Binding("space", "pause", "pause/go on"),
+        Binding("full_stop", "step", "step"),
+        Binding("s", "step_far", "step 1 s"),
+        Binding("plus,equals_sign", "speed(2.0)", "faster", key_display="+"),
+        Binding("minus", "speed(0.5)", "slower", key_display="-"),
+        Binding("m", "fastest", "fastest"),
+        Binding("r", "restart", "restart node"),
+        Binding("p", "prompt", "set parameter"),
+        Binding("x,ctrl+c", "stop", "end run", key_display="x x"),
+        Binding("q", "quit", "quit"),
+        Binding("escape", "leave_prompt", show=False),
+    ]
+    ENABLE_COMMAND_PALETTE = False
+
+    def __init__(self, connection: Connection, leave: bool = False) -> None:
+        super().__init__()
+        self._connection = connection
+        self._leave = leave
+        self.snapshot: Snapshot | None = None
+        self._shown = -1
+        self._stop_asked = 0.0
+
+    def compose(self) -> ComposeResult:
+        """Lay the screen out."""
+        yield Static(Text("waiting for the run …"), id="head")
+        with Horizontal(id="tables"):
+            with Vertical(id="left"):
+                for name in LEFT:
+                    yield _table(name)
+            with Vertical(id="right"):
+                for name in RIGHT:
+                    yield _table(name)
+        yield RichLog(id="log", max_lines=1000, wrap=True)
+        yield Input(id="prompt", placeholder="node.key=value", select_on_focus=False)
+        yield Footer()
+
+    def on_mount(self) -> None:
+        """Begin to listen to the run."""
+        self.query_one("#log").border_title = "log"
+        for name in COLUMNS:
+            table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
+            table.border_title = name
+            for column, title in enumerate(COLUMNS[name]):
+                table.add_column(_cell(name, column, title), key=title)
+        self.query_one("#nodes").focus()
+        self.run_worker(self._listen(), exclusive=True)
+
+    async def _listen(self) -> None:
+        reason = ""
+        try:
+            async for snapshot in self._connection.snapshots():
+                self.show(snapshot)
+                reason = snapshot.ended
+        except VisnavError as error:
+            reason = str(error)
+        head = self.query_one("#head", Static)
+        head.update(Text(f"the run is over: {reason or 'it does not answer any more'}"))
+        if self._leave:
+            self.exit()
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Show a snapshot."""
+        self.snapshot = snapshot
+        self.query_one("#head", Static).update(Text(headline(snapshot)))
+        for name in COLUMNS:
+            self._fill(name, snapshot)
+        log = self.query_one("#log", RichLog)
+        for line in snapshot.log:
+            if line.number > self._shown:
+                self._shown = line.number
+                log.write(_log_line(line), expand=True)
+
+    def _fill(self, name: str, snapshot: Snapshot) -> None:
+        """Write a table's rows over those that stand there, so that the cursor stays."""
+        table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
+        found = rows(name, snapshot)
+        table.set_class(not found, "none")
+        if [row[0] for row in found] != [key.value for key in table.rows]:
+            table.clear()
+            for row in found:
+                table.add_row(*(_cell(name, n, text) for n, text in enumerate(row)), key=row[0])
+            return
+        for row in found:
+            for column, text in enumerate(row):
+                cell = _cell(name, column, text)
+                title = COLUMNS[name][column]
+                if table.get_cell(row[0], title) != cell:
+                    table.update_cell(row[0], title, cell, update_width=True)
+
+    # Keys.
+
+    def _ask(self, command: Command) -> None:
+        """Ask the run; keys work on while it has not answered."""
+        self.run_worker(self._tell(command))
+
+    async def _tell(self, command: Command) -> None:
+        answer = await self._connection.ask(command)
+        severity = "information" if answer.done else "error"
+        self.notify(answer.text, severity=severity, markup=False)  # type: ignore[arg-type]
+
+    def action_pause(self) -> None:
+        """Let time stand, or run again."""
+        if self.snapshot is not None:
+            paused = self.snapshot.clock.paused
+            self._ask(Resume() if paused else Pause())
+            self._expect(paused=not paused)
+
+    def action_step(self) -> None:
+        """Let the next thing happen."""
+        self._ask(Step())
+
+    def action_step_far(self) -> None:
+        """Let a second go by."""
+        self._ask(Step(seconds=1.0))
+
+    def action_speed(self, factor: float) -> None:
+        """Let time run faster, or slower."""
+        if self.snapshot is not None:
+            asked = min(max(aim(self.snapshot.clock) * factor, SLOWEST), QUICKEST)
+            self._ask(Speed(factor=asked))
+            self._expect(asked=asked)
+
+    def action_fastest(self) -> None:
+        """Let time run as fast as it can."""
+        self._ask(Speed(factor=None))
+        self._expect(asked=None)
+
+    def _expect(self, **changes: Any) -> None:
+        """Go by what was asked until the next snapshot, as the next key may come before it."""
+        if self.snapshot is not None and not self.snapshot.clock.fixed:
+            clock = msgspec.structs.replace(self.snapshot.clock, **changes)
+            self.snapshot = msgspec.structs.replace(self.snapshot, clock=clock)
+
+    def action_restart(self) -> None:
+        """Start the node under the cursor anew."""
+        if (node := self._chosen()) is not None:
+            self._ask(Restart(node=node))
+
+    def action_stop(self) -> None:
+        """End the run, if the key is pressed twice."""
+        now = time.monotonic()
+        if now - self._stop_asked < CONFIRM:
+            self._ask(Stop())
+        else:
+            self.notify("press it again to end the run", severity="warning")
+        self._stop_asked = now
+
+    def action_prompt(self) -> None:
+        """Ask for a setting of the node under the cursor."""
+        if self.snapshot is None:
+            return
+        known = [
+            f"{node.name}.{key}={value}"
+            for node in self.snapshot.nodes
+            for key, value in node.settings.items()
+        ]
+        prompt = self.query_one("#prompt", Input)
+        prompt.suggester = SuggestFromList(known)
+        mine = [text for text in known if text.startswith(f"{self._chosen()}.")]
+        prompt.value = mine[0].partition("=")[0] + "=" if mine else ""
+        prompt.cursor_position = len(prompt.value)
+        prompt.placeholder = known[0] if known else "no node has a setting that can change"
+        prompt.add_class("asking")
+        prompt.focus()
+
+    def action_leave_prompt(self) -> None:
+        """Set nothing."""
+        self.query_one("#prompt").remove_class("asking")
+        self.query_one("#nodes").focus()
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Set what was asked for."""
+        self.action_leave_prompt()
+        if event.value.strip():
+            self._ask(Set(text=event.value))
+
+    def _chosen(self) -> str | None:
+        """Return the node under the cursor."""
+        table: DataTable[Text] = self.query_one("#nodes", DataTable)
+        if not table.row_count:
+            return None
+        return table.coordinate_to_cell_key(table.cursor_coordinate).row_key.value
+
+
+def _table(name: str) -> DataTable[Text]:
+    return DataTable(id=name, cursor_type="row", show_cursor=name == "nodes", zebra_stripes=True)
+
+
+def _cell(table: str, column: int, text: str) -> Text:
+    return Text(text, justify="right" if is_number(table, column) else "left")
+
+
+def _log_line(line: LogLine) -> Text:
+    text = f"{line.seconds:10.3f} {line.level:8} {line.speaker}: {line.text}"
+    return Text(text, style=_COLOURS.get(line.level, ""))

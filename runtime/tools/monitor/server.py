@@ -1,0 +1,236 @@
+"""The end of the monitor that is in the run: a Unix socket, served by a thread of its own.
+
+The run's loop does nothing but make a snapshot or do what it was asked, when the thread asks it
+to; encoding and sending is the thread's. The rhythm is the thread's, too, because time on the
+run's loop may be simulated.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import logging
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from runtime.errors import CommandError, VisnavError
+from runtime.tools.monitor.address import socket_of
+from runtime.tools.monitor.command import (
+    LONGEST_COMMAND,
+    UNREADABLE,
+    Answer,
+    Asked,
+    Set,
+    Watch,
+    decode_from_client,
+    encode,
+)
+from runtime.tools.monitor.observer import Observer, told
+
+R = TypeVar("R")
+
+log = logging.getLogger("visnav.runtime")
+
+PERIOD = 0.2
+"""Real seconds between two snapshots."""
+
+PARTING = 1.0
+"""Real seconds within which those who watch must take the last snapshot."""
+
+_LISTENING = 5.0
+"""Real seconds within which the socket must be there."""
+
+BEHIND = 1 << 20
+"""Bytes that may wait for one who watches; whoever is slower than that misses snapshots."""
+
+
+class Server:
+    """Serves those who look at a run.
+
+    Args:
+        observer: Looks at the run, and does what is asked.
+        loop: The run's loop, on which the observer is called.
+        path: Of the socket.
+    """
+
+    def __init__(self, observer: Observer, loop: asyncio.AbstractEventLoop, path: Path) -> None:
+        self._observer = observer
+        self._run_loop = loop
+        self._path = path
+        self._watching: set[asyncio.StreamWriter] = set()
+        self._clients: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
+        self._ready = threading.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._end = asyncio.Event()
+        self._last = b""
+        self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
+
+    def start(self) -> bool:
+        """Listen; tell whether that is possible."""
+        self._thread.start()
+        return self._ready.wait(_LISTENING) and self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Send those who watch how it ended, and listen no more; on the run's loop."""
+        try:
+            if self._watching:
+                self._last = encode(self._observer.take()) + b"\n"
+            self._observer.end()
+        except Exception:  # who looks on must not spoil a run's end
+            log.exception("the monitor failed")
+        with contextlib.suppress(RuntimeError):  # its loop is closed: it could not listen
+            if self._loop is not None:
+                self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join(5.0)
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except OSError as error:
+            log.warning("nobody can look at this run: no socket at %s: %s", self._path, error)
+        finally:
+            self._ready.set()
+
+    async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        listener = self._listener()
+        server = await asyncio.start_unix_server(self._accept, sock=listener, limit=LONGEST_COMMAND)
+        self._ready.set()
+        publishing = asyncio.create_task(self._publish())
+        await self._end.wait()
+        publishing.cancel()
+        server.close()
+        for writer in self._watching:
+            writer.write(self._last)
+        writers = list(self._clients.values())
+        for task, writer in self._clients.items():
+            task.cancel()
+            writer.close()
+        closing = asyncio.gather(*(w.wait_closed() for w in writers), return_exceptions=True)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(closing, PARTING)  # what was written still goes out
+        for writer in writers:
+            writer.transport.abort()
+        await asyncio.sleep(0)  # they let go of their sockets
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+    def _listener(self) -> socket.socket:
+        """Return a socket that listens; until it does, it has not the name by which it is found.
+
+        Others would take it for one that a killed run has left, and remove it.
+        """
+        listener = socket.socket(socket.AF_UNIX)
+        new = self._path.with_suffix(".new")
+        new.unlink(missing_ok=True)
+        listener.bind(str(new))
+        new.chmod(0o600)
+        listener.listen(100)
+        new.rename(self._path)
+        return listener
+
+    async def _publish(self) -> None:
+        """Measure and send snapshots while there is somebody who watches."""
+        measuring = failed = False
+        while True:
+            await asyncio.sleep(PERIOD)
+            try:
+                if measuring != bool(self._watching):
+                    measuring = not measuring
+                    change = self._observer.begin if measuring else self._observer.end
+                    await self._on_run_loop(change)
+                elif measuring:
+                    line = encode(await self._on_run_loop(self._observer.take)) + b"\n"
+                    for writer in self._watching:
+                        if writer.transport.get_write_buffer_size() < BEHIND:
+                            writer.write(line)
+            except Exception:
+                if not failed:
+                    log.exception("the monitor failed")
+                failed = True
+
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._end.is_set():
+            writer.transport.abort()
+            return
+        task = asyncio.create_task(self._attend(reader, writer))
+        self._clients[task] = writer  # at once: a task that has not begun ends without a word
+        task.add_done_callback(self._clients.pop)
+
+    async def _attend(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            async for line in reader:
+                await self._hear(line, writer)
+                await writer.drain()  # whoever reads no answers is asked for no more
+        except (OSError, ValueError):  # gone, or a line without an end
+            pass
+        except asyncio.CancelledError:  # the run is over
+            pass
+        finally:
+            self._watching.discard(writer)
+            writer.close()
+
+    async def _hear(self, line: bytes, writer: asyncio.StreamWriter) -> None:
+        try:
+            message = decode_from_client(line)
+        except UNREADABLE as error:
+            answer = Answer(number=-1, done=False, text=f"expected a command: {error}")
+            writer.write(encode(answer) + b"\n")
+            return
+        match message:
+            case Watch():
+                self._watching.add(writer)
+            case Asked():
+                writer.write(encode(await self._answer(message)) + b"\n")
+
+    async def _answer(self, asked: Asked) -> Answer:
+        try:
+            text = await self._on_run_loop(lambda: self._observer.do(asked.command))
+        except VisnavError as error:
+            return Answer(number=asked.number, done=False, text=str(error))
+        except Exception:
+            log.exception("the monitor failed")
+            text = "the run could not do it, and its log says why"
+            return Answer(number=asked.number, done=False, text=text)
+        if not isinstance(asked.command, Set):  # which says so itself
+            log.info("asked by hand: %s", told(asked.command))
+        return Answer(number=asked.number, done=True, text=text)
+
+    async def _on_run_loop(self, call: Callable[[], R]) -> R:
+        """Have a function called on the run's loop, and return its result."""
+        done: concurrent.futures.Future[R] = concurrent.futures.Future()
+
+        def do() -> None:
+            if not done.set_running_or_notify_cancel():
+                return
+            try:
+                done.set_result(call())
+            except Exception as error:
+                done.set_exception(error)
+
+        self._run_loop.call_soon_threadsafe(do)
+        return await asyncio.wrap_future(done)
+
+
+@contextlib.contextmanager
+def serving(observer: Observer, run: str) -> Iterator[Path | None]:
+    """Let a run be looked at while the block lasts; called on its loop.
+
+    Yields:
+        The socket's path; `None` if there can be none.
+    """
+    try:
+        path = socket_of(run)
+    except (CommandError, OSError) as error:
+        log.warning("nobody can look at this run: %s", error)
+        yield None
+        return
+    server = Server(observer, asyncio.get_running_loop(), path)
+    try:
+        yield path if server.start() else None
+    finally:
+        server.stop()

@@ -1,0 +1,43 @@
+"""A sweep: one file run with many settings and seeds, each run in a process of its own.
+
+    config.toml, --vary, --seeds  →  Plan of Jobs  →  Executor  →  Rows  →  tables and plots
+
+Read in this order: `values` (what ``--vary`` says), `plan` (which runs there are), `process` (one
+run), `rows` (what is remembered of it), `execute` (all runs), `tables` and `plots` (the result).
+`console` is what a terminal shows meanwhile; the command itself is `runtime.tools.cli.sweep`.
+
+The executor may be any of `concurrent.futures`, also one that spreads the runs over machines on
+which the project is installed. With Dask (``pip install distributed``)::
+
+    plan = make_plan(Path("config.toml"), ["camera.rate=5,10,20"], seeds=3)
+    with Client("tcp://scheduler:8786") as client:  # from dask.distributed
+        rows = sweep(plan, client.get_executor(pure=False))
+    write_tables(plan, rows)
+    draw_plots(plan, rows)
+
+``pure=False`` lets a failed run be tried again. A job carries its settings as text; what it reads
+besides (modules beside the file, trajectories, worlds) must be found at the same paths on every
+machine, and a run's folder of results stays on the machine that ran it unless the sweep's folder
+is shared. The rows come back in any case.
+"""
+
+from runtime.tools.sweep.execute import Watch, sweep
+from runtime.tools.sweep.plan import Job, Plan, make_plan
+from runtime.tools.sweep.plots import draw_plots
+from runtime.tools.sweep.process import Children, run_job
+from runtime.tools.sweep.rows import Row
+from runtime.tools.sweep.tables import summarise, write_tables
+
+__all__ = [
+    "Children",
+    "Job",
+    "Plan",
+    "Row",
+    "Watch",
+    "draw_plots",
+    "make_plan",
+    "run_job",
+    "summarise",
+    "sweep",
+    "write_tables",
+]

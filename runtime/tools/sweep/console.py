@@ -1,0 +1,131 @@
+"""What the terminal shows of a sweep: its progress, and the table at its end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
+from rich.table import Table
+from rich.text import Text
+
+from runtime.tools.sweep.execute import Watch
+from runtime.tools.sweep.plan import Job, Plan
+from runtime.tools.sweep.process import Children
+from runtime.tools.sweep.rows import Row
+from runtime.tools.sweep.tables import MAIN_FIGURES, Combination
+
+
+class Display(Watch):
+    """A bar in a terminal, else a line for each run that has ended; a context manager.
+
+    Args:
+        children: What is counted as running.
+        console: Where to show it.
+    """
+
+    def __init__(self, children: Children, console: Console) -> None:
+        self.failed = 0
+        self.finished = 0
+        self._children = children
+        self._console = console
+        self._missing = 0
+        self._begin = self._last = time.monotonic()
+        self._bar = Progress(
+            TextColumn("sweep"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            _State(self),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("sweep", total=None)
+
+    def __enter__(self) -> Display:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        type_: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def begin(self, missing: Sequence[Job], finished: int) -> None:
+        """Show how many runs there are."""
+        self._missing = len(missing)
+        self._begin = self._last = time.monotonic()
+        if finished:
+            self._print(f"{finished} runs are finished already, {len(missing)} to do")
+        self._bar.update(self._task, total=len(missing))
+
+    def done(self, job: Job, row: Row) -> None:
+        """Count a run; show it, unless there is a bar and it is finished."""
+        self.finished += 1
+        self.failed += bool(row["error"])
+        self._last = time.monotonic()
+        self._bar.update(self._task, completed=self.finished)
+        if row["error"]:
+            self._print(f"{self._count()} {job}: failed: {row['error']}")
+        elif not self._console.is_terminal:
+            seconds = f"{row['wall_seconds']:.1f} s" if row["wall_seconds"] else "done"
+            missed = ", missed a threshold" if row["passed"] is False else ""
+            self._print(f"{self._count()} {job}: {seconds}{missed}, {self.state()}")
+
+    def interrupted(self) -> None:
+        """Say that this may take a while, and how it does not."""
+        self._print("ending the runs that are under way; Ctrl-C ends them at once")
+
+    def state(self) -> str:
+        """Return what the count does not tell: failures, what runs now, and how long it takes."""
+        left = "?"
+        if self.finished:
+            each = (self._last - self._begin) / self.finished
+            until = self._last + each * (self._missing - self.finished)
+            left = _clock(max(until - time.monotonic(), 0))
+        return f"{self.failed} failed, {len(self._children)} running, {left} left"
+
+    def _count(self) -> str:
+        return f"{self.finished}/{self._missing}"
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+class _State(ProgressColumn):
+    def __init__(self, display: Display) -> None:
+        super().__init__()
+        self._display = display
+
+    def render(self, _: Any) -> Text:
+        return Text(self._display.state())
+
+
+def summary_table(plan: Plan, combinations: Sequence[Combination]) -> Table:
+    """Return the medians of the main figures that there are; `write_tables` has their ranges."""
+    names = [n for n in MAIN_FIGURES if any(n in each.figures for each in combinations)]
+    table = Table(title="medians over the seeds", title_justify="left")
+    for parameter in plan.parameters:
+        table.add_column(parameter.path)
+    table.add_column("estimator")
+    for name in ["runs", "failed", "passed", *names]:
+        table.add_column(name.replace("_", " "), justify="right")
+    for each in combinations:
+        passed = "" if each.passed is None else f"{each.passed}"
+        counts = [f"{each.runs}", f"{each.failed}", passed]
+        figures = [f"{each.figures[n].median:.4g}" if n in each.figures else "" for n in names]
+        words = map(Text, [*each.settings, each.estimator])
+        table.add_row(*words, *counts, *figures)
+    return table
+
+
+def _clock(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}"

@@ -1,0 +1,133 @@
+"""Which runs a sweep consists of, all of them checked before the first one starts."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import tomli_w
+
+from runtime.config import Config, load, to_builtins
+from runtime.errors import ConfigError
+from runtime.tools.sweep.values import Parameter, parameter
+
+
+class Job(msgspec.Struct, frozen=True, kw_only=True):
+    """One run, with all that another machine needs to know of it.
+
+    Attributes:
+        id: Of these settings and this seed, in this sweep or any other.
+        text: The settings as TOML, defaults and seed included.
+        folder: Of the file that they come from; modules of its nodes are looked for there.
+        settings: What is varied, as path and value, in the order of the parameters.
+        seed: Of the run's random numbers.
+        out: Absolute path of the folder for the run's results.
+    """
+
+    id: str
+    text: str
+    folder: str
+    settings: tuple[tuple[str, str], ...]
+    seed: int
+    out: str
+
+    def __str__(self) -> str:
+        """Return what tells it from the others of its sweep."""
+        return " ".join([*(f"{path}={text}" for path, text in self.settings), f"seed={self.seed}"])
+
+
+class Plan(msgspec.Struct, frozen=True, kw_only=True):
+    """A whole sweep.
+
+    Attributes:
+        parameters: What is varied.
+        jobs: All runs: the first parameter changes slowest, the seed quickest.
+        out: Absolute path of the folder for everything.
+    """
+
+    parameters: tuple[Parameter, ...]
+    jobs: tuple[Job, ...]
+    out: Path
+
+
+def make_plan(
+    config: Path,
+    vary: Sequence[str] = (),
+    *,
+    overrides: Sequence[str] = (),
+    seeds: int = 1,
+    out: Path | None = None,
+) -> Plan:
+    """Plan a sweep.
+
+    Args:
+        config: The TOML file.
+        vary: ``PATH=V1,V2,…``, the paths as in `overrides`.
+        overrides: ``node.key=value`` or ``run.key=value``, the same for all runs.
+        seeds: How many seeds each combination is run with, from the file's on.
+        out: Folder for everything; ``sweeps/<name of the run>`` if not given.
+
+    Raises:
+        ConfigError: Something is wrong with the file, a path or a value, or two combinations
+            come to the same settings.
+    """
+    if seeds < 1:
+        raise ConfigError(f"--seeds: expected at least 1, found {seeds}")
+    parameters = tuple(parameter(change) for change in vary)
+    _refuse_repeated([p.path for p in parameters], [o.partition("=")[0] for o in overrides])
+    loaded = []
+    for texts in itertools.product(*(p.texts for p in parameters)):
+        settings = tuple(zip((p.path for p in parameters), texts, strict=True))
+        loaded.append((settings, _load(config, overrides, settings)))
+    first = loaded[0][1].run
+    out = (out or Path("sweeps") / first.name).absolute()
+    jobs: dict[str, Job] = {}
+    for settings, resolved in loaded:
+        for seed in range(first.seed, first.seed + seeds):
+            job = _job(resolved, settings, seed, config.resolve().parent, out)
+            if job.id in jobs:
+                raise ConfigError(
+                    f"--vary: expected combinations that differ, found the same settings for "
+                    f"{jobs[job.id]} and {job}"
+                )
+            jobs[job.id] = job
+    return Plan(parameters=parameters, jobs=tuple(jobs.values()), out=out)
+
+
+def _refuse_repeated(varied: list[str], fixed: list[str]) -> None:
+    for index, path in enumerate(varied):
+        if path == "run.seed":
+            raise ConfigError("--vary run.seed: expected --seeds N for several seeds")
+        if path in varied[:index]:
+            raise ConfigError(f"--vary {path}: expected each path once, found it a second time")
+        if path in (other.strip() for other in fixed):
+            raise ConfigError(f"--vary {path}: expected a path without --set, found both")
+
+
+def _load(config: Path, overrides: Sequence[str], settings: tuple[tuple[str, str], ...]) -> Config:
+    changes = [f"{path}={text}" for path, text in settings]
+    try:
+        return load(config, [*overrides, *changes])
+    except ConfigError as error:
+        if not changes:
+            raise
+        raise ConfigError(f"with {' '.join(changes)}: {error}") from error
+
+
+def _job(
+    config: Config, settings: tuple[tuple[str, str], ...], seed: int, folder: Path, out: Path
+) -> Job:
+    config = msgspec.structs.replace(config, run=msgspec.structs.replace(config.run, seed=seed))
+    text = tomli_w.dumps(to_builtins(config))
+    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return Job(
+        id=key,
+        text=text,
+        folder=str(folder),
+        settings=settings,
+        seed=seed,
+        out=str(out / "runs" / key),
+    )

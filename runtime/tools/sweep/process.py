@@ -1,0 +1,169 @@
+"""One run as a process of its own: started, waited for or interrupted, and read.
+
+What it prints goes to ``output.txt`` in the run's folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from runtime.results import claim
+from runtime.tools.sweep.plan import Job
+from runtime.tools.sweep.rows import Row, failed
+
+_STOPPED = {"Ctrl-C", "SIGTERM", "SIGHUP"}
+"""Reasons for a run's end that are no end of its own; see `runtime.execute`."""
+
+_LONGEST_ERROR = 300
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """The part of a run's summary that says how well it went."""
+
+    passed: bool | None
+    estimators: dict[str, dict[str, Any]] = {}
+
+
+class Ended(msgspec.Struct, frozen=True):
+    """What a sweep reads of a run's ``summary.json``."""
+
+    reason: str
+    sim_seconds: float
+    wall_seconds: float
+    digest: str | None = None
+    not_deterministic: list[str] = []
+    verdict: Verdict | None = None
+    workers: dict[str, dict[str, float | None]] = {}
+
+
+def run_job(job: Job) -> Row:
+    """Run a job and wait for its end; may be sent to another process or machine.
+
+    An exception here, KeyboardInterrupt above all, ends the run in order first.
+    """
+    return Children().run(job)
+
+
+class Children:
+    """Runs of this process, from any number of threads, which can be ended together."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()  # a signal may interrupt an interruption
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self.ending = False
+        """Whether they were interrupted."""
+
+    def __len__(self) -> int:
+        return len(self._running)
+
+    def run(self, job: Job) -> Row:
+        """Run a job and wait for its end."""
+        out = Path(job.out)
+        if out.exists():
+            shutil.rmtree(out)
+        claim(out)
+        settings = out / "config.toml"
+        settings.write_text(job.text, encoding="utf-8")
+        command = [sys.executable, "-m", "runtime", "run", str(settings)]
+        paths = [os.environ.get("PYTHONPATH", ""), job.folder]
+        begin = time.monotonic()
+        with (out / "output.txt").open("wb") as output:
+            with self._lock:
+                if self.ending:
+                    return failed(job, "not started")
+                child = subprocess.Popen(  # noqa: S603
+                    [*command, "--out", str(out), "--quiet"],
+                    env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    # A terminal's Ctrl-C would reach it as well as us, and twice means at once.
+                    start_new_session=True,
+                )
+                self._running.add(child)
+            try:
+                code = child.wait()
+            except BaseException:
+                child.send_signal(signal.SIGINT)
+                child.wait()
+                raise
+            finally:
+                with self._lock:
+                    self._running.discard(child)
+        return read_results(job, code, time.monotonic() - begin)
+
+    def interrupt(self) -> None:
+        """Let all running ones end in order, and start no more; called again, end them at once."""
+        with self._lock:
+            for child in self._running:
+                if not self.ending:
+                    child.send_signal(signal.SIGINT)
+                elif child.poll() is None:
+                    # Not by a second SIGINT, which may fall together with the first; and its
+                    # workers are in its group.
+                    with contextlib.suppress(ProcessLookupError):
+                        os.killpg(child.pid, signal.SIGKILL)
+            self.ending = True
+
+
+def read_results(job: Job, code: int, wall_seconds: float) -> Row:
+    """Put together the row of a process that has ended.
+
+    Args:
+        job: What it ran.
+        code: Its exit code: 0, or 1 if it missed a threshold; all else is a failure, and so is
+            a 1 without a verdict, which is what Python ends with after an exception.
+        wall_seconds: How long it took.
+    """
+    out = Path(job.out)
+    row = failed(job, "")
+    row["exit_code"], row["wall_seconds"] = code, round(wall_seconds, 6)
+    ended, unread = None, ""
+    try:
+        ended = msgspec.json.decode((out / "summary.json").read_bytes(), type=Ended)
+    except OSError as error:
+        unread = f"expected a summary.json, found: {error.strerror}"
+    except msgspec.MsgspecError as error:
+        unread = f"summary.json: {error}"
+    verdict = ended and ended.verdict
+    if code < 0:
+        row["error"] = f"ended by {signal.Signals(-code).name}"
+    elif code and not (code == 1 and verdict and verdict.passed is False):
+        text = (out / "output.txt").read_text(encoding="utf-8", errors="replace")
+        row["error"] = _same_everywhere(last_error(text), job) or f"exit code {code}"
+    else:
+        row["error"] = unread
+    if ended is not None:
+        row["sim_seconds"], row["run_seconds"] = ended.sim_seconds, ended.wall_seconds
+        row["workers"] = ended.workers
+        row["digest"] = None if ended.not_deterministic else ended.digest
+        if ended.reason in _STOPPED:
+            row["error"] = f"interrupted by {ended.reason}"
+    if verdict and not row["error"]:
+        row["passed"], row["estimators"] = verdict.passed, verdict.estimators
+    return row
+
+
+def last_error(output: str) -> str:
+    """Return the last line that is an error, or else the last line, of what a run printed."""
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
+    errors = [line for line in lines if line.startswith("error: ")]
+    return (errors or lines or [""])[-1].removeprefix("error: ")
+
+
+def _same_everywhere(error: str, job: Job) -> str:
+    """Take out of an error what differs between two sweeps that are equal."""
+    error = error.replace(job.out, f"runs/{job.id}")
+    return re.sub(r"\b0x[0-9a-f]{6,}", "0x…", error)[:_LONGEST_ERROR]

@@ -1,0 +1,175 @@
+"""Rows as tables: ``table.csv``, ``summary.csv``, ``timing.csv`` and ``costs.csv``.
+
+``table.csv`` and ``summary.csv`` hold nothing that differs between two equal sweeps in lockstep;
+whatever depends on the machine is in ``timing.csv`` (runs) and ``costs.csv`` (their workers).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import statistics
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from runtime.tools.sweep.plan import Job, Plan
+from runtime.tools.sweep.rows import Row
+
+MAIN_FIGURES = (
+    "ate_rmse_m",
+    "ate_percent",
+    "rpe_trans_percent",
+    "rpe_rot_deg_per_m",
+    "coverage_percent",
+    "lost_seconds",
+    "restarts",
+    "latency_p50_ms",
+    "available_rmse_m",
+)
+"""Figures of an estimator that ``summary.csv`` sums up, where a verdict has them."""
+
+
+class Spread(msgspec.Struct, frozen=True):
+    """One figure over the seeds that have it."""
+
+    median: float
+    least: float
+    most: float
+
+
+class Combination(msgspec.Struct, frozen=True, kw_only=True):
+    """One combination of settings and one estimator, over all seeds.
+
+    Attributes:
+        settings: Values of the parameters, in their order.
+        estimator: Its name; empty if no run has a verdict.
+        runs: How many seeds were run.
+        failed: How many of these came to nothing; no figure knows of them.
+        passed: How many met the estimator's thresholds; `None` if there are none.
+        figures: Main figure to its spread.
+    """
+
+    settings: tuple[str, ...]
+    estimator: str
+    runs: int
+    failed: int
+    passed: int | None
+    figures: dict[str, Spread]
+
+
+def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
+    """Write the four tables into the plan's folder; rows of other plans are left out."""
+    paths = [p.path for p in plan.parameters]
+    own = in_order(plan, rows)
+    _write(plan.out / "table.csv", *_table(paths, own))
+    header = ["run", *paths, "seed", "wall_seconds", "run_seconds", "sim_seconds"]
+    times = [
+        [*_head(job), row["wall_seconds"], row["run_seconds"], row["sim_seconds"]]
+        for job, row in own
+    ]
+    _write(plan.out / "timing.csv", header, times)
+    workers = [
+        (_head(job), name, costs)
+        for job, row in own
+        for name, costs in row.get("workers", {}).items()
+    ]
+    keys = list(dict.fromkeys(key for _, _, costs in workers for key in costs))
+    header = ["run", *paths, "seed", "worker", *keys]
+    costs_of_all = [[*h, name, *(costs.get(k) for k in keys)] for h, name, costs in workers]
+    _write(plan.out / "costs.csv", header, costs_of_all)
+    header = [*paths, "estimator", "runs", "failed", "passed"]
+    header += [f"{name}_{what}" for name in MAIN_FIGURES for what in ("median", "min", "max")]
+    lines = []
+    for each in summarise(plan, rows):
+        line: list[Any] = [*each.settings, each.estimator, each.runs, each.failed, each.passed]
+        for name in MAIN_FIGURES:
+            spread = each.figures.get(name)
+            line += [spread.median, spread.least, spread.most] if spread else [None] * 3
+        lines.append(line)
+    _write(plan.out / "summary.csv", header, lines)
+
+
+def in_order(plan: Plan, rows: Iterable[Row]) -> list[tuple[Job, Row]]:
+    """Return the rows of a plan's jobs, in their order."""
+    known = {row["id"]: row for row in rows}
+    return [(job, known[job.id]) for job in plan.jobs if job.id in known]
+
+
+def summarise(plan: Plan, rows: Iterable[Row]) -> list[Combination]:
+    """Sum up the seeds of each combination and estimator, in a stable order."""
+    own = in_order(plan, rows)
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for job, row in own:
+        groups.setdefault(tuple(text for _, text in job.settings), []).append(row)
+    names = list(dict.fromkeys(name for _, row in own for name in row["estimators"]))
+    return [
+        _combination(settings, name, group)
+        for settings, group in groups.items()
+        for name in [n for n in names if any(n in row["estimators"] for row in group)] or [""]
+    ]
+
+
+def numbers(values: Iterable[Any]) -> list[float]:
+    """Return those that are numbers."""
+    return [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
+
+
+def _combination(settings: tuple[str, ...], name: str, group: Sequence[Row]) -> Combination:
+    figures = [row["estimators"][name] for row in group if name in row["estimators"]]
+    passed = [f["passed"] for f in figures if isinstance(f.get("passed"), bool)]
+    spreads = {}
+    for main in MAIN_FIGURES:
+        if found := numbers(f.get(main) for f in figures):
+            spreads[main] = Spread(statistics.median(found), min(found), max(found))
+    return Combination(
+        settings=settings,
+        estimator=name,
+        runs=len(group),
+        failed=sum(bool(row["error"]) for row in group),
+        passed=sum(passed) if passed else None,
+        figures=spreads,
+    )
+
+
+def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], list[list[Any]]]:
+    """Return header and lines: one a run and estimator, or one for a run that has none."""
+    header = ["run", *paths, "seed", "exit_code", "error", "passed", "sim_seconds", "digest"]
+    found = {key for _, row in rows for f in row["estimators"].values() for key in f}
+    figures = [name for name in MAIN_FIGURES if name in found]
+    figures += sorted(found - {*figures})
+    lines = []
+    for job, row in rows:
+        head = [*_head(job), row["exit_code"], row["error"], row["passed"]]
+        head += [row["sim_seconds"], row["digest"]]
+        for name, own in (row["estimators"] or {"": {}}).items():
+            lines.append([*head, name, *(own.get(figure) for figure in figures)])
+    taken = {*header, "estimator"}
+    header.append("estimator")
+    header += [f"estimator_{name}" if name in taken else name for name in figures]
+    return header, lines
+
+
+def _head(job: Job) -> list[Any]:
+    return [job.id, *(text for _, text in job.settings), job.seed]
+
+
+def _write(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows([_cell(value) for value in line] for line in lines)
+
+
+def _cell(value: Any) -> str:
+    """Return a value as it stands in a table: like JSON, but texts without quotes."""
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list) and all(isinstance(v, str) for v in value):
+        return "; ".join(value)
+    return json.dumps(value)

@@ -1,0 +1,210 @@
+"""Noting steps and events while the run runs: a tuple each, and nothing else on the loop."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import functools
+import logging
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from events import Event
+from runtime.clock import Clock
+from runtime.errors import ConfigError
+from runtime.node import Node
+from runtime.probes import Call
+from runtime.realtime import RealClock
+from runtime.sender import Sender, Tap
+from runtime.supervisor import Supervisor
+from runtime.tools.tracing.spool import CHUNK, Pace, Spool
+from runtime.tools.tracing.write import write_trace
+
+log = logging.getLogger("visnav.runtime")
+
+OUTSIDE = "runtime"
+"""Who offloaded what no node did."""
+
+
+class Recorder:
+    """A probe that notes what it sees, for a `Spool`.
+
+    Each note is a tuple that begins with its kind::
+
+        "step", node, what, begin, end, run, cause
+        "event", time, run, sender, type of event, source, stamp, identity, cause, listeners
+        "thread", thread, node, function, submitted, begin, end
+        "worker", process, method, asked, answered
+
+    Times are nanoseconds of `time.perf_counter_ns`; `run` and `stamp` are of the run's clock, but
+    for `run` in real time (see `Pace`).
+    An identity is `id` of the event; a cause is the identity of the event that the innermost step
+    was given, or 0.
+
+    Args:
+        clock: The run's clock.
+        spool: Takes the notes, a list at a time.
+    """
+
+    def __init__(self, clock: Clock, spool: Spool) -> None:
+        # In real time the two clocks are one but for origin and speed, so one look is enough.
+        self._now = time.perf_counter_ns if isinstance(clock, RealClock) else clock.now
+        self._clock = clock
+        self._spool = spool
+        self._notes: list[tuple[Any, ...]] = []
+        self._cause = [0]
+        self.beside: deque[tuple[Any, ...]] = spool.beside
+        """Notes of other threads, which must not touch the loop's list."""
+        self.tap: Tap = self._make_tap()
+
+    def around(self, node: str, what: str, call: Call) -> Call:
+        """Return a function that calls `call` and notes when it began and ended."""
+        notes, add, current, now = self._notes, self._notes.append, self._cause, self._now
+        time_ns, flush, identity = time.perf_counter_ns, self._flush, id
+
+        def noting(argument: Any) -> Any:
+            before = current[0]
+            # A tick, say, may lie where an event lay before.
+            current[0] = cause = identity(argument) if isinstance(argument, Event) else 0
+            run, begin = now(), time_ns()
+            try:
+                return call(argument)
+            finally:
+                add(("step", node, what, begin, time_ns(), run, cause))
+                current[0] = before
+                if len(notes) > CHUNK:
+                    flush()
+
+        return noting
+
+    def _make_tap(self) -> Tap:
+        notes, add, current, now = self._notes, self._notes.append, self._cause, self._now
+        time_ns, flush, identity = time.perf_counter_ns, self._flush, id
+
+        def tap(sender: Sender[Any] | None, event: Event) -> None:
+            add(
+                (
+                    "event",
+                    time_ns(),
+                    now(),
+                    sender,
+                    type(event),
+                    event.source,
+                    event.stamp,
+                    identity(event),
+                    current[0],
+                    None if sender is None else sender._candidates,
+                )
+            )
+            if len(notes) > CHUNK:
+                flush()
+
+        return tap
+
+    def asked(self, process: str, method: str, answer: concurrent.futures.Future[Any]) -> None:
+        """Note a worker's call once it is answered."""
+        asked = time.perf_counter_ns()
+        answer.add_done_callback(
+            lambda _: self.beside.append(("worker", process, method, asked, time.perf_counter_ns()))
+        )
+
+    def close(self) -> None:
+        """Hand over what is left, while the run's clock still goes."""
+        if isinstance(self._clock, RealClock):
+            real, run, speed = time.perf_counter_ns(), self._clock.now(), self._clock.speed
+            self._spool.pace = Pace(round(real - run / speed), speed)
+        self._flush()
+
+    def _flush(self) -> None:
+        self._spool.put(self._notes.copy())
+        self._notes.clear()
+
+
+class NotingExecutor(concurrent.futures.Executor):
+    """Notes who offloads what, and when a thread does it.
+
+    Args:
+        inner: Does the work.
+        note: Takes a note from any thread.
+    """
+
+    def __init__(
+        self, inner: concurrent.futures.Executor, note: Callable[[tuple[Any, ...]], None]
+    ) -> None:
+        self._inner = inner
+        self._note = note
+
+    def submit(
+        self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
+    ) -> concurrent.futures.Future[Any]:
+        """Have a function called in a thread."""
+        submitted, node = time.perf_counter_ns(), _asker()
+        inner = fn.func if isinstance(fn, functools.partial) else fn
+        name = getattr(inner, "__qualname__", type(inner).__name__)
+
+        def noting() -> Any:
+            begin = time.perf_counter_ns()
+            try:
+                return fn(*args, **kwargs)
+            finally:
+                thread = threading.current_thread().name
+                self._note(("thread", thread, node, name, submitted, begin, time.perf_counter_ns()))
+
+        return self._inner.submit(noting)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the threads."""
+        self._inner.shutdown(wait, cancel_futures=cancel_futures)
+
+
+@contextlib.contextmanager
+def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
+    """Trace a run while the block lasts, then write the trace.
+
+    Args:
+        supervisor: Of the run; nothing has been sent yet.
+        path: Of the trace; compressed if it ends with ``.gz``.
+        name: Of the run.
+
+    Raises:
+        ConfigError: There can be no such file.
+    """
+    if not path.name or path.is_dir():
+        raise ConfigError(f"{path}: expected the name of a file for a trace, found a folder")
+    try:
+        spool = Spool(path.with_name(path.name + ".part"))
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: expected a place for a trace, found: {error.strerror}"
+        ) from None
+    recorder = Recorder(supervisor.clock, spool)
+    supervisor.probes.attach(recorder)
+    supervisor.executor = NotingExecutor(supervisor.executor, recorder.beside.append)
+    try:
+        yield
+    finally:
+        recorder.close()
+        spool.close()
+        if spool.failed is None:
+            _write(spool, path, supervisor, name)
+        spool.discard()
+
+
+def _write(spool: Spool, path: Path, supervisor: Supervisor, name: str) -> None:
+    order = [node.name for node in supervisor.ever]
+    try:
+        write_trace(spool, path, name=name, clock=supervisor.clock.kind, nodes=order)
+    except OSError as error:  # a full disk: the run's other results must not go with the trace
+        log.error("%s: the trace could not be written: %s", path, error)
+        path.unlink(missing_ok=True)
+
+
+def _asker() -> str:
+    """Return the node whose `offload` called `submit`, which called this."""
+    caller = sys._getframe(2).f_locals.get("self")
+    return caller.name if isinstance(caller, Node) else OUTSIDE

@@ -1,0 +1,153 @@
+"""Keeping notes in a file while a run goes on, so that memory stays bounded.
+
+A thread encodes a list of notes at a time, which is short enough not to be felt on the loop. What
+the notes mean is in `runtime.tools.tracing.record`.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from events import Category, Event, Image, Setpoint
+
+log = logging.getLogger("visnav.runtime")
+
+CHUNK = 1024
+"""Notes in a list, about; encoding one takes some tenths of a millisecond."""
+
+_LENGTH_BYTES = 4
+
+
+class Kind(msgspec.Struct, frozen=True):
+    """What a trace must know of a type of event.
+
+    Attributes:
+        sensed: A sensor's: a path may begin with it.
+        seen: A camera's: preferred to other sensors'.
+        asked: A set-point: a path ends with it.
+    """
+
+    sensed: bool
+    seen: bool
+    asked: bool
+
+
+class Pace(NamedTuple):
+    """How the run's clock goes in real time; `run` of a note is then real time, too.
+
+    Attributes:
+        origin: When the run's clock showed 0.
+        speed: Its seconds per real second.
+    """
+
+    origin: int
+    speed: float
+
+    def run(self, real: int) -> int:
+        """Return what the run's clock showed (ns); 0 before it began."""
+        return max(round((real - self.origin) * self.speed), 0)
+
+
+class Spool:
+    """A file of notes.
+
+    Args:
+        path: Of the file; it is deleted when the notes have been read.
+
+    Attributes:
+        beside: Notes of other threads than the loop's.
+        pace: Of the run's clock, if that is real; known at the end.
+        kinds: What is known of each type of event, by name.
+        hearers: Nodes that hear events of a sender, type and source.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self.beside: deque[tuple[Any, ...]] = deque()
+        self.pace: Pace | None = None
+        self.kinds: dict[str, Kind] = {}
+        self.hearers: dict[tuple[str, str, str], tuple[str, ...]] = {}
+        self.origin = time.perf_counter_ns()
+        """Before all that is noted."""
+        self.failed: OSError | None = None
+        """Why there can be no trace any more."""
+        self._file = path.open("wb", buffering=0)
+        self._lists: queue.SimpleQueue[list[tuple[Any, ...]] | None] = queue.SimpleQueue()
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._thread = threading.Thread(target=self._write, name="trace", daemon=True)
+        self._thread.start()
+
+    def put(self, notes: list[tuple[Any, ...]]) -> None:
+        """Take a list of notes, in the order in which they were made."""
+        self._lists.put(notes)
+
+    def close(self) -> None:
+        """Write what is left; nothing is taken afterwards."""
+        self._lists.put(None)
+        self._thread.join()
+        self._file.close()
+
+    def discard(self) -> None:
+        """Delete the file."""
+        self.path.unlink(missing_ok=True)
+
+    def read(self) -> Iterator[list[Any]]:
+        """Yield all notes in the order in which they were taken, and delete the file."""
+        with self.path.open("rb") as file:
+            while length := file.read(_LENGTH_BYTES):
+                yield from msgspec.msgpack.decode(file.read(int.from_bytes(length, "little")))
+        self.discard()
+
+    def _write(self) -> None:
+        while (notes := self._lists.get()) is not None:
+            self._try_to_append(self._drained() + notes)
+        self._try_to_append(self._drained())
+
+    def _try_to_append(self, notes: list[tuple[Any, ...]]) -> None:
+        if self.failed is None:
+            try:
+                self._append(notes)
+            except OSError as error:  # a full disk, which must not spoil the run
+                self.failed = error
+                log.warning("no trace from here on: %s", error)
+
+    def _drained(self) -> list[tuple[Any, ...]]:
+        found = []
+        while self.beside:
+            found.append(self.beside.popleft())
+        return found
+
+    def _append(self, notes: list[tuple[Any, ...]]) -> None:
+        content = self._encode([self._plain(n) if n[0] == "event" else n for n in notes])
+        rest = memoryview(len(content).to_bytes(_LENGTH_BYTES, "little") + content)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+
+    def _plain(self, note: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Return the note of an event in words and numbers, and remember who heard it."""
+        _, time, run, sender, event, source, stamp, identity, cause, listeners = note
+        name = "run.announced" if sender is None else sender.name
+        key = (name, event.__name__, source)
+        if key not in self.hearers:
+            heard = (each.node for each in listeners or () if each.hears(event, source))
+            self.hearers[key] = tuple(dict.fromkeys(heard))
+            self.kinds[event.__name__] = _kind(event)
+        return ("event", time, run, *key, stamp, identity, cause)
+
+
+def _kind(event: type[Event]) -> Kind:
+    return Kind(
+        sensed=bool(event.category & (Category.SENSOR | Category.GEOMETRY)),
+        seen=issubclass(event, Image),
+        asked=issubclass(event, Setpoint),
+    )

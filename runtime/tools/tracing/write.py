@@ -1,0 +1,238 @@
+"""Making a trace of notes: JSON trace events, which ui.perfetto.dev and chrome://tracing open.
+
+Format: "Trace Event Format", the Chromium project's document of 2016.
+Its time stamps are microseconds of real time; the run's clock stands in the arguments.
+"""
+
+from __future__ import annotations
+
+import bisect
+import gzip
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import msgspec
+
+from runtime.tools.tracing.causes import Causes, Said
+from runtime.tools.tracing.spool import Pace, Spool
+
+MADE_BY = "python -m runtime run --trace"
+"""Tells our traces from others."""
+
+LOOP, THREADS, WORKERS, SENSORS = 1, 2, 3, 4
+"""Numbers of what the trace shows as processes."""
+
+_TITLES = {
+    LOOP: "nodes on the event loop",
+    THREADS: "offloaded to threads",
+    WORKERS: "worker processes",
+    SENSORS: "exposures",
+}
+_MOMENT = 0.1
+"""Microseconds that a moment is given, so that an arrow has something to begin at. What follows
+comes later: between reading the time and delivering an event lies the note itself."""
+
+
+def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Iterable[str]) -> None:
+    """Write the notes of a run as a trace.
+
+    Args:
+        spool: The notes; is used up.
+        path: Of the trace; compressed if it ends with ``.gz``.
+        name: Of the run.
+        clock: ``lockstep`` or ``real``.
+        nodes: Names, in the order in which they are to be shown.
+    """
+    about = {"run": name, "clock": clock, "made by": MADE_BY}
+    with _open(path) as file:
+        file.write(b'{"displayTimeUnit":"ms","otherData":' + msgspec.json.encode(about))
+        file.write(b',"traceEvents":[\n')
+        separator = b""
+        for event in _Writer(spool, nodes).events():
+            file.write(separator + msgspec.json.encode(event))
+            separator = b",\n"
+        file.write(b"\n]}\n")
+
+
+def _open(path: Path) -> IO[bytes]:
+    if path.name.endswith(".gz"):
+        return gzip.open(path, "wb", compresslevel=4)  # type: ignore[return-value]
+    return path.open("wb")
+
+
+class _Writer:
+    """Turns notes into trace events, one after the other."""
+
+    def __init__(self, spool: Spool, nodes: Iterable[str]) -> None:
+        self._spool = spool
+        self._causes = Causes(spool.kinds, spool.hearers)
+        self._moments = _Moments(spool.pace)
+        self._tracks: dict[tuple[int, str], int] = {}
+        self._answered: dict[str, int] = {}
+        self._flows = 0
+        self._exposed: set[tuple[str, int]] = set()
+        self._nodes = list(nodes)
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """Yield the trace's events."""
+        for process, title in _TITLES.items():
+            yield _about("process_name", process, 0, name=title)
+            yield _about("process_sort_index", process, 0, sort_index=process)
+        for node in self._nodes:
+            yield from self._track(LOOP, node)
+        for kind, *note in self._spool.read():
+            if kind == "step":
+                yield from self._step(*note)
+            elif kind == "event":
+                yield from self._event(*note)
+            elif kind == "thread":
+                yield from self._thread(*note)
+            else:
+                yield from self._worker(*note)
+
+    def _track(self, process: int, name: str) -> Iterator[dict[str, Any]]:
+        if (process, name) not in self._tracks:
+            number = self._tracks[process, name] = len(self._tracks) + 1
+            yield _about("thread_name", process, number, name=name)
+            yield _about("thread_sort_index", process, number, sort_index=number)
+
+    def _slice(
+        self, process: int, track: str, name: str, begin: int, end: float | None, **args: Any
+    ) -> Iterator[dict[str, Any]]:
+        yield from self._track(process, track)
+        yield {
+            "ph": "X",
+            "pid": process,
+            "tid": self._tracks[process, track],
+            "name": name,
+            "ts": self._us(begin),
+            "dur": _MOMENT if end is None else round((end - begin) / 1e3, 3),
+            "args": args,
+        }
+
+    def _step(
+        self, node: str, what: str, begin: int, end: int, run: int, _: int
+    ) -> Iterator[dict[str, Any]]:
+        run = self._moments.add(begin, run)
+        yield from self._slice(LOOP, node, what, begin, end, run_s=run / 1e9)
+
+    def _event(
+        self,
+        time: int,
+        run: int,
+        sender: str,
+        event: str,
+        source: str,
+        stamp: int,
+        identity: int,
+        given: int,
+    ) -> Iterator[dict[str, Any]]:
+        run = self._moments.add(time, run)
+        said = self._causes.add(time, run, sender, event, source, stamp, identity, given)
+        args: dict[str, Any] = {
+            "port": sender,
+            "source": source,
+            "run_s": run / 1e9,
+            "stamp_s": stamp / 1e9,
+        }
+        path: list[Said] = []
+        if self._spool.kinds[event].asked and said.cause is not None:
+            path = said.path()
+            begin = self._exposure(path[0])
+            args |= {
+                "path": describe(path),
+                "run_ms": (run - path[0].stamp) / 1e6,
+                "real_ms": round((time - begin) / 1e6, 6),
+            }
+        yield from self._slice(LOOP, said.node, f"send {event}", time, None, **args)
+        if path:
+            yield from self._flow(path)
+
+    def _exposure(self, said: Said) -> int:
+        """Return when in real time a sensor's event was true."""
+        return min(self._moments.of(said.stamp, said.time), said.time)
+
+    def _flow(self, path: list[Said]) -> Iterator[dict[str, Any]]:
+        """Draw arrows from an exposure over all that was sent to a set-point."""
+        self._flows += 1
+        first = path[0]
+        begin = self._exposure(first)
+        if (first.source, first.stamp) not in self._exposed:
+            self._exposed.add((first.source, first.stamp))
+            yield from self._slice(
+                SENSORS, first.source, f"{first.event} exposed", begin, None,
+                run_s=first.stamp / 1e9,
+            )  # fmt: skip
+        steps = [(SENSORS, first.source, begin), *((LOOP, s.node, s.time) for s in path)]
+        for index, (process, track, time) in enumerate(steps):
+            yield {
+                "ph": "s" if index == 0 else "f" if index == len(steps) - 1 else "t",
+                "bp": "e",  # at the slice that encloses this time
+                "pid": process,
+                "tid": self._tracks[process, track],
+                "ts": self._us(time),
+                "id": self._flows,
+                "cat": "path",
+                "name": f"{first.event} to {path[-1].event}",
+            }
+
+    def _thread(
+        self, thread: str, node: str, function: str, submitted: int, begin: int, end: int
+    ) -> Iterator[dict[str, Any]]:
+        waited = round((begin - submitted) / 1e6, 6)
+        name = f"{node}: {function}"
+        yield from self._slice(THREADS, thread, name, begin, end, node=node, waited_ms=waited)
+
+    def _worker(
+        self, process: str, method: str, asked: int, answered: int
+    ) -> Iterator[dict[str, Any]]:
+        # A process answers one call after the other: it begins when the last one is done.
+        begin = max(asked, self._answered.get(process, 0))
+        self._answered[process] = answered
+        waited = round((begin - asked) / 1e6, 6)
+        yield from self._slice(WORKERS, process, method, begin, answered, waited_ms=waited)
+
+    def _us(self, time: int) -> float:
+        return round((time - self._spool.origin) / 1e3, 3)
+
+
+class _Moments:
+    """When in real time the run's clock showed what."""
+
+    KEPT = 100_000
+
+    def __init__(self, pace: Pace | None) -> None:
+        self._pace = pace
+        self._runs: list[int] = []
+        self._times: list[int] = []
+
+    def add(self, time: int, run: int) -> int:
+        """Note that the clock showed `run` at `time`; return what it really showed then."""
+        if self._pace is not None:
+            return self._pace.run(run)
+        if not self._runs or run > self._runs[-1]:
+            self._runs.append(run)
+            self._times.append(time)
+            if len(self._runs) > 2 * self.KEPT:
+                del self._runs[: self.KEPT], self._times[: self.KEPT]
+        return run
+
+    def of(self, stamp: int, latest: int) -> int:
+        """Return when the clock showed `stamp`; `latest` if that is not known."""
+        if self._pace is not None:
+            return round(self._pace.origin + stamp / self._pace.speed)
+        index = bisect.bisect_left(self._runs, stamp)
+        return self._times[index] if index < len(self._times) else latest
+
+
+def describe(path: list[Said]) -> str:
+    """Return a path as text: ``→`` where an event follows from another, ``⇢`` where it may."""
+    arrows = {"begins": "", "follows": " → ", "holds": " ⇢ "}
+    return "".join(
+        f"{arrows[s.how]}{s.source if s.how == 'begins' else s.node} {s.event}" for s in path
+    )
+
+
+def _about(what: str, process: int, track: int, **args: Any) -> dict[str, Any]:
+    return {"ph": "M", "name": what, "pid": process, "tid": track, "args": args}

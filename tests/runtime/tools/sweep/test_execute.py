@@ -1,0 +1,187 @@
+"""All runs of a plan on several executors, interrupted and taken up again; no run is real."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+import pytest
+
+from runtime.errors import ConfigError
+from runtime.tools.sweep import Job, Row, Watch, sweep
+from runtime.tools.sweep.rows import Rows, failed
+from tests.runtime.tools.sweep.samples import die, plan_in, pretend, refuse
+
+
+@contextmanager
+def threads() -> Iterator[Executor]:
+    with ThreadPoolExecutor(2) as executor:
+        yield executor
+
+
+@contextmanager
+def processes() -> Iterator[Executor]:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as executor:
+        yield executor
+
+
+@contextmanager
+def dask() -> Iterator[Executor]:
+    distributed = pytest.importorskip("dask.distributed")
+    with distributed.Client(
+        processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None
+    ) as client:
+        yield client.get_executor(pure=False)
+
+
+EXECUTORS = [
+    threads,
+    pytest.param(processes, marks=pytest.mark.slow),
+    pytest.param(dask, marks=pytest.mark.slow),
+]
+
+
+class Diary(Watch):
+    """Writes down what it is told."""
+
+    def __init__(self) -> None:
+        self.missing: list[Job] = []
+        self.finished = 0
+        self.rows: list[Row] = []
+        self.interruptions = 0
+
+    def begin(self, missing: Sequence[Job], finished: int) -> None:
+        self.missing, self.finished = list(missing), finished
+
+    def done(self, job: Job, row: Row) -> None:
+        assert job.id == row["id"]
+        self.rows.append(row)
+
+    def interrupted(self) -> None:
+        self.interruptions += 1
+
+
+@pytest.mark.parametrize("executor", EXECUTORS)
+def test_every_executor_gives_the_same_rows_in_the_order_of_the_plan(
+    tmp_path: Path, executor: Callable[[], AbstractContextManager[Executor]]
+) -> None:
+    plan, diary = plan_in(tmp_path, "judge.rate=5,4,6", seeds=2), Diary()
+    with executor() as pool:
+        rows = sweep(plan, pool, run=pretend, watch=diary)
+        assert sweep(plan, pool, run=refuse) == rows
+    assert rows == [pretend(job) for job in plan.jobs]
+    assert (len(diary.missing), diary.finished, len(diary.rows)) == (6, 0, 6)
+
+
+@pytest.mark.slow
+def test_a_process_that_takes_its_pool_along_is_a_row(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.rate=5,4,6")
+    with processes() as pool:
+        rows = sweep(plan, pool, run=die)
+    assert [row["error"].partition(":")[0] for row in rows] == ["BrokenProcessPool"] * 3
+    with threads() as pool:
+        assert sweep(plan, pool, run=pretend) == [pretend(job) for job in plan.jobs]
+
+
+def test_what_failed_is_run_again_and_what_is_finished_is_not(tmp_path: Path) -> None:
+    plan, calls = plan_in(tmp_path, "judge.rate=1,2,3"), []
+
+    def run(job: Job) -> Row:
+        calls.append(str(job))
+        if len(calls) == 2:
+            raise OSError("disk full")
+        return pretend(job) if len(calls) != 3 else failed(job, "out of order")
+
+    with ThreadPoolExecutor(1) as pool:
+        rows = sweep(plan, pool, run=run)
+        assert [row["error"] for row in rows] == ["", "OSError: disk full", "out of order"]
+        diary = Diary()
+        rows = sweep(plan, pool, run=run, watch=diary)
+        assert [row["error"] for row in rows] == ["", "", ""]
+        assert diary.finished == 1
+        more = plan_in(tmp_path, "judge.rate=4,1,2,3")
+        assert len(sweep(more, pool, run=run)) == 4
+        assert len(calls) == 3 + 2 + 1
+        assert len(sweep(plan, pool, run=run, fresh=True)) == 3
+    assert len(calls) == 6 + 3
+
+
+class Impatient(Diary):
+    """Presses Ctrl-C when the first run has ended, and lets the others go on after that."""
+
+    def __init__(self, go_on: threading.Event) -> None:
+        super().__init__()
+        self.go_on = go_on
+
+    def done(self, job: Job, row: Row) -> None:
+        raise KeyboardInterrupt
+
+    def interrupted(self) -> None:
+        super().interrupted()
+        self.go_on.set()
+
+
+@pytest.mark.parametrize("ends_well", [True, False])
+def test_an_interruption_keeps_what_is_finished_and_waits_for_what_runs(
+    tmp_path: Path, ends_well: bool
+) -> None:
+    plan, calls = plan_in(tmp_path, "judge.rate=1,2,3,4"), []
+    go_on, second = threading.Event(), threading.Event()
+
+    def run(job: Job) -> Row:
+        calls.append(job)
+        if "judge.rate=1" in str(job):
+            second.wait()
+            return pretend(job)
+        second.set()
+        go_on.wait()
+        return pretend(job) if ends_well else failed(job, "interrupted")
+
+    watch = Impatient(go_on)
+    with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt):
+        sweep(plan, pool, run=run, watch=watch)
+    assert watch.interruptions == 1
+    ran = len(calls)
+    assert 2 <= ran <= 3  # the first one's thread may have taken up another
+    calls.clear()
+    with ThreadPoolExecutor(2) as pool:
+        rows = sweep(plan, pool, run=run)
+    assert [row["error"] for row in rows] == ["", *["" if ends_well else "interrupted"] * 3]
+    assert len(calls) == 4 - (ran if ends_well else 1)
+
+
+def test_only_one_sweep_writes_into_a_folder(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path)
+    with (
+        Rows(plan.out / "rows.jsonl"),
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(ConfigError, match=r"rows.jsonl: expected it free, found another sweep"),
+    ):
+        sweep(plan, pool, run=pretend)
+
+
+def test_a_line_that_was_cut_short_is_run_again(tmp_path: Path) -> None:
+    plan, diary = plan_in(tmp_path, "judge.rate=1,2,3"), Diary()
+    with ThreadPoolExecutor(1) as pool:
+        rows = sweep(plan, pool, run=pretend)
+        path = plan.out / "rows.jsonl"
+        path.write_bytes(path.read_bytes()[:-10])
+        assert sweep(plan, pool, run=pretend, watch=diary) == rows
+        assert [str(job) for job in diary.missing] == ["judge.rate=3 seed=3"]
+        assert sweep(plan, pool, run=refuse) == rows
+
+
+def test_a_figure_that_is_no_number_is_none(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path)
+
+    def run(job: Job) -> Row:
+        return pretend(job) | {"estimators": {"vo": {"ate_percent": float("nan")}}}
+
+    with ThreadPoolExecutor(1) as pool:
+        (row,) = sweep(plan, pool, run=run)
+    assert row["estimators"] == {"vo": {"ate_percent": None}}

@@ -1,0 +1,121 @@
+"""Rows as tables and pictures."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+from matplotlib.image import imread
+
+from runtime.tools.sweep import Row, draw_plots, summarise, write_tables
+from runtime.tools.sweep.plots import lines
+from runtime.tools.sweep.rows import failed
+from runtime.tools.sweep.tables import Spread
+from tests.runtime.tools.sweep.samples import plan_in, pretend
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_table_has_a_line_for_each_run_and_estimator(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.rate=5,60", seeds=2)
+    rows = [pretend(job) for job in plan.jobs]
+    rows[0] = failed(plan.jobs[0], "out of order")
+    write_tables(plan, [*reversed(rows), failed(plan_in(tmp_path, seeds=9).jobs[-1], "of another")])
+    table = read(plan.out / "table.csv")
+    assert [(line["judge.rate"], line["seed"], line["estimator"]) for line in table] == [
+        ("5", "3", ""),
+        *[(rate, seed, name) for rate, seed in [("5", "4"), ("60", "3"), ("60", "4")]
+          for name in ("vo", "slam")],
+    ]  # fmt: skip
+    assert (table[0]["exit_code"], table[0]["error"]) == ("", "out of order")
+    assert [table[0][key] for key in ("passed", "ate_percent", "estimator_passed")] == [""] * 3
+    assert table[1] == {
+        "run": plan.jobs[1].id, "judge.rate": "5", "seed": "4", "exit_code": "0", "error": "",
+        "passed": "true", "sim_seconds": "", "digest": "", "estimator": "vo",
+        "ate_percent": "5.04", "note": "made up", "estimator_passed": "true",
+    }  # fmt: skip
+    assert table[-1]["passed"] == table[-1]["estimator_passed"] == "false"
+    times = read(plan.out / "timing.csv")
+    assert [line["run"] for line in times] == [job.id for job in plan.jobs]
+    assert [line["wall_seconds"] for line in times] == ["", "0.5", "0.5", "0.5"]
+
+
+def test_a_summary_has_the_spread_over_the_seeds_and_counts_what_failed(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.rate=1,2", seeds=4)
+    rows = [pretend(job) for job in plan.jobs]
+    rows[1] = failed(plan.jobs[1], "out of order")
+    for index in range(4, 8):
+        rows[index] = failed(plan.jobs[index], "out of order")
+    first, second, last = summarise(plan, rows)
+    assert (first.settings, first.estimator, second.estimator) == (("1",), "vo", "slam")
+    assert (first.runs, first.failed, first.passed) == (4, 1, 3)
+    assert first.figures == {"ate_percent": Spread(1.05, 1.03, 1.06)}
+    assert second.figures == {"ate_percent": Spread(0.525, 0.515, 0.53)}
+    assert (last.settings, last.estimator, last.failed) == (("2",), "", 4)
+    assert (last.passed, last.figures) == (None, {})
+    write_tables(plan, rows)
+    line = read(plan.out / "summary.csv")[0]
+    assert [line[f"ate_percent_{what}"] for what in ("median", "min", "max")] == [
+        "1.05", "1.03", "1.06",
+    ]  # fmt: skip
+    assert line["ate_rmse_m_median"] == ""
+
+
+def with_ate(row: Row, **ate: float | None) -> Row:
+    row["estimators"] = {name: {"ate_percent": value} for name, value in ate.items()}
+    return row
+
+
+def test_a_line_for_each_combination_of_the_others(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.rate=20,10", "judge.method=flow,depth", seeds=3)
+    rows = [pretend(job) for job in plan.jobs]
+    for job, row in zip(plan.jobs, rows, strict=True):
+        rate, method = (text for _, text in job.settings)
+        ate = None if (rate, method) == ("20", "depth") else float(rate) + job.seed**2
+        with_ate(row, vo=ate)
+    flow, depth = lines(plan, rows, plan.parameters[0], "ate_percent")
+    assert (flow.label, depth.label) == ("judge.method=flow", "judge.method=depth")
+    assert (flow.texts, depth.texts) == (("20", "10"), ("10",))
+    assert (flow.middle, flow.low, flow.high) == ((36, 26), (29, 19), (45, 35))
+    assert lines(plan, rows, plan.parameters[0], "lost_seconds") == []
+    labels = [line.label for line in lines(plan, rows, plan.parameters[1], "ate_percent")]
+    assert labels == ["judge.rate=20", "judge.rate=10"]
+
+
+def test_many_combinations_become_one_line_with_quartiles(tmp_path: Path) -> None:
+    many = ",".join(map(str, range(1, 6)))
+    plan = plan_in(tmp_path, "judge.method=flow,depth", f"judge.rate={many}")
+    rows = [with_ate(pretend(j), vo=float(dict(j.settings)["judge.rate"]), b=1) for j in plan.jobs]
+    vo, other = lines(plan, rows, plan.parameters[0], "ate_percent")
+    assert (vo.label, other.label) == ("vo, all others", "b, all others")
+    assert (vo.texts, vo.low, vo.middle, vo.high) == (("flow", "depth"), (2, 2), (3, 3), (4, 4))
+    assert len(lines(plan, rows, plan.parameters[1], "ate_percent")) == 4
+
+
+def test_a_picture_for_each_parameter(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.latency=0ms,80ms", "judge.method=flow,depth", seeds=2)
+    rows = [pretend(job) for job in plan.jobs]
+    drawn = draw_plots(plan, rows)
+    assert [path.name for path in drawn] == ["judge.latency.png", "judge.method.png"]
+    for path in drawn:
+        picture = imread(path)
+        assert picture.shape[0] > 300
+        assert picture.std() > 0.05
+
+
+def test_nothing_is_drawn_of_runs_without_figures(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.latency=0ms,80ms")
+    assert draw_plots(plan, [failed(job, "out of order") for job in plan.jobs]) == []
+    assert not (plan.out / "plots").exists()
+
+
+@pytest.mark.parametrize("name", ["table.csv", "timing.csv", "summary.csv"])
+def test_a_sweep_without_verdicts_has_tables_too(tmp_path: Path, name: str) -> None:
+    plan = plan_in(tmp_path, seeds=2)
+    rows = [with_ate(pretend(job)) for job in plan.jobs]
+    write_tables(plan, rows)
+    assert len(read(plan.out / name)) == (1 if name == "summary.csv" else 2)

@@ -1,0 +1,157 @@
+"""The command line, in a fresh process wherever it runs nodes."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from runtime.summary import Summary, TickSummary
+from tests.runtime.tools.samples_cli import ROOT, command, command_here, config_file, summary
+
+pytestmark = pytest.mark.timeout(180)
+
+
+def processor_time(*arguments: str) -> float:
+    """Return user and system seconds of a child."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def test_help_comes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It imports little beyond what it cannot do without, however slow the machine is just now."""
+    monkeypatch.chdir(ROOT)
+    least = min(processor_time("-c", "import numpy, typer.rich_utils") for _ in range(3))
+    assert min(processor_time("-m", "runtime", "--help") for _ in range(3)) < 1.8 * least
+
+
+def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "Noise", "Speaker", "Reader", run="duration = 2")
+    done = command("run", path, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "sent" in done.stdout
+    assert "2.0 s on the lockstep clock" in done.stdout
+    results = tmp_path / "runs" / "sample"
+    first = summary(results)
+    assert set(first) == set(Summary.__struct_fields__)
+    assert (first["clock"], first["seed"], first["reason"]) == ("lockstep", 0, "duration")
+    assert (first["error"], first["sim_seconds"]) == (None, 2.0)
+    assert 0 <= first["wall_seconds"] < 20
+    assert first["events"] == {"Ping": 40}
+    assert first["drops"] == {"reader.pings": 0}
+    assert set(first["ticks"]) == {"noise.speak", "speaker.speak"}
+    tick = first["ticks"]["speaker.speak"]
+    assert set(tick) == set(TickSummary.__struct_fields__)
+    assert (tick["hz"], tick["late_max_us"], tick["missed"]) == (10.0, 0.0, 0)
+    assert len((results / "pings.txt").read_text().splitlines()) == first["events"]["Ping"]
+    assert (results / "log.txt").exists()
+    msgspec.json.decode((results / "summary.json").read_bytes(), type=Summary)
+
+    again = command("run", results / "config.toml", "--out", "again", "-q", folder=tmp_path)
+    assert (again.returncode, again.stdout) == (0, "")
+    assert summary(tmp_path / "again")["digest"] == first["digest"]
+    other = command("run", path, "--set", "run.seed=1", "-q", folder=tmp_path)
+    assert other.returncode == 0
+    assert summary(results)["digest"] != first["digest"]
+
+
+def test_a_node_that_fails_is_one_line_and_a_summary(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "Failing", run="duration = 2")
+    done = command("run", path, "-q", folder=tmp_path)
+    assert done.returncode == 2
+    line = done.stderr.splitlines()[-1]
+    assert line.startswith("error: failing: RuntimeError: out of order (runtime/samples.py:")
+    assert "Traceback" not in done.stderr
+    found = summary(tmp_path / "runs" / "sample")
+    assert (found["reason"], found["sim_seconds"]) == ("failing failed", 0.5)
+    assert found["error"] == "failing: RuntimeError: out of order"
+    log = (tmp_path / "runs" / "sample" / "log.txt").read_text()
+    assert "0.500000 ERROR    runtime: failing: RuntimeError: out of order" in log
+    assert "Traceback" in log
+
+
+@pytest.mark.parametrize(
+    ("on_error", "code"), [pytest.param("drop", 0, marks=pytest.mark.slow), ("stop", 2)]
+)
+def test_a_thread_that_never_returns_does_not_keep_the_process(
+    on_error: str, code: int, tmp_path: Path
+) -> None:
+    path = config_file(tmp_path, "Failing", "Stuck", run="duration = 1\nclock = 'real'")
+    done = command("run", path, "--set", f"failing.on_error={on_error}", "-q", folder=tmp_path)
+    assert done.returncode == code
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("error: ")]
+    assert lines[-1] == "warning: still busy, left behind: offload_0"
+    assert summary(tmp_path / "runs" / "sample")["sim_seconds"] > 0.5
+
+
+def test_mistakes_are_one_line(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "Speaker")
+    mistakes: list[tuple[list[str | Path], str]] = [
+        (["run", "none.toml"], "error: none.toml: expected a readable file, found: No such"),
+        (["check", path, "--set", "speaker.rte=3"], "error: sample.toml: nodes[0] (speaker): exp"),
+        (["graph", path, "--set", "speakr.rate=3"], "\"speakr\" (did you mean 'speaker'?)"),
+        (["nodes", "Multirotr"], "(did you mean 'Multirotor'?)"),
+    ]
+    for arguments, line in mistakes:
+        done = command_here(*arguments, folder=tmp_path)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert len(done.stderr.splitlines()) == 1
+        assert line in done.stderr
+
+
+def test_check_says_what_is_right_and_warns_of_what_is_not_connected(tmp_path: Path) -> None:
+    done = command_here("check", config_file(tmp_path, "Speaker", "Echo"), folder=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout.rstrip().endswith("2 nodes, 1 connections: right")
+    done = command_here("check", config_file(tmp_path, "Reader"), folder=tmp_path)
+    assert done.returncode == 0
+    assert done.stderr == "warning: reader.pings: expects Ping, and no node sends it\n"
+    assert not (tmp_path / "runs").exists()
+
+
+def test_graph_prints_mermaid_or_draws(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "Speaker", "Echo", "Reader")
+    lines = command_here("graph", path, folder=tmp_path).stdout.splitlines()
+    assert lines[0] == "flowchart LR"
+    assert "    speaker -- Ping --> echo" in lines
+    assert "    speaker -- Ping --> reader" in lines
+    done = command_here("graph", path, "--out", "graph.png", folder=tmp_path)
+    assert (done.returncode, done.stdout) == (0, "graph.png\n")
+    assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_nodes_lists_ports_and_settings(tmp_path: Path) -> None:
+    done = command_here("nodes", "multirotor", folder=tmp_path)
+    assert done.returncode == 0
+    assert "sims.multirotor.node:Multirotor" in done.stdout
+    for line in (
+        "sends Imu as imu",
+        "sends Image as images",
+        "calls control at the rate 'control_rate'",
+        "setting imu_rate: float = 200",
+    ):
+        assert line in done.stdout
+
+
+def test_log_events_prints_each_event_with_arrays_by_shape(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "Speaker", "Painter", run="duration = 0.25")
+    done = command("run", path, "--log", "events", "-q", folder=tmp_path)
+    assert done.returncode == 0
+    log = (tmp_path / "runs" / "sample" / "log.txt").read_text()
+    assert log.count("events: speaker.pings Ping speaker: count=") == 3
+    assert "events: painter.images Image painter: " in log
+    assert "data=uint8[4, 6, 3]" in log
+    assert "count=2" in done.stderr
+
+
+def test_without_arguments_it_explains_itself() -> None:
+    done = command(folder=ROOT)
+    assert "Fly a simulated vehicle" in done.stdout + done.stderr
+    assert os.fspath(ROOT) not in done.stderr

@@ -1,0 +1,105 @@
+"""Which event led to which."""
+
+from __future__ import annotations
+
+from runtime.tools.tracing.causes import Causes, Said
+from runtime.tools.tracing.spool import Kind
+
+KINDS = {
+    "Image": Kind(sensed=True, seen=True, asked=False),
+    "Imu": Kind(sensed=True, seen=False, asked=False),
+    "Pose": Kind(sensed=False, seen=False, asked=False),
+    "Setpoint": Kind(sensed=False, seen=False, asked=True),
+    "Note": Kind(sensed=False, seen=False, asked=False),
+}
+HEARERS = {
+    ("drone.images", "Image", "drone"): ("vo", "pilot"),
+    ("drone.imu", "Imu", "drone"): ("vo", "pilot"),
+    ("vo.poses", "Pose", "vo"): ("pilot", "drone"),
+    ("pilot.setpoints", "Setpoint", "pilot"): ("drone",),
+    ("drone.notes", "Note", "drone"): ("vo",),
+}
+
+
+class Story:
+    """Tells events one by one."""
+
+    def __init__(self) -> None:
+        self.causes = Causes(KINDS, HEARERS)
+        self.number = 0
+
+    def __call__(self, sender: str, event: str, stamp: int, given: int = 0) -> Said:
+        self.number += 1
+        source = sender.partition(".")[0]
+        return self.causes.add(
+            self.number, self.number, sender, event, source, stamp, self.number, given
+        )
+
+
+def path(said: Said) -> list[tuple[str, str]]:
+    return [(each.event, each.how) for each in said.path()]
+
+
+def test_an_estimate_follows_from_the_image_whose_stamp_it_bears() -> None:
+    tell = Story()
+    tell("drone.images", "Image", 10)
+    tell("drone.images", "Image", 20)
+    tell("drone.imu", "Imu", 20)
+    said = tell("vo.poses", "Pose", 10)
+    assert path(said) == [("Image", "begins"), ("Pose", "follows")]
+    assert said.path()[0].stamp == 10
+
+
+def test_of_two_sensors_of_one_stamp_the_camera_counts() -> None:
+    tell = Story()
+    tell("drone.images", "Image", 20)
+    tell("drone.imu", "Imu", 20)
+    assert path(tell("vo.poses", "Pose", 20))[0] == ("Image", "begins")
+
+
+def test_what_a_node_sends_on_hearing_an_event_follows_from_it() -> None:
+    tell = Story()
+    tell("drone.images", "Image", 10)
+    pose = tell("vo.poses", "Pose", 10)
+    tell("drone.images", "Image", 20)
+    said = tell("pilot.setpoints", "Setpoint", 25, given=2)
+    assert said.cause is pose
+    assert path(said) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "follows")]
+
+
+def test_what_a_node_sends_by_itself_holds_the_newest_of_a_camera() -> None:
+    tell = Story()
+    tell("drone.images", "Image", 10)
+    tell("vo.poses", "Pose", 10)
+    tell("drone.imu", "Imu", 30)
+    said = tell("pilot.setpoints", "Setpoint", 30)  # the stamp of the IMU, by chance
+    assert path(said) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "holds")]
+
+
+def test_no_path_goes_on_behind_a_set_point_or_through_a_node_twice() -> None:
+    tell = Story()
+    tell("drone.images", "Image", 10)
+    tell("vo.poses", "Pose", 10)
+    tell("pilot.setpoints", "Setpoint", 12, given=2)
+    assert tell("drone.notes", "Note", 13, given=3).cause is None
+    assert tell("vo.poses", "Pose", 99, given=0).how == "holds"
+
+
+def test_a_sensor_begins_whatever_its_node_was_given() -> None:
+    tell = Story()
+    tell("drone.images", "Image", 10)
+    tell("vo.poses", "Pose", 10)
+    assert path(tell("drone.images", "Image", 20, given=2)) == [("Image", "begins")]
+
+
+def test_without_a_sensor_there_is_no_path() -> None:
+    assert Story()("pilot.setpoints", "Setpoint", 1).cause is None
+
+
+def test_nothing_follows_from_what_its_node_does_not_hear() -> None:
+    tell = Story()
+    tell("drone.images", "Image", 10)
+    tell("vo.poses", "Pose", 10)
+    tell("drone.notes", "Note", 12, given=2)
+    said = tell("pilot.setpoints", "Setpoint", 13, given=3)  # which is vo's alone
+    assert path(said) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "holds")]
