@@ -91,6 +91,7 @@ def results() -> Results:
     )
 
 
+@pytest.mark.slow
 def test_the_page_says_first_what_its_numbers_do_not_show(tmp_path: Path) -> None:
     """Caveats, then ratios, then tables; what was not measured is at the end, with the reason."""
     write(results(), tmp_path, tmp_path / "RESULTS.md")

@@ -254,6 +254,7 @@ def test_matrices_and_tuples_are_the_same_pose() -> None:
     assert orientation == pytest.approx(pose[1])
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(st.integers(1, 400), st.sampled_from(("lit", "dark", "dazzling")))),
     st.integers(0, 2000),

@@ -68,6 +68,7 @@ def test_stamps_keep_their_nanoseconds(tmp_path: Path) -> None:
     assert "\n12.000000001 " in (tmp_path / "trajectory.tum").read_text()
 
 
+@pytest.mark.slow
 def test_pictures_are_drawn(tmp_path: Path) -> None:
     inputs: list[Event] = [odometry(500_000_000 * k, k) for k in range(20)]
     inputs += [image(500_000_000 * k, grey=k % 2 == 1) for k in range(20)]
@@ -142,6 +143,7 @@ class Failing(FlightLog):
             raise RuntimeError("now")
 
 
+@pytest.mark.slow
 def test_a_restart_keeps_what_was_written_before(tmp_path: Path) -> None:
     """The trajectory goes on, whatever was said while it was down; pictures are drawn by part."""
     inputs: list[Event] = [odometry(100_000_000 * k, 0.1 * k) for k in range(60)]

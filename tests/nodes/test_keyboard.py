@@ -159,6 +159,7 @@ def test_letters_are_those_of_the_layout(begin: Begin, display: Display) -> None
         display.call("setxkbmap", "us")
 
 
+@pytest.mark.slow
 def test_closing_the_window_ends_the_run(begin: Begin, display: Display) -> None:
     """The cross of the window ends the run in order, held keys released."""
     run = begin()
@@ -214,6 +215,7 @@ def test_pictures_of_two_cameras_are_warned_of_once(
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "found"),
     [({}, "DISPLAY is not set"), ({"DISPLAY": ":4711"}, "DISPLAY=:4711, X11: Failed to open")],

@@ -69,6 +69,7 @@ def transform(
     )
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(poses, st.integers(0, 100), st.booleans()), min_size=1, max_size=7))
 def test_a_lookup_is_the_product_of_the_matrices(edges: list[tuple[Pose, int, bool]]) -> None:
     """Between any two frames of any tree: up from the source, and down to the target."""

@@ -93,6 +93,7 @@ def beside_the_plan(result: NodeResult) -> np.ndarray:
     return np.array([np.subtract(truth[p.stamp], p.position) for p in plans])
 
 
+@pytest.mark.slow
 def test_right_estimates_though_late_keep_the_vehicle_on_its_path(world: str) -> None:
     result = fly(world)
     assert result.reason == "pilot: tour flown"
@@ -121,6 +122,7 @@ def off_its_place(result: NodeResult, start: float, end: float) -> float:
     return float(np.linalg.norm(np.subtract(flown, flown[0]), axis=1).max())
 
 
+@pytest.mark.slow
 def test_estimates_in_another_frame_are_not_followed(world: str) -> None:
     result = fly(world, anew=(5.0, 8.0))
     waits = [event for event in result.of(Hover) if 5.0 < event.stamp / SECOND < 8.0]
@@ -130,6 +132,7 @@ def test_estimates_in_another_frame_are_not_followed(world: str) -> None:
     assert result.reason == "pilot: tour flown"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trouble", ["anew", "blind"])
 def test_when_no_estimates_come_any_more_it_lands_where_it_is(world: str, trouble: str) -> None:
     oracle: dict[str, Any] = {trouble: (5.0, 99.0)}

@@ -23,6 +23,7 @@ def arena() -> Iterator[Arena]:
     made.close()
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(
     st.lists(

@@ -98,6 +98,7 @@ runs = st.builds(
 speakers = st.builds(SpeakerConfig, rate=st.floats(1e-3, 1e5), text=names, pause=seconds)
 
 
+@pytest.mark.slow
 @given(runs, speakers, st.sampled_from(["stop", "restart", "drop"]))
 def test_what_is_written_reads_the_same(run: RunConfig, speaker: Any, on_error: Any) -> None:
     table = {"nodes": [{"name": "s", "type": "tests.runtime.samples:Speaker"}]}

@@ -28,6 +28,7 @@ pytestmark = pytest.mark.timeout(60)
 MS = 1_000_000
 
 
+@pytest.mark.slow
 async def test_waiting_takes_real_time_only_and_computing_processor_time_too() -> None:
     async with worker() as plant:
         for _ in range(3):
@@ -40,6 +41,7 @@ async def test_waiting_takes_real_time_only_and_computing_processor_time_too() -
         assert 200 * MS <= plant.costs.cpu.maximum < plant.costs.wall.maximum + 100 * MS
 
 
+@pytest.mark.slow
 async def test_threads_that_go_on_after_an_answer_are_counted_with_the_next() -> None:
     async with worker() as plant:
         await plant.call(Plant.burn_beside, 0.2)
@@ -94,6 +96,7 @@ class Gardener(Node):
             await other.call_for(0.01 * number, Plant.pid)
 
 
+@pytest.mark.slow
 def test_a_runs_summary_and_tables_say_what_each_worker_has_cost(tmp_path: Path) -> None:
     Gardener.lives = 0
     settings = RunConfig(duration=Duration(2.0), seed=3)

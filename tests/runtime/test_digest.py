@@ -71,6 +71,7 @@ def test_digests_are_equal_exactly_if_what_each_said_is(one: list[Said], other: 
     assert (digest(*one) == digest(*other)) == (by_speaker(one) == by_speaker(other))
 
 
+@pytest.mark.slow
 @given(st.lists(sayings, max_size=6).flatmap(lambda e: st.tuples(st.just(e), st.permutations(e))))
 def test_the_order_counts_within_a_speaker_only(pair: tuple[list[Said], list[Said]]) -> None:
     one, other = pair
@@ -105,6 +106,7 @@ def test_types_and_shapes_of_the_same_bytes_are_told_apart() -> None:
     assert len({digest(measured(view)) for view in views}) == len(views)
 
 
+@pytest.mark.slow
 @given(hnp.arrays("float32", hnp.array_shapes(min_dims=2, max_dims=3)))
 def test_the_layout_in_memory_does_not_matter(array: npt.NDArray[np.float32]) -> None:
     assume(not np.isnan(array).any())
@@ -124,6 +126,7 @@ def test_the_order_within_sets_and_mappings_does_not_matter(names: list[str]) ->
     assert digest(measured(array, set(names))) == digest(measured(array, set("abcd")))
 
 
+@pytest.mark.slow
 def test_another_process_finds_the_same() -> None:
     """Hashes of texts, and so the order of sets, differ from process to process."""
     code = """

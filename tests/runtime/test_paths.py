@@ -144,6 +144,7 @@ JSON = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(JSON)
 def test_whatever_stands_there_is_for_the_check_of_types_to_refuse(table: Any) -> None:
     """Resolving changes texts only, and what is absolute stays as it is."""

@@ -193,6 +193,7 @@ async def test_a_view_keeps_the_memory_of_its_array() -> None:
     assert (view == 1).all()
 
 
+@pytest.mark.slow
 async def test_200_megabytes_through_a_worker_take_a_few() -> None:
     async with worker() as plant:
         for value in range(200):
@@ -205,6 +206,7 @@ async def test_200_megabytes_through_a_worker_take_a_few() -> None:
         assert memory_of(pipe._window._fd) <= 4 * MEGABYTE
 
 
+@pytest.mark.slow
 async def test_what_a_worker_keeps_stays_intact() -> None:
     async with worker() as plant:
         for value in range(6):

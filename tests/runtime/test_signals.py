@@ -96,6 +96,7 @@ def test_a_second_ctrl_c_ends_at_once(clock: str, tmp_path: Path) -> None:
     assert code in {-signal.SIGINT, 130}
 
 
+@pytest.mark.slow
 def test_ctrl_c_wakes_an_idle_run(tmp_path: Path) -> None:
     for clock in CLOCKS:
         run = f"clock = '{clock}'\nshutdown_limit = 0.2"
@@ -109,6 +110,7 @@ def test_ctrl_c_wakes_an_idle_run(tmp_path: Path) -> None:
         assert "found it still running (runtime/samples.py:" in line
 
 
+@pytest.mark.slow
 def test_what_a_shell_put_into_the_background_can_be_interrupted(tmp_path: Path) -> None:
     """Shells have background processes ignore SIGINT; who sends one nevertheless means it."""
     path = config_file(tmp_path, "Reader", "Lively", run=PACED["lockstep"])

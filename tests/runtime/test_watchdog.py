@@ -91,6 +91,7 @@ def watch(*nodes: type[Node[Any]], clock: str, duration: float = 0.25) -> Watchd
     return dogs[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 @pytest.mark.parametrize("way", ["sleep", "lock", "queue", "child"])
 def test_a_blocking_handler_is_reported_with_node_and_line(clock: str, way: str) -> None:
@@ -103,6 +104,7 @@ def test_a_blocking_handler_is_reported_with_node_and_line(clock: str, way: str)
     assert 0.04 < stall.seconds < 5
 
 
+@pytest.mark.slow
 def test_the_line_is_the_one_that_blocks() -> None:
     Blocker.way = "sleep"
     dog = watch(Blocker, clock="real")
@@ -126,6 +128,7 @@ class CountingLoop:
         self.loop.call_soon_threadsafe(call, *args)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
 @pytest.mark.parametrize("busy", [False, True])
 def test_only_a_busy_loop_is_woken(name: str, busy: bool) -> None:

@@ -59,6 +59,7 @@ async def test_calls_of_one_process_are_answered_in_order() -> None:
         assert plant.outstanding() == 0
 
 
+@pytest.mark.slow
 async def test_two_processes_share_the_calls() -> None:
     async with worker(processes=2) as plant:
         busy = [asyncio.create_task(plant.call(Plant.sleep, 0.2)) for _ in range(2)]
@@ -85,6 +86,7 @@ async def test_an_exception_of_the_object_comes_back_with_the_workers_traceback(
         assert await plant.call(Plant.echo, 1) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trouble", "error", "text"),
     [
@@ -107,6 +109,7 @@ async def test_a_constructor_that_hangs_is_killed() -> None:
             pass
 
 
+@pytest.mark.slow
 async def test_arguments_that_cannot_be_pickled_are_the_callers_mistake() -> None:
     async with worker() as plant:
         with pytest.raises((TypeError, AttributeError), match="pickle"):
@@ -154,6 +157,7 @@ async def test_what_a_process_prints_is_passed_on() -> None:
     assert lines == ["hello", "world"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("work", [0.0, 0.2])
 def test_in_lockstep_an_answer_is_due_exactly_after_the_latency(work: float) -> None:
     async def main() -> tuple[int, int]:
@@ -169,6 +173,7 @@ def test_in_lockstep_an_answer_is_due_exactly_after_the_latency(work: float) -> 
     assert run_in_lockstep(main()) == (80_000_000, 500_000_000)
 
 
+@pytest.mark.slow
 async def test_in_real_time_an_answer_comes_no_sooner_than_the_latency() -> None:
     async with worker(latency=0.2) as plant:
         clock = plant._clock
@@ -235,6 +240,7 @@ async def test_ctrl_c_does_not_reach_a_worker() -> None:
         assert os.getpgid(pid) != os.getpgid(0)  # nor in its first moments, before it can say so
 
 
+@pytest.mark.slow
 async def test_close_ends_the_processes_and_fails_what_waits() -> None:
     async with worker(processes=2) as plant:
         pids = set(await asyncio.gather(plant.call(Plant.pid), plant.call(Plant.pid)))

@@ -152,6 +152,7 @@ async def test_an_argument_that_cannot_be_made_there_fails_only_its_call() -> No
         assert await plant.call(Plant.echo, 1) == 1
 
 
+@pytest.mark.slow
 async def test_stuck_processes_are_ended_together() -> None:
     """Each has the same two seconds, not one after the other."""
     async with worker(processes=3) as plant:

@@ -61,6 +61,7 @@ FATES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fate", "clock", "error", "text"), FATES)
 def test_a_worker_that_ends_is_its_nodes_fault(
     fate: str, clock: str, error: type[Exception], text: str
@@ -75,6 +76,7 @@ def test_a_worker_that_ends_is_its_nodes_fault(
     assert not alive(Gardener.pids[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fate", "clock"), [("die", "lockstep"), ("idle", "real")])
 def test_a_restarted_node_has_a_new_worker(fate: str, clock: str) -> None:
     Gardener.fate = fate
@@ -101,6 +103,7 @@ def test_a_worker_that_cannot_be_made_ends_the_start(trouble: str, text: str) ->
     assert str(outcome.error).startswith(text)
 
 
+@pytest.mark.slow
 def test_the_end_of_a_run_ends_its_workers() -> None:
     Gardener.fate = "none"
     Gardener.pids.append(0)

@@ -41,6 +41,7 @@ def assert_true(before: Odometry, now: Odometry, after: Odometry) -> None:
     np.testing.assert_allclose(now.angular_velocity, rates, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_twist_along_a_trajectory_is_that_of_its_poses(tmp_path: Path) -> None:
     """With turns about all axes, and stamps since 1970 (a float has them to 0.2 microseconds)."""
     random = np.random.default_rng(5)
@@ -63,6 +64,7 @@ def test_the_twist_along_a_trajectory_is_that_of_its_poses(tmp_path: Path) -> No
     assert min(speeds[i] for i in between) > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame_id", ["map", "heading"])
 def test_the_twist_of_a_velocity_is_that_of_the_poses(tmp_path: Path, frame_id: str) -> None:
     """While it holds; before and afterwards, and where the camera is put, it rests."""

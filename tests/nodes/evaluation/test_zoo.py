@@ -80,6 +80,7 @@ def test_a_good_one_beside_them_is_judged_as_if_alone(
     assert zoo["passed"] is False
 
 
+@pytest.mark.slow
 def test_without_thresholds_a_good_one_is_not_judged_and_an_absent_one_fails(
     tmp_path: Path,
 ) -> None:

@@ -205,6 +205,7 @@ def test_what_a_frame_says_of_its_size_is_read_as_its_library_reads_it(
     assert layout.frame_size(data) == size
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=100)
 @given(data=st.data())
 def test_no_file_raises_anything_but_our_own_error(

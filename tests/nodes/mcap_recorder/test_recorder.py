@@ -69,6 +69,7 @@ def test_simulated_time_waits_for_a_slow_disk(tmp_path: Path) -> None:
     assert [each.event.stamp for each in found] == [event.stamp for event in events]
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_run_in_order(tmp_path: Path) -> None:
     """The error names the file; what is not in it is counted."""
     (tmp_path / "recording.mcap").symlink_to("/dev/full")
@@ -76,6 +77,7 @@ def test_a_full_disk_ends_the_run_in_order(tmp_path: Path) -> None:
         record([imu(0)], tmp_path)
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_at_the_very_end_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -91,6 +93,7 @@ def test_a_disk_that_is_full_at_the_very_end_is_an_error(
         record([*announcements(), *said(0)], tmp_path, chunk_size=1 << 28)
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_slow_at_the_end_has_its_time_after_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -169,6 +172,7 @@ def test_without_a_folder_nothing_is_recorded() -> None:
     assert record([imu(0)], None).reason == "duration"
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> None:
     """The run hears of it, and simulated time does not wait for what will not come."""
     path, failures = tmp_path / "a.mcap", list[RecordingError]()
@@ -238,6 +242,7 @@ def test_a_recorder_that_is_stopped_ends_the_run_and_loses_nothing(
     assert found[:3] == [20_000_000, 40_000_000, 60_000_000]
 
 
+@pytest.mark.slow
 def test_a_process_that_cannot_be_woken_is_ended_and_what_it_had_written_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

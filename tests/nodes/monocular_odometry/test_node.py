@@ -49,6 +49,7 @@ def picture(number: int, data: Grey) -> Event:
     )
 
 
+@pytest.mark.slow
 def test_it_says_that_its_scale_is_free_and_nothing_before_it_has_a_map() -> None:
     images = [look(pose(x=0.06 * i)) for i in range(18)] + [np.zeros_like(look(pose()))]
     events = [picture(i, image) for i, image in enumerate(images)]

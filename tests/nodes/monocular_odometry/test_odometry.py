@@ -66,6 +66,7 @@ MOTIONS: dict[str, list[Place]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", MOTIONS.values(), ids=MOTIONS)
 def test_a_motion_has_its_direction_and_its_turn(path: list[Place]) -> None:
     *_, last = follow(MonocularOdometry(INFO), pictures(path))
@@ -76,6 +77,7 @@ def test_a_motion_has_its_direction_and_its_turn(path: list[Place]) -> None:
     assert turned(last.pose, true) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tiles", [FLAT, STEPPED, RELIEF], ids=["flat", "stepped", "relief"])
 def test_the_unit_of_length_stays(tiles: tuple[Tile, ...]) -> None:
     path: list[Place] = [(0.07 * i, 0.005 * i, 0.004 * i, 0.2 * i) for i in range(34)]
@@ -101,6 +103,7 @@ def test_a_camera_that_hurries_is_followed() -> None:
     assert unit(said[-1], hurry[-1]) == pytest.approx(2.0, rel=0.02)
 
 
+@pytest.mark.slow
 def test_landmarks_that_leave_are_replaced_by_far_ones_in_time() -> None:
     path: list[Place] = [(0.06 * i,) for i in range(50)]
     said = follow(MonocularOdometry(INFO), pictures(path, BOARD))
@@ -205,6 +208,7 @@ def elsewhere(count: int) -> list[Grey]:
     return pictures([(7.0 + 0.04 * i, 4.0, 0.78) for i in range(count)], FLAT)
 
 
+@pytest.mark.slow
 def test_a_new_map_waits_for_patience_says_so_and_goes_on_from_the_last_pose() -> None:
     odometry = MonocularOdometry(INFO, MonocularSettings(patience=0.15))
     *_, before = follow(odometry, pictures(DOWN_AND_ASIDE, FLAT))
@@ -225,12 +229,14 @@ def test_a_new_map_waits_for_patience_says_so_and_goes_on_from_the_last_pose() -
     assert metres / units == pytest.approx(2.0, rel=0.15)  # about as deep as the last
 
 
+@pytest.mark.slow
 def test_before_patience_ends_there_is_no_new_map() -> None:
     odometry = MonocularOdometry(INFO, MonocularSettings(patience=10.0))
     follow(odometry, pictures(RIGHT, FLAT))
     assert all(each.lost for each in follow(odometry, elsewhere(8), 24))
 
 
+@pytest.mark.slow
 def test_a_known_place_is_better_than_a_new_map_even_after_patience() -> None:
     odometry = MonocularOdometry(INFO, MonocularSettings(patience=0.1))
     *_, before = follow(odometry, pictures(RIGHT))

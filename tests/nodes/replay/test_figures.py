@@ -197,6 +197,7 @@ def test_a_bag_comes_back(bag: Path) -> None:
     found.close()
 
 
+@pytest.mark.slow
 def test_compressed_pictures_of_a_bag_come_back(tmp_path: Path) -> None:
     """PNG to the bit, and depth to the millimetre."""
     found = sets.reader(sets.compressed_bag(tmp_path))

@@ -156,6 +156,7 @@ def test_a_recording_that_was_mended_does_not_know_when_it_ended(tmp_path: Path)
     assert Recorded(path).end() is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 @given(data=st.data())
 @settings(max_examples=25, deadline=None)

@@ -178,6 +178,7 @@ def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
     assert {p: p.read_bytes() for p in again.rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.slow
 def test_hostile_names_are_shown_as_they_are(tmp_path: Path) -> None:
     """Markup stays text, and neither formulas nor a leading underscore trouble the legends."""
     truth, name = walk(3), "_<script>alert('$x^{$')</script>&飛"

@@ -57,6 +57,7 @@ def test_a_camera_at_rest_stays(make: Make) -> None:
     assert max(off(each, pose())[0] for each in said) < 1e-3
 
 
+@pytest.mark.slow
 @METHODS
 def test_equal_pictures_give_equal_bits(make: Make) -> None:
     first, second = (follow(make(INFO), MOTIONS["all at once"]) for _ in range(2))
@@ -65,6 +66,7 @@ def test_equal_pictures_give_equal_bits(make: Make) -> None:
         assert a.points.tobytes() == b.points.tobytes()
 
 
+@pytest.mark.slow
 @METHODS
 def test_colour_and_grey_are_the_same(make: Make) -> None:
     grey, coloured = make(INFO), make(INFO)
@@ -75,6 +77,7 @@ def test_colour_and_grey_are_the_same(make: Make) -> None:
     np.testing.assert_allclose(a.pose, b.pose, atol=1e-4)
 
 
+@pytest.mark.slow
 @METHODS
 def test_a_dark_moment_is_lost_and_regained_at_the_same_place(make: Make) -> None:
     tracker, path = make(INFO), RIGHT

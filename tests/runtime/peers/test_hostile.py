@@ -138,6 +138,7 @@ class Attacker(threading.Thread):
         self.seen.set()
 
 
+@pytest.mark.slow
 def test_without_the_secret_nobody_connects() -> None:
     config = settings(*THREE, duration=0.5)
     first = Process(config, "asker").up()

@@ -40,6 +40,7 @@ def test_in_lockstep_the_digest_is_that_of_one_process(shared: bool) -> None:
             assert summary.wall_seconds > 10 * DELAY  # there was a wire, and it was used
 
 
+@pytest.mark.slow
 def test_in_real_time_both_clocks_show_the_same() -> None:
     """Though a word takes a while: offsets are measured, and half a round trip is known."""
     config = settings(*THREE, clock="real", duration=0.5)

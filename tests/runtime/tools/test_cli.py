@@ -62,6 +62,7 @@ def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) 
     assert summary(results)["digest"] != first["digest"]
 
 
+@pytest.mark.slow
 def test_a_node_that_fails_is_one_line_and_a_summary(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Failing", run="duration = 2")
     done = command("run", path, "-q", folder=tmp_path)
@@ -140,6 +141,7 @@ def test_nodes_lists_ports_and_settings(tmp_path: Path) -> None:
         assert line in done.stdout
 
 
+@pytest.mark.slow
 def test_log_events_prints_each_event_with_arrays_by_shape(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Speaker", "Painter", run="duration = 0.25")
     done = command("run", path, "--log", "events", "-q", folder=tmp_path)

@@ -35,6 +35,7 @@ def test_a_step_settles_within_three_seconds(axis: int, length: float) -> None:
         assert max(abs(s.position[other] - goal[other]) for _, s in track) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length", "astray"), [(0.2, 0.02), (30.0, 0.15)])
 def test_near_and_far_places_are_not_overshot(length: float, astray: float) -> None:
     flight = airborne()

@@ -39,6 +39,7 @@ def test_white_noise_averages_out_with_the_root_of_time() -> None:
     np.testing.assert_allclose(deviation, np.repeat([1.7e-4, 2e-3], 3), rtol=0.2)
 
 
+@pytest.mark.slow
 def test_bias_wanders_with_the_root_of_time() -> None:
     """Over many seeds its spread after 5 s and 20 s is random_walk·√t, across blocks too."""
     runs = np.array(

@@ -105,6 +105,7 @@ def test_samples_stay_on_their_own_grid_at_any_rate() -> None:
 CAMERA = {"name": "front", "width": 8, "height": 6, "images": ["grey"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "imu_rate", "latency"), [(30, 200, "40ms"), (70, 200, 0), (50, 20, 0), (7.3, 33, 0)]
 )
@@ -138,6 +139,7 @@ def test_exposures_are_equidistant_and_true_at_their_own_stamps(
             assert len(before) > due
 
 
+@pytest.mark.slow
 def test_the_truth_between_imu_samples_is_the_one_that_a_fast_imu_tells() -> None:
     """Exposures at 70 Hz beside an IMU of 20 Hz, against one of 1000 Hz: within a micrometre of
     the straight line between milliseconds, and no exposure changes the flight."""
@@ -157,6 +159,7 @@ def test_the_truth_between_imu_samples_is_the_one_that_a_fast_imu_tells() -> Non
             assert event.position == pytest.approx(straight, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_an_imu_may_trigger_the_cameras(caplog: pytest.LogCaptureFixture) -> None:
     """Then every exposure has the stamp of an IMU sample; unequal intervals are warned of."""
     caplog.set_level(logging.WARNING, "visnav.drone")
@@ -193,6 +196,7 @@ def test_cameras_that_cannot_be_are_refused_with_the_file(
         spec(Multirotor, "drone", config)
 
 
+@pytest.mark.slow
 def test_several_vehicles_say_whom_they_obey() -> None:
     """Otherwise one pilot would steer all of them; the refusal has the words to write."""
     vehicles = [spec(Multirotor, name, {"world": world}) for name in ("a", "b")]
@@ -203,6 +207,7 @@ def test_several_vehicles_say_whom_they_obey() -> None:
         run_nodes([half, vehicles[1]], duration=0.1)
 
 
+@pytest.mark.slow
 def test_several_vehicles_are_each_steered_by_their_own_pilot() -> None:
     def obeying(name: str) -> NodeSpec:
         inputs = {"command": f"{name}/pilot", "setpoint": f"{name}/pilot"}
@@ -262,6 +267,7 @@ def test_a_collision_is_told_once_while_it_lasts() -> None:
     assert hits[0].position[0] == pytest.approx(4.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_fall_ends_in_a_collision_with_the_floor() -> None:
     result = fly(takeoff(), Disarm(stamp=3 * SECOND, source="t"), duration=5)
     assert [type(e) for e in result.of(Disarmed)] == [Disarmed]

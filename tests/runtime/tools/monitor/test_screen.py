@@ -61,6 +61,7 @@ async def test_it_shows_what_there_is_and_keeps_the_cursor() -> None:
         assert screen.query_one("#ticks").display
 
 
+@pytest.mark.slow
 async def test_keys_ask_the_run() -> None:
     stand = Stand(snapshot())
     presses: list[tuple[list[str], list[Any]]] = [

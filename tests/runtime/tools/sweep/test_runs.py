@@ -62,6 +62,7 @@ def test_a_run_that_fails_is_a_row_and_the_sweep_goes_on(tmp_path: Path) -> None
     assert (tmp_path / "out" / "plots" / "judge.fail.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished_and_ends_runs_in_order(tmp_path: Path) -> None:
     sign = tmp_path / "sign"
     os.mkfifo(sign)

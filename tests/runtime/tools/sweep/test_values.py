@@ -30,6 +30,7 @@ def written(value: Any) -> str:
     return text.partition("0,")[2].strip().removesuffix(",\n]").strip()
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(values.map(written) | words, st.sampled_from(["", " "])), min_size=1))
 def test_values_are_split_at_the_commas_between_them(pieces: list[tuple[str, str]]) -> None:
     text = ",".join(space + piece + space for piece, space in pieces)
