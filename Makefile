@@ -73,7 +73,7 @@ bench-quick: $(READY)  ## Run the quick benchmarks (under two minutes).
 pictures: demo $(READY)  ## Make the README's pictures anew (needs Chromium for two of them; minutes).
 	$(BIN)/python tools/readme_pictures.py
 	$(BIN)/python -m runtime run examples/rerun.toml
-	$(BIN)/python tools/view_picture.py runs/rerun/flight.rrd docs/rerun.png
+	$(BIN)/python tools/view_picture.py runs/rerun/flight.rrd docs/images/rerun.png
 	$(BIN)/python tools/monitor_pictures.py
 
 clean:  ## Remove the environment, results and caches.

@@ -1,4 +1,4 @@
-"""Make the pictures of the monitor: docs/monitor.png and docs/web.png.
+"""Make the images of the monitor: `monitor.png` and `web.png` in docs/images.
 
 Starts examples/closed_loop.toml at real speed, looks at it in both ways, and ends it. Needs
 Chromium, which draws them.
@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
+DOCS = ROOT / "docs" / "images"
 SIZE = (150, 44)
 """Columns and lines of the terminal."""
 FLYING = 8.0

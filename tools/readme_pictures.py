@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-PLOTS, DOCS = Path("runs/tour/plots"), Path("docs")
+PLOTS, DOCS = Path("runs/tour/plots"), Path("docs/images")
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Whatever a node raises, wherever it does: the run ends as documented, and keeps what there was.
 
-Node faults × clocks × on_error, each a run of the command line's; ``docs/what-happens-when.md``
-has the rules.
+Node faults × clocks × on_error, each a run of the command line's. The rules are in
+``docs/explanation/what-happens-when.md``.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def test_a_run_survives_whatever_a_node_raises(number: int, tmp_path: Path) -> N
 
 def test_the_page_of_what_happens_when_names_tests_and_messages_that_there_are() -> None:
     """Each row names a file of tests, and quotes messages as the runtime has them."""
-    page = (ROOT / "docs" / "what-happens-when.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "explanation" / "what-happens-when.md").read_text(encoding="utf-8")
     rows = [line.split("|")[1:-1] for line in page.splitlines() if line.startswith("| ")][1:]
     assert len(rows) >= 18
     sources = "".join(
