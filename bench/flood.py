@@ -144,7 +144,7 @@ def _settings(port: int, seconds: float) -> dict[str, Any]:
         "run": {"clock": "real", "duration": seconds, "log": "error"},
         "nodes": [
             {"name": "probe", "type": f"{__name__}:Probe"},
-            {"name": "drone", "type": "sims.multirotor.node:Multirotor"},
+            {"name": "drone", "type": "sims.multirotor:Multirotor"},
             {
                 "name": "ros2",
                 "type": "nodes.ros2_bridge:Ros2Bridge",

@@ -20,7 +20,7 @@ from events import Takeoff, VelocitySetpoint
 from runtime import Node, Output, Tick, every
 from runtime.config import parse
 from runtime.execute import execute
-from sims.multirotor import (
+from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,
     ImuNoise,
@@ -103,7 +103,7 @@ def _run(seconds: float, cameras: list[dict[str, Any]]) -> float:
                     {"name": "pilot", "type": f"{__name__}:Pilot"},
                     {
                         "name": "drone",
-                        "type": "sims.multirotor.node:Multirotor",
+                        "type": "sims.multirotor:Multirotor",
                         "cameras": cameras,
                         "control_rate": CONTROL,
                         "imu_rate": IMU,

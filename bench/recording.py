@@ -136,7 +136,7 @@ def _measure(recorder: dict[str, object] | None, seconds: float, rate: float) ->
     _run = _Run(late=[])
     camera = {"name": "camera", "images": ["rgb", "depth"], "rate": rate}
     nodes: list[dict[str, object]] = [
-        {"name": "drone", "type": "sims.multirotor.node:Multirotor", "cameras": [camera]},
+        {"name": "drone", "type": "sims.multirotor:Multirotor", "cameras": [camera]},
         {"name": "probe", "type": "bench.recording:Probe"},
     ]
     if recorder is not None:

@@ -257,7 +257,7 @@ def _settings(mode: Mode, seconds: float, rate: float, size: int, port: int) -> 
         "run": {"clock": "real", "duration": seconds + 1.0, "log": "error"},
         "nodes": [
             {"name": "probe", "type": f"{here}:Probe", "mode": mode},
-            {"name": "drone", "type": "sims.multirotor.node:Multirotor"},
+            {"name": "drone", "type": "sims.multirotor:Multirotor"},
             {
                 "name": "camera",
                 "type": f"{here}:Camera",

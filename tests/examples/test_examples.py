@@ -75,7 +75,7 @@ def test_computer_vision_follows_the_trajectory(tmp_path: Path) -> None:
 def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
     """`closed_loop` lands without a collision, and was where the truth says it should be."""
     summary = run("closed_loop", tmp_path, "evaluation.report=false")
-    assert summary["reason"] == "pilot: tour flown"
+    assert summary["reason"] == "pilot: flight completed"
     assert summary["outputs"]["drone.happenings"] == 4
     figures = summary["verdict"]["estimators"]["odometry"]
     assert figures["lost_seconds"] == 0.0
@@ -176,7 +176,7 @@ def test_two_machines_start_in_either_order(tmp_path: Path, clock: str, first: i
     changes = ["run.duration=4s", f"run.clock={clock}", f"network.meet=tcp/127.0.0.1:{free_port()}"]
     settings = [word for change in changes for word in ("--set", change)]
     command = [sys.executable, "-m", "runtime", "run", "examples/two_machines.toml", "--quiet"]
-    groups = ["drone,tour", "odometry,evaluation"]
+    groups = ["drone,pilot", "odometry,evaluation"]
     started = []
     for only in groups if first == 0 else reversed(groups):
         out = ["--only", only, "--out", str(tmp_path / only)]

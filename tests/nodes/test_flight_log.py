@@ -16,7 +16,7 @@ from runtime.config import Config, RunConfig
 from runtime.errors import NodeError
 from runtime.execute import execute
 from runtime.testing import run_node, run_nodes, spec
-from tests.nodes.test_tour import Vehicle
+from tests.nodes.pilots.test_waypoint_follower import Vehicle
 
 
 def odometry(stamp: int, x: float = 0.0, yaw: float = 0.0) -> Odometry:

@@ -33,8 +33,8 @@ name = "front"
 name = "down"
 images = ["grey"]
 [[nodes]]
-name = "tour"
-type = "nodes.tour:Tour"
+name = "pilot"
+type = "nodes.pilots:WaypointFollower"
 waypoints = [[0, 0, -1], [-3, 0, -1], [-3, 3, -1]]
 [[nodes]]
 name = "odometry"
@@ -49,7 +49,7 @@ type = "nodes.flight_log:FlightLog"
 def room(tmp_path: Path) -> Path:
     (tmp_path / "room.xml").write_text(ROOM)
     path = tmp_path / "room.toml"
-    path.write_text(FILE.replace("sims.multirotor:", "sims.multirotor.node:"))
+    path.write_text(FILE)
     return path
 
 
@@ -63,7 +63,7 @@ def test_a_right_file_is_right_from_anywhere(room: Path) -> None:
     for folder in (room.parent, ROOT):
         done = command_here("check", room, folder=folder)
         assert (done.returncode, done.stderr) == (0, "")
-        assert done.stdout.endswith("4 nodes, 11 connections: right\n")
+        assert done.stdout.endswith("4 nodes, 10 connections: right\n")
     assert sorted(each.name for each in room.parent.iterdir()) == ["room.toml", "room.xml"]
 
 
@@ -78,16 +78,16 @@ MISTAKES = [
     ("drone.position=[9.0,0.0]", "drone: position: expected ground", "[9, 0, -0.1]: outside"),
     ("drone.position=[2.0,0.0]", "drone: position: expected a free place", "in pillar"),
     ("drone.height=-1", "drone: position: expected a free place", "in the ground (floor)"),
-    ("tour.waypoints=[[0,0,1.5]]", "waypoints[0]: expected a free", "heights are negative"),
-    ("tour.waypoints=[[0,0,-1],[9,0,-1]]", "waypoints[1]: expected a free way", "found pillar"),
-    ("tour.waypoints=[[-9,0,-1]]", "waypoints[0]: expected a free way", "found south between"),
-    ("tour.waypoints=[[0,0,-9]]", "waypoints[0]", "ceiling"),
-    ("tour.waypoints=[[2,0,-1]]", "waypoints[0]: expected a free place", "in pillar"),
+    ("pilot.waypoints=[[0,0,1.5]]", "waypoints[0]: expected a free", "heights are negative"),
+    ("pilot.waypoints=[[0,0,-1],[9,0,-1]]", "waypoints[1]: expected a free way", "found pillar"),
+    ("pilot.waypoints=[[-9,0,-1]]", "waypoints[0]: expected a free way", "found south between"),
+    ("pilot.waypoints=[[0,0,-9]]", "waypoints[0]", "ceiling"),
+    ("pilot.waypoints=[[2,0,-1]]", "waypoints[0]: expected a free place", "in pillar"),
     ("front.latency=40", "cameras[0].latency: expected a unit", 'did you mean "40ms"'),
     ("odometry.latency=15", "latency: expected a unit", 'did you mean "15ms"'),
     ("log.plot=trajectory.tum", "log: expected files of its own", ""),
     ("log.plot=summary.json", "log: expected files of its own", "summary.json, which the run"),
-    ("log.name=tour", "nodes[3].name: expected a name that no other node has", '"tour"'),
+    ("log.name=pilot", "nodes[3].name: expected a name that no other node has", '"pilot"'),
     ("log.plt=x.png", "nodes[3] (log): expected one of", "'plt' (did you mean 'plot'?)"),
 ]
 
@@ -113,9 +113,9 @@ def test_a_vehicle_that_starts_in_the_air_is_odd(room: Path) -> None:
 
 
 def test_an_input_that_names_what_is_not_there_is_odd(room: Path) -> None:
-    code, lines = check(room, 'tour.inputs={moved="dron"}')
+    code, lines = check(room, 'pilot.inputs={odometry="dron"}')
     assert code == 0
-    assert lines[0].startswith("warning: tour: inputs.moved: expected one of drone, tour, ")
+    assert lines[0].startswith("warning: pilot: inputs.odometry: expected one of drone, pilot, ")
 
 
 def test_a_recording_is_looked_for_beside_the_file(tmp_path: Path) -> None:

@@ -21,10 +21,10 @@ from events import (
     TrackingRegained,
 )
 from nodes.estimation import Estimator, pose_matrix
-from nodes.visual_pilot import VisualPilot
+from nodes.pilots import VisualPilot
 from runtime import Input
 from runtime.testing import NodeResult, run_nodes, spec
-from sims.multirotor.node import Multirotor
+from sims.multirotor import Multirotor
 
 SECOND = 1_000_000_000
 FAILS = 6.0
@@ -79,7 +79,7 @@ class Ideal(Estimator):
 def flight(tmp_path_factory: pytest.TempPathFactory) -> NodeResult:
     world: Path = tmp_path_factory.mktemp("world") / "floor.xml"
     world.write_text(FLOOR)
-    pilot = {"waypoints": [[0, 0, -1.5], [8.0, 0.0, -1.5]], "speed": 0.9, "give_up": "4s"}
+    pilot = {"waypoints": [[0, 0, -1.5], [8.0, 0.0, -1.5]], "speed": 0.9, "landing_timeout": "4s"}
     return run_nodes(
         [
             spec(Multirotor, "drone", {"world": str(world), "position": [0.5, 1.0]}),

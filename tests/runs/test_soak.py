@@ -27,7 +27,7 @@ digest = true
 
 [[nodes]]
 name = "drone"
-type = "sims.multirotor.node:Multirotor"
+type = "sims.multirotor:Multirotor"
 control_rate = 100
 
 [[nodes]]

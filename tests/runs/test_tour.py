@@ -113,7 +113,7 @@ def test_the_tour_flies_round_the_hall_and_lands(tmp_path: Path) -> None:
     """Without cameras a minute's flight takes seconds."""
     fly(tmp_path, "out", "drone.cameras=[]")
     found = summary(tmp_path / "out")
-    assert found["reason"] == "tour: tour flown"
+    assert found["reason"] == "pilot: flight completed"
     assert (found["events"]["TakenOff"], found["events"]["Landed"]) == (1, 1)
     assert found["events"].get("Collision", 0) == 0
     assert 40 < found["sim_seconds"] < 75
@@ -128,7 +128,7 @@ def test_the_tour_flies_round_the_hall_and_lands(tmp_path: Path) -> None:
 def test_the_whole_tour_with_pictures(tmp_path: Path) -> None:
     fly(tmp_path, "out", *SMALL)
     found = summary(tmp_path / "out")
-    assert found["reason"] == "tour: tour flown"
+    assert found["reason"] == "pilot: flight completed"
     assert found["events"].get("Collision", 0) == 0
     assert abs(found["events"]["Image"] - 30 * found["sim_seconds"]) < 4
 

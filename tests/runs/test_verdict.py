@@ -26,7 +26,7 @@ def fly(folder: Path, config: Path, *settings: str, code: int | None = 0) -> dic
 @pytest.mark.parametrize("world", ["config.toml", "examples/yard.toml"])
 def test_odometry_keeps_within_a_third_of_a_percent(world: str, tmp_path: Path) -> None:
     summary = fly(tmp_path, ROOT / world, "evaluation.report=false")
-    assert summary["reason"] == "tour: tour flown"
+    assert summary["reason"] == "pilot: flight completed"
     # Armed, taken off, landed, disarmed: no collision among what happened.
     assert summary["outputs"]["drone.happenings"] == 4
     verdict = summary["verdict"]

@@ -12,7 +12,7 @@ from runtime.errors import ConfigError
 DRONE = """
 [[nodes]]
 name = "drone"
-type = "sims.multirotor.node:Multirotor"
+type = "sims.multirotor:Multirotor"
 """
 CAMERAS = """
 [[nodes.cameras]]
@@ -100,8 +100,11 @@ OF_NODES = [
     ('name = "x"\ntype = "a"', 'nodes[0] (x): type: expected "module:Class", found "a"'),
     ('name = "x"\ntype = "..a:B"', 'nodes[0] (x): type: expected "module:Class", found "..a:B"'),
     ('name = "x"\ntype = "nodes.flightlog:A"', '"nodes.flightlog" (did you mean \'nodes.flight_'),
-    ('name = "x"\ntype = "nodes.tour:Tuor"', "found \"Tuor\" (did you mean 'Tour'?)"),
-    ('name = "x"\ntype = "nodes.tour:Node"', 'expected a node of nodes.tour, found "Node"'),
+    ('name = "x"\ntype = "nodes.pilots:Teleob"', "found \"Teleob\" (did you mean 'Teleop'?)"),
+    (
+        'name = "x"\ntype = "nodes.pilots.pilot:Node"',
+        'expected a node of nodes.pilots.pilot, found "Node"',
+    ),
     ('name = "x"\ntype = "os.path:join"', 'expected a node of os.path, found "join"'),
     ('name = "x"\ntype = "a:B"\non_error = "cry"', 'on_error: expected "stop" or "restart" or'),
 ]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from runtime import Duration
 from runtime.config import Config, RunConfig, parse, to_builtins
-from sims.multirotor.node import MultirotorConfig
+from sims.multirotor import MultirotorConfig
 from tests.runtime.samples import Speaker, SpeakerConfig
 from tests.runtime.test_config import CAMERAS, DRONE, SPEAKER, message, read
 

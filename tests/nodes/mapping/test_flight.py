@@ -11,10 +11,10 @@ import pytest
 
 from events import Odometry
 from nodes.mapping import Mapping
+from nodes.pilots import WaypointFollower
 from nodes.report.ply import read_ply
-from nodes.tour import Tour
 from runtime.testing import run_nodes, spec
-from sims.multirotor.node import Multirotor
+from sims.multirotor import Multirotor
 from sims.worlds import TOURS
 from tests.nodes.mapping.surfaces import distances
 from tests.runtime.tools.samples_cli import ROOT, start, summary
@@ -29,10 +29,10 @@ WAYPOINTS = [TOURS["hall"][k] for k in (0, 1, 2, 3, 6)]
 def fly(out: Path) -> list[Odometry]:
     """Fly at 3 m/s, 11 m of it straight along the west side of the hall, and map it twice."""
     camera = {"name": "camera", "width": 320, "height": 240, "rate": 15, "latency": "40ms"}
-    tour = {"speed": 3.0, "acceleration": 3.0, "waypoints": WAYPOINTS, "wait": 0.5}
+    pilot = {"speed": 3.0, "acceleration": 3.0, "waypoints": WAYPOINTS, "start_delay": 0.5}
     nodes = [
         spec(Multirotor, "drone", {"world": "hall", "cameras": [camera]}),
-        spec(Tour, "tour", tour),
+        spec(WaypointFollower, "pilot", pilot),
         spec(Mapping, "matched", {"pose": "matched"}),
         spec(Mapping, "latest", {"pose": "latest"}),
     ]

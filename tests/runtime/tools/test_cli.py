@@ -131,7 +131,7 @@ def test_graph_prints_mermaid_or_draws(tmp_path: Path) -> None:
 def test_nodes_lists_ports_and_settings(tmp_path: Path) -> None:
     done = command_here("nodes", "multirotor", folder=tmp_path)
     assert done.returncode == 0
-    assert "sims.multirotor.node:Multirotor" in done.stdout
+    assert "sims.multirotor:Multirotor" in done.stdout
     for line in (
         "sends Imu as imu",
         "sends Image as images",

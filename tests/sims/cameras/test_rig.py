@@ -28,7 +28,7 @@ from runtime.units import Latency
 from sims.cameras import CameraSpec, optical_in_body
 from sims.cameras.delivery import delay_of
 from sims.computer_vision import FreeCamera
-from sims.multirotor.node import Multirotor
+from sims.multirotor import Multirotor
 
 MS = 1_000_000
 PERIOD = 40 * MS

@@ -1,0 +1,164 @@
+"""What all scripted flights have in common: take off, follow a path, land, end the run.
+
+By which pose the path is followed is up to the subclass: `nodes.pilots.waypoint_follower` takes the
+vehicle's true one, `nodes.pilots.visual_pilot` an estimator's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from typing_extensions import TypeVar
+
+from events import (
+    Announcement,
+    Command,
+    Hover,
+    Land,
+    Landed,
+    Odometry,
+    PathAnnouncement,
+    PoseEstimate,
+    Shutdown,
+    TakenOff,
+    Takeoff,
+    Vector3,
+    VehicleAnnouncement,
+    VehicleEvent,
+)
+from nodes.pilots.waypoint_path import WaypointPath, plan
+from runtime import Duration, Node, NodeConfig, Output, on
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class PilotConfig(NodeConfig):
+    """Settings of a scripted flight.
+
+    Attributes:
+        waypoints: Places to pass, metres in ``map`` (x north, y east, z down: heights are
+            negative). The path begins above the place where the vehicle stands.
+        speed: Highest speed along the path, metres per second.
+        acceleration: Highest acceleration along the path and across it, metres per second squared.
+        corner_radius: Distance from a waypoint at which the rounding of its corner begins, metres.
+        turn_time: Seconds over which changes of heading are smoothed.
+        rate: Set-points per second.
+        start_delay: Time from the first known pose to take-off, seconds.
+        end_run: Whether the run ends once the vehicle has landed.
+    """
+
+    waypoints: Annotated[tuple[Vector3, ...], msgspec.Meta(min_length=1)]
+    speed: Positive = 1.3
+    acceleration: Positive = 1.0
+    corner_radius: Positive = 0.8
+    turn_time: Duration = Duration(0.5)  # immutable
+    rate: Positive = 50
+    start_delay: Duration = Duration(0.5)
+    end_run: bool = True
+
+
+C = TypeVar("C", bound=PilotConfig, default=PilotConfig)
+
+
+class Pilot(Node[C], ABC):
+    """Base of the nodes that take off, follow a path, land and end the run.
+
+    A subclass calls `update_pose` with the vehicle's pose as it knows it, and implements `follow`.
+    """
+
+    commands = Output(Command)
+    shutdowns = Output(Shutdown)
+
+    outcome = "flight completed"
+    """Why the run ends, once the vehicle has landed."""
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce the waypoints."""
+        yield PathAnnouncement(stamp=0, source=self.name, waypoints=self.config.waypoints)
+
+    def __init__(self) -> None:
+        self.pose: Odometry | PoseEstimate | None = None
+        self._pose_known = asyncio.Event()
+        self._taken_off = asyncio.Event()
+        self._landed = asyncio.Event()
+        self._vehicles: list[str] = []
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Refuse to fly where it is open which of several vehicles is meant."""
+        if not isinstance(announcement, VehicleAnnouncement):
+            return
+        self._vehicles.append(announcement.source)
+        ports = [
+            port
+            for port, handles in self.declared.handlers.items()
+            if port not in self.sources
+            and any(issubclass(event, Odometry | VehicleEvent) for event in handles.events)
+        ]
+        if ports and len(self._vehicles) > 1:
+            first = self._vehicles[0]
+            line = ", ".join(f'{port} = "{first}"' for port in ports)
+            raise ValueError(
+                f"of several vehicles, {self.name} was expected to say which it flies, but it "
+                f"hears them all: write inputs = {{ {line} }} into its entry, if it is {first}"
+            )
+
+    def update_pose(self, pose: Odometry | PoseEstimate) -> None:
+        """Note the vehicle's pose; the first one starts the flight."""
+        self.pose = pose
+        self._pose_known.set()
+
+    @abstractmethod
+    async def follow(self, path: WaypointPath) -> None:
+        """Fly along a path that begins now."""
+
+    @on(TakenOff, Landed)
+    def vehicle_events(self, event: VehicleEvent) -> None:
+        """Note that the vehicle has taken off, or has landed."""
+        (self._taken_off if isinstance(event, TakenOff) else self._landed).set()
+
+    async def run(self) -> None:
+        """Take off, follow the path, land, and end the run."""
+        clock, name = self.clock, self.name
+        await self._pose_known.wait()
+        await clock.sleep(self.config.start_delay)
+        assert self.pose is not None
+        height = self.pose.position[2] - self.config.waypoints[0][2]
+        self.commands.send(Takeoff(stamp=clock.now(), source=name, altitude=max(height, 0.5)))
+        await self._taken_off.wait()
+        path = await self.offload(self._plan, self.pose)
+        if path is not None:
+            self.log.info("a path of %.1f m in %.1f s", path.length, path.seconds)
+            await self.follow(path)
+        self.commands.send(Hover(stamp=clock.now(), source=name))
+        self.commands.send(Land(stamp=clock.now(), source=name))
+        await self._landed.wait()
+        self.log.info("landed")
+        await clock.sleep(0.5)
+        if self.config.end_run:
+            self.shutdowns.send(Shutdown(stamp=clock.now(), source=name, reason=self.outcome))
+
+    def _plan(self, start: Odometry | PoseEstimate) -> WaypointPath | None:
+        """Return the path from here; `None` if the only waypoint is where the vehicle is."""
+        config = self.config
+        w, x, y, z = start.orientation
+        points = [start.position]
+        for waypoint in config.waypoints:
+            if math.dist(points[-1], waypoint) > 0.05:
+                points.append(waypoint)
+        if len(points) == 1:
+            return None
+        return plan(
+            np.array(points),
+            speed=config.speed,
+            acceleration=config.acceleration,
+            radius=config.corner_radius,
+            yaw=math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+            turn_time=config.turn_time,
+            step=1 / config.rate,
+        )

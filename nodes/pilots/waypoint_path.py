@@ -1,0 +1,156 @@
+"""Timed paths through waypoints: rounded corners, limited speed and acceleration, smooth heading.
+
+Pure numpy; the nodes that fly them are in `nodes.pilots.pilot` and its subclasses.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+_SPACING = 0.02
+"""Metres between the points at which a path is computed."""
+
+_REST = 1.0
+"""Seconds at rest at both ends, so that smoothing neither cuts the path short nor starts it with
+a jerk."""
+
+
+class WaypointPath(msgspec.Struct, frozen=True, eq=False):
+    """A path with a position and a heading for each moment, at regular steps.
+
+    Attributes:
+        step: Seconds between two rows.
+        position: Metres, shape (n, 3).
+        velocity: Metres per second, shape (n, 3).
+        acceleration: Metres per second squared, shape (n, 3).
+        yaw: Radians, continuous (not wrapped), shape (n,).
+        yaw_rate: Radians per second, shape (n,).
+    """
+
+    step: float
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+    yaw: Floats
+    yaw_rate: Floats
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the path, seconds."""
+        return (len(self.position) - 1) * self.step
+
+    @property
+    def length(self) -> float:
+        """Length of the path, metres."""
+        return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
+
+
+def plan(
+    waypoints: Floats,
+    *,
+    speed: float,
+    acceleration: float,
+    radius: float,
+    yaw: float,
+    turn_time: float,
+    step: float,
+) -> WaypointPath:
+    """Return a path along straight lines between waypoints, at rest at both ends.
+
+    Args:
+        waypoints: Metres in ``map``, shape (n, 3), n ≥ 2, no two neighbours alike.
+        speed: Metres per second that it never exceeds.
+        acceleration: Metres per second squared, along the path and across it.
+        radius: Metres from a corner at which its rounding begins, at most.
+        yaw: Heading at the start, radians.
+        turn_time: Seconds over which changes of heading are smoothed; apart from that, the heading
+            is the direction of flight.
+        step: Seconds between rows.
+    """
+    points, along = _resample(_round_corners(waypoints, radius), _SPACING)
+    pace = _speeds(points, along, speed, acceleration)
+    # Time at each point: each stretch at the mean of its ends' speeds.
+    time = np.concatenate([[0.0], np.cumsum(np.diff(along) / ((pace[1:] + pace[:-1]) / 2))])
+    moving = np.interp(np.arange(0.0, time[-1], step), time, along)
+    before = np.zeros(round(_REST / step))
+    # At the end, too, until the heading is reached.
+    after = np.full(round(max(2 * turn_time, _REST) / step), along[-1])
+    arc = np.concatenate([before, moving, after])
+    arc = _smooth(arc, round(0.3 / step))
+    position = np.stack([np.interp(arc, along, axis) for axis in points.T], axis=1)
+    position = np.apply_along_axis(_smooth, 0, position, round(0.3 / step))
+    velocity = np.gradient(position, step, axis=0)
+    heading = _headings(velocity, yaw)
+    heading = _smooth(heading, round(turn_time / step))
+    return WaypointPath(
+        step=step,
+        position=position,
+        velocity=velocity,
+        acceleration=np.gradient(velocity, step, axis=0),
+        yaw=heading,
+        yaw_rate=np.gradient(heading, step),
+    )
+
+
+def _round_corners(points: Floats, radius: float) -> Floats:
+    """Replace each corner by a quadratic Bézier curve, which stays inside the corner."""
+    rounded = [points[:1]]
+    for before, corner, after in zip(points, points[1:], points[2:], strict=False):
+        ends = []
+        for other in (before, after):
+            way = other - corner
+            distance = float(np.linalg.norm(way))
+            ends.append(corner + way * min(radius, distance / 2) / distance)
+        t = np.linspace(0.0, 1.0, 33)[:, None]
+        rounded.append((1 - t) ** 2 * ends[0] + 2 * t * (1 - t) * corner + t**2 * ends[1])
+    rounded.append(points[-1:])
+    return np.concatenate(rounded)
+
+
+def _arc_length(points: Floats) -> Floats:
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def _resample(points: Floats, spacing: float) -> tuple[Floats, Floats]:
+    """Return points at equal distances along the path, and those distances."""
+    along = _arc_length(points)
+    keep = np.concatenate([[True], np.diff(along) > 0])
+    at = np.linspace(0.0, along[-1], max(int(along[-1] / spacing), 2))
+    return np.stack([np.interp(at, along[keep], axis) for axis in points[keep].T], axis=1), at
+
+
+def _speeds(points: Floats, along: Floats, speed: float, acceleration: float) -> Floats:
+    """Return the fastest speed at each point that respects both limits, forwards and back."""
+    tangent = np.gradient(points, along, axis=0)
+    curvature = np.linalg.norm(np.gradient(tangent, along, axis=0), axis=1)
+    limit = np.minimum(speed, np.sqrt(acceleration / np.maximum(curvature, 1e-6)))
+    limit[0] = limit[-1] = 0.05  # nearly: at 0 the first step would take for ever
+    for order in (range(1, len(limit)), range(len(limit) - 2, -1, -1)):
+        for i in order:
+            before = i - 1 if order.step > 0 else i + 1
+            reach = np.sqrt(limit[before] ** 2 + 2 * acceleration * abs(along[i] - along[before]))
+            limit[i] = min(limit[i], reach)
+    return np.asarray(limit)
+
+
+def _headings(velocity: Floats, yaw: float) -> Floats:
+    """Return the direction of flight; where the path hardly moves, the last one before."""
+    moving = np.hypot(velocity[:, 0], velocity[:, 1]) > 0.2
+    heading = np.arctan2(velocity[:, 1], velocity[:, 0])
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), -1))
+    held = np.where(last >= 0, heading[last], yaw)
+    return np.unwrap(np.concatenate([[yaw], held]))[1:]
+
+
+def _smooth(values: Floats, width: int) -> Floats:
+    """Average over a Gaussian window of `width` rows, holding the ends."""
+    if width < 1:
+        return values
+    reach = 3 * width
+    window = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    padded = np.pad(values, reach, mode="edge")
+    return np.convolve(padded, window / window.sum(), mode="valid")

@@ -1,0 +1,47 @@
+"""A quadrotor: its MuJoCo model, physics, IMU noise, control cascade and autopilot.
+
+Everything here is pure: time is an argument, nothing waits, nothing is sent. One step of a run is
+
+    physics.advance_to(stamp)
+    state = physics.state()
+    physics.set_motors(*autopilot.update(stamp, state, physics.touching()))
+"""
+
+from sims.vehicle.autopilot import Autopilot, Phase
+from sims.vehicle.control import Controller, Motors
+from sims.vehicle.gains import Gains, Limits
+from sims.vehicle.imu import ImuNoise, ImuParameters
+from sims.vehicle.mixer import Mixer
+from sims.vehicle.model import (
+    STANDING_HEIGHT,
+    TIMESTEP_NS,
+    Motor,
+    VehicleParameters,
+    attach_vehicle,
+    read_parameters,
+)
+from sims.vehicle.physics import Contact, Physics, PhysicsDivergedError, State
+from sims.vehicle.setpoints import Setpoint
+
+__all__ = [
+    "STANDING_HEIGHT",
+    "TIMESTEP_NS",
+    "Autopilot",
+    "Contact",
+    "Controller",
+    "Gains",
+    "ImuNoise",
+    "ImuParameters",
+    "Limits",
+    "Mixer",
+    "Motor",
+    "Motors",
+    "Phase",
+    "Physics",
+    "PhysicsDivergedError",
+    "Setpoint",
+    "State",
+    "VehicleParameters",
+    "attach_vehicle",
+    "read_parameters",
+]

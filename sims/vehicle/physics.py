@@ -1,0 +1,271 @@
+"""The physics of one world with one vehicle: stepping, and reading what is true at an instant.
+
+No sensor noise (see `imu`), no control (see `control`), no pictures. Everything that comes out is
+in our frames: world NED, body FRD.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from events import Quaternion, Vector3
+from sims.vehicle.model import TIMESTEP_NS, VehicleParameters, read_parameters
+
+Floats = npt.NDArray[np.float64]
+
+
+class PhysicsDivergedError(Exception):
+    """The state is no longer finite: the world's model or what was written into it is at fault."""
+
+
+class State(msgspec.Struct, frozen=True, gc=False):
+    """Where the vehicle is and how it moves.
+
+    Attributes:
+        position: Metres NED.
+        orientation: Rotation FRD → NED.
+        velocity: Metres per second NED.
+        angular_velocity: Radians per second FRD.
+    """
+
+    position: Vector3
+    orientation: Quaternion
+    velocity: Vector3
+    angular_velocity: Vector3
+
+
+class Contact(msgspec.Struct, frozen=True, gc=False):
+    """One point at which the vehicle touches something.
+
+    Attributes:
+        other: Name of the other geom; of its body if it has none.
+        position: Metres NED.
+        normal: Unit vector NED, from the other towards the vehicle.
+        speed: Metres per second at which the two close in along the normal; negative if they part.
+    """
+
+    other: str
+    position: Vector3
+    normal: Vector3
+    speed: float
+
+
+class Physics:
+    """A world with a vehicle in it, stepped by whole milliseconds.
+
+    What is read is exactly that of `time_ns`: the accelerometer too. MuJoCo's ``mj_step`` leaves
+    sensors and contacts of *before* its last integration behind, so the forward pass for the
+    present instant is made when they are first asked for, and the next advance starts from it
+    with ``mj_step2`` instead of computing it again. The motors' thrust is a state of its own
+    (their lag), so a new command changes nothing at the instant at which it is given.
+
+    Whoever writes a state into `data` does it before anything is read at that instant.
+
+    Args:
+        model: A compiled world, with the vehicle attached by `model.attach_vehicle`.
+        name: The vehicle's name in it.
+
+    Raises:
+        ValueError: The world has no such vehicle, or another time step.
+    """
+
+    def __init__(self, model: mujoco.MjModel, name: str) -> None:
+        self.parameters: VehicleParameters = read_parameters(model, name)
+        if abs(model.opt.timestep * 1e9 - TIMESTEP_NS) > 1e-3:
+            raise ValueError(
+                f"expected a world with a time step of 0.001 s, found {model.opt.timestep} s"
+            )
+        self.model = model
+        self.data: Any = mujoco.MjData(model)
+        self._body = model.body(f"{name}/base_link").id
+        joint = model.joint(f"{name}/free")
+        pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
+        motor = model.actuator(f"{name}/motor1").id
+        sensor = int(model.sensor(f"{name}/gyroscope").adr[0])
+        # Views on MuJoCo's own memory; `tolist` makes plain floats of them in one C call each.
+        self._of_pose, self._of_twist = slice(pose, pose + 7), slice(twist, twist + 6)
+        self._pose = self.data.qpos[self._of_pose]
+        self._twist = self.data.qvel[self._of_twist]
+        self._motors = self.data.ctrl[motor : motor + 4]
+        self._imu = self.data.sensordata[sensor : sensor + 6]
+        self._steps = 0
+        self._fresh = False
+
+    @property
+    def time_ns(self) -> int:
+        """Nanoseconds simulated since the start or the last `reset`; whole milliseconds."""
+        return self._steps * TIMESTEP_NS
+
+    def advance_to(self, stamp_ns: int) -> None:
+        """Step with the present motor commands to the last whole millisecond ≤ `stamp_ns`.
+
+        Does nothing if it is there already, or later.
+
+        Raises:
+            PhysicsDivergedError: The state is no longer finite.
+        """
+        steps = stamp_ns // TIMESTEP_NS - self._steps
+        if steps <= 0:
+            return
+        data = self.data
+        self._steps += steps
+        if self._fresh:
+            self._fresh = False
+            mujoco.mj_step2(self.model, data)
+            steps -= 1
+        if steps:
+            mujoco.mj_step(self.model, data, steps)
+        # MuJoCo starts again at time 0 when it finds a number that is not finite.
+        if data.time < (self._steps - 0.5) * 1e-9 * TIMESTEP_NS:
+            raise PhysicsDivergedError(
+                f"the simulation diverged before {self.time_ns / 1e9:.3f} s: "
+                "its state was no longer finite"
+            )
+
+    def set_motors(self, m0: float, m1: float, m2: float, m3: float) -> None:
+        """Set the motor commands, each 0 to 1 of its full thrust; clamped beyond."""
+        motors = self._motors
+        motors[0] = m0
+        motors[1] = m1
+        motors[2] = m2
+        motors[3] = m3
+
+    def state(self) -> State:
+        """Return where the vehicle is and how it moves."""
+        return _state(self._pose, self._twist)
+
+    def state_at(self, stamp_ns: int) -> tuple[State, Floats, Floats]:
+        """Return the state at a time at or after `time_ns`, less than or just one step later.
+
+        Between two steps the world is carried on as the next step will carry it: a whole step
+        later this is what `advance_to` gives. (Damped joints of other bodies, which MuJoCo steps
+        implicitly, may differ slightly.)
+
+        Returns:
+            The vehicle's state; copies of the world's generalised positions, shape (nq,), and
+            velocities, shape (nv,), for a renderer.
+
+        Raises:
+            ValueError: The time is before `time_ns`, or more than a step later.
+        """
+        ahead = stamp_ns - self.time_ns
+        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        if not 0 <= ahead <= TIMESTEP_NS:
+            expected = f"{self.time_ns} to {self.time_ns + TIMESTEP_NS} ns"
+            raise ValueError(f"state_at: expected a time of {expected}, found {stamp_ns} ns")
+        if ahead:
+            if not self._fresh:
+                self._refresh()
+            # As semi-implicit Euler does it: first the velocity, and with that the position.
+            next_qvel = qvel + self.data.qacc * (TIMESTEP_NS * 1e-9)
+            mujoco.mj_integratePos(self.model, qpos, next_qvel, ahead * 1e-9)
+            qvel += self.data.qacc * (ahead * 1e-9)
+        return _state(qpos[self._of_pose], qvel[self._of_twist]), qpos, qvel
+
+    def imu(self) -> tuple[Vector3, Vector3]:
+        """Return the true angular velocity (rad/s, FRD) and specific force (m/s², FRD).
+
+        Measured at the centre of mass. At rest the specific force is (0, 0, -9.81).
+        """
+        if not self._fresh:
+            self._refresh()
+        wx, wy, wz, ax, ay, az = self._imu.tolist()
+        return (wx, -wy, -wz), (ax, -ay, -az)
+
+    def touching(self) -> bool:
+        """Return whether the vehicle touches anything; cheaper than `contacts`."""
+        if not self._fresh:
+            self._refresh()
+        return bool(self.data.ncon) and bool(self._own_contacts())
+
+    def contacts(self) -> list[Contact]:
+        """Return every point at which the vehicle touches something."""
+        if not self._fresh:
+            self._refresh()
+        if not self.data.ncon:
+            return []
+        return [self._contact(index, own) for index, own in self._own_contacts()]
+
+    def settle(self) -> None:
+        """Have the vehicle rest on the ground, its weight carried, if that is where it starts.
+
+        Feet that only just touch the ground are pushed by nothing: the vehicle would begin with a
+        free fall of 0.1 mm. A vehicle that does not come to rest within 1 cm and half a second
+        stays where it is; so does all else in the world. Call it before the first step.
+        """
+        trial = mujoco.MjData(self.model)
+        mujoco.mj_step(self.model, trial, 500_000_000 // TIMESTEP_NS)
+        pose, twist = trial.qpos[self._of_pose], trial.qvel[self._of_twist]
+        if np.abs(twist).max() < 1e-3 and np.linalg.norm(pose[:3] - self._pose[:3]) < 0.01:
+            self._pose[:] = pose
+            self._fresh = False
+
+    def reset(self) -> None:
+        """Go back to the start: time 0, the world as compiled, motors off."""
+        mujoco.mj_resetData(self.model, self.data)
+        self._steps = 0
+        self._fresh = False
+
+    def _refresh(self) -> None:
+        mujoco.mj_forward(self.model, self.data)
+        self._fresh = True
+
+    def _own_contacts(self) -> list[tuple[int, int]]:
+        """Return (contact, which of its two geoms is the vehicle's) for each that pushes."""
+        body_of = self.model.geom_bodyid
+        contact = self.data.contact
+        own = []
+        for index, (pair, distance) in enumerate(
+            zip(contact.geom.tolist(), contact.dist.tolist(), strict=True)
+        ):
+            # MuJoCo also lists pairs within the margin that do not touch yet.
+            if distance > 0.0:
+                continue
+            for side in (0, 1):
+                if body_of[pair[side]] == self._body:
+                    own.append((index, side))
+                    break
+        return own
+
+    def _contact(self, index: int, own: int) -> Contact:
+        contact = self.data.contact[index]
+        geom = int(contact.geom[1 - own])
+        # The contact's first axis points from its first geom to its second.
+        sign = 1.0 if own == 1 else -1.0
+        nx, ny, nz = (sign * component for component in contact.frame[:3].tolist())
+        point = tuple(contact.pos.tolist())
+        ax, ay, az = self._velocity_at(self._body, point)
+        bx, by, bz = self._velocity_at(int(self.model.geom_bodyid[geom]), point)
+        closing = -((ax - bx) * nx + (ay - by) * ny + (az - bz) * nz)
+        x, y, z = point
+        return Contact(self._name_of(geom), (x, -y, -z), (nx, -ny, -nz), closing)
+
+    def _velocity_at(self, body: int, point: Vector3) -> Vector3:
+        """Return the velocity (m/s, NWU) of a body's material at a point of the world."""
+        velocity = np.zeros(6)  # angular, then linear, at the body's origin, in the world's axes
+        mujoco.mj_objectVelocity(
+            self.model, self.data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0
+        )
+        wx, wy, wz, vx, vy, vz = velocity.tolist()
+        ox, oy, oz = self.data.xpos[body].tolist()
+        x, y, z = point[0] - ox, point[1] - oy, point[2] - oz
+        return vx + wy * z - wz * y, vy + wz * x - wx * z, vz + wx * y - wy * x
+
+    def _name_of(self, geom: int) -> str:
+        name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_GEOM, geom)
+        if not name:
+            body = int(self.model.geom_bodyid[geom])
+            name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_BODY, body)
+        return str(name or f"geom {geom}")
+
+
+def _state(pose: Floats, twist: Floats) -> State:
+    """Return a free joint's qpos, shape (7,), and qvel, shape (6,), in our frames."""
+    x, y, z, qw, qx, qy, qz = pose.tolist()
+    vx, vy, vz, wx, wy, wz = twist.tolist()
+    return State((x, -y, -z), (qw, qx, -qy, -qz), (vx, -vy, -vz), (wx, -wy, -wz))

@@ -1,0 +1,319 @@
+"""The multirotor as a node: what it announces, obeys, refuses and tells."""
+
+from __future__ import annotations
+
+import logging
+from fractions import Fraction
+from itertools import pairwise
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from events import (
+    BodyRateSetpoint,
+    CameraAnnouncement,
+    Collision,
+    Disarm,
+    Disarmed,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Land,
+    Odometry,
+    PoseStamped,
+    PositionSetpoint,
+    TakenOff,
+    Takeoff,
+    VehicleAnnouncement,
+    VehicleEvent,
+    VelocitySetpoint,
+)
+from runtime.config import NodeSpec
+from runtime.errors import ConfigError, NodeError, RefusedError
+from runtime.testing import NodeResult, run_node, run_nodes, spec
+from sims import frames
+from sims.multirotor import Multirotor
+from sims.vehicle import STANDING_HEIGHT
+from tests.runtime.samples_runs import supervise
+from tests.sims.vehicle.flight import WORLD
+
+SECOND = 1_000_000_000
+
+world = ""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _world(tmp_path_factory: pytest.TempPathFactory) -> None:
+    global world
+    path = tmp_path_factory.mktemp("world") / "tiny.xml"
+    path.write_text(WORLD)
+    world = str(path)
+
+
+def fly(*inputs: Event, duration: float = 1.0, **config: Any) -> NodeResult:
+    config = {"world": world} | config
+    return run_node(Multirotor, inputs=inputs, config=config, duration=duration, name="drone")
+
+
+def place(stamp: int, x: float, y: float, z: float) -> PositionSetpoint:
+    return PositionSetpoint(stamp=stamp, source="test", position=(x, y, z))
+
+
+def takeoff(stamp: int = 0, altitude: float = 1.0) -> Takeoff:
+    return Takeoff(stamp=stamp, source="test", altitude=altitude)
+
+
+def test_it_announces_vehicle_and_imu() -> None:
+    result = fly(position=[1.0, -2.0], yaw=90, imu_rate=100, duration=0.01)
+    (vehicle,), (imu,) = result.of(VehicleAnnouncement), result.of(ImuAnnouncement)
+    assert vehicle.source == "drone"
+    assert vehicle.position == pytest.approx((1.0, -2.0, -STANDING_HEIGHT), abs=1e-3)
+    assert vehicle.orientation == pytest.approx((0.5**0.5, 0, 0, 0.5**0.5))
+    assert vehicle.max_thrust > vehicle.mass * 9.81
+    assert (imu.source, imu.rate, imu.frame_id) == ("drone/imu", 100, "base_link")
+    assert imu.gyroscope_noise_density > 0
+
+
+def test_imu_and_odometry_come_together_at_their_rate() -> None:
+    result = fly(imu_rate=100, duration=0.5)
+    stamps = [e.stamp for e in result.of(Imu)]
+    assert stamps == [k * SECOND // 100 for k in range(50)]
+    assert [e.stamp for e in result.of(Odometry)] == stamps
+    assert result.of(Imu)[10].linear_acceleration[2] == pytest.approx(-9.81, abs=0.3)
+    assert result.ticks["drone.control"].calls == 200
+
+
+def test_at_rest_the_imu_feels_gravity_from_its_first_sample_on() -> None:
+    result = fly(duration=1.0)
+    found = np.array([e.linear_acceleration for e in result.of(Imu)])
+    density = result.of(ImuAnnouncement)[0].accelerometer_noise_density
+    np.testing.assert_allclose(
+        found, np.tile((0.0, 0.0, -9.81), (200, 1)), atol=6 * density * 200**0.5
+    )
+
+
+def test_samples_stay_on_their_own_grid_at_any_rate() -> None:
+    """Not on the physics' milliseconds, which 300 Hz are not."""
+    result = fly(imu_rate=300, duration=0.5)
+    assert [e.stamp for e in result.of(Imu)] == [k * SECOND // 300 for k in range(150)]
+    assert [e.stamp for e in result.of(Odometry)] == [k * SECOND // 300 for k in range(150)]
+
+
+CAMERA = {"name": "front", "width": 8, "height": 6, "images": ["grey"]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rate", "imu_rate", "latency"), [(30, 200, "40ms"), (70, 200, 0), (50, 20, 0), (7.3, 33, 0)]
+)
+def test_exposures_are_equidistant_and_true_at_their_own_stamps(
+    rate: float, imu_rate: float, latency: str | float
+) -> None:
+    """Whatever the IMU's rate: nothing drifts, nothing comes twice; the truth is told at the very
+    stamp, and is the pose in the camera's; and before a picture comes all IMU samples up to it."""
+    camera = CAMERA | {"rate": rate, "latency": latency, "position": [0.2, 0.0, 0.0]}
+    result = fly(takeoff(), cameras=[camera], camera_processes=1, imu_rate=imu_rate, duration=1.0)
+    images, moves = result.of(Image), result.of(Odometry)
+    hz = Fraction(rate).limit_denominator(1000)
+    expected = [int(k * SECOND / hz) for k in range(len(images))]
+    assert len(images) >= 0.9 * rate
+    assert [e.stamp for e in images] == expected
+    assert [e.stamp for e in result.of(Imu)] == [
+        int(k * SECOND / Fraction(imu_rate)) for k in range(len(result.of(Imu)))
+    ]
+    stamps = [e.stamp for e in moves]
+    assert stamps == sorted(set(stamps))
+    truth = {e.stamp: e for e in moves}
+    for pose in result.of(PoseStamped):
+        body = truth[pose.stamp]
+        ahead = frames.rotate(body.orientation, (0.2, 0.0, 0.0))
+        place = [a + b for a, b in zip(body.position, ahead, strict=True)]
+        assert pose.position == pytest.approx(place, abs=1e-9)
+    for index, event in enumerate(result.sent):
+        if isinstance(event, Image):
+            before = [e.stamp for e in result.sent[:index] if isinstance(e, Imu)]
+            due = int(event.stamp * Fraction(imu_rate) / SECOND)
+            assert len(before) > due
+
+
+@pytest.mark.slow
+def test_the_truth_between_imu_samples_is_the_one_that_a_fast_imu_tells() -> None:
+    """Exposures at 70 Hz beside an IMU of 20 Hz, against one of 1000 Hz: within a micrometre of
+    the straight line between milliseconds, and no exposure changes the flight."""
+
+    def moves(imu_rate: int, **config: Any) -> list[Odometry]:
+        return fly(takeoff(), imu_rate=imu_rate, duration=1.2, **config).of(Odometry)
+
+    fine = moves(1000)
+    camera = CAMERA | {"rate": 70, "loss": 1.0}
+    grid = np.array([e.stamp for e in fine])
+    places = np.array([e.position for e in fine])
+    found = moves(20, cameras=[camera], camera_processes=1)
+    assert len(found) > 90
+    for event in found:
+        if event.stamp <= grid[-1]:
+            straight = [np.interp(event.stamp, grid, places[:, axis]) for axis in range(3)]
+            assert event.position == pytest.approx(straight, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_an_imu_may_trigger_the_cameras(caplog: pytest.LogCaptureFixture) -> None:
+    """Then every exposure has the stamp of an IMU sample; unequal intervals are warned of."""
+    caplog.set_level(logging.WARNING, "visnav.drone")
+    cameras = [CAMERA | {"rate": 30}, CAMERA | {"name": "even", "rate": 40}]
+    result = fly(cameras=cameras, camera_processes=1, trigger="imu", duration=0.5)
+    samples = {e.stamp for e in result.of(Imu)}
+    assert {e.stamp for e in result.of(Odometry)} == samples
+    stamps = [e.stamp for e in result.of(Image) if e.source == "drone/front"]
+    assert set(stamps) <= samples
+    assert {b - a for a, b in pairwise(stamps)} == {30 * SECOND // 1000, 35 * SECOND // 1000}
+    (said,) = [r.getMessage() for r in caplog.records]
+    assert said.startswith("front: 30 Hz does not divide the 200 Hz of the IMU")
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        (
+            {"trigger": "imu", "imu_rate": 20, "cameras": [CAMERA | {"rate": 30}]},
+            r"front: rate: expected at most the 20 Hz .* found 30 Hz",
+        ),
+        ({"cameras": [CAMERA | {"rate": 1001}]}, r"rate.*1000"),
+        ({"cameras": [CAMERA, CAMERA]}, r"front: expected a name of its own"),
+        (
+            {"cameras": [CAMERA | {"rate": 50, "exposure": "21ms"}]},
+            r"front: exposure: expected at most the 20 ms .* found 21 ms",
+        ),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused_with_the_file(
+    config: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        spec(Multirotor, "drone", config)
+
+
+@pytest.mark.slow
+def test_several_vehicles_say_whom_they_obey() -> None:
+    """Otherwise one pilot would steer all of them; the refusal has the words to write."""
+    vehicles = [spec(Multirotor, name, {"world": world}) for name in ("a", "b")]
+    with pytest.raises(RefusedError, match=r"^a: .* inputs = \{ command = .PILOT., setpoint"):
+        run_nodes(vehicles, duration=0.1)
+    half = msgspec.structs.replace(vehicles[0], inputs={"setpoint": "tour"})
+    with pytest.raises(RefusedError, match=r"^a: .* inputs = \{ command = .PILOT. \}"):
+        run_nodes([half, vehicles[1]], duration=0.1)
+
+
+@pytest.mark.slow
+def test_several_vehicles_are_each_steered_by_their_own_pilot() -> None:
+    def obeying(name: str) -> NodeSpec:
+        inputs = {"command": f"{name}/pilot", "setpoint": f"{name}/pilot"}
+        return msgspec.structs.replace(spec(Multirotor, name, {"world": world}), inputs=inputs)
+
+    orders = [
+        Takeoff(stamp=0, source="a/pilot", altitude=1.0),
+        Takeoff(stamp=SECOND, source="b/pilot", altitude=2.0),
+        PositionSetpoint(stamp=4 * SECOND, source="a/pilot", position=(1.0, 0.0, -1.0)),
+    ]
+    result = run_nodes([obeying("a"), obeying("b")], inputs=orders, duration=7.0)
+    for name, place in (("a", (1.0, 0.0, -1.0)), ("b", (0.0, 0.0, -2.1))):
+        (up,) = [e for e in result.of(TakenOff) if e.source == name]
+        last = [e for e in result.of(Odometry) if e.source == name][-1]
+        assert last.position == pytest.approx(place, abs=0.1)
+        assert up.stamp > (name == "b") * SECOND
+
+
+def test_take_off_and_landing_are_told() -> None:
+    land = Land(stamp=4 * SECOND, source="test")
+    result = fly(takeoff(), land, duration=9)
+    told = [type(e).__name__ for e in result.sent if isinstance(e, VehicleEvent)]
+    assert told == ["Armed", "TakenOff", "Landed", "Disarmed"]
+    (up,) = result.of(TakenOff)
+    height = next(e.position[2] for e in result.of(Odometry) if e.stamp >= up.stamp)
+    assert height == pytest.approx(-STANDING_HEIGHT - 1.0, abs=0.15)
+    assert result.of(Collision) == []
+
+
+def test_a_row_of_refused_setpoints_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, "visnav.drone")
+    fly(*(place(k * SECOND // 50, 0, 0, -1) for k in range(30)))
+    assert [r.getMessage() for r in caplog.records] == ["PositionSetpoint refused: disarmed"]
+
+
+def test_each_refused_order_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, "visnav.drone")
+    fly(Land(stamp=0, source="t"), Disarm(stamp=0, source="t"), takeoff(altitude=-1.0))
+    assert [r.getMessage() for r in caplog.records] == [
+        "Land refused: not in the air",
+        "Disarm refused: already disarmed",
+        "Takeoff refused: Takeoff.altitude: expected a number > 0, found -1.0",
+    ]
+
+
+def test_a_collision_is_told_once_while_it_lasts() -> None:
+    """Flown against a wall and pressed against it for four seconds."""
+    push = [
+        VelocitySetpoint(stamp=3 * SECOND + k * SECOND // 20, source="t", velocity=(1.5, 0.0, 0.0))
+        for k in range(120)
+    ]
+    result = fly(takeoff(), *push, duration=9)
+    hits = [hit for hit in result.of(Collision) if hit.other == "wall"]
+    assert 1 <= len(hits) <= 12
+    assert hits[0].speed > 0.5
+    assert hits[0].normal == pytest.approx((-1, 0, 0), abs=0.2)
+    assert hits[0].position[0] == pytest.approx(4.0, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_fall_ends_in_a_collision_with_the_floor() -> None:
+    result = fly(takeoff(), Disarm(stamp=3 * SECOND, source="t"), duration=5)
+    assert [type(e) for e in result.of(Disarmed)] == [Disarmed]
+    spin = BodyRateSetpoint(
+        stamp=3 * SECOND, source="t", angular_velocity=(0.0, 0.0, 0.0), thrust=0.0
+    )
+    hits = fly(takeoff(altitude=2.0), spin, duration=4.49).of(Collision)
+    assert hits
+    assert hits[0].other == "floor"
+    assert hits[0].speed > 1.0
+
+
+def test_the_same_seed_gives_the_same_flight_and_another_another() -> None:
+    def measured(seed: int) -> list[Imu]:
+        node = spec(Multirotor, "drone", {"world": world})
+        return [e for e in supervise([node], duration=0.2, seed=seed).sent if isinstance(e, Imu)]
+
+    assert measured(1) == measured(1)
+    assert measured(1) != measured(2)
+
+
+def test_it_runs_in_real_time() -> None:
+    """At 400 Hz, whatever else the machine does: late ticks are counted, not lost."""
+    outcome = supervise([spec(Multirotor, "drone", {"world": world})], clock="real", duration=1.0)
+    assert outcome.error is None
+    ticker, end = outcome.supervisor.tickers["drone.control"], outcome.supervisor.clock.now()
+    assert 395 <= ticker.calls + ticker.missed <= 400 * end / SECOND + 1
+    stamps = [e.stamp for e in outcome.sent if isinstance(e, Odometry)]
+    assert stamps == sorted(set(stamps))
+    assert 0.9 * SECOND < stamps[-1] <= end
+
+
+def test_cameras_announce_themselves_and_deliver() -> None:
+    camera = {"name": "front", "width": 32, "height": 24, "rate": 20, "latency": "40ms"}
+    result = fly(cameras=[camera], camera_processes=1, duration=0.3)
+    (announced,) = result.of(CameraAnnouncement)
+    assert (announced.source, announced.parent_frame_id) == ("drone/front", "base_link")
+    assert (announced.rate, announced.latency) == (20, 0.04)
+    assert (announced.info.width, announced.info.height) == (32, 24)
+    images = result.of(Image)
+    assert [e.stamp for e in images] == [k * SECOND // 20 for k in range(6)]
+    assert {(e.source, e.frame_id, e.data.shape) for e in images} == {
+        ("drone/front", announced.frame_id, (24, 32, 3))
+    }
+
+
+def test_a_world_that_is_not_there_is_named() -> None:
+    with pytest.raises(NodeError, match=r"drone: .*hal\b"):
+        fly(world="hal")

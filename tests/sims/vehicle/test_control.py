@@ -1,0 +1,160 @@
+"""The cascade flown in the physics: steps, legs, turns, hovering, and the lower set-points."""
+
+from __future__ import annotations
+
+from math import cos, hypot, pi, radians, sin
+
+import pytest
+
+from events import AttitudeSetpoint, BodyRateSetpoint, Event, PositionSetpoint
+from sims.frames import from_euler, yaw_of
+from sims.vehicle import Controller, Limits, State
+from tests.sims.vehicle.flight import UP, airborne, place, step_response, velocity
+
+
+def test_hover_holds_within_five_centimetres() -> None:
+    for _, state in airborne().fly(10.0):
+        x, y, z = state.position
+        assert hypot(x, y, z + UP) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("axis", "length"), [(0, 2.0), (1, -2.0), (2, -2.0), (2, 2.0)], ids=["x", "y", "up", "down"]
+)
+def test_a_step_settles_within_three_seconds(axis: int, length: float) -> None:
+    """To 5 %, with less than 10 % of overshoot, and less than 10 cm astray on the other axes."""
+    flight = airborne()
+    goal = [0.0, 0.0, -UP]
+    goal[axis] += length
+    flight.autopilot.command(place(*goal))
+    track = flight.fly(5.0)
+    overshoot, settled = step_response([(t, s.position[axis]) for t, s in track], goal[axis])
+    assert overshoot < 0.1
+    assert settled < 3.0
+    for other in {0, 1, 2} - {axis}:
+        assert max(abs(s.position[other] - goal[other]) for _, s in track) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("length", "astray"), [(0.2, 0.02), (30.0, 0.15)])
+def test_near_and_far_places_are_not_overshot(length: float, astray: float) -> None:
+    flight = airborne()
+    flight.autopilot.command(place(length, 0.0, -UP))
+    places = [state.position[0] for _, state in flight.fly(3.0 + length / 3.0)]
+    assert max(places) < length + astray
+    assert places[-1] == pytest.approx(length, abs=0.1)
+
+
+def test_a_fast_leg_keeps_its_height() -> None:
+    """5 m/s from standing and back to standing: less than 0.3 m of height lost, none gained."""
+    flight = airborne()
+    track = flight.fly(4.0, lambda stamp: velocity(stamp, 5.0, 0.0))
+    assert track[-1][1].velocity == pytest.approx((5.0, 0.0, 0.0), abs=0.1)
+    track += flight.fly(3.0, lambda stamp: velocity(stamp, 0.0, 0.0))
+    assert track[-1][1].velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
+    assert max(abs(s.position[2] + UP) for _, s in track) < 0.3
+
+
+def test_feed_forward_follows_a_circle() -> None:
+    """3 m/s on a radius of 3 m, nose along the path: within 15 cm once on it."""
+
+    def on_circle(stamp: int) -> Event:
+        a = stamp * 1e-9
+        return PositionSetpoint(
+            stamp=stamp,
+            source="test",
+            position=(3.0 * sin(a), 3.0 - 3.0 * cos(a), -UP),
+            velocity=(3.0 * cos(a), 3.0 * sin(a), 0.0),
+            acceleration=(-3.0 * sin(a), 3.0 * cos(a), 0.0),
+            yaw=a,
+            yaw_rate=1.0,
+        )
+
+    track = airborne().fly(10.0, on_circle)[1600:]
+    for t, state in track:
+        assert (
+            hypot(state.position[0] - 3.0 * sin(t), state.position[1] - 3.0 + 3.0 * cos(t)) < 0.15
+        )
+        turned = yaw_of(state.orientation) - t
+        assert abs((turned + pi) % (2.0 * pi) - pi) < 0.05
+
+
+@pytest.mark.parametrize(("start", "turn"), [(0.0, 1.5), (3.0, 0.5), (0.0, -2.5)])
+def test_a_yaw_step_takes_the_short_way_and_does_not_move_the_vehicle(
+    start: float, turn: float
+) -> None:
+    flight = airborne(start)
+    flight.autopilot.command(place(0.0, 0.0, -UP, yaw=start + turn))
+    track = flight.fly(4.0)
+    turned = [(t, (yaw_of(s.orientation) - start + pi) % (2.0 * pi) - pi) for t, s in track]
+    overshoot, settled = step_response(turned, turn)
+    assert overshoot < 0.1
+    assert settled < 3.0
+    assert max(hypot(*s.position[:2]) for _, s in track) < 0.05
+
+
+def test_velocity_along_the_heading_flies_where_the_nose_points() -> None:
+    flight = airborne(yaw=pi / 2)
+    track = flight.fly(3.0, lambda stamp: velocity(stamp, 2.0, 1.0, -0.5, frame_id="heading"))
+    assert track[-1][1].velocity == pytest.approx((-1.0, 2.0, -0.5), abs=0.05)
+    assert yaw_of(track[-1][1].orientation) == pytest.approx(pi / 2, abs=0.01)
+
+
+def test_yaw_rate_turns_on_through_renewed_setpoints() -> None:
+    flight = airborne()
+    track = flight.fly(3.0, lambda stamp: velocity(stamp, 0.0, 0.0, yaw_rate=0.8))
+    assert yaw_of(track[-1][1].orientation) == pytest.approx(2.4, abs=0.1)
+
+
+def test_limits_hold_whatever_is_asked() -> None:
+    """A place half a kilometre away and deep below: tilt, speed and descent stay bounded."""
+    flight = airborne()
+    limits = Limits()
+    flight.autopilot.command(place(500.0, 0.0, 500.0))
+    for _, state in flight.fly(6.0):
+        _, x, y, _ = state.orientation
+        assert 1.0 - 2.0 * (x * x + y * y) > cos(limits.tilt + radians(6.0))
+        assert state.velocity[0] < 1.05 * limits.speed
+        assert state.velocity[2] < 1.1 * limits.descent
+
+
+def test_an_attitude_is_held_at_its_thrust() -> None:
+    flight = airborne()
+    goal = from_euler(0.3, -0.1, 0.2)
+    track = flight.fly(
+        1.0,
+        lambda stamp: AttitudeSetpoint(stamp=stamp, source="test", orientation=goal, thrust=0.6),
+    )
+    assert track[-1][1].orientation == pytest.approx(goal, abs=0.01)
+    parameters = flight.physics.parameters
+    thrust = -flight.physics.imu()[1][2] * parameters.mass
+    assert thrust == pytest.approx(0.6 * parameters.max_thrust, rel=0.05)  # less some drag
+
+
+def test_body_rates_are_followed_on_all_axes_at_once() -> None:
+    flight = airborne()
+    goal = (1.0, -0.5, 0.8)
+    track = flight.fly(
+        1.0,
+        lambda stamp: BodyRateSetpoint(
+            stamp=stamp, source="test", angular_velocity=goal, thrust=0.5
+        ),
+    )
+    for t, state in track:
+        if t > 0.6:
+            assert state.angular_velocity == pytest.approx(goal, abs=0.05)
+
+
+def test_it_recovers_from_being_upside_down() -> None:
+    flight = airborne()
+    flight.physics.data.qpos[10:14] = (0.0, 1.0, 0.0, 0.0)  # after the ball's seven and a position
+    track = flight.fly(6.0)
+    assert track[-1][1].position == pytest.approx((0.0, 0.0, -UP), abs=0.1)
+    assert max(s.position[2] for _, s in track) < -UP + 8.0
+
+
+def test_a_faulty_setpoint_is_an_error() -> None:
+    controller = Controller(airborne().physics.parameters)
+    state = State((0.0,) * 3, (1.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3)
+    with pytest.raises(ValueError, match="expected 'map' or 'heading', found 'body'"):
+        controller.follow(velocity(0, 1.0, 0.0, frame_id="body"), state)

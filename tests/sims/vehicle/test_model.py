@@ -1,0 +1,72 @@
+"""The vehicle's model: its numbers are sane and its names are its own."""
+
+from __future__ import annotations
+
+import re
+from math import radians, tan
+
+import mujoco
+import numpy as np
+import pytest
+
+from sims.vehicle import Physics, attach_vehicle, read_parameters
+from tests.sims.vehicle.flight import WORLD, compiled
+
+
+def test_parameters_are_those_of_a_450_class_quadrotor() -> None:
+    parameters = read_parameters(compiled(), "drone")
+    assert parameters.mass == pytest.approx(1.2)
+    assert parameters.max_thrust / (parameters.mass * parameters.gravity) == pytest.approx(
+        2.2, abs=0.05
+    )
+    x, y, _ = parameters.motors[0].position
+    assert 2.0 * (x * x + y * y) ** 0.5 == pytest.approx(0.45, abs=0.005)
+    assert parameters.motor_time_constant == 0.04
+    a, b, c = sorted(parameters.inertia)
+    assert a + b > c  # or no body of matter could have it
+
+
+def test_two_vehicles_share_a_world() -> None:
+    spec = mujoco.MjSpec.from_string(WORLD)
+    attach_vehicle(spec, "one", (1.0, 2.0, -3.0), 0.5)
+    attach_vehicle(spec, "two", (-1.0, 2.0, -3.0), 0.0)
+    state = Physics(spec.compile(), "one").state()
+    assert state.position == pytest.approx((1.0, 2.0, -3.0))
+    assert state.orientation == pytest.approx((0.9689, 0.0, 0.0, 0.2474), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "drone"])
+def test_a_bad_or_taken_name_is_refused(name: str) -> None:
+    spec = mujoco.MjSpec.from_string(WORLD)
+    attach_vehicle(spec, "drone", (0.0, 0.0, -1.0), 0.0)
+    with pytest.raises(ValueError, match="name"):
+        attach_vehicle(spec, name, (0.0, 0.0, -2.0), 0.0)
+
+
+def test_a_missing_vehicle_is_named() -> None:
+    with pytest.raises(ValueError, match="'plane'"):
+        Physics(compiled(), "plane")
+
+
+def test_another_time_step_is_refused() -> None:
+    spec = mujoco.MjSpec.from_string(WORLD)
+    attach_vehicle(spec, "drone", (0.0, 0.0, -1.0), 0.0)
+    spec.option.timestep = 0.002
+    with pytest.raises(ValueError, match=re.escape("found 0.002 s")):
+        Physics(spec.compile(), "drone")
+
+
+def test_a_forward_camera_does_not_see_the_airframe() -> None:
+    """No visible geom meets the rays of a 100° picture taken 0.1 m ahead of the origin."""
+    spec = mujoco.MjSpec()
+    attach_vehicle(spec, "drone", (0.0, 0.0, -1.0), 0.0)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    visible = [1, 1, 1, 0, 0, 0]
+    hit = np.zeros(1, dtype=np.int32)
+    for column in range(-20, 21):
+        for row in range(-20, 21):
+            ray = [1.0, tan(radians(50.0)) * column / 20.0, row / 20.0]
+            distance = mujoco.mj_ray(model, data, [0.1, 0.0, 1.0], ray, visible, 1, -1, hit)
+            assert distance == -1.0, f"ray {ray} meets geom {hit[0]} at {distance}"

@@ -1,0 +1,293 @@
+"""Physics: what is read is true at its instant, whole steps or pieces, and in our frames."""
+
+from __future__ import annotations
+
+from math import exp
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from events import Vector3
+from sims import frames
+from sims.vehicle import STANDING_HEIGHT, Physics, PhysicsDivergedError, State
+from tests.sims.vehicle.flight import UP, compiled
+
+MS = 1_000_000
+
+
+def wild(physics: Physics, milliseconds: int, read_every: int) -> list[State]:
+    """Throw the vehicle about for a while and onto the floor; look every `read_every` ms."""
+    generator = np.random.default_rng(1)
+    states = []
+    for tick in range(0, milliseconds, 20):
+        physics.set_motors(*generator.uniform(0.0, 0.75, 4).tolist())
+        for part in range(read_every, 21, read_every):
+            physics.advance_to((tick + part) * MS)
+            if read_every < 20:
+                physics.imu()
+                physics.contacts()
+        states.append(physics.state())
+    return states
+
+
+def test_time_goes_by_whole_milliseconds() -> None:
+    physics = Physics(compiled(), "drone")
+    physics.advance_to(2_500_000)
+    assert physics.time_ns == 2 * MS
+    state = physics.state()
+    physics.advance_to(1 * MS)  # the past: nothing happens
+    physics.advance_to(2_999_999)
+    assert physics.time_ns == 2 * MS
+    assert physics.state() == state
+
+
+@pytest.mark.parametrize("read_every", [1, 2, 5, 10])
+def test_pieces_and_readings_change_nothing(read_every: int) -> None:
+    """In one go or in pieces, sensors read or not, in flight or on the floor: the same bits."""
+    whole = wild(Physics(compiled(0.3), "drone"), 2000, 20)
+    pieces = wild(Physics(compiled(0.3), "drone"), 2000, read_every)
+    assert pieces == whole
+
+
+def test_reset_goes_back_to_the_start() -> None:
+    physics = Physics(compiled(0.3), "drone")
+    first = wild(physics, 500, 5)
+    physics.reset()
+    assert physics.time_ns == 0
+    assert wild(physics, 500, 5) == first
+
+
+def test_at_rest_the_imu_feels_the_ground_push() -> None:
+    physics = Physics(compiled(), "drone")
+    physics.advance_to(2000 * MS)
+    rates, force = physics.imu()
+    assert force == pytest.approx((0.0, 0.0, -9.81), abs=1e-3)
+    assert rates == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert physics.state().position == pytest.approx((0.0, 0.0, -STANDING_HEIGHT), abs=1e-3)
+
+
+def test_a_settled_vehicle_rests_from_the_first_instant() -> None:
+    """Feet that only just touch the ground carry nothing: the IMU would feel a free fall."""
+    physics = Physics(compiled(yaw=0.3), "drone")
+    ball = physics.data.qpos[:7].tolist()
+    physics.settle()
+    assert physics.time_ns == 0
+    assert physics.data.qpos[:7].tolist() == ball
+    before = physics.state()
+    assert before.position == pytest.approx((0.0, 0.0, -STANDING_HEIGHT), abs=1e-3)
+    for stamp in range(0, 500 * MS, MS):
+        physics.advance_to(stamp)
+        rates, force = physics.imu()
+        assert force == pytest.approx((0.0, 0.0, -9.81), abs=1e-3)
+        assert rates == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert physics.state().position == pytest.approx(before.position, abs=1e-6)
+
+
+def test_what_does_not_stand_does_not_settle() -> None:
+    physics = Physics(compiled(UP), "drone")
+    before = physics.data.qpos.tolist()
+    physics.settle()
+    assert physics.data.qpos.tolist() == before
+
+
+@given(
+    motors=st.tuples(*[st.floats(0.0, 1.0)] * 4),
+    height=st.sampled_from([0.12, 0.3, UP]),
+    steps=st.integers(1, 400),
+    offsets=st.lists(st.integers(0, MS), min_size=1, max_size=4),
+)
+@settings(max_examples=20, deadline=None)
+def test_between_two_steps_the_state_is_on_the_way_from_one_to_the_other(
+    motors: tuple[float, float, float, float], height: float, steps: int, offsets: list[int]
+) -> None:
+    """In flight and in contact; a whole step later it is that of the step; and looking changes
+    nothing."""
+    physics, plain = (Physics(compiled(height), "drone") for _ in range(2))
+    for each in (physics, plain):
+        each.set_motors(*motors)
+        each.advance_to(steps * MS)
+    now = physics.state()
+    asked = {offset: physics.state_at(steps * MS + offset) for offset in [0, MS, *offsets]}
+    assert asked[0][0] == now
+    plain.advance_to((steps + 1) * MS)
+    physics.advance_to((steps + 1) * MS)
+    assert physics.state() == plain.state()
+    after, qpos, qvel = asked[MS]
+    np.testing.assert_allclose(qpos, plain.data.qpos, atol=1e-12)
+    np.testing.assert_allclose(qvel, plain.data.qvel, atol=1e-12)
+    for offset, (state, _, _) in asked.items():
+        for field in ("position", "velocity", "angular_velocity"):
+            start, end = np.array(getattr(now, field)), np.array(getattr(after, field))
+            expected = start + offset / MS * (end - start)
+            np.testing.assert_allclose(getattr(state, field), expected, atol=1e-9)
+
+
+def test_the_past_and_the_far_future_are_not_between_two_steps() -> None:
+    physics = Physics(compiled(UP), "drone")
+    physics.advance_to(5 * MS)
+    for stamp in (5 * MS - 1, 6 * MS + 1):
+        with pytest.raises(ValueError, match=f"found {stamp} ns"):
+            physics.state_at(stamp)
+
+
+def test_in_free_fall_the_imu_feels_nothing() -> None:
+    physics = Physics(compiled(UP), "drone")
+    physics.advance_to(20 * MS)
+    assert physics.imu()[1] == pytest.approx((0.0, 0.0, 0.0), abs=2e-3)
+    assert physics.state().velocity == pytest.approx((0.0, 0.0, 0.1962), abs=1e-4)
+
+
+def test_hover_thrust_carries_the_weight() -> None:
+    physics = Physics(compiled(UP), "drone")
+    share = physics.parameters.hover_thrust
+    physics.data.act[:] = share
+    physics.set_motors(share, share, share, share)
+    physics.advance_to(1000 * MS)
+    assert physics.state().velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    assert physics.imu()[1][2] == pytest.approx(-9.81)
+
+
+def test_motors_answer_as_a_lag_of_40_ms() -> None:
+    physics = Physics(compiled(UP), "drone")
+    physics.set_motors(0.5, 0.5, 0.5, 0.5)
+    physics.advance_to(40 * MS)
+    parameters = physics.parameters
+    thrust = -physics.imu()[1][2] * parameters.mass
+    assert thrust == pytest.approx(0.5 * parameters.max_thrust * (1.0 - exp(-1.0)), rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("motors", "axis"),
+    [((0.5, 0.5, 0.4, 0.4), 2), ((0.4, 0.5, 0.5, 0.4), 0), ((0.5, 0.4, 0.5, 0.4), 1)],
+    ids=["yaw", "roll", "pitch"],
+)
+def test_motors_turn_the_vehicle_the_right_way(
+    motors: tuple[float, float, float, float], axis: int
+) -> None:
+    """The pair 1, 2 turns the nose right; the left pair rolls right; the front pair pitches up."""
+    physics = Physics(compiled(UP), "drone")
+    physics.set_motors(*motors)
+    physics.advance_to(100 * MS)
+    rates = physics.state().angular_velocity
+    assert rates[axis] > 0.02
+    assert all(abs(rate) < 0.01 * rates[axis] for i, rate in enumerate(rates) if i != axis)
+
+
+def test_accelerometer_and_gyroscope_agree_with_the_motion_that_follows() -> None:
+    """At every instant of a wild flight, and not those of a step before or after."""
+    physics = Physics(compiled(UP, 0.7), "drone")
+    generator = np.random.default_rng(3)
+    for tick in range(1, 400):
+        if tick % 10 == 1:
+            physics.set_motors(*generator.uniform(0.2, 0.8, 4).tolist())
+        physics.advance_to(tick * MS)
+        before = physics.state()
+        rates, force = physics.imu()
+        assert rates == pytest.approx(before.angular_velocity, abs=1e-12)
+        physics.advance_to((tick + 1) * MS)
+        after = physics.state().velocity
+        felt = frames.rotate(before.orientation, force)
+        expected = [(b - a) / 1e-3 for a, b in zip(before.velocity, after, strict=True)]
+        assert (felt[0], felt[1], felt[2] + 9.81) == pytest.approx(expected, abs=1e-6)
+
+
+def test_momentum_and_energy_are_kept_without_air() -> None:
+    physics = Physics(compiled(UP), "drone")
+    model = physics.model
+    density, viscosity = model.opt.density, model.opt.viscosity
+    model.opt.density = model.opt.viscosity = 0.0
+    try:
+        physics.data.qvel[6:] = (1.0, 0.5, 2.0, 3.0, -2.0, 4.0)  # after the ball's six
+        before = _momentum_and_energy(physics)
+        physics.advance_to(500 * MS)
+        after = _momentum_and_energy(physics)
+    finally:
+        model.opt.density, model.opt.viscosity = density, viscosity
+    assert after[0] == pytest.approx(before[0], rel=0.01, abs=1e-3)
+    # Semi-implicit Euler falls g·t·h/2 further than the parabola.
+    lost = physics.parameters.mass * 9.81**2 * 0.5 * 1e-3 / 2.0
+    assert after[1] == pytest.approx(before[1] - lost, abs=1e-3)
+
+
+def _momentum_and_energy(physics: Physics) -> tuple[Vector3, float]:
+    state = physics.state()
+    parameters = physics.parameters
+    spin = [j * w for j, w in zip(parameters.inertia, state.angular_velocity, strict=True)]
+    momentum = frames.rotate(state.orientation, (spin[0], spin[1], spin[2]))
+    energy = (
+        0.5 * parameters.mass * sum(v * v for v in state.velocity)
+        + 0.5 * sum(s * w for s, w in zip(spin, state.angular_velocity, strict=True))
+        - parameters.mass * 9.81 * (state.position[2] + UP)
+    )
+    return momentum, energy
+
+
+def test_air_slows_the_vehicle_down() -> None:
+    """Falling from rest, the drag nears 0.5 ρ v² A with A of about 0.08 m²."""
+    physics = Physics(compiled(UP), "drone")
+    physics.advance_to(1500 * MS)
+    speed = physics.state().velocity[2]
+    drag = -physics.imu()[1][2] * physics.parameters.mass
+    assert drag / (0.5 * 1.225 * speed * speed) == pytest.approx(0.08, rel=0.1)
+
+
+def test_flying_into_a_wall_is_a_contact_with_it() -> None:
+    physics = Physics(compiled(3.0), "drone")
+    physics.data.qvel[6] = 8.0
+    while not (contacts := physics.contacts()):
+        assert physics.time_ns < 1000 * MS
+        physics.advance_to(physics.time_ns + 1 * MS)
+    assert physics.touching()
+    for contact in contacts:
+        assert contact.other == "wall"
+        assert contact.normal == pytest.approx((-1.0, 0.0, 0.0), abs=0.02)
+        assert contact.position[0] == pytest.approx(4.0, abs=0.02)
+        assert contact.speed == pytest.approx(physics.state().velocity[0], rel=0.05)
+
+
+def test_being_hit_from_above_counts_the_speed_of_both() -> None:
+    """The other is a moving body whose geom has no name: it is called by its body's."""
+    physics = Physics(compiled(10.0), "drone")
+    physics.data.qpos[:3] = (0.0, 0.0, 10.12)
+    physics.data.qvel[:3] = (0.0, 0.0, -2.0)
+    physics.data.qvel[6:9] = (0.0, 0.0, 1.0)
+    while not (contacts := physics.contacts()):
+        assert physics.time_ns < 100 * MS
+        physics.advance_to(physics.time_ns + 1 * MS)
+    (contact,) = contacts
+    assert contact.other == "ball"
+    assert contact.normal == pytest.approx((0.0, 0.0, 1.0), abs=1e-6)
+    assert contact.speed == pytest.approx(3.0, rel=0.02)
+
+
+def test_what_others_touch_is_not_ours() -> None:
+    """The ball lies on the floor while the vehicle is in the air."""
+    physics = Physics(compiled(UP), "drone")
+    physics.advance_to(500 * MS)
+    physics.imu()
+    assert physics.data.ncon > 0
+    assert not physics.touching()
+    assert physics.contacts() == []
+
+
+def test_the_state_comes_as_copies() -> None:
+    physics = Physics(compiled(), "drone")
+    _, qpos, qvel = physics.state_at(0)
+    qpos[:] = qvel[:] = 7.0
+    assert (qpos.shape, qvel.shape) == ((physics.model.nq,), (physics.model.nv,))
+    assert physics.state().position == pytest.approx((0.0, 0.0, -STANDING_HEIGHT))
+    assert physics.state().velocity == (0.0, 0.0, 0.0)
+
+
+def test_a_state_that_is_not_finite_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the present folder
+    physics = Physics(compiled(UP), "drone")
+    physics.advance_to(100 * MS)
+    physics.data.qvel[8] = float("nan")
+    with pytest.raises(PhysicsDivergedError, match=r"0\.105 s"):
+        physics.advance_to(105 * MS)
