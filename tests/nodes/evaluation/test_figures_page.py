@@ -8,7 +8,9 @@ from pathlib import Path
 from nodes.evaluation.judging import Thresholds, judge
 from tests.nodes.report.folders import recorded, walk
 
-PAGE = (Path(__file__).parents[3] / "docs" / "explanation" / "figures.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs" / "explanation" / "figures.md").read_text(
+    encoding="utf-8"
+)
 
 
 def test_every_figure_and_threshold_is_explained() -> None:
