@@ -24,8 +24,9 @@ import numpy.typing as npt
 
 from bench.flooder import TWIST
 from events import Takeoff
-from nodes.ros2_bridge.keys import Topic, data_key
-from nodes.ros2_bridge.typestore import TypeStore
+from nodes.ros2_bridge.keys import data_key
+from nodes.ros_messages.topics import Topic
+from nodes.ros_messages.typestore import TypeStore
 from runtime import Node, Output, Tick, every
 from runtime.config import parse
 from runtime.execute import execute

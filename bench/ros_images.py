@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 
-from nodes.ros2_bridge.pictures import ImageWriter, make_header
-from nodes.ros2_bridge.typestore import TypeStore
+from nodes.ros_messages.images import ImageWriter, make_header
+from nodes.ros_messages.typestore import TypeStore
 
 IMAGE = "sensor_msgs/msg/Image"
 FRAME = "camera_optical_frame"

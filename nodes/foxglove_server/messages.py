@@ -23,7 +23,7 @@ from events import (
     Vector3,
 )
 from nodes.foxglove_server.scene import Colour, Trail
-from nodes.rerun_view.pictures import jpeg
+from nodes.viewing.images import jpeg
 
 SECOND = 1_000_000_000
 

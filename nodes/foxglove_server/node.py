@@ -27,7 +27,7 @@ from events import (
 from nodes.foxglove_server.publishing import Publishing
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
-from nodes.rerun_view.pictures import Thinning
+from nodes.viewing.images import Thinning
 from runtime import Node, Stream, Tick, every, on
 from runtime.errors import MissingDependencyError, VisnavError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from events import Vector3
-from nodes.rerun_view.paths import Path
+from nodes.viewing.paths import Path
 
 Colour = tuple[float, float, float]
 """Red, green, blue, 0 to 1."""

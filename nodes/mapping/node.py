@@ -22,8 +22,8 @@ from events import (
 )
 from nodes.estimation import WORKER_ENVIRONMENT, pose_matrix
 from nodes.mapping.mapper import Mapper
+from nodes.mapping.transforms import TransformError, TransformTree
 from nodes.trajectory.growing import part_name
-from nodes.transforms import TransformError, TransformTree
 from runtime import Bundle, Duration, Node, NodeConfig, Output, on
 from runtime.paths import OutputPath
 from runtime.units import Latency

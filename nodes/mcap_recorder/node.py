@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 from events import Announcement, Event
+from nodes.mcap.disk import RecordingError
 from nodes.mcap_recorder.backlog import Backlog
-from nodes.mcap_recorder.disk import RecordingError
 from nodes.mcap_recorder.order import Order
 from nodes.mcap_recorder.recording import STANDSTILL, Recording, spare_cores
 from nodes.mcap_recorder.settings import McapRecorderConfig

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import msgspec
 
+from nodes.mcap.disk import RecordingError
+from nodes.mcap.mcap_file import McapWriter
 from nodes.mcap_recorder import pipe
-from nodes.mcap_recorder.disk import RecordingError
-from nodes.mcap_recorder.mcap_file import McapWriter
 from nodes.mcap_recorder.order import Answer, Order
 from nodes.mcap_recorder.topics import Topics
 from runtime.errors import MissingDependencyError, WireError

@@ -21,9 +21,9 @@ import msgspec
 from typing_extensions import Buffer
 
 from events import Announcement
+from nodes.mcap.disk import RecordingError
 from nodes.mcap_recorder import pipe
 from nodes.mcap_recorder.backlog import Backlog, Waiting
-from nodes.mcap_recorder.disk import RecordingError
 from nodes.mcap_recorder.order import Answer, Order, command
 from runtime.errors import MissingDependencyError, WireError
 from runtime.wire import pack

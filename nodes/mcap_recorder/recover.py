@@ -9,9 +9,9 @@ from typing import Any
 
 import msgspec
 
-from nodes.mcap_recorder import layout, records
-from nodes.mcap_recorder.disk import RecordingError, is_being_written, unwritable
-from nodes.mcap_recorder.mcap_file import contents
+from nodes.mcap import layout, records
+from nodes.mcap.disk import RecordingError, is_being_written, unwritable
+from nodes.mcap.mcap_file import contents
 
 MENDED = "visnav_mended"
 """Metadata of a file in which something could not be mended: what, by number."""

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from nodes.mcap.mcap_file import Compression
 from nodes.mcap_recorder.backlog import WhenFull
-from nodes.mcap_recorder.mcap_file import Compression
-from nodes.ros2_bridge.typestore import Distribution
+from nodes.ros_messages.typestore import Distribution
 from runtime import NodeConfig
 from runtime.paths import OutputPath
 

@@ -18,34 +18,25 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Announcement, CameraAnnouncement, DepthImage, Event, VehicleAnnouncement
-from nodes.mcap_recorder import native
-from nodes.mcap_recorder.mcap_file import McapWriter
+from nodes.mcap import native
+from nodes.mcap.arrays import HOLDERS
+from nodes.mcap.mcap_file import McapWriter
 from nodes.mcap_recorder.settings import McapRecorderConfig
-from nodes.ros2_bridge.keys import Topic, ros_name
-from nodes.ros2_bridge.pictures import make_header
-from nodes.ros2_bridge.plan import FrameNames, publication
+from nodes.ros2_bridge.plan import publication
 from nodes.ros2_bridge.publishing import Publishing
 from nodes.ros2_bridge.session import Session
 from nodes.ros2_bridge.settings import KINDS, Ros2BridgeConfig
-from nodes.ros2_bridge.stamps import Stamps
-from nodes.ros2_bridge.typestore import TypeStore
+from nodes.ros_messages.depth import COMPRESSED, DEPTH_HEAD
+from nodes.ros_messages.frame_names import FrameNames
+from nodes.ros_messages.images import make_header
+from nodes.ros_messages.stamps import Stamps
+from nodes.ros_messages.topics import Topic, ros_name
+from nodes.ros_messages.typestore import TypeStore
 from runtime.errors import WireError
 from runtime.wire import event_type, unpack
 
 PREFIX = "/visnav"
 """Before the topics of events as they are."""
-
-HOLDERS = {
-    "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/CompressedImage",
-    "sensor_msgs/msg/PointCloud2",
-}
-"""Types of messages that have an event's arrays."""
-
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
-
-DEPTH_HEAD = struct.Struct("<iff")
-"""Before the PNG of compressed_depth_image_transport; zeros for whole millimetres."""
 
 _LATCHED = (
     "- history: keep_last\n  depth: 1\n  reliability: reliable\n  durability: transient_local\n"

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from events import Quaternion, Vector3
-from nodes.ros2_bridge.frames import multiply, rotate, turn_rotation, turn_vector, unit
+from nodes.ros_messages.frames import multiply, rotate, turn_rotation, turn_vector, unit
 
 Pose = tuple[Vector3, Quaternion]
 

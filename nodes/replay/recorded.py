@@ -7,14 +7,13 @@ from itertools import islice
 from pathlib import Path
 
 from events import Announcement, CameraAnnouncement, Event
-from nodes.mcap_recorder import native
-from nodes.mcap_recorder.arrays import arrays
-from nodes.mcap_recorder.disk import RecordingError
-from nodes.mcap_recorder.mcap_file import Record, contents, read
-from nodes.mcap_recorder.topics import HOLDERS
+from nodes.mcap import native
+from nodes.mcap.arrays import HOLDERS, arrays
+from nodes.mcap.disk import RecordingError
+from nodes.mcap.mcap_file import Record, contents, read
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
-from nodes.ros2_bridge.plan import FrameNames
-from nodes.ros2_bridge.typestore import TypeStore
+from nodes.ros_messages.frame_names import FrameNames
+from nodes.ros_messages.typestore import TypeStore
 from runtime.errors import WireError
 from runtime.wire import event_type
 

@@ -28,17 +28,17 @@ from events import (
     Odometry,
     PoseEstimate,
 )
-from nodes.mcap_recorder import layout
-from nodes.mcap_recorder.arrays import decoded
+from nodes.mcap import layout
+from nodes.mcap.arrays import decoded
 from nodes.replay.bag_topics import chosen
 from nodes.replay.folders import standing
 from nodes.replay.mounting import Mountings
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.replay.settings import Topic, Use
-from nodes.ros2_bridge.calibration import camera_announcement
-from nodes.ros2_bridge.incoming import READERS, Reading, estimate
-from nodes.ros2_bridge.stamps import Stamps
-from nodes.ros2_bridge.typestore import Bag
+from nodes.ros_messages.calibration import camera_announcement
+from nodes.ros_messages.incoming import READERS, Reading, estimate
+from nodes.ros_messages.stamps import Stamps
+from nodes.ros_messages.typestore import Bag
 from runtime.errors import VisnavError
 
 _SAME_CLOCK = 60 * 1_000_000_000

@@ -37,8 +37,8 @@ from nodes.replay.folders import (
 )
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.replay.settings import Pinhole
-from nodes.ros2_bridge.calibration import OPTICAL_IN_BODY
-from nodes.ros2_bridge.frames import conjugate, multiply
+from nodes.ros_messages.calibration import OPTICAL_IN_BODY
+from nodes.ros_messages.frames import conjugate, multiply
 from nodes.trajectory.table import read_rows
 
 FARTHEST = 20_000_000

@@ -22,11 +22,11 @@ from events import (
     TrackingEvent,
     VehicleEvent,
 )
-from nodes.rerun_view.pictures import Thinning
 from nodes.rerun_view.recorder import Recorder
 from nodes.rerun_view.recording import Numbered
 from nodes.rerun_view.settings import RerunConfig
 from nodes.trajectory.growing import part_name
+from nodes.viewing.images import Thinning
 from runtime import Node, Stream, on
 
 _PICTURES, _ROWS = 256, 16384

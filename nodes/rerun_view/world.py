@@ -25,10 +25,10 @@ from events import (
 from nodes.estimation import pose_matrix, pose_tuples
 from nodes.evaluation.live import RecentTruth
 from nodes.rerun_view import entities
-from nodes.rerun_view.paths import Path
-from nodes.rerun_view.pictures import CENTIMETRES, Points, Surroundings, depth_png, jpeg
 from nodes.rerun_view.recording import Colour, Numbered, Recording
 from nodes.rerun_view.settings import RerunConfig
+from nodes.viewing.images import CENTIMETRES, Points, Surroundings, depth_png, jpeg
+from nodes.viewing.paths import Path
 
 _TRUTH, _PLAN = (80, 220, 120), (140, 140, 150)
 _INLIER, _OUTLIER = (90, 240, 120), (240, 80, 70)

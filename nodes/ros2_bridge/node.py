@@ -32,18 +32,18 @@ from events import (
     Setpoint,
     TransformStamped,
 )
-from nodes.ros2_bridge.calibration import camera_announcement
 from nodes.ros2_bridge.complaints import Complaints
-from nodes.ros2_bridge.hearing import Hearing
 from nodes.ros2_bridge.inbox import Inbox
+from nodes.ros2_bridge.incoming_topic import Hearing
 from nodes.ros2_bridge.keys import NodeName
-from nodes.ros2_bridge.messages import Time
+from nodes.ros2_bridge.outgoing_topic import Telling, event_type
 from nodes.ros2_bridge.publishing import Publishing
 from nodes.ros2_bridge.session import Session, SessionError
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
-from nodes.ros2_bridge.stamps import Stamps
-from nodes.ros2_bridge.telling import Telling, event_type
-from nodes.ros2_bridge.typestore import TypeStore
+from nodes.ros_messages.calibration import camera_announcement
+from nodes.ros_messages.messages import Time
+from nodes.ros_messages.stamps import Stamps
+from nodes.ros_messages.typestore import TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
 from runtime.errors import FatalError, UncheckableError
 from runtime.ports import Handles

@@ -17,9 +17,8 @@ from events import (
     ImuAnnouncement,
     VehicleAnnouncement,
 )
-from nodes.ros2_bridge.frames import Axes, axes_of
-from nodes.ros2_bridge.keys import Qos, ros_name, topic_name
 from nodes.ros2_bridge.settings import Kind, Ros2BridgeConfig
+from nodes.ros_messages.topics import Qos, ros_name, topic_name
 
 What = Literal[
     "image",
@@ -166,76 +165,3 @@ def camera_topics(images: tuple[str, ...], config: Ros2BridgeConfig) -> Iterator
             yield "compressed_depth"
     if "segmentation" in images:
         yield "segmentation"
-
-
-class CameraFrames(msgspec.Struct, frozen=True):
-    """A camera's two frames in ROS (REP 103): ``camera_link`` and ``camera_optical_frame``."""
-
-    link: str
-    optical: str
-
-
-class FrameNames:
-    """Our frames' names and axes, and what ROS calls them.
-
-    Of one vehicle alone, frames have the names of REP 105 (``odom``, ``base_link``). Once there is
-    a second, the vehicle's name stands before those of each: ``drone/odom``, ``drone/base_link``.
-    Whose frame is meant follows from who speaks: ``drone/camera`` is of ``drone``.
-    """
-
-    def __init__(self) -> None:
-        self._cameras: dict[str, tuple[str, str]] = {}
-        """Optical frame to the camera's source and its own name."""
-        self._vehicles: list[str] = []
-
-    def add_vehicle(self, source: str) -> None:
-        """Take in a vehicle."""
-        if source not in self._vehicles:
-            self._vehicles.append(source)
-
-    def add(self, camera: CameraAnnouncement) -> CameraFrames:
-        """Take in a camera: its frames have its own name, or its vehicle's too if that is taken."""
-        if camera.frame_id not in self._cameras:
-            name = ros_name(camera.source.rpartition("/")[2])
-            if any(known == name for _, known in self._cameras.values()):
-                name = ros_name(camera.source).replace("/", "_")
-            self._cameras[camera.frame_id] = (camera.source, name)
-        found = self.camera(camera.frame_id)
-        assert found is not None
-        return found
-
-    def camera(self, frame_id: str) -> CameraFrames | None:
-        """Return the frames of the camera with this optical frame, if there is one."""
-        known = self._cameras.get(frame_id)
-        if known is None:
-            return None
-        source, name = known
-        prefix = ""
-        if len(self._vehicles) > 1 and (vehicle := self._carrier(source)):
-            prefix, name = f"{ros_name(vehicle)}/", ros_name(source.rpartition("/")[2])
-        return CameraFrames(f"{prefix}{name}_link", f"{prefix}{name}_optical_frame")
-
-    def vehicle(self, source: str) -> str:
-        """Return the vehicle that a source belongs to: else the first; empty if there is none."""
-        return self._carrier(source) or (self._vehicles[0] if self._vehicles else "")
-
-    def name(self, frame_id: str, source: str = "") -> str:
-        """Return what ROS calls a frame that a source speaks of."""
-        if frame_id == "map":
-            return frame_id
-        camera = self.camera(frame_id)
-        if camera is not None:
-            return camera.optical
-        if len(self._vehicles) > 1:
-            return f"{ros_name(self.vehicle(source))}/{frame_id}"
-        return frame_id
-
-    def axes(self, frame_id: str) -> Axes:
-        """Return how a frame's axes lie."""
-        return "optical" if frame_id in self._cameras else axes_of(frame_id)
-
-    def _carrier(self, source: str) -> str:
-        for vehicle in self._vehicles:
-            if source == vehicle or source.startswith(f"{vehicle}/"):
-                return vehicle
-        return ""

@@ -35,19 +35,20 @@ from events import (
     Vector3,
     VehicleAnnouncement,
 )
-from nodes.ros2_bridge.depth import CompressedDepthWriter
-from nodes.ros2_bridge.frames import turn_points, turn_rotation, turn_vector
-from nodes.ros2_bridge.keys import Topic, topic_name
-from nodes.ros2_bridge.messages import Messages, Time
-from nodes.ros2_bridge.paths import Path
-from nodes.ros2_bridge.pictures import CloudWriter, CompressedWriter, ImageWriter
-from nodes.ros2_bridge.plan import NAMES, FrameNames, Publication, What, announced, publication
+from nodes.ros2_bridge.outgoing_topic import Telling, Writing
+from nodes.ros2_bridge.plan import NAMES, Publication, What, announced, publication
 from nodes.ros2_bridge.session import Publisher, Session
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
-from nodes.ros2_bridge.stamps import SECOND
-from nodes.ros2_bridge.telling import Telling, Writing
-from nodes.ros2_bridge.transforms import Transforms
-from nodes.ros2_bridge.typestore import TypeStore
+from nodes.ros_messages.depth import CompressedDepthWriter
+from nodes.ros_messages.frame_names import FrameNames
+from nodes.ros_messages.frames import turn_points, turn_rotation, turn_vector
+from nodes.ros_messages.images import CloudWriter, CompressedWriter, ImageWriter
+from nodes.ros_messages.messages import Messages, Time
+from nodes.ros_messages.paths import Path
+from nodes.ros_messages.stamps import SECOND
+from nodes.ros_messages.topics import Topic, topic_name
+from nodes.ros_messages.transforms import Transforms
+from nodes.ros_messages.typestore import TypeStore
 
 
 class Publishing:

@@ -19,14 +19,8 @@ import zenoh
 
 from nodes.ros2_bridge.attachment import Attachment, pack
 from nodes.ros2_bridge.gid import gid
-from nodes.ros2_bridge.keys import (
-    NodeName,
-    Topic,
-    data_key,
-    endpoint_token,
-    node_token,
-    ros2dds_key,
-)
+from nodes.ros2_bridge.keys import NodeName, data_key, endpoint_token, node_token, ros2dds_key
+from nodes.ros_messages.topics import Topic
 
 T = TypeVar("T")
 

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from nodes.ros2_bridge.incoming import READERS
-from nodes.ros2_bridge.keys import Qos, dds_type, topic_name
-from nodes.ros2_bridge.typestore import Distribution
+from nodes.ros_messages.incoming import READERS
+from nodes.ros_messages.topics import Qos, dds_type, topic_name
+from nodes.ros_messages.typestore import Distribution
 from runtime import NodeConfig
 from runtime.paths import InputPath
 

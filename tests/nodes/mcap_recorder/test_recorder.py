@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from events import Event, Image
+from nodes.mcap.disk import RecordingError
+from nodes.mcap.mcap_file import McapWriter, contents, read
 from nodes.mcap_recorder import McapRecorder, McapRecorderConfig, pipe
 from nodes.mcap_recorder.backlog import Backlog
-from nodes.mcap_recorder.disk import RecordingError
-from nodes.mcap_recorder.mcap_file import McapWriter, contents, read
 from nodes.mcap_recorder.order import Order
 from nodes.mcap_recorder.process import Process
 from nodes.mcap_recorder.recording import Recording

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from nodes.mcap_recorder import layout
-from nodes.mcap_recorder.mcap_file import read
+from nodes.mcap import layout
+from nodes.mcap.mcap_file import read
 from runtime.errors import VisnavError
 from runtime.tools.cli.recover import recover
-from tests.nodes.mcap_recorder.test_mcap_file import write
+from tests.nodes.mcap.test_mcap_file import write
 
 
 def test_a_torn_file_is_mended_and_a_whole_one_is_not(

@@ -12,12 +12,13 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from events import Announcement, DepthImage, Event, Image
-from nodes.mcap_recorder import native
-from nodes.mcap_recorder.arrays import decoded
-from nodes.mcap_recorder.mcap_file import McapWriter
+from nodes.mcap import native
+from nodes.mcap.arrays import decoded
+from nodes.mcap.mcap_file import McapWriter
 from nodes.mcap_recorder.settings import McapRecorderConfig
-from nodes.mcap_recorder.topics import DEPTH_HEAD, Topics, in_millimetres
+from nodes.mcap_recorder.topics import Topics, in_millimetres
 from nodes.replay.recorded import Recorded
+from nodes.ros_messages.depth import DEPTH_HEAD
 from runtime.wire import pack
 from tests.nodes.mcap_recorder.samples import announcements, depth, image, odometry, said, same
 

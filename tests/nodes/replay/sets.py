@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from events import Announcement, Event
 from nodes.dataset import DatasetWriter
-from nodes.mcap_recorder.mcap_file import McapWriter
+from nodes.mcap.mcap_file import McapWriter
 from nodes.mcap_recorder.settings import McapRecorderConfig
 from nodes.mcap_recorder.topics import Topics
 from nodes.replay.formats import open_reader

@@ -33,7 +33,7 @@ from nodes.replay.euroc import read_sensor
 from nodes.replay.formats import open_reader
 from nodes.replay.reader import Reader, ReplayError
 from nodes.replay.settings import ReplayConfig
-from nodes.ros2_bridge.frames import rotate
+from nodes.ros_messages.frames import rotate
 from nodes.trajectory.table import epoch_of
 from tests.nodes.dataset.samples import (
     camera,

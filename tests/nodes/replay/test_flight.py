@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from nodes.mcap_recorder.mcap_file import contents, read
+from nodes.mcap.mcap_file import contents, read
 from nodes.replay.reader import Timed
 from nodes.replay.recorded import Recorded
 from runtime.wire import pack

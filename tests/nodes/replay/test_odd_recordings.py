@@ -13,11 +13,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from events import CameraAnnouncement
-from nodes.mcap_recorder.mcap_file import contents
+from nodes.mcap.mcap_file import contents
 from nodes.mcap_recorder.recover import recover_file
 from nodes.replay.reader import MOST_TROUBLE, ReplayError
 from nodes.replay.recorded import Recorded
-from nodes.ros2_bridge.typestore import Bag
+from nodes.ros_messages.typestore import Bag
 from tests.nodes.replay import sets
 
 S = 1_700_000_000_000_000_000

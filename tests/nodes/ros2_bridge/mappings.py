@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, cast
 
 from events import Event
-from nodes.ros2_bridge.incoming import Reading
-from nodes.ros2_bridge.telling import Writing
+from nodes.ros2_bridge.outgoing_topic import Writing
+from nodes.ros_messages.incoming import Reading
 
 PERCENT = 100
 BATTERY = "sensor_msgs/msg/BatteryState"

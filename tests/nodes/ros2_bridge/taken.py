@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from nodes.ros2_bridge.keys import Topic
 from nodes.ros2_bridge.session import Take
-from tests.nodes.ros2_bridge import said
+from nodes.ros_messages.topics import Topic
+from tests.nodes.ros_messages import samples
 
 
 class Taken:
@@ -33,7 +33,7 @@ class Taken:
 
     def read(self) -> list[Any]:
         """Return the messages."""
-        return [said.store().deserialize(each, self.topic.type) for each in self.messages]
+        return [samples.store().deserialize(each, self.topic.type) for each in self.messages]
 
 
 class TakingSession:

@@ -26,8 +26,8 @@ from events import (
     Setpoint,
 )
 from runtime import Node, NodeConfig, Output, Tick, every, on
-from tests.nodes.ros2_bridge import said
 from tests.nodes.ros2_bridge.mappings import Battery
+from tests.nodes.ros_messages import samples
 
 
 class TalkerConfig(NodeConfig):
@@ -46,7 +46,7 @@ class Talker(Node[TalkerConfig]):
         self._heard: dict[str, Event] = {}
 
     def announce(self) -> Iterable[Announcement]:
-        return [said.vehicle(), said.camera(), said.imu(), said.estimator()]
+        return [samples.vehicle(), samples.camera(), samples.imu(), samples.estimator()]
 
     @every(hz="rate")
     def talk(self, tick: Tick) -> None:
@@ -55,8 +55,8 @@ class Talker(Node[TalkerConfig]):
         depth, points = np.full((48, 64), 2.5, np.float32), np.eye(3, dtype=np.float32)
         zero = (0.0, 0.0, 0.0)
         for event in (
-            said.odometry(now),
-            said.image(now),
+            samples.odometry(now),
+            samples.image(now),
             DepthImage(stamp=now, source="drone/camera", frame_id=optical, data=depth),
             Imu(
                 stamp=now,

@@ -13,8 +13,8 @@ import zenoh
 
 from nodes.ros2_bridge.attachment import unpack
 from nodes.ros2_bridge.gid import gid
-from tests.nodes.ros2_bridge import said
 from tests.nodes.ros2_bridge.network import bridged_run, client, zenoh_session
+from tests.nodes.ros_messages import samples
 
 pytest.importorskip("zenoh_ros2_sdk")
 
@@ -77,7 +77,7 @@ def test_the_client_decodes_every_topic(seen: tuple[Any, Any, str]) -> None:
     assert heard["/drone/imu"]["linear_acceleration"] == {"x": 0.0, "y": 0.0, "z": 9.81}
     assert heard["/drone/odom"]["pose"]["pose"]["position"] == {"x": 2.5, "y": 1.0, "z": 3.0}
     picture = heard["/drone/camera/image_raw"]
-    first = said.image().data.ravel()[:4].tolist()
+    first = samples.image().data.ravel()[:4].tolist()
     assert picture["data"] == {"size": 48 * 64 * 3, "first": first}
     assert (picture["encoding"], picture["step"]) == ("rgb8", 192)
     assert heard["/drone/camera/depth/image_raw"]["encoding"] == "32FC1"
@@ -119,14 +119,14 @@ def test_a_late_joiner_gets_the_fixed_transforms_and_whole_attachments(tmp_path:
         bridged_run(tmp_path, seconds=60) as (_, port),
         zenoh_session(connect=f"tcp/127.0.0.1:{port}") as session,
     ):
-        samples: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        received: queue.SimpleQueue[Any] = queue.SimpleQueue()
         with session.declare_subscriber("0/drone/odom/**") as other:
             other.recv()  # so the run is well under way
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
         _late = zenoh.ext.declare_advanced_subscriber(
-            session, "0/tf_static/**", samples.put, history=history
+            session, "0/tf_static/**", received.put, history=history
         )
-        sample = samples.get(timeout=10)
+        sample = received.get(timeout=10)
         tokens = [
             str(reply.ok.key_expr)
             for reply in session.liveliness().get("@ros2_lv/0/**/%tf_static/**", timeout=5)
@@ -136,5 +136,5 @@ def test_a_late_joiner_gets_the_fixed_transforms_and_whole_attachments(tmp_path:
     assert said_by.sequence == 1
     assert [gid(token) for token in tokens] == [said_by.gid]
     assert tokens[0].endswith("/:1:,1:,:,:,,")
-    message = said.store().deserialize(sample.payload.to_bytes(), "tf2_msgs/msg/TFMessage")
+    message = samples.store().deserialize(sample.payload.to_bytes(), "tf2_msgs/msg/TFMessage")
     assert len(message.transforms) == 3

@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from bench.flooder import TWIST
-from nodes.ros2_bridge.keys import Topic, data_key
-from tests.nodes.ros2_bridge import said
+from nodes.ros2_bridge.keys import data_key
+from nodes.ros_messages.topics import Topic
 from tests.nodes.ros2_bridge.network import bridged_run
+from tests.nodes.ros_messages import samples
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(150)]
 
@@ -32,7 +33,7 @@ rate = {rate}
 @pytest.mark.parametrize("rate", [100.0, 100_000.0])
 def test_what_was_sent_is_what_was_heard_and_what_was_dropped(rate: float, tmp_path: Path) -> None:
     """At a rate that refuses most, and at one that lets all wait."""
-    key = data_key(0, Topic(name="/cmd_vel", type=TWIST, hash=said.store().hash(TWIST)))
+    key = data_key(0, Topic(name="/cmd_vel", type=TWIST, hash=samples.store().hash(TWIST)))
     with bridged_run(tmp_path, enough=9, more=MORE.format(rate=rate)) as (run, port):
         command = [sys.executable, "-m", "bench.flooder", str(port), key, "10000", "1", "4"]
         flooder = subprocess.run(

@@ -16,10 +16,11 @@ from typing import Any
 import pytest
 import zenoh
 
-from nodes.ros2_bridge.keys import Topic, data_key
-from tests.nodes.ros2_bridge import said
+from nodes.ros2_bridge.keys import data_key
+from nodes.ros_messages.topics import Topic
 from tests.nodes.ros2_bridge.network import bridged_run, free_port, zenoh_session
-from tests.nodes.ros2_bridge.test_hearing import valid
+from tests.nodes.ros2_bridge.test_incoming_topic import valid
+from tests.nodes.ros_messages import samples
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(150)]
 
@@ -27,7 +28,7 @@ TWIST = "geometry_msgs/msg/Twist"
 
 
 def key(topic: str, type_: str) -> str:
-    return data_key(0, Topic(name=topic, type=type_, hash=said.store().hash(type_)))
+    return data_key(0, Topic(name=topic, type=type_, hash=samples.store().hash(type_)))
 
 
 def wait_for(session: zenoh.Session, keys: str, seconds: float = 30.0) -> Any:
@@ -38,7 +39,7 @@ def wait_for(session: zenoh.Session, keys: str, seconds: float = 30.0) -> Any:
 
 
 def clock(sample: Any) -> tuple[int, int]:
-    message = said.store().deserialize(sample.payload.to_bytes(), "rosgraph_msgs/msg/Clock")
+    message = samples.store().deserialize(sample.payload.to_bytes(), "rosgraph_msgs/msg/Clock")
     return message.clock.sec, message.clock.nanosec
 
 

@@ -9,18 +9,14 @@ from nodes.ros2_bridge.attachment import SIZE, Attachment, pack, unpack
 from nodes.ros2_bridge.gid import gid
 from nodes.ros2_bridge.keys import (
     NodeName,
-    Qos,
-    Topic,
     data_key,
-    dds_type,
     endpoint_token,
     graph_key,
     node_token,
     ros2dds_key,
-    ros_name,
-    topic_name,
 )
-from nodes.ros2_bridge.typestore import TypeStore
+from nodes.ros_messages.topics import Qos, Topic, dds_type, ros_name, topic_name
+from nodes.ros_messages.typestore import TypeStore
 
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 LISTENER = "aac3178e146ba6f1fc6e6a4085e77f21"

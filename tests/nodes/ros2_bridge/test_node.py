@@ -23,20 +23,21 @@ from events import (
     MagneticField,
     NavSatFix,
 )
-from nodes.ros2_bridge.keys import Topic, data_key
-from nodes.ros2_bridge.messages import Messages
+from nodes.ros2_bridge.keys import data_key
 from nodes.ros2_bridge.node import Ros2Bridge
-from nodes.ros2_bridge.pictures import ImageWriter, read_image
-from nodes.ros2_bridge.plan import FrameNames
-from nodes.ros2_bridge.typestore import TypeStore
+from nodes.ros_messages.frame_names import FrameNames
+from nodes.ros_messages.images import ImageWriter, read_image
+from nodes.ros_messages.messages import Messages
+from nodes.ros_messages.topics import Topic
+from nodes.ros_messages.typestore import TypeStore
 from runtime.errors import ConfigError, FatalError, MissingDependencyError
 from runtime.testing import run_node
-from tests.nodes.ros2_bridge import said
 from tests.nodes.ros2_bridge.mappings import Battery
 from tests.nodes.ros2_bridge.network import free_port, zenoh_session
 from tests.nodes.ros2_bridge.taken import TakingSession
+from tests.nodes.ros_messages import samples
 
-ANNOUNCED = [said.vehicle(), said.camera(), said.imu(), said.estimator()]
+ANNOUNCED = [samples.vehicle(), samples.camera(), samples.imu(), samples.estimator()]
 POSE = "geometry_msgs/msg/PoseStamped"
 TWIST = {"topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "as": "velocity"}
 
@@ -74,7 +75,7 @@ def test_a_bridge_of_zenoh_s_for_dds_gets_its_own_keys_and_no_attachment(
     listener: Listener,
 ) -> None:
     config = listener.config | {"keys": "ros2dds", "namespace": "/fleet"}
-    run_node(Ros2Bridge, inputs=[*ANNOUNCED, said.odometry(1)], config=config, duration=0.1)
+    run_node(Ros2Bridge, inputs=[*ANNOUNCED, samples.odometry(1)], config=config, duration=0.1)
     found = listener.collect("fleet/drone/odom")
     assert found["fleet/drone/odom"][0].attachment is None
     assert set(found) <= {"fleet/drone/odom", "tf", "tf_static", "clock"}
@@ -89,7 +90,7 @@ def test_only_what_is_asked_for_is_published_under_the_name_that_is_asked_for(
         "compressed": "jpeg",
         "topics": {"drone/odom": "/truth"},
     }
-    inputs = [*ANNOUNCED, said.image(10_000_000), said.odometry(20_000_000)]
+    inputs = [*ANNOUNCED, samples.image(10_000_000), samples.odometry(20_000_000)]
     run_node(Ros2Bridge, inputs=inputs, config=config, duration=0.1)
     found = listener.collect("0/truth/")
     topics = {"/".join(key.split("/")[1:-2]) for key in found}
@@ -121,7 +122,7 @@ def test_further_sensors_paths_and_mappings_of_the_users_own(listener: Listener)
         Battery(stamp=1, source="drone", percentage=0.5),
         Battery(stamp=2, source="drone", percentage=-1.0),
         *[
-            msgspec.structs.replace(said.odometry(t * ms), position=(0.1 * t, 0.0, 0.0))
+            msgspec.structs.replace(samples.odometry(t * ms), position=(0.1 * t, 0.0, 0.0))
             for t in range(10, 260)
         ],
         FluidPressure(stamp=300 * ms, source="last", fluid_pressure=1e5),
@@ -141,7 +142,7 @@ def test_further_sensors_paths_and_mappings_of_the_users_own(listener: Listener)
         "0/last/pressure": 1,
     }
     paths: list[Any] = [
-        said.store().deserialize(sample.payload.to_bytes(), "nav_msgs/msg/Path")
+        samples.store().deserialize(sample.payload.to_bytes(), "nav_msgs/msg/Path")
         for sample in found["0/drone/path"]
     ]
     assert [len(path.poses) for path in paths] == [1, 101, 201]
@@ -169,9 +170,9 @@ def test_a_camera_of_ros_is_waited_for_and_announced(
 ) -> None:
     """Whatever else comes on its topic first."""
     type_ = "sensor_msgs/msg/CameraInfo"
-    topic = Topic(name="/eye/camera_info", type=type_, hash=said.store().hash(type_))
-    info = said.camera().info
-    data = Messages(said.store(), FrameNames()).camera_info((0, 0), info, "eye_optical")
+    topic = Topic(name="/eye/camera_info", type=type_, hash=samples.store().hash(type_))
+    info = samples.camera().info
+    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), info, "eye_optical")
     done = threading.Event()
 
     def publish() -> None:
@@ -210,12 +211,12 @@ def test_pictures_are_read_in_order_beside_the_loop(
         threads.append(threading.current_thread())
         return read_image(*given)
 
-    writer = ImageWriter(said.store(), "eye", "bgr8")
+    writer = ImageWriter(samples.store(), "eye", "bgr8")
     pixels = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
     pictures = [bytes(writer.write((0, n), pixels)) for n in range(1, 6)]
     session = TakingSession([*pictures, b"nonsense"])
     monkeypatch.setattr("nodes.ros2_bridge.node.Session", lambda *_, **__: session)
-    monkeypatch.setattr("nodes.ros2_bridge.incoming.read_image", read)
+    monkeypatch.setattr("nodes.ros_messages.incoming.read_image", read)
     table = {"topic": "/eye", "type": "sensor_msgs/msg/Image", "as": "image"}
     found = run_node(Ros2Bridge, config={"subscriptions": [table]}, duration=0.1).of(Image)
     assert [each.stamp for each in found] == [1, 2, 3, 4, 5]

@@ -12,11 +12,11 @@ import pytest
 from events import Event, Image, PointCloud
 from nodes.ros2_bridge.node import Ros2Bridge
 from runtime.testing import run_node
-from tests.nodes.ros2_bridge import said
 from tests.nodes.ros2_bridge.mappings import Battery
 from tests.nodes.ros2_bridge.taken import TakingSession
+from tests.nodes.ros_messages import samples
 
-ANNOUNCED: list[Event] = [said.vehicle(), said.camera(), said.imu(), said.estimator()]
+ANNOUNCED: list[Event] = [samples.vehicle(), samples.camera(), samples.imu(), samples.estimator()]
 HERE = "tests.nodes.ros2_bridge.mappings"
 
 Bridge = Callable[..., TakingSession]
@@ -29,7 +29,7 @@ def bridge(monkeypatch: pytest.MonkeyPatch) -> Bridge:
     def run(inputs: list[Event], duration: float = 0.4, **config: Any) -> TakingSession:
         session = TakingSession()
         monkeypatch.setattr("nodes.ros2_bridge.node.Session", lambda *_, **__: session)
-        monkeypatch.setattr("nodes.ros2_bridge.node.TypeStore", lambda *_: said.store())
+        monkeypatch.setattr("nodes.ros2_bridge.node.TypeStore", lambda *_: samples.store())
         run_node(Ros2Bridge, inputs=inputs, config=config, duration=duration)
         return session
 
@@ -41,7 +41,7 @@ def stamps(messages: list[Any]) -> list[int]:
 
 
 def test_in_lockstep_every_picture_is_published_in_order(bridge: Bridge) -> None:
-    pictures = [said.image(10_000_000 * (i + 1)) for i in range(20)]
+    pictures = [samples.image(10_000_000 * (i + 1)) for i in range(20)]
     session = bridge([*ANNOUNCED, *pictures])
     (images,), (info,), (clock,) = map(
         session.on, ("/drone/camera/image_raw", "/drone/camera/camera_info", "/clock")
@@ -54,7 +54,7 @@ def test_in_lockstep_every_picture_is_published_in_order(bridge: Bridge) -> None
 
 def test_sensors_are_best_effort_and_fixed_frames_are_kept(bridge: Bridge) -> None:
     """As rclcpp's SensorDataQoS and tf2's broadcasters have it."""
-    session = bridge([*ANNOUNCED, said.odometry(1)])
+    session = bridge([*ANNOUNCED, samples.odometry(1)])
     sensor, plain = "2::,5:,:,:,,", "::,10:,:,:,,"
     assert {each.topic.name: each.topic.qos.text() for each in session.taken} == {
         "/drone/camera/camera_info": sensor,
@@ -123,10 +123,10 @@ def test_points_of_a_camera_s_optical_frame_stay_as_they_are(bridge: Bridge) -> 
 
 
 def test_two_vehicles_have_topics_and_frames_of_their_own(bridge: Bridge) -> None:
-    other = msgspec.structs.replace(said.vehicle(), source="other", position=(9.0, 0.0, 0.0))
-    moved = msgspec.structs.replace(said.odometry(1), source="other")
-    cameras = [said.camera(), said.camera("other/camera")]
-    session = bridge([said.vehicle(), other, *cameras, said.odometry(1), moved])
+    other = msgspec.structs.replace(samples.vehicle(), source="other", position=(9.0, 0.0, 0.0))
+    moved = msgspec.structs.replace(samples.odometry(1), source="other")
+    cameras = [samples.camera(), samples.camera("other/camera")]
+    session = bridge([samples.vehicle(), other, *cameras, samples.odometry(1), moved])
     for name in ("drone", "other"):
         (odometry,) = session.on(f"/{name}/odom")
         assert [m.child_frame_id for m in odometry.read()] == [f"{name}/base_link"]
@@ -152,7 +152,7 @@ def test_two_vehicles_have_topics_and_frames_of_their_own(bridge: Bridge) -> Non
 def test_names_that_nothing_has_are_told_of(
     bridge: Bridge, config: dict[str, Any], line: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    bridge([*ANNOUNCED, said.odometry(1)], duration=0.01, **config)
+    bridge([*ANNOUNCED, samples.odometry(1)], duration=0.01, **config)
     warned = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert len(warned) == bool(line)
     assert line in "".join(warned)

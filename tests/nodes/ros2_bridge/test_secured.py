@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 import zenoh
 
-from nodes.ros2_bridge.keys import NodeName, Qos, Topic, data_key
+from nodes.ros2_bridge.keys import NodeName, data_key
 from nodes.ros2_bridge.session import Session
+from nodes.ros_messages.topics import Qos, Topic
 from tests.nodes.ros2_bridge.network import free_port
 
 pytestmark = [

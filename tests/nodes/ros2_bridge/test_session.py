@@ -12,8 +12,9 @@ import pytest
 
 from nodes.ros2_bridge.attachment import unpack
 from nodes.ros2_bridge.gid import gid
-from nodes.ros2_bridge.keys import NodeName, Qos, Topic, data_key, endpoint_token, node_token
+from nodes.ros2_bridge.keys import NodeName, data_key, endpoint_token, node_token
 from nodes.ros2_bridge.session import Session, SessionError, _configuration
+from nodes.ros_messages.topics import Qos, Topic
 from tests.nodes.ros2_bridge.network import free_port, zenoh_session
 
 TOPIC = Topic(name="/a/b", type="std_msgs/msg/Empty", hash="RIHS01_0", qos=Qos(depth=3))

@@ -1,0 +1,104 @@
+"""What the bridge hears: the bytes of a topic to an event, and all that may be wrong with them."""
+
+from __future__ import annotations
+
+import importlib
+
+from events import Event
+from nodes.ros2_bridge.complaints import Complaints
+from nodes.ros2_bridge.settings import Ros2BridgeConfig, Subscription
+from nodes.ros_messages.incoming import READERS, Reader, Reading
+from nodes.ros_messages.stamps import Stamps
+from nodes.ros_messages.topics import Qos, Topic, ros_name, topic_name
+from nodes.ros_messages.typestore import MessageError, TypeStore
+
+
+class Hearing:
+    """One subscription's way from bytes to an event.
+
+    Args:
+        subscription: As the file says.
+        config: The bridge's settings.
+        store: Of the types.
+        node: The bridge's name, for the events' source.
+        complaints: Told of what is wrong.
+
+    Raises:
+        ValueError: The type is not known, or the mapping cannot be imported.
+    """
+
+    def __init__(
+        self,
+        subscription: Subscription,
+        config: Ros2BridgeConfig,
+        store: TypeStore,
+        node: str,
+        complaints: Complaints,
+    ) -> None:
+        self.subscription = subscription
+        name = topic_name(config.namespace, subscription.topic)
+        self.topic = topic(store, name, subscription.type, subscription.qos)
+        self.source = subscription.source or f"{node}/{ros_name(subscription.topic)}"
+        self.heard = 0
+        self._store = store
+        self._complaints = complaints
+        self._read = _reader(subscription)
+
+    def complain(self, kind: str, detail: str) -> None:
+        """Count, and now and then log, something wrong with this topic."""
+        self._complaints.add(self.topic.name, kind, detail)
+
+    def event(self, data: bytes, now: int, stamps: Stamps) -> Event | None:
+        """Return what a message becomes; `None` if it is refused, or of no use."""
+        try:
+            message = self._store.deserialize(data, self.topic.type)
+        except MessageError as error:
+            self.complain(f"not a {self.topic.type}", str(error))
+            return None
+        reading = Reading(
+            source=self.source, now=now, stamps=stamps, frame_id=self.subscription.frame_id
+        )
+        try:
+            event = self._read(message, reading)
+        except (ValueError, TypeError, ArithmeticError) as error:
+            self.complain("message refused", str(error))
+            return None
+        except Exception as error:  # a mapping is the user's own
+            self.complain("mapping failed", f"{type(error).__name__}: {error}")
+            return None
+        if event is None:
+            return None
+        if not isinstance(event, Event):
+            self.complain("mapping failed", f"expected an event, found {type(event).__name__}")
+            return None
+        self.heard += 1
+        return event
+
+
+def topic(store: TypeStore, name: str, type_: str, qos: Qos) -> Topic:
+    """Return a topic as the file has it.
+
+    Raises:
+        ValueError: The type is not known.
+    """
+    try:
+        return Topic(name=name, type=type_, hash=store.hash(type_), qos=qos)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def _reader(subscription: Subscription) -> Reader:
+    if subscription.use:
+        return READERS[subscription.type, subscription.use]
+    module, _, name = subscription.mapping.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"{subscription.topic}: mapping: expected a function that can be imported, "
+            f"found {subscription.mapping!r}: {error}"
+        ) from None
+    if not callable(found):
+        raise ValueError(f"{subscription.topic}: mapping: expected a function, found {found!r}")
+    read: Reader = found
+    return read

@@ -1,0 +1,237 @@
+"""Pictures and clouds as messages, with no more copies than one, and pictures back as events.
+
+Nearly all of such a message is its data, so the rest is serialised once by `typestore`, and then
+only stamp, length and data are written, into a buffer that is used again. The bytes are those
+that rosbags would make. A writer belongs to one topic and one thread at a time.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from events import DepthImage, Image
+from nodes.ros_messages.typestore import TypeStore
+
+_STAMP = struct.Struct("<iI")
+_STAMP_AT = 4
+"""A header is the first field of each of these messages, and begins with the stamp."""
+_LENGTH = struct.Struct("<I")
+
+_NONE = np.zeros(0, np.uint8)
+_POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
+_PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
+_TURNS = {
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "8UC3": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+}
+
+
+class ImageWriter:
+    """Writes ``sensor_msgs/msg/Image``.
+
+    Args:
+        store: Of the types.
+        frame_id: Optical frame.
+        encoding: ``rgb8``, ``mono8``, ``32FC1`` or ``32SC1``.
+    """
+
+    def __init__(self, store: TypeStore, frame_id: str, encoding: str) -> None:
+        self._store = store
+        self.frame_id = frame_id
+        self.encoding = encoding
+        self._shape: tuple[int, ...] | None = None
+        self._buffer = bytearray()
+
+    def write(self, stamp: tuple[int, int], data: npt.NDArray[Any]) -> bytearray:
+        """Return the message; it is overwritten by the next.
+
+        Args:
+            stamp: Seconds and nanoseconds.
+            data: Pixels, shape (height, width) or (height, width, channels).
+        """
+        if data.shape != self._shape:
+            self._begin(data)
+        _STAMP.pack_into(self._buffer, _STAMP_AT, *stamp)
+        np.copyto(self._pixels, data)
+        return self._buffer
+
+    def _begin(self, data: npt.NDArray[Any]) -> None:
+        message = self._store.message("sensor_msgs/msg/Image")
+        head = self._store.serialize(
+            message(
+                header=make_header(self._store, (0, 0), self.frame_id),
+                height=data.shape[0],
+                width=data.shape[1],
+                encoding=self.encoding,
+                is_bigendian=0,
+                step=data.nbytes // max(data.shape[0], 1),
+                data=_NONE,
+            )
+        )
+        _LENGTH.pack_into(head, len(head) - 4, data.nbytes)
+        self._shape = data.shape
+        self._buffer = head + bytearray(data.nbytes)
+        flat = np.frombuffer(self._buffer, data.dtype.newbyteorder("<"), data.size, len(head))
+        self._pixels = flat.reshape(data.shape)
+
+
+class CompressedWriter:
+    """Writes ``sensor_msgs/msg/CompressedImage`` as image_transport's plugin does.
+
+    Args:
+        store: Of the types.
+        frame_id: Optical frame.
+        how: Format of the picture.
+        quality: Of a JPEG, 1 to 100.
+    """
+
+    def __init__(
+        self, store: TypeStore, frame_id: str, how: Literal["jpeg", "png"], quality: int
+    ) -> None:
+        self._store = store
+        self._frame_id = frame_id
+        self._how = how
+        self._options = [cv2.IMWRITE_JPEG_QUALITY, quality] if how == "jpeg" else []
+
+    def write(self, stamp: tuple[int, int], data: npt.NDArray[np.uint8]) -> bytearray:
+        """Return the message.
+
+        Args:
+            stamp: Seconds and nanoseconds.
+            data: Pixels, shape (height, width, 3) in RGB, or (height, width).
+        """
+        colour = data.ndim == 3
+        pixels = cv2.cvtColor(data, cv2.COLOR_RGB2BGR) if colour else data
+        _, encoded = cv2.imencode(f".{self._how}", pixels, self._options)
+        format_ = f"{'rgb8' if colour else 'mono8'}; {self._how} compressed "
+        message = self._store.message("sensor_msgs/msg/CompressedImage")
+        return self._store.serialize(
+            message(
+                header=make_header(self._store, stamp, self._frame_id),
+                format=format_ + ("bgr8" if colour else "mono8"),
+                data=encoded.ravel(),
+            )
+        )
+
+
+class CloudWriter:
+    """Writes ``sensor_msgs/msg/PointCloud2`` with the fields x, y, z and, if wanted, rgb.
+
+    Args:
+        store: Of the types.
+        frame_id: Of the points.
+        fields: ``xyz`` leaves out rgb, and its four bytes of each point empty.
+    """
+
+    def __init__(
+        self, store: TypeStore, frame_id: str, fields: Literal["xyz", "xyzrgb"] = "xyzrgb"
+    ) -> None:
+        self._store = store
+        self._header = frame_id
+        self._names = ("x", "y", "z", "rgb") if fields == "xyzrgb" else ("x", "y", "z")
+
+    def write(
+        self,
+        stamp: tuple[int, int],
+        points: npt.NDArray[np.float32],
+        colors: npt.NDArray[np.uint8] | None = None,
+    ) -> bytearray:
+        """Return the message.
+
+        Args:
+            stamp: Seconds and nanoseconds.
+            points: Metres in ROS's axes, shape (n, 3).
+            colors: Red, green, blue, shape (n, 3), or (0, 3) for none: then all are white.
+                Not for ``xyz``.
+        """
+        count = len(points)
+        message = self._store.message("sensor_msgs/msg/PointCloud2")
+        field = self._store.message("sensor_msgs/msg/PointField")
+        names = enumerate(self._names)
+        frame = self._store.serialize(
+            message(
+                header=make_header(self._store, stamp, self._header),
+                height=1,
+                width=count,
+                fields=[field(name=n, offset=4 * i, datatype=7, count=1) for i, n in names],
+                is_bigendian=False,
+                point_step=_POINT.itemsize,
+                row_step=_POINT.itemsize * count,
+                data=_NONE,
+                is_dense=bool(np.isfinite(points).all()),
+            )
+        )
+        dense = frame.pop()  # follows the data
+        begin, size = len(frame), count * _POINT.itemsize
+        _LENGTH.pack_into(frame, begin - 4, size)
+        frame += bytearray(size + 1)
+        frame[-1] = dense
+        rows = np.frombuffer(frame, _POINT, count, begin)
+        rows["xyz"] = points
+        if colors is not None:
+            rows["bgr"] = colors[:, ::-1] if len(colors) else 255
+        return frame
+
+
+def make_header(store: TypeStore, stamp: tuple[int, int], frame_id: str) -> Any:
+    """Return a ``std_msgs/msg/Header``."""
+    time = store.message("builtin_interfaces/msg/Time")(sec=stamp[0], nanosec=stamp[1])
+    return store.message("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)
+
+
+def read_image(message: Any, source: str, stamp: int, frame_id: str) -> Image:
+    """Read a colour or grey picture.
+
+    Raises:
+        ValueError: The encoding is another, or sizes do not fit each other.
+    """
+    channels = _PIXEL_BYTES.get(message.encoding)
+    if channels is None:
+        raise ValueError(
+            f"encoding: expected one of {', '.join(_PIXEL_BYTES)}, found {message.encoding!r:.80}"
+        )
+    pixels = _rows(message, channels).reshape(message.height, message.width, channels)
+    if channels == 1:
+        return Image(
+            stamp=stamp, source=source, frame_id=frame_id, encoding="mono8", data=pixels[:, :, 0]
+        )
+    turn = _TURNS.get(message.encoding)
+    rgb: Any = np.ascontiguousarray(pixels) if turn is None else cv2.cvtColor(pixels, turn)
+    return Image(stamp=stamp, source=source, frame_id=frame_id, data=rgb)
+
+
+def read_depth(message: Any, source: str, stamp: int, frame_id: str) -> DepthImage:
+    """Read depth in metres (``32FC1``) or millimetres (``16UC1``); what is not known is ``inf``.
+
+    Raises:
+        ValueError: The encoding is another, or sizes do not fit each other.
+    """
+    size = {"32FC1": 4, "16UC1": 2}.get(message.encoding)
+    if size is None:
+        raise ValueError(f"encoding: expected 32FC1 or 16UC1, found {message.encoding!r:.80}")
+    order = ">" if message.is_bigendian else "<"
+    rows = np.ascontiguousarray(_rows(message, size)).view(
+        f"{order}{'f' if size == 4 else 'u'}{size}"
+    )
+    metres = rows.astype(np.float32) * np.float32(1.0 if size == 4 else 0.001)
+    metres[~(metres > 0.0)] = np.inf
+    return DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=metres)
+
+
+def _rows(message: Any, pixel: int) -> npt.NDArray[np.uint8]:
+    """Return a picture's bytes, shape (height, width * pixel), without what fills up its rows."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data: npt.NDArray[np.uint8] = message.data
+    if height < 1 or width < 1 or step < width * pixel or len(data) != height * step:
+        raise ValueError(
+            f"expected height * step bytes, and a step of {pixel} bytes a pixel or more, found "
+            f"{width} x {height} pixels, a step of {step} and {len(data)} bytes"
+        )
+    return data.reshape(height, step)[:, : width * pixel]

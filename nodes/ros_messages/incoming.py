@@ -1,0 +1,230 @@
+"""ROS messages to events, in our frames. What is not sane is refused with a ValueError.
+
+`READERS` has a function for each type of message and use; a mapping of the user's own is called
+alike. World ENU becomes NED, body FLU FRD; optical axes stay. See `frames`. Pictures are in
+`pictures`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import atan2, isfinite
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from events import (
+    Event,
+    Imu,
+    Odometry,
+    PoseEstimate,
+    PoseSetpoint,
+    PositionSetpoint,
+    Quaternion,
+    Vector3,
+    VelocitySetpoint,
+)
+from nodes.ros_messages.frames import (
+    axes_of,
+    turn_covariance,
+    turn_rotation,
+    turn_vector,
+    unit,
+)
+from nodes.ros_messages.images import read_depth, read_image
+from nodes.ros_messages.stamps import Stamps
+
+
+class Reading(msgspec.Struct, frozen=True, kw_only=True):
+    """What a reader needs to know beside the message.
+
+    Attributes:
+        source: Of the event.
+        now: On the run's clock (ns).
+        stamps: How messages tell the time.
+        frame_id: If set, stands in the place of the message's own.
+    """
+
+    source: str
+    now: int
+    stamps: Stamps = Stamps()
+    frame_id: str = ""
+
+    def stamp(self, header: Any) -> int:
+        """Return the time of a message with a header.
+
+        Raises:
+            ValueError: It is no time of this run.
+        """
+        return self.stamps.back(header.stamp.sec, header.stamp.nanosec, self.now)
+
+    def frame(self, header: Any, default: str) -> str:
+        """Return the frame that an event is to name."""
+        return self.frame_id or header.frame_id or default
+
+
+Reader = Callable[[Any, Reading], Event | None]
+
+
+def estimate(message: Any, reading: Reading) -> Event:
+    """Read a PoseStamped as an estimate."""
+    return _estimate(message.header, message.pose, (), reading)
+
+
+def estimate_with_covariance(message: Any, reading: Reading) -> Event:
+    """Read a PoseWithCovarianceStamped, or an Odometry, as an estimate."""
+    covariance = message.pose.covariance
+    if not np.isfinite(covariance).all():
+        raise ValueError("covariance: expected finite numbers")
+    given = covariance if covariance.any() else ()
+    child = getattr(message, "child_frame_id", "") or "base_link"
+    return _estimate(message.header, message.pose.pose, given, reading, child)
+
+
+def odometry(message: Any, reading: Reading) -> Event:
+    """Read an Odometry as a body's pose and twist."""
+    frame_id, child = reading.frame(message.header, "odom"), message.child_frame_id or "base_link"
+    position, orientation = _pose(message.pose.pose, frame_id, child)
+    twist, axes = message.twist.twist, axes_of(child)
+    return Odometry(
+        stamp=reading.stamp(message.header),
+        source=reading.source,
+        frame_id=frame_id,
+        child_frame_id=child,
+        position=position,
+        orientation=orientation,
+        linear_velocity=turn_vector(axes, _vector(twist.linear)),
+        angular_velocity=turn_vector(axes, _vector(twist.angular)),
+    )
+
+
+def velocity(message: Any, reading: Reading) -> Event:
+    """Read a Twist as a velocity along the vehicle's heading."""
+    return _velocity(message, reading.now, reading.frame_id or "heading", reading)
+
+
+def stamped_velocity(message: Any, reading: Reading) -> Event:
+    """Read a TwistStamped as a velocity in ``map``, or else along the vehicle's heading."""
+    frame_id = "map" if reading.frame(message.header, "") == "map" else "heading"
+    return _velocity(message.twist, reading.stamp(message.header), frame_id, reading)
+
+
+def position(message: Any, reading: Reading) -> Event:
+    """Read a PoseStamped as a place to be at, with its heading."""
+    place, orientation = _pose_in_map(message, reading)
+    w, x, y, z = orientation
+    return PositionSetpoint(
+        stamp=reading.stamp(message.header),
+        source=reading.source,
+        position=place,
+        yaw=atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
+
+
+def pose(message: Any, reading: Reading) -> Event:
+    """Read a PoseStamped as a place to be at in an attitude."""
+    place, orientation = _pose_in_map(message, reading)
+    return PoseSetpoint(
+        stamp=reading.stamp(message.header),
+        source=reading.source,
+        position=place,
+        orientation=orientation,
+    )
+
+
+def imu(message: Any, reading: Reading) -> Event:
+    """Read an Imu, without its orientation."""
+    frame_id = reading.frame(message.header, "base_link")
+    axes = axes_of(frame_id)
+    return Imu(
+        stamp=reading.stamp(message.header),
+        source=reading.source,
+        frame_id=frame_id,
+        angular_velocity=turn_vector(axes, _vector(message.angular_velocity)),
+        linear_acceleration=turn_vector(axes, _vector(message.linear_acceleration)),
+    )
+
+
+def image(message: Any, reading: Reading) -> Event:
+    """Read an Image as a colour or grey picture."""
+    header = message.header
+    return read_image(message, reading.source, reading.stamp(header), reading.frame(header, ""))
+
+
+def depth(message: Any, reading: Reading) -> Event:
+    """Read an Image as depth."""
+    header = message.header
+    return read_depth(message, reading.source, reading.stamp(header), reading.frame(header, ""))
+
+
+def nothing(message: Any, reading: Reading) -> None:
+    """Make no event of a message."""
+
+
+READERS: dict[tuple[str, str], Reader] = {
+    ("geometry_msgs/msg/PoseStamped", "estimate"): estimate,
+    ("geometry_msgs/msg/PoseWithCovarianceStamped", "estimate"): estimate_with_covariance,
+    ("nav_msgs/msg/Odometry", "estimate"): estimate_with_covariance,
+    ("nav_msgs/msg/Odometry", "odometry"): odometry,
+    ("geometry_msgs/msg/Twist", "velocity"): velocity,
+    ("geometry_msgs/msg/TwistStamped", "velocity"): stamped_velocity,
+    ("geometry_msgs/msg/PoseStamped", "position"): position,
+    ("geometry_msgs/msg/PoseStamped", "pose"): pose,
+    ("sensor_msgs/msg/Image", "image"): image,
+    ("sensor_msgs/msg/Image", "depth"): depth,
+    ("sensor_msgs/msg/Imu", "imu"): imu,
+    ("sensor_msgs/msg/CameraInfo", "camera"): nothing,
+}
+"""By type of message and use."""
+
+
+def _estimate(
+    header: Any, pose: Any, covariance: Any, reading: Reading, child: str = "base_link"
+) -> Event:
+    frame_id = reading.frame(header, "odom")
+    place, orientation = _pose(pose, frame_id, child)
+    given = turn_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
+    return PoseEstimate(
+        stamp=reading.stamp(header),
+        source=reading.source,
+        frame_id=frame_id,
+        child_frame_id=child,
+        position=place,
+        orientation=orientation,
+        covariance=tuple(given),
+    )
+
+
+def _velocity(twist: Any, stamp: int, frame_id: str, reading: Reading) -> Event:
+    turned = turn_vector("world" if frame_id == "map" else "body", _vector(twist.linear))
+    return VelocitySetpoint(
+        stamp=stamp,
+        source=reading.source,
+        frame_id=frame_id,
+        velocity=turned,
+        yaw_rate=-_vector(twist.angular)[2],
+    )
+
+
+def _pose_in_map(message: Any, reading: Reading) -> tuple[Vector3, Quaternion]:
+    frame_id = reading.frame(message.header, "map")
+    if frame_id != "map":
+        raise ValueError(f'frame_id: expected "map", found {frame_id!r:.80}')
+    return _pose(message.pose, "map", "base_link")
+
+
+def _pose(pose: Any, parent: str, child: str) -> tuple[Vector3, Quaternion]:
+    q, axes = pose.orientation, axes_of(parent)
+    rotation = unit((float(q.w), float(q.x), float(q.y), float(q.z)))
+    return (
+        turn_vector(axes, _vector(pose.position)),
+        turn_rotation(axes, axes_of(child), rotation),
+    )
+
+
+def _vector(vector: Any) -> Vector3:
+    x, y, z = float(vector.x), float(vector.y), float(vector.z)
+    if not isfinite(x + y + z):
+        raise ValueError(f"expected finite numbers, found {(x, y, z)}")
+    return (x, y, z)

@@ -1,0 +1,247 @@
+"""Events to ROS messages that are small: as CDR, in ROS's frames. Pictures are in `pictures`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from events import (
+    CameraInfo,
+    FluidPressure,
+    Imu,
+    ImuAnnouncement,
+    MagneticField,
+    NavSatFix,
+    Odometry,
+    PoseEstimate,
+    PoseStamped,
+    Quaternion,
+    Range,
+    Score,
+    Vector3,
+)
+from nodes.ros_messages.frame_names import FrameNames
+from nodes.ros_messages.frames import Axes, turn_covariance, turn_rotation, turn_vector
+from nodes.ros_messages.images import make_header
+from nodes.ros_messages.typestore import TypeStore
+
+Time = tuple[int, int]
+"""Seconds and nanoseconds."""
+
+_ZEROS_9, _ZEROS_36 = np.zeros(9), np.zeros(36)
+_UNKNOWN = np.array([-1.0, *[0.0] * 8])
+"""A covariance that says: this is not measured (sensor_msgs/Imu)."""
+
+
+class Transform(NamedTuple):
+    """A frame in its parent, already in ROS's names and axes."""
+
+    parent: str
+    child: str
+    translation: Vector3
+    rotation: Quaternion
+
+
+class Messages:
+    """Makes messages.
+
+    Args:
+        store: Of the types.
+        frames: What ROS calls our frames.
+    """
+
+    def __init__(self, store: TypeStore, frames: FrameNames) -> None:
+        self._store = store
+        self._frames = frames
+        names = {
+            "vector": "geometry_msgs/msg/Vector3",
+            "point": "geometry_msgs/msg/Point",
+            "quaternion": "geometry_msgs/msg/Quaternion",
+            "pose": "geometry_msgs/msg/Pose",
+            "twist": "geometry_msgs/msg/Twist",
+            "pose_covariance": "geometry_msgs/msg/PoseWithCovariance",
+            "twist_covariance": "geometry_msgs/msg/TwistWithCovariance",
+            "transform": "geometry_msgs/msg/Transform",
+            "transform_stamped": "geometry_msgs/msg/TransformStamped",
+        }
+        self._make: dict[str, Any] = {name: store.message(type_) for name, type_ in names.items()}
+
+    def odometry(self, time: Time, event: Odometry) -> bytearray:
+        """Return a nav_msgs/Odometry: the pose in its parent, the twist in the body."""
+        make, axes = self._make, self._frames.axes(event.child_frame_id)
+        twist = make["twist"](
+            linear=self._vector(turn_vector(axes, event.linear_velocity)),
+            angular=self._vector(turn_vector(axes, event.angular_velocity)),
+        )
+        pose = self._pose(event.frame_id, axes, event.position, event.orientation)
+        message = self._store.message("nav_msgs/msg/Odometry")(
+            header=self._header(time, event.frame_id, event.source),
+            child_frame_id=self._frames.name(event.child_frame_id, event.source),
+            pose=make["pose_covariance"](pose=pose, covariance=_ZEROS_36),
+            twist=make["twist_covariance"](twist=twist, covariance=_ZEROS_36),
+        )
+        return self._store.serialize(message)
+
+    def pose(self, time: Time, event: PoseStamped | PoseEstimate, child: Axes) -> bytearray:
+        """Return a geometry_msgs/PoseStamped; `child` are the axes of the frame that is placed."""
+        message = self._store.message("geometry_msgs/msg/PoseStamped")(
+            header=self._header(time, event.frame_id, event.source),
+            pose=self._pose(event.frame_id, child, event.position, event.orientation),
+        )
+        return self._store.serialize(message)
+
+    def pose_with_covariance(self, time: Time, event: PoseEstimate, child: Axes) -> bytearray:
+        """Return a geometry_msgs/PoseWithCovarianceStamped; zeros if nothing is known."""
+        covariance = _ZEROS_36
+        if event.covariance:
+            axes = self._frames.axes(event.frame_id)
+            covariance = turn_covariance(axes, np.array(event.covariance))
+        pose = self._pose(event.frame_id, child, event.position, event.orientation)
+        message = self._store.message("geometry_msgs/msg/PoseWithCovarianceStamped")(
+            header=self._header(time, event.frame_id, event.source),
+            pose=self._make["pose_covariance"](pose=pose, covariance=covariance),
+        )
+        return self._store.serialize(message)
+
+    def imu(self, time: Time, event: Imu, noise: ImuAnnouncement | None) -> bytearray:
+        """Return a sensor_msgs/Imu without orientation.
+
+        The covariances are those of one sample: squared noise density times rate.
+        """
+        axes = self._frames.axes(event.frame_id)
+        gyroscope = accelerometer = _ZEROS_9
+        if noise is not None:
+            gyroscope = _diagonal(noise.gyroscope_noise_density**2 * noise.rate)
+            accelerometer = _diagonal(noise.accelerometer_noise_density**2 * noise.rate)
+        message = self._store.message("sensor_msgs/msg/Imu")(
+            header=self._header(time, event.frame_id, event.source),
+            orientation=self._make["quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=_UNKNOWN,
+            angular_velocity=self._vector(turn_vector(axes, event.angular_velocity)),
+            angular_velocity_covariance=gyroscope,
+            linear_acceleration=self._vector(turn_vector(axes, event.linear_acceleration)),
+            linear_acceleration_covariance=accelerometer,
+        )
+        return self._store.serialize(message)
+
+    def camera_info(self, time: Time, info: CameraInfo, frame_id: str) -> bytearray:
+        """Return a sensor_msgs/CameraInfo: plumb_bob; K, R (one) and P of a single camera."""
+        k = info.matrix()
+        projection = np.zeros((3, 4))
+        projection[:, :3] = k
+        message = self._store.message("sensor_msgs/msg/CameraInfo")(
+            header=self._header(time, frame_id),
+            height=info.height,
+            width=info.width,
+            distortion_model="plumb_bob",
+            d=np.array(info.distortion, np.float64),
+            k=k.ravel(),
+            r=np.eye(3).ravel(),
+            p=projection.ravel(),
+            binning_x=0,
+            binning_y=0,
+            roi=self._store.message("sensor_msgs/msg/RegionOfInterest")(
+                x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+            ),
+        )
+        return self._store.serialize(message)
+
+    def transforms(self, time: Time, transforms: Iterable[Transform]) -> bytearray:
+        """Return a tf2_msgs/TFMessage."""
+        make = self._make
+        message = self._store.message("tf2_msgs/msg/TFMessage")(
+            transforms=[
+                make["transform_stamped"](
+                    header=make_header(self._store, time, each.parent),
+                    child_frame_id=each.child,
+                    transform=make["transform"](
+                        translation=self._vector(each.translation),
+                        rotation=self._quaternion(each.rotation),
+                    ),
+                )
+                for each in transforms
+            ]
+        )
+        return self._store.serialize(message)
+
+    def clock(self, time: Time) -> bytearray:
+        """Return a rosgraph_msgs/Clock."""
+        stamp = self._store.message("builtin_interfaces/msg/Time")(sec=time[0], nanosec=time[1])
+        return self._store.serialize(self._store.message("rosgraph_msgs/msg/Clock")(clock=stamp))
+
+    def range(self, time: Time, event: Range) -> bytearray:
+        """Return a sensor_msgs/Range; ours says nothing of its mounting, so it is the body's."""
+        type_ = self._store.message("sensor_msgs/msg/Range")
+        more = {"variance": 0.0} if "variance" in type_.__annotations__ else {}  # since Iron
+        message = type_(
+            header=self._header(time, "base_link", event.source),
+            radiation_type=type_.INFRARED,
+            field_of_view=0.0,
+            min_range=event.min_range,
+            max_range=event.max_range,
+            range=event.range,
+            **more,
+        )
+        return self._store.serialize(message)
+
+    def pressure(self, time: Time, event: FluidPressure) -> bytearray:
+        """Return a sensor_msgs/FluidPressure."""
+        message = self._store.message("sensor_msgs/msg/FluidPressure")(
+            header=self._header(time, "base_link", event.source),
+            fluid_pressure=event.fluid_pressure,
+            variance=event.variance,
+        )
+        return self._store.serialize(message)
+
+    def magnetic_field(self, time: Time, event: MagneticField) -> bytearray:
+        """Return a sensor_msgs/MagneticField; its covariance of zeros says: not known."""
+        message = self._store.message("sensor_msgs/msg/MagneticField")(
+            header=self._header(time, "base_link", event.source),
+            magnetic_field=self._vector(turn_vector("body", event.magnetic_field)),
+            magnetic_field_covariance=_ZEROS_9,
+        )
+        return self._store.serialize(message)
+
+    def fix(self, time: Time, event: NavSatFix) -> bytearray:
+        """Return a sensor_msgs/NavSatFix of a plain GPS fix, whose covariance is not known."""
+        status = self._store.message("sensor_msgs/msg/NavSatStatus")
+        type_ = self._store.message("sensor_msgs/msg/NavSatFix")
+        message = type_(
+            header=self._header(time, "base_link", event.source),
+            status=status(status=status.STATUS_FIX, service=status.SERVICE_GPS),
+            latitude=event.latitude,
+            longitude=event.longitude,
+            altitude=event.altitude,
+            position_covariance=_ZEROS_9,
+            position_covariance_type=type_.COVARIANCE_TYPE_UNKNOWN,
+        )
+        return self._store.serialize(message)
+
+    def score(self, event: Score) -> bytearray:
+        """Return a std_msgs/Float64."""
+        return self._store.serialize(self._store.message("std_msgs/msg/Float64")(data=event.value))
+
+    def _header(self, time: Time, frame_id: str, source: str = "") -> Any:
+        return make_header(self._store, time, self._frames.name(frame_id, source))
+
+    def _pose(self, parent: str, child: Axes, position: Vector3, orientation: Quaternion) -> Any:
+        axes = self._frames.axes(parent)
+        x, y, z = turn_vector(axes, position)
+        return self._make["pose"](
+            position=self._make["point"](x=x, y=y, z=z),
+            orientation=self._quaternion(turn_rotation(axes, child, orientation)),
+        )
+
+    def _vector(self, vector: Vector3) -> Any:
+        x, y, z = vector
+        return self._make["vector"](x=x, y=y, z=z)
+
+    def _quaternion(self, rotation: Quaternion) -> Any:
+        w, x, y, z = rotation
+        return self._make["quaternion"](x=x, y=y, z=z, w=w)
+
+
+def _diagonal(variance: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.diag([variance] * 3).ravel()

@@ -1,0 +1,1 @@
+"""What the viewers share: which images are shown, how they are encoded, and paths in pieces."""
