@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-all check fix peers bench bench-quick orbslam3 pictures clean
+.PHONY: help setup demo test test-slow test-all check fix wheel peers bench bench-quick orbslam3 pictures clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -28,7 +28,7 @@ $(CORE): pyproject.toml
 	@touch $@
 
 $(READY): $(CORE)
-	$(BIN)/python -m pip install --quiet -e '.[dev]'
+	$(BIN)/python -m pip install --quiet -e '.[dev,docs]'
 	@touch $@
 
 demo: $(CORE)  ## Fly the standard tour, judge visual odometry on it, and report in runs/tour.
@@ -54,6 +54,9 @@ check: $(READY)  ## Check style and types.
 fix: $(READY)  ## Mend what style checks can mend.
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+wheel: $(READY)  ## Build the wheel into dist.
+	$(BIN)/python -m build --outdir dist .
 
 orbslam3: $(READY)  ## Install ORB-SLAM3 (GPL) and train its vocabulary from rendered pictures.
 	$(BIN)/python -m pip install --quiet -e '.[orbslam3]'

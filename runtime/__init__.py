@@ -10,6 +10,7 @@ folder), `config` and `paths` (the file), `preflight` (what `check` says of it),
 (looking on) can wait. `testing` is for tests of nodes.
 """
 
+from runtime import neighbours as _neighbours  # noqa: F401  # first, as it checks `events`
 from runtime.bundles import Bundle
 from runtime.clock import Clock
 from runtime.errors import RefusedError, VisnavError

@@ -16,6 +16,7 @@ import typer
 from runtime.errors import VisnavError
 from runtime.tools.cli.bench import bench
 from runtime.tools.cli.check import check
+from runtime.tools.cli.example import demo, example
 from runtime.tools.cli.export import export
 from runtime.tools.cli.graph import graph
 from runtime.tools.cli.nodes import nodes
@@ -36,6 +37,8 @@ app = typer.Typer(
     help="Fly a simulated vehicle, feed a visual-navigation system, and measure it.",
 )
 app.command()(run)
+app.command()(demo)
+app.command()(example)
 app.command()(check)
 app.command()(graph)
 app.command()(nodes)

@@ -1,0 +1,100 @@
+"""``demo`` and ``example``: the files that come with the project, also in an installed wheel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from runtime.tools.cli.common import Overrides
+
+INSTALLED = Path(__file__).parents[1] / "example_files"
+CHECKOUT = Path(__file__).parents[3]
+
+
+def demo(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for results; runs/tour if not given.")
+    ] = None,
+    overrides: Overrides = None,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
+    ] = False,
+) -> None:
+    """Fly the standard tour, and judge visual odometry on it (config.toml)."""
+    from runtime.tools.cli.run import run
+
+    run(example_files()["config"], out=out, overrides=overrides, quiet=quiet)
+
+
+def example(
+    name: Annotated[
+        str | None, typer.Argument(help="Which one to copy; all are listed if not given.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder to copy it to.")] = Path(),
+) -> None:
+    """List the examples, or copy one, with the files that it reads, to start from."""
+    import shutil
+
+    from runtime.errors import CommandError, ConfigError, suggest
+
+    examples = example_files()
+    if name is None:
+        for each, path in examples.items():
+            print(f"{each:18} {_about(path)}")
+        return
+    if name not in examples:
+        raise ConfigError(
+            f"expected the name of an example, found {name!r}{suggest(name, examples)}"
+        )
+    files = [examples[name], *_read_by(examples[name])]
+    targets = [out / file.name for file in files]
+    if existing := [target for target in targets if target.exists()]:
+        raise CommandError(f"{existing[0]}: expected no file of this name, found one")
+    out.mkdir(parents=True, exist_ok=True)
+    for file, target in zip(files, targets, strict=True):
+        shutil.copyfile(file, target)
+        print(target)
+
+
+def example_files() -> dict[str, Path]:
+    """Return the examples by name; the standard tour is ``config``.
+
+    Raises:
+        CommandError: Only a part of the project is installed.
+    """
+    from runtime.errors import CommandError
+
+    if INSTALLED.is_dir():
+        files = list(INSTALLED.glob("*.toml"))
+    else:
+        files = [CHECKOUT / "config.toml", *(CHECKOUT / "examples").glob("*.toml")]
+    if not files or not all(file.is_file() for file in files):
+        raise CommandError(f"expected examples in {INSTALLED}, found none: install the project")
+    return {file.stem: file for file in sorted(files)}
+
+
+def _about(path: Path) -> str:
+    """Return the first sentence of the comment at the top of a file."""
+    comment = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        text = line.removeprefix("#").strip()
+        if text.startswith(":schema"):
+            continue
+        if not line.startswith("#") or not text:
+            break
+        comment.append(text)
+    return " ".join(comment).partition(". ")[0].rstrip(".:")
+
+
+def _read_by(path: Path) -> list[Path]:
+    """Return the files beside an example that it names: worlds, trajectories, modules of nodes."""
+    text = path.read_text(encoding="utf-8")
+    beside = (file for file in sorted(path.parent.iterdir()) if file.suffix != ".toml")
+    return [
+        file
+        for file in beside
+        if file.is_file()
+        and (f'"{file.name}"' in text or (file.suffix == ".py" and f'"{file.stem}:' in text))
+    ]

@@ -1,0 +1,142 @@
+"""What is shipped works where it arrives: the wheel in a clean environment, examples, names."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+from runtime.config import load
+from tests.runtime.tools.samples_cli import command_here
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = sorted([ROOT / "config.toml", *(ROOT / "examples").glob("*.toml")])
+
+
+def python(
+    code: str, folder: Path, *first: Path, executable: str | Path = sys.executable
+) -> subprocess.CompletedProcess[str]:
+    """Run a line of Python, or ``-m …``, in a folder, with these folders first on its path."""
+    path = os.pathsep.join(map(str, (*first, ROOT)))
+    words = code.split() if code.startswith("-m ") else ["-c", code]
+    return subprocess.run(
+        [str(executable), *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_another_package_called_events_is_named(tmp_path: Path) -> None:
+    """Both commands end with one line that says which file stands in the way."""
+    (tmp_path / "events.py").write_text("class Event: ...\n")
+    for code in ("-m runtime nodes", "import visnav; visnav.main()"):
+        done = python(code, tmp_path, tmp_path)
+        assert done.returncode != 0
+        (line,) = done.stderr.splitlines()
+        assert "expected the package events of visnav-runtime" in line
+        assert str(tmp_path / "events.py") in line
+
+
+def test_another_package_called_runtime_is_named(tmp_path: Path) -> None:
+    (tmp_path / "runtime").mkdir()
+    (tmp_path / "runtime" / "__init__.py").write_text("")
+    done = python("import visnav; visnav.main()", tmp_path, tmp_path)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: expected the package runtime in ")
+    assert str(tmp_path / "runtime" / "__init__.py") in line
+
+
+def test_the_console_command_is_the_command_line(tmp_path: Path) -> None:
+    done = python("import sys, visnav; sys.argv[1:] = ['--help']; visnav.main()", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Fly a simulated vehicle" in done.stdout
+
+
+def test_all_examples_are_listed_with_what_they_show() -> None:
+    lines = command_here("example", folder=ROOT).stdout.splitlines()
+    assert [line.split()[0] for line in lines] == [path.stem for path in EXAMPLES]
+    assert all(len(line.split()) > 3 for line in lines)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_a_copied_example_is_whole(path: Path, tmp_path: Path) -> None:
+    """All that it reads comes along: it is as right in another folder."""
+    done = command_here("example", path.stem, "--out", str(tmp_path), folder=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert load(tmp_path / path.name).nodes
+    beside = {"brightness": "brightness.py", "plain": "plain_room.xml"}
+    beside["computer_vision"] = "orbit.tum"
+    if path.stem in beside:
+        assert (tmp_path / beside[path.stem]).is_file()
+    again = command_here("example", path.stem, "--out", str(tmp_path), folder=ROOT)
+    assert again.returncode == 2
+    assert "expected no file of this name" in again.stderr
+
+
+def test_an_example_that_is_not_there_is_guessed() -> None:
+    done = command_here("example", "monoculer", folder=ROOT)
+    assert done.returncode == 2
+    assert "did you mean 'monocular'?" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
+    """Built, installed with what it needs and nothing else, and used away from the checkout."""
+    subprocess.run(
+        [sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(ROOT)],
+        check=True,
+        capture_output=True,
+    )
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    venv.create(tmp_path / "venv", with_pip=True)
+    bin_ = tmp_path / "venv" / "bin"
+    environment = {k: v for k, v in os.environ.items() if k not in {"PYTHONPATH", "VIRTUAL_ENV"}}
+    environment |= {"NO_COLOR": "1", "COLUMNS": "200"}
+    (tmp_path / "work").mkdir()
+
+    def done(*words: str | Path) -> str:
+        finished = subprocess.run(
+            list(map(str, words)),
+            cwd=tmp_path / "work",
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+        assert finished.returncode == 0, f"{words}: {finished.stderr}{finished.stdout}"
+        return finished.stdout
+
+    done(bin_ / "pip", "install", "--quiet", wheel)
+    visnav = bin_ / "visnav"
+    assert "example" in done(visnav, "--help")
+    assert "Multirotor" in done(visnav, "nodes")
+    assert "monocular" in done(visnav, "example")
+    done(visnav, "example", "brightness")
+    done(visnav, "check", "brightness.toml")
+    shorter = (
+        "--set",
+        "run.duration=3s",
+        "--set",
+        "camera.width=128",
+        "--set",
+        "camera.height=128",
+    )
+    judged = subprocess.run(
+        [str(visnav), "demo", "--quiet", "--out", "tour", *shorter],
+        cwd=tmp_path / "work",
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert judged.returncode in {0, 1}, judged.stderr  # three seconds need not pass
+    folder = tmp_path / "work" / "tour"
+    assert json.loads((folder / "summary.json").read_text())["events"]["Image"] > 60
+    assert (folder / "report.html").stat().st_size > 10_000

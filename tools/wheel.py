@@ -1,0 +1,26 @@
+"""What a wheel holds besides the packages: `config.toml` and the examples, for `visnav demo`."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from setuptools.command.build_py import build_py
+
+ROOT = Path(__file__).parents[1]
+INSIDE = "runtime/tools/example_files"
+"""Where the commands `demo` and `example` look for them once they are installed."""
+
+
+class BuildWithExamples(build_py):
+    """Copies the examples into the package; a checkout is used as it is."""
+
+    def run(self) -> None:
+        """Build the packages, then add the examples."""
+        super().run()
+        if self.editable_mode:
+            return
+        target = Path(self.build_lib) / INSIDE
+        target.mkdir(parents=True, exist_ok=True)
+        for file in [ROOT / "config.toml", *sorted((ROOT / "examples").glob("*.*"))]:
+            shutil.copyfile(file, target / file.name)
