@@ -133,7 +133,7 @@ def _bare(seconds: float) -> float:
         physics.advance_to(stamp)
         touching = physics.touching()
         physics.set_motors(*autopilot.update(stamp, physics.state(), touching))
-        autopilot.take_happenings()
+        autopilot.take_events()
         if tick % (CONTROL // IMU) == 0:
             noise.add(*physics.imu())
             physics.state()

@@ -1,13 +1,12 @@
 """Computer-vision mode: a free camera in a world, with no vehicle and no physics.
 
-For calibration and fast data sets. The camera goes where it is told: to a set-point at once,
-along with a velocity, or along a trajectory file; one set of images for each update.
+For calibration and fast data sets. The camera jumps to pose set-points, moves with velocity
+set-points, or follows a trajectory file; each update gives one set of images.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,21 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from events import (
-    Announcement,
-    DepthImage,
-    Image,
     Odometry,
     PoseSetpoint,
-    PoseStamped,
     PositionSetpoint,
     Quaternion,
-    SegmentationImage,
-    TransformStamped,
     Vector3,
     VelocitySetpoint,
 )
-from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
-from runtime.paths import InputPath, NameOrPath
+from runtime import Tick, every, on
+from runtime.paths import InputPath
 from sims.cameras import (
     CameraSpec,
     add_free_camera,
@@ -38,64 +31,56 @@ from sims.cameras import (
     pose_to_qpos,
     qvel_between,
 )
-from sims.cameras.rig import CameraOutputs, CameraRig
 from sims.frames import from_euler, multiply, normalize, rotate, rotate_inverse, yaw_of
+from sims.simulator import Rate, Simulator, SimulatorConfig
 from sims.worlds import load_world
-
-Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
-Count = Annotated[int, msgspec.Meta(ge=1, le=16)]
 
 MOMENT = 1e-3
 """Seconds, half of them before the stamp, over which the camera's velocity is taken."""
 
 
-class FreeCameraConfig(NodeConfig):
-    """Settings of a free camera.
+class FreeCameraConfig(SimulatorConfig):
+    """Settings of a free camera, besides those of every simulator.
 
     Attributes:
-        world: Name of a built-in world, or path of an MJCF file.
-        position: Where it starts, metres in ``map`` (NED).
+        position: Position at the start, metres in ``map`` (NED).
         orientation: Roll, pitch, yaw at the start, degrees.
         rate: Updates per second; each exposes all cameras, whatever rate their own settings name.
-        cameras: What it carries.
+        cameras: The cameras that are carried; at least one.
         trajectory: TUM file (stamp x y z qx qy qz qw; NED, FRD) to follow from its first stamp
             on; the run ends with it. Empty for none.
-        setpoint_timeout: After this long a velocity is void.
-        camera_processes: How many processes render.
-        render_threads: Threads of the software renderer in each of them.
     """
 
-    world: NameOrPath = "hall"
     position: Vector3 = (0.0, 0.0, -1.5)
     orientation: Vector3 = (0.0, 0.0, 0.0)
     rate: Rate = 30
     cameras: Annotated[tuple[CameraSpec, ...], msgspec.Meta(min_length=1)]
     trajectory: InputPath = ""
-    setpoint_timeout: Duration = Duration(0.5)  # immutable
-    camera_processes: Count = 2
-    render_threads: Count = 1
 
     def __post_init__(self) -> None:
         check_cameras(_at_rate(self))
 
 
-class FreeCamera(Node[FreeCameraConfig]):
-    """Cameras that go where they are told, with no vehicle and no physics.
+class FreeCamera(Simulator[FreeCameraConfig]):
+    """Cameras that follow set-points or a trajectory file, with no vehicle and no physics.
 
-    The odometry's twist is that of the trajectory, or of the velocity that it was told: where the
-    rows of a file are knots between straight lines, the mean of both sides. A camera that is put
-    somewhere at once rests there.
+    The odometry's twist is that of the trajectory, or of the velocity set-point. At a row of the
+    file, where two straight lines meet, it is the mean of both. After a jump to a pose it is zero.
     """
 
-    images = Output(Image)
-    depth = Output(DepthImage)
-    segmentation = Output(SegmentationImage)
-    camera_poses = Output(PoseStamped)
-    transforms = Output(TransformStamped)
-    odometry = Output(Odometry)
+    @property
+    def frame_id(self) -> str:
+        """Frame of the body that carries the cameras: the node's name."""
+        return self.name
+
+    @property
+    def cameras(self) -> tuple[CameraSpec, ...]:
+        """The cameras, all at the rate of the updates."""
+        return _at_rate(self.config)
 
     async def on_startup(self) -> None:
         """Build the world, and start what renders it."""
+        await super().on_startup()
         config = self.config
         roll, pitch, yaw = (math.radians(angle) for angle in config.orientation)
         self._position = config.position
@@ -105,50 +90,25 @@ class FreeCamera(Node[FreeCameraConfig]):
         self._rows = (
             await self.offload(read_tum, Path(config.trajectory)) if (config.trajectory) else None
         )
-        specs = _at_rate(config)
-        self._cameras = [spec.name for spec in specs]
-        outputs = CameraOutputs(self.images, self.depth, self.segmentation, self.camera_poses)
-        self._rig = CameraRig(self, specs, outputs, config.camera_processes, config.render_threads)
-        await self._rig.start(await self.offload(self._build, specs))
+        await self.rig.start(await self.offload(self._build))
 
-    def _build(self, specs: tuple[CameraSpec, ...]) -> Any:
+    def _build(self) -> Any:
         world = load_world(self.config.world, bare=self.checking)
-        add_free_camera(world, self.name, specs)
+        add_free_camera(world, self.name, self.cameras)
         return world.compile()
 
-    def announce(self) -> Iterable[Announcement]:
-        """Say what cameras these are."""
-        return self._rig.announcements(self.name)
-
-    def on_change(self, before: FreeCameraConfig) -> None:  # noqa: ARG002
-        """Deliver pictures as the settings now say."""
-        self._rig.change(_at_rate(self.config))
-
-    async def run(self) -> None:
-        """Say once where the cameras sit."""
-        for mounting in self._rig.transforms(self.name):
-            self.transforms.send(mounting)
-
-    @on(PoseSetpoint)
-    def pose(self, event: PoseSetpoint) -> None:
-        """Be there."""
-        self._position, self._orientation = event.position, normalize(event.orientation)
-        self._velocity = None
-
-    @on(PositionSetpoint)
-    def place(self, event: PositionSetpoint) -> None:
-        """Be there, level."""
-        self._position, self._orientation = event.position, from_euler(event.yaw, 0.0, 0.0)
-        self._velocity = None
-
-    @on(VelocitySetpoint)
-    def velocity(self, event: VelocitySetpoint) -> None:
-        """Move like that until told otherwise, or until it is void."""
-        self._velocity = event
+    @on(PoseSetpoint, PositionSetpoint, VelocitySetpoint)
+    def setpoints(self, event: PoseSetpoint | PositionSetpoint | VelocitySetpoint) -> None:
+        """Jump to a pose, or to a position with level attitude, or move with a velocity."""
+        self._velocity = event if isinstance(event, VelocitySetpoint) else None
+        if isinstance(event, PoseSetpoint):
+            self._position, self._orientation = event.position, normalize(event.orientation)
+        elif isinstance(event, PositionSetpoint):
+            self._position, self._orientation = event.position, from_euler(event.yaw, 0.0, 0.0)
 
     @every(hz="rate")
     def update(self, tick: Tick) -> None:
-        """Move, say where, and expose."""
+        """Move, send the pose, and expose all cameras."""
         if self._rows is not None and not self._follow(tick.stamp):
             self.stop("trajectory ended")
             return
@@ -169,19 +129,15 @@ class FreeCamera(Node[FreeCameraConfig]):
             )
         )
         qpos = pose_to_qpos(self._position, self._orientation)
-        for camera in self._cameras:
-            self._rig.expose(camera, tick.stamp, qpos, qvel)
-
-    async def on_shutdown(self) -> None:
-        """Say which pictures are missing."""
-        self._rig.say_what_is_missing()
+        for camera in self.config.cameras:
+            self.rig.expose(camera.name, tick.stamp, qpos, qvel)
 
     def _drift(self, stamp: int) -> None:
         """Move with the last velocity since the last update."""
         self._position, self._orientation = self._drifted((stamp - self._stamp) / 1e9, stamp)
 
     def _pose_in(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
-        """Return the pose a moment after (or before) `stamp`; what is put somewhere rests there."""
+        """Return the pose some seconds after `stamp`, or before it if negative."""
         if self._rows is not None:
             return pose_at(self._rows, stamp / 1e9 + seconds)
         return self._drifted(seconds, stamp)

@@ -1,6 +1,6 @@
-"""A simulated multirotor as a node: what it listens to, what it says, and when.
+"""A simulated multirotor as a node: its inputs, outputs and timing.
 
-Physics, control and cameras are pure modules beside this one and in `sims.cameras`.
+Physics and control are pure modules in `sims.vehicle`; cameras are in `sims.cameras`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import msgspec
 
@@ -16,24 +16,18 @@ from events import (
     Announcement,
     Collision,
     Command,
-    DepthImage,
-    Image,
     Imu,
     ImuAnnouncement,
     Odometry,
     PathAnnouncement,
-    PoseStamped,
-    SegmentationImage,
     Setpoint,
-    TransformStamped,
     VehicleAnnouncement,
     VehicleEvent,
 )
-from runtime import Duration, Node, NodeConfig, Output, Tick, every, on
-from runtime.paths import NameOrPath
-from sims.cameras import CameraSpec, add_camera, check_cameras
-from sims.cameras.rig import CameraOutputs, CameraRig
+from runtime import Output, Tick, every, on
+from sims.cameras import add_camera, check_cameras
 from sims.frames import rotate_inverse
+from sims.simulator import Rate, Simulator, SimulatorConfig
 from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,
@@ -50,47 +44,36 @@ from sims.vehicle.clearance import FALL, Clearance, trouble_at_start, trouble_on
 from sims.vehicle.physics import Contact
 from sims.worlds import load_world
 
-Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
-Count = Annotated[int, msgspec.Meta(ge=1, le=16)]
-
 FRAME = "base_link"
+"""Frame of the vehicle's body."""
 
 
-class MultirotorConfig(NodeConfig):
-    """Settings of a multirotor.
+class MultirotorConfig(SimulatorConfig):
+    """Settings of a multirotor, besides those of every simulator.
 
     Attributes:
-        world: Name of a built-in world, or path of an MJCF file.
-        position: Where it stands at the start, x north and y east in metres.
+        position: Position on the ground at the start: x north and y east, metres.
         height: Height of the ground there, metres above the world's zero.
-        yaw: Where it looks at the start, degrees clockwise from north.
-        control_rate: Hertz of the controller.
-        imu_rate: Hertz of the IMU, and of the ground truth, which is also told at each exposure.
+        yaw: Heading at the start, degrees clockwise from north.
+        control_rate: Rate of the controller, Hz.
+        imu_rate: Rate of the IMU and of the ground truth (`odometry`), Hz. The ground truth is also
+            sent at each exposure.
         imu: Noise of the IMU.
-        cameras: What it carries.
         trigger: ``free``: each camera exposes at its own rate, at equal intervals. ``imu``: the
             next IMU sample after that triggers the exposure, so that image, depth, pose and IMU
             share their stamps; the intervals are equal only if the camera's rate divides the
             IMU's.
-        camera_processes: How many processes render.
-        render_threads: Threads of the software renderer in each of them.
-        setpoint_timeout: After this long a velocity, attitude or rate set-point is void.
-        gains: Of the controller.
-        limits: Of the controller.
+        gains: Gains of the controller.
+        limits: Limits of the controller.
     """
 
-    world: NameOrPath = "hall"
     position: tuple[float, float] = (0.0, 0.0)
     height: float = 0.0
     yaw: float = 0.0
     control_rate: Rate = 400
     imu_rate: Rate = 200
     imu: ImuParameters = ImuParameters()
-    cameras: tuple[CameraSpec, ...] = ()
     trigger: Literal["free", "imu"] = "free"
-    camera_processes: Count = 2
-    render_threads: Count = 1
-    setpoint_timeout: Duration = Duration(0.5)  # immutable
     gains: Gains = Gains()
     limits: Limits = Limits()
 
@@ -104,28 +87,18 @@ class MultirotorConfig(NodeConfig):
                 )
 
 
-class Multirotor(Node[MultirotorConfig]):
+class Multirotor(Simulator[MultirotorConfig]):
     """A quadrotor with cameras, an IMU and ground truth, in a MuJoCo world."""
 
-    images = Output(Image)
-    depth = Output(DepthImage)
-    segmentation = Output(SegmentationImage)
-    camera_poses = Output(PoseStamped)
-    transforms = Output(TransformStamped)
     imu = Output(Imu)
-    odometry = Output(Odometry)
-    happenings = Output(VehicleEvent)
+    vehicle_events = Output(VehicleEvent)
+
+    frame_id = FRAME
 
     async def on_startup(self) -> None:
         """Build the world, and start what renders it."""
+        await super().on_startup()
         config = self.config
-        self._rig = CameraRig(
-            self,
-            config.cameras,
-            CameraOutputs(self.images, self.depth, self.segmentation, self.camera_poses),
-            config.camera_processes,
-            config.render_threads,
-        )
         north, east = config.position
         self._start = (north, east, -config.height - STANDING_HEIGHT)
         model = await self.offload(self._build)
@@ -141,17 +114,17 @@ class Multirotor(Node[MultirotorConfig]):
         self._noise = ImuNoise(config.imu, config.imu_rate, self.rng)
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
-        self._told = -1
+        self._odometry_stamp = -1
         self._triggered: list[str] = []
-        await self._rig.start(model)
+        await self.rig.start(model)
         free = config.trigger == "free"
-        if free:  # a picture that comes at once comes after the IMU sample of its stamp
-            self.every(config.imu_rate, self.sense, "sense")
+        if free:  # an image without latency comes after the IMU sample of its stamp
+            self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
         for camera in config.cameras:
             call = self._expose if free else self._trigger
             self.every(camera.rate, functools.partial(call, camera.name), camera.name)
         if not free:
-            self.every(config.imu_rate, self.sense, "sense")
+            self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
 
     def _build(self) -> Any:
         config = self.config
@@ -162,7 +135,7 @@ class Multirotor(Node[MultirotorConfig]):
         return world.compile()
 
     def announce(self) -> Iterable[Announcement]:
-        """Say what vehicle this is and what it senses."""
+        """Announce the vehicle, its IMU and its cameras."""
         parameters, state = self._physics.parameters, self._physics.state()
         yield VehicleAnnouncement(
             stamp=0,
@@ -180,7 +153,7 @@ class Multirotor(Node[MultirotorConfig]):
             frame_id=FRAME,
             **msgspec.structs.asdict(self.config.imu),
         )
-        yield from self._rig.announcements(FRAME)
+        yield from super().announce()
         if self.config.trigger == "imu":
             for camera in self.config.cameras:
                 periods = self.config.imu_rate / camera.rate
@@ -199,8 +172,8 @@ class Multirotor(Node[MultirotorConfig]):
             self._refuse_path(announcement)
         if not isinstance(announcement, VehicleAnnouncement) or announcement.source == self.name:
             return
-        if obeying_all := [port for port in ("command", "setpoint") if port not in self.sources]:
-            line = ", ".join(f'{port} = "PILOT"' for port in obeying_all)
+        if unnarrowed := [port for port in ("commands", "setpoints") if port not in self.sources]:
+            line = ", ".join(f'{port} = "PILOT"' for port in unnarrowed)
             raise ValueError(
                 "of several vehicles, each was expected to say which node it obeys, but "
                 f"{self.name} obeys them all: write inputs = {{ {line} }} into its entry, "
@@ -209,7 +182,7 @@ class Multirotor(Node[MultirotorConfig]):
 
     def _refuse_path(self, announcement: PathAnnouncement) -> None:
         """Raise `ValueError` if this vehicle is to fly a path and cannot."""
-        pilot = self.sources.get("setpoint", announcement.source)
+        pilot = self.sources.get("setpoints", announcement.source)
         if announcement.source != pilot and not announcement.source.startswith(f"{pilot}/"):
             return
         if trouble_at_start(self._clearance, self._start):  # which `check` tells
@@ -218,30 +191,21 @@ class Multirotor(Node[MultirotorConfig]):
             raise ValueError(trouble)
 
     def check(self) -> Iterable[str]:
-        """Say why it cannot stand where it is to start."""
+        """Return why the vehicle cannot stand at its start."""
         if trouble := trouble_at_start(self._clearance, self._start):
             yield f"position: {trouble}"
         elif (fall := self._clearance.ground_below(self._start) or 0.0) > FALL:
             self.log.warning("position, height: it starts %.2g m above the ground, and falls", fall)
 
-    def on_change(self, before: MultirotorConfig) -> None:  # noqa: ARG002
-        """Deliver pictures as the settings now say."""
-        self._rig.change(self.config.cameras)
-
-    async def run(self) -> None:
-        """Say once where the cameras sit."""
-        for mounting in self._rig.transforms(FRAME):
-            self.transforms.send(mounting)
-
     @on(Command)
-    def command(self, event: Command) -> None:
-        """Obey, or say why not."""
+    def commands(self, event: Command) -> None:
+        """Obey a command, or log why it is refused."""
         if reason := self._autopilot.command(event):
             self.log.warning("%s refused: %s", type(event).__name__, reason)
 
     @on(Setpoint)
-    def setpoint(self, event: Setpoint) -> None:
-        """Follow it; say why not at the first of a row of refused ones."""
+    def setpoints(self, event: Setpoint) -> None:
+        """Follow a set-point, or log why it is refused, once for each reason in a row."""
         reason = self._autopilot.command(event) or ""
         if reason and reason != self._refused:
             self.log.warning("%s refused: %s", type(event).__name__, reason)
@@ -254,15 +218,15 @@ class Multirotor(Node[MultirotorConfig]):
         physics.advance_to(tick.stamp)
         touching = physics.touching()
         physics.set_motors(*autopilot.update(tick.stamp, physics.state(), touching))
-        for happening in autopilot.take_happenings():
-            self.happenings.send(happening(stamp=physics.time_ns, source=self.name))
+        for event in autopilot.take_events():
+            self.vehicle_events.send(event(stamp=physics.time_ns, source=self.name))
         if touching and autopilot.phase is not Phase.DISARMED:
-            self._look_at_contacts()
+            self._send_collisions()
         elif not touching:
             self._touched = frozenset()
 
-    def sense(self, tick: Tick) -> None:
-        """Measure, tell the truth, and expose the cameras that this triggers."""
+    def sample_sensors(self, tick: Tick) -> None:
+        """Send an IMU sample and the ground truth, and expose the cameras that this triggers."""
         stamp = self._advance(tick)
         # Between two steps the acceleration is constant.
         _, force = self._physics.imu()
@@ -276,9 +240,9 @@ class Multirotor(Node[MultirotorConfig]):
                 linear_acceleration=force,
             )
         )
-        self._tell(stamp, state)
+        self._send_odometry(stamp, state)
         for camera in self._triggered:
-            self._rig.expose(camera, stamp, qpos, qvel)
+            self.rig.expose(camera, stamp, qpos, qvel)
         self._triggered.clear()
 
     def _trigger(self, camera: str, _: Tick) -> None:
@@ -287,23 +251,23 @@ class Multirotor(Node[MultirotorConfig]):
     def _expose(self, camera: str, tick: Tick) -> None:
         stamp = self._advance(tick)
         state, qpos, qvel = self._physics.state_at(stamp)
-        self._tell(stamp, state)
-        self._rig.expose(camera, stamp, qpos, qvel)
+        self._send_odometry(stamp, state)
+        self.rig.expose(camera, stamp, qpos, qvel)
 
     def _advance(self, tick: Tick) -> int:
-        """Step the physics up to a tick, and return the stamp of what is then true.
+        """Step the physics up to a tick, and return the stamp of the state then.
 
-        That is the tick's; in real time, where a later one may have been served before, maybe the
-        physics'.
+        That is the tick's stamp, or that of the physics if a later tick has been served before, as
+        may happen in real time.
         """
         self._physics.advance_to(tick.stamp)
         return max(tick.stamp, self._physics.time_ns)
 
-    def _tell(self, stamp: int, state: State) -> None:
-        """Tell the truth about a time, once."""
-        if stamp <= self._told:
+    def _send_odometry(self, stamp: int, state: State) -> None:
+        """Send the ground truth of a stamp, once."""
+        if stamp <= self._odometry_stamp:
             return
-        self._told = stamp
+        self._odometry_stamp = stamp
         self.odometry.send(
             Odometry(
                 stamp=stamp,
@@ -315,17 +279,13 @@ class Multirotor(Node[MultirotorConfig]):
             )
         )
 
-    async def on_shutdown(self) -> None:
-        """Say which pictures are missing."""
-        self._rig.say_what_is_missing()
-
-    def _look_at_contacts(self) -> None:
+    def _send_collisions(self) -> None:
         contacts = [c for c in self._physics.contacts() if not _stands_on(c)]
         touched = frozenset(c.other for c in contacts)
         for contact in contacts:
             if contact.other not in self._touched:
                 self._touched |= {contact.other}
-                self.happenings.send(
+                self.vehicle_events.send(
                     Collision(
                         stamp=self._physics.time_ns,
                         source=self.name,
@@ -339,5 +299,5 @@ class Multirotor(Node[MultirotorConfig]):
 
 
 def _stands_on(contact: Contact) -> bool:
-    """Tell whether a contact is but the feet on the ground: pushed up, and gently."""
+    """Return whether a contact is only that of the feet with the ground: upwards, and gentle."""
     return contact.normal[2] < -0.7 and contact.speed < 1.0

@@ -31,19 +31,19 @@ from sims.cameras.spec import CameraSpec, announcement, optical_frame, optical_i
 
 
 class CameraOutputs(msgspec.Struct, frozen=True):
-    """Where a rig sends what its cameras see."""
+    """Outputs of the node that carries the cameras."""
 
     images: Sender[Image]
-    depth: Sender[DepthImage]
-    segmentation: Sender[SegmentationImage]
-    poses: Sender[PoseStamped]
+    depth_images: Sender[DepthImage]
+    segmentation_images: Sender[SegmentationImage]
+    camera_poses: Sender[PoseStamped]
 
 
 class _Exposure(NamedTuple):
     spec: CameraSpec
     stamp: int
     due: int
-    """When it is delivered (ns), unless the one before it is later."""
+    """Time of delivery (ns), unless that of the exposure before is later."""
     qpos: npt.NDArray[np.float64]
     qvel: npt.NDArray[np.float64] | None
 
@@ -51,17 +51,16 @@ class _Exposure(NamedTuple):
 class CameraRig:
     """All cameras of one body.
 
-    Every image is sent `latency` seconds, and up to `jitter` more, after its exposure with the
-    stamp of the exposure, and before it, with the same stamp, the pose of the camera (source and
-    frame as the image's). A camera with both ``rgb`` and ``grey`` sends the grey ones as
-    ``<source>/grey``.
+    Every image has the stamp of its exposure, and is sent `latency` seconds, and up to `jitter`
+    more, after it. Just before, the pose of the camera is sent, with the same stamp and source. A
+    camera with both ``rgb`` and ``grey`` sends the grey images as ``<source>/grey``.
 
     Args:
-        node: The node whose rig it is; a camera's source is ``<node>/<camera>``.
+        node: The node that carries the cameras; a camera's source is ``<node>/<camera>``.
         specs: The cameras, which the model has under the names ``<node>/<camera>``.
         outputs: Where the events go.
-        processes: How many render. Alternate frames go to alternate processes.
-        threads: Of the software renderer in each of them.
+        processes: Number of processes that render; frames go to them in turn.
+        threads: Threads of the software renderer in each of them.
     """
 
     def __init__(
@@ -106,11 +105,11 @@ class CameraRig:
         )
 
     def change(self, specs: tuple[CameraSpec, ...]) -> None:
-        """Deliver from the next exposure on as these say; what is drawn stays as it was."""
+        """Take over latency, jitter and loss of these, from the next exposure on."""
         self._specs = {spec.name: spec for spec in specs}
 
     def announcements(self, parent_frame_id: str) -> Iterable[CameraAnnouncement]:
-        """Say what the cameras will provide."""
+        """Return the announcements of the cameras."""
         name = self._node.name
         for spec in self._specs.values():
             yield announcement(
@@ -122,7 +121,7 @@ class CameraRig:
             )
 
     def transforms(self, parent_frame_id: str) -> Iterable[TransformStamped]:
-        """Say where the cameras sit: each one's optical frame in the body's, for the whole run."""
+        """Return the pose of each camera's optical frame in the body's, constant for the run."""
         name = self._node.name
         for spec in self._specs.values():
             position, orientation = optical_in_body(spec)
@@ -143,7 +142,7 @@ class CameraRig:
         qpos: npt.NDArray[np.float64],
         qvel: npt.NDArray[np.float64] | None = None,
     ) -> None:
-        """Have a camera take a picture of a state; the events follow when it is due.
+        """Expose a camera at a state; its events are sent when they are due.
 
         Args:
             camera: Its name.
@@ -168,7 +167,7 @@ class CameraRig:
         exposure = _Exposure(spec, stamp, stamp + round(delay * 1e9), qpos, qvel)
         self._node.start(self._deliver(exposure, before, done))
 
-    def say_what_is_missing(self) -> None:
+    def log_missing(self) -> None:
         """Log how many exposures were not delivered, and why."""
         for camera, lost in self.lost.items():
             if lost:
@@ -204,17 +203,17 @@ class CameraRig:
         source = f"{self._node.name}/{spec.name}"
         frame_id = optical_frame(spec, f"{self._node.name}/")
         out, stamp = self._outputs, frame.stamp
-        out.poses.send(
+        out.camera_poses.send(
             PoseStamped(
                 stamp=stamp, source=source, position=frame.position, orientation=frame.orientation
             )
         )
         if frame.depth is not None:
-            out.depth.send(
+            out.depth_images.send(
                 DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=frame.depth)
             )
         if frame.segmentation is not None:
-            out.segmentation.send(
+            out.segmentation_images.send(
                 SegmentationImage(
                     stamp=stamp, source=source, frame_id=frame_id, data=frame.segmentation
                 )

@@ -114,7 +114,7 @@ class Autopilot:
         self._timeout_ns = round(setpoint_timeout * 1e9)
         self._climb = climb
         self._descent = descent
-        self._happenings: list[type[VehicleEvent]] = []
+        self._events: list[type[VehicleEvent]] = []
         self._order: Event | None = None
         self._expires_ns: int | None = None
         self._last_ns: int | None = None
@@ -167,12 +167,12 @@ class Autopilot:
             return _STOPPED
         return self._controller.update(state, dt)
 
-    def take_happenings(self) -> list[type[VehicleEvent]]:
+    def take_events(self) -> list[type[VehicleEvent]]:
         """Return what has happened since the last call (`Armed`, `TakenOff`, …), oldest first."""
-        happenings = self._happenings
-        if happenings:
-            self._happenings = []
-        return happenings
+        events = self._events
+        if events:
+            self._events = []
+        return events
 
     def _refusal(self, event: Event) -> str | None:
         """Return why a command is not obeyed now, None if it is."""
@@ -223,12 +223,12 @@ class Autopilot:
     def _arm(self) -> None:
         self.phase = Phase.ARMED
         self._controller.reset()
-        self._happenings.append(Armed)
+        self._events.append(Armed)
 
     def _disarm(self) -> None:
         self.phase = Phase.DISARMED
         self._order = None
-        self._happenings.append(Disarmed)
+        self._events.append(Disarmed)
 
     def _begin(self, order: Event, state: State) -> None:
         """Start what was ordered from where the vehicle is now."""
@@ -271,7 +271,7 @@ class Autopilot:
         ):
             self._controller.hold(self._place, (0.0, 0.0, 0.0), self._yaw)
             self.phase = Phase.FLYING
-            self._happenings.append(TakenOff)
+            self._events.append(TakenOff)
 
     def _land(self, stamp_ns: int, state: State, touching: bool) -> bool:
         """Stop, go down, and return True once the vehicle stands and is disarmed."""
@@ -284,7 +284,7 @@ class Autopilot:
         elif self._standing_ns is None:
             self._standing_ns = stamp_ns
         elif stamp_ns - self._standing_ns >= 200_000_000:
-            self._happenings.append(Landed)
+            self._events.append(Landed)
             self._disarm()
             return True
         return False

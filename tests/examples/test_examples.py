@@ -76,7 +76,7 @@ def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
     """`closed_loop` lands without a collision, and was where the truth says it should be."""
     summary = run("closed_loop", tmp_path, "evaluation.report=false")
     assert summary["reason"] == "pilot: flight completed"
-    assert summary["outputs"]["drone.happenings"] == 4
+    assert summary["outputs"]["drone.vehicle_events"] == 4
     figures = summary["verdict"]["estimators"]["odometry"]
     assert figures["lost_seconds"] == 0.0
     assert figures["ate_percent"] < 0.3

@@ -28,7 +28,7 @@ def test_odometry_keeps_within_a_third_of_a_percent(world: str, tmp_path: Path) 
     summary = fly(tmp_path, ROOT / world, "evaluation.report=false")
     assert summary["reason"] == "pilot: flight completed"
     # Armed, taken off, landed, disarmed: no collision among what happened.
-    assert summary["outputs"]["drone.happenings"] == 4
+    assert summary["outputs"]["drone.vehicle_events"] == 4
     verdict = summary["verdict"]
     figures = verdict["estimators"]["odometry"]
     assert verdict["passed"]

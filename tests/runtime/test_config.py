@@ -62,7 +62,7 @@ def test_mistakes_in_the_run(tmp_path: Path, line: str, expected: str, found: st
 
 
 IN_DRONE = [
-    ("wrld = 1", "expected one of world, position, ", "'wrld' (did you mean 'world'?)"),
+    ("wrld = 1", "expected one of world, cameras, ", "'wrld' (did you mean 'world'?)"),
     ("world = 1", "world: expected a text", "found 1"),
     ("position = [1]", "position: expected a list of length 2", "found [1]"),
     ('position = [1, "a"]', "position[1]: expected a number", 'found "a"'),
@@ -80,7 +80,7 @@ IN_DRONE = [
     (CAMERAS + 'images = ["red"]', 'cameras[1].images[0]: expected "rgb" or', 'found "red"'),
     (CAMERAS + "images = []", "cameras[1]: images: expected one or more", "found none"),
     ("[[nodes.cameras]]\nrate = 3", 'cameras[0]: expected a setting "name"', "found none"),
-    ('inputs = { setpont = "tour" }', "inputs: expected an input or", "mean 'setpoint'?)"),
+    ('inputs = { setponts = "pilot" }', "inputs: expected an input or", "mean 'setpoints'?)"),
 ]
 
 

@@ -200,17 +200,17 @@ def test_cameras_that_cannot_be_are_refused_with_the_file(
 def test_several_vehicles_say_whom_they_obey() -> None:
     """Otherwise one pilot would steer all of them; the refusal has the words to write."""
     vehicles = [spec(Multirotor, name, {"world": world}) for name in ("a", "b")]
-    with pytest.raises(RefusedError, match=r"^a: .* inputs = \{ command = .PILOT., setpoint"):
+    with pytest.raises(RefusedError, match=r"^a: .* inputs = \{ commands = .PILOT., setpoints"):
         run_nodes(vehicles, duration=0.1)
-    half = msgspec.structs.replace(vehicles[0], inputs={"setpoint": "tour"})
-    with pytest.raises(RefusedError, match=r"^a: .* inputs = \{ command = .PILOT. \}"):
+    half = msgspec.structs.replace(vehicles[0], inputs={"setpoints": "tour"})
+    with pytest.raises(RefusedError, match=r"^a: .* inputs = \{ commands = .PILOT. \}"):
         run_nodes([half, vehicles[1]], duration=0.1)
 
 
 @pytest.mark.slow
 def test_several_vehicles_are_each_steered_by_their_own_pilot() -> None:
     def obeying(name: str) -> NodeSpec:
-        inputs = {"command": f"{name}/pilot", "setpoint": f"{name}/pilot"}
+        inputs = {"commands": f"{name}/pilot", "setpoints": f"{name}/pilot"}
         return msgspec.structs.replace(spec(Multirotor, name, {"world": world}), inputs=inputs)
 
     orders = [

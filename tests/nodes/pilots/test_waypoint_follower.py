@@ -34,7 +34,7 @@ class Vehicle(Node):
     """Is where it is told to be, a second after it has been told to take off or land."""
 
     odometry = Output(Odometry)
-    happenings = Output(Event)
+    vehicle_events = Output(Event)
     place: ClassVar[Vector3] = (0.0, 0.0, -0.1)
 
     def __init__(self) -> None:
@@ -67,9 +67,9 @@ class Vehicle(Node):
     def land(self, _: Land) -> None:
         self.start(self.later(Landed))
 
-    async def later(self, happening: type[Event]) -> None:
+    async def later(self, event: type[Event]) -> None:
         await self.clock.sleep(1.0)
-        self.happenings.send(happening(stamp=self.clock.now(), source=self.name))
+        self.vehicle_events.send(event(stamp=self.clock.now(), source=self.name))
 
     def announce(self) -> list[Announcement]:
         return [

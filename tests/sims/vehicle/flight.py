@@ -46,7 +46,7 @@ class Flight:
         self.autopilot = Autopilot(physics.parameters)
         self.ticks = 0
         self.time = 0.0
-        self.happenings: list[type[Event]] = []
+        self.events: list[type[Event]] = []
 
     @property
     def stamp(self) -> int:
@@ -64,7 +64,7 @@ class Flight:
                 self.autopilot.command(say(self.stamp))
             motors = self.autopilot.update(self.stamp, state, self.physics.touching())
             self.physics.set_motors(*motors)
-            self.happenings += self.autopilot.take_happenings()
+            self.events += self.autopilot.take_events()
             track.append((self.ticks / 400, state))
             self.ticks += 1
         return track

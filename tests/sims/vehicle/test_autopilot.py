@@ -48,14 +48,14 @@ def test_take_off_hover_land_disarm() -> None:
     flight = grounded()
     assert flight.autopilot.command(TAKEOFF) is None
     climb = flight.fly(5.0)
-    assert flight.happenings == [Armed, TakenOff]
+    assert flight.events == [Armed, TakenOff]
     assert -1.2 < min(s.velocity[2] for _, s in climb) < -0.8
     hover = flight.fly(2.0)
     for _, state in hover:
         assert state.position == pytest.approx((0.0, 0.0, -1.5 - STANDING_HEIGHT), abs=0.05)
     assert flight.autopilot.command(LAND) is None
     descent = flight.fly(5.0)
-    assert flight.happenings == [Armed, TakenOff, Landed, Disarmed]
+    assert flight.events == [Armed, TakenOff, Landed, Disarmed]
     assert flight.autopilot.phase is Phase.DISARMED
     assert max(s.velocity[2] for _, s in descent) < 0.6
     assert descent[-1][1].position == pytest.approx((0.0, 0.0, -STANDING_HEIGHT), abs=0.02)
@@ -65,7 +65,7 @@ def test_take_off_hover_land_disarm() -> None:
 def test_taken_off_is_told_near_the_altitude_and_slow() -> None:
     flight = grounded()
     flight.autopilot.command(TAKEOFF)
-    while TakenOff not in flight.happenings:
+    while TakenOff not in flight.events:
         ((_, state),) = flight.fly(1 / 400)
         assert flight.ticks < 2400
     assert state.position[2] == pytest.approx(-1.5 - STANDING_HEIGHT, abs=0.1)
@@ -78,7 +78,7 @@ def test_it_flies_again_after_landing() -> None:
     flight.fly(5.0)
     flight.autopilot.command(TAKEOFF)
     flight.fly(5.0)
-    assert flight.happenings == [Armed, TakenOff, Landed, Disarmed, Armed, TakenOff]
+    assert flight.events == [Armed, TakenOff, Landed, Disarmed, Armed, TakenOff]
 
 
 def test_landing_out_of_fast_flight_stops_first() -> None:
@@ -103,7 +103,7 @@ def test_disarmed_motors_stand_still_and_armed_ones_idle() -> None:
     flight.autopilot.command(DISARM)
     flight.fly(0.1)
     assert flight.physics.data.ctrl.tolist() == [0.0] * 4
-    assert flight.happenings == [Armed, Disarmed]
+    assert flight.events == [Armed, Disarmed]
 
 
 def test_disarming_in_the_air_stops_the_motors() -> None:
@@ -111,7 +111,7 @@ def test_disarming_in_the_air_stops_the_motors() -> None:
     assert flight.autopilot.command(DISARM) is None
     flight.fly(1 / 400)
     assert flight.physics.data.ctrl.tolist() == [0.0] * 4
-    assert flight.happenings[-1] is Disarmed
+    assert flight.events[-1] is Disarmed
 
 
 def test_armed_on_the_ground_a_setpoint_starts_the_flight() -> None:
@@ -121,7 +121,7 @@ def test_armed_on_the_ground_a_setpoint_starts_the_flight() -> None:
     assert flight.autopilot.command(place(1.0, 0.0, -2.0)) is None
     track = flight.fly(5.0)
     assert track[-1][1].position == pytest.approx((1.0, 0.0, -2.0), abs=0.05)
-    assert flight.happenings == [Armed]
+    assert flight.events == [Armed]
 
 
 @pytest.mark.parametrize(

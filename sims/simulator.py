@@ -1,0 +1,104 @@
+"""What the nodes of all simulators have in common: a world, and cameras in it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+import msgspec
+from typing_extensions import TypeVar
+
+from events import (
+    Announcement,
+    DepthImage,
+    Image,
+    Odometry,
+    PoseStamped,
+    SegmentationImage,
+    TransformStamped,
+)
+from runtime import Duration, Node, NodeConfig, Output
+from runtime.paths import NameOrPath
+from sims.cameras import CameraSpec
+from sims.cameras.rig import CameraOutputs, CameraRig
+
+Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+Count = Annotated[int, msgspec.Meta(ge=1, le=16)]
+
+
+class SimulatorConfig(NodeConfig):
+    """Settings of every simulator.
+
+    Attributes:
+        world: Name of a built-in world (``hall``, ``yard``), or path of an MJCF file. The axes of
+            an MJCF file are x north, y west, z up, as MuJoCo's bodies have theirs forward, left and
+            up; those of all settings and events are x north, y east, z down (NED). So a geom with
+            ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
+        cameras: The cameras that are carried.
+        camera_processes: Number of processes that render.
+        render_threads: Threads of the software renderer in each of them.
+        setpoint_timeout: Age beyond which a set-point is ignored, unless it is one of position or
+            pose, which hold until the next.
+    """
+
+    world: NameOrPath = "hall"
+    cameras: tuple[CameraSpec, ...] = ()
+    camera_processes: Count = 2
+    render_threads: Count = 1
+    setpoint_timeout: Duration = Duration(0.5)  # immutable
+
+
+C = TypeVar("C", bound=SimulatorConfig, default=SimulatorConfig)
+
+
+class Simulator(Node[C], ABC):
+    """Base of the simulators' nodes: their common outputs, and the cameras.
+
+    A subclass compiles the model in `on_startup`, after that of this class, and then starts the
+    rig; the rest of the cameras' work is done here.
+    """
+
+    images = Output(Image)
+    depth_images = Output(DepthImage)
+    segmentation_images = Output(SegmentationImage)
+    camera_poses = Output(PoseStamped)
+    transforms = Output(TransformStamped)
+    odometry = Output(Odometry)
+
+    @property
+    @abstractmethod
+    def frame_id(self) -> str:
+        """Frame of the body that carries the cameras."""
+
+    @property
+    def cameras(self) -> tuple[CameraSpec, ...]:
+        """The cameras as they are used."""
+        return self.config.cameras
+
+    async def on_startup(self) -> None:
+        """Prepare the cameras."""
+        config = self.config
+        outputs = CameraOutputs(
+            self.images, self.depth_images, self.segmentation_images, self.camera_poses
+        )
+        self.rig = CameraRig(
+            self, self.cameras, outputs, config.camera_processes, config.render_threads
+        )
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce the cameras."""
+        return self.rig.announcements(self.frame_id)
+
+    def on_change(self, before: Any) -> None:  # noqa: ARG002
+        """Deliver images as the changed settings say."""
+        self.rig.change(self.cameras)
+
+    async def run(self) -> None:
+        """Send the poses of the cameras on the body, once."""
+        for mounting in self.rig.transforms(self.frame_id):
+            self.transforms.send(mounting)
+
+    async def on_shutdown(self) -> None:
+        """Log how many images are missing."""
+        self.rig.log_missing()
