@@ -23,6 +23,7 @@ from runtime.tools.cli.nodes import nodes
 from runtime.tools.cli.recover import recover
 from runtime.tools.cli.report import report
 from runtime.tools.cli.run import leave_behind, run
+from runtime.tools.cli.schema import schema
 from runtime.tools.cli.set import set_
 from runtime.tools.cli.sweep import sweep
 from runtime.tools.cli.top import top
@@ -42,6 +43,7 @@ app.command()(example)
 app.command()(check)
 app.command()(graph)
 app.command()(nodes)
+app.command()(schema)
 app.command()(sweep)
 app.command()(report)
 app.command()(export)

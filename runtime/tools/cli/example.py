@@ -35,6 +35,7 @@ def example(
     out: Annotated[Path, typer.Option(help="Folder to copy it to.")] = Path(),
 ) -> None:
     """List the examples, or copy one, with the files that it reads, to start from."""
+    import re
     import shutil
 
     from runtime.errors import CommandError, ConfigError, suggest
@@ -55,6 +56,9 @@ def example(
     out.mkdir(parents=True, exist_ok=True)
     for file, target in zip(files, targets, strict=True):
         shutil.copyfile(file, target)
+        if file.suffix == ".toml":  # the schema lies elsewhere; the command `schema` writes one
+            text = file.read_text(encoding="utf-8")
+            target.write_text(re.sub(r"\A#:schema .*\n", "", text), encoding="utf-8")
         print(target)
 
 
