@@ -9,12 +9,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 from typing_extensions import TypeVar
 
 from events import (
@@ -25,16 +24,15 @@ from events import (
     EstimatorAnnouncement,
     Image,
     PoseEstimate,
-    Quaternion,
     TakenOff,
     TrackedFeatures,
     TrackingEvent,
     TrackingLost,
     TrackingRegained,
-    Vector3,
     VehicleAnnouncement,
     VehicleEvent,
 )
+from events.poses import pose_matrix, pose_tuples
 from runtime import Node, NodeConfig, Output, on
 from runtime.errors import suggest
 from runtime.units import Latency
@@ -314,19 +312,3 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
             position=position,
             orientation=orientation,
         )
-
-
-def pose_matrix(position: Vector3, orientation: Quaternion) -> Floats:
-    """Return a pose (metres; w, x, y, z) as the transform from child to parent, shape (4, 4)."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(orientation, scalar_first=True).as_matrix()
-    matrix[:3, 3] = position
-    return matrix
-
-
-def pose_tuples(matrix: npt.NDArray[Any]) -> tuple[Vector3, Quaternion]:
-    """Return a transform, shape (4, 4), as position (metres) and orientation (w, x, y, z)."""
-    x, y, z = matrix[:3, 3].tolist()
-    quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True, scalar_first=True)
-    qw, qx, qy, qz = quaternion.tolist()
-    return (x, y, z), (qw, qx, qy, qz)

@@ -22,6 +22,7 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
+from events.rotations import from_rpy, from_yaw, multiply, normalize, rotate, rotate_inverse, yaw_of
 from runtime import Tick, every, on
 from runtime.paths import InputPath
 from sims.cameras import (
@@ -31,7 +32,6 @@ from sims.cameras import (
     pose_to_qpos,
     qvel_between,
 )
-from sims.frames import from_euler, multiply, normalize, rotate, rotate_inverse, yaw_of
 from sims.simulator import Rate, Simulator, SimulatorConfig
 from sims.worlds import load_world
 
@@ -84,7 +84,7 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         config = self.config
         roll, pitch, yaw = (math.radians(angle) for angle in config.orientation)
         self._position = config.position
-        self._orientation: Quaternion = from_euler(yaw, pitch, roll)
+        self._orientation: Quaternion = from_rpy(roll, pitch, yaw)
         self._velocity: VelocitySetpoint | None = None
         self._stamp = 0
         self._rows = (
@@ -104,7 +104,7 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         if isinstance(event, PoseSetpoint):
             self._position, self._orientation = event.position, normalize(event.orientation)
         elif isinstance(event, PositionSetpoint):
-            self._position, self._orientation = event.position, from_euler(event.yaw, 0.0, 0.0)
+            self._position, self._orientation = event.position, from_yaw(event.yaw)
 
     @every(hz="rate")
     def update(self, tick: Tick) -> None:
@@ -149,10 +149,10 @@ class FreeCamera(Simulator[FreeCameraConfig]):
             return self._position, self._orientation
         velocity = order.velocity
         if order.frame_id == "heading":
-            velocity = rotate(from_euler(yaw_of(self._orientation), 0.0, 0.0), velocity)
+            velocity = rotate(from_yaw(yaw_of(self._orientation)), velocity)
         x, y, z = self._position
         vx, vy, vz = velocity
-        turn = from_euler(order.yaw_rate * seconds, 0.0, 0.0)
+        turn = from_yaw(order.yaw_rate * seconds)
         place = (x + vx * seconds, y + vy * seconds, z + vz * seconds)
         return place, normalize(multiply(turn, self._orientation))
 

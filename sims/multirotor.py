@@ -24,9 +24,9 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
+from events.rotations import rotate_inverse
 from runtime import Output, Tick, every, on
 from sims.cameras import add_camera, check_cameras
-from sims.frames import rotate_inverse
 from sims.simulator import Rate, Simulator, SimulatorConfig
 from sims.vehicle import (
     STANDING_HEIGHT,

@@ -14,11 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, PoseStamped, Vector3
+from events.frames import flip_yz, rotation_to_nwu
+from events.poses import pose_matrix
+from events.rotations import rotate
 from nodes.dataset.pictures import PictureFile, in_16_bits, in_grey
 from nodes.dataset.recording import Recording, real
-from nodes.dataset.rig import Rig, mounting
+from nodes.dataset.rig import WORLD_AXES, Rig
 from nodes.dataset.rows import RowFile
-from nodes.dataset.world import WORLD, rotation_to_nwu, to_parent, vector_to_nwu
 from nodes.trajectory.formats import EUROC_HEADER, euroc_row
 
 _IMU_HEADER = (
@@ -98,9 +100,9 @@ class Euroc(Recording):
                 self._places.add(event.position)
             row = euroc_row(
                 self.epoch + event.stamp,
-                vector_to_nwu(event.position),
+                flip_yz(event.position),
                 rotation_to_nwu(event.orientation),
-                vector_to_nwu(to_parent(event.orientation, event.linear_velocity)),
+                flip_yz(rotate(event.orientation, event.linear_velocity)),
             )
             self._truth.add(event.stamp, row)
 
@@ -128,7 +130,7 @@ class Euroc(Recording):
         return len(self._places) > 1 and not self._velocity_said
 
     def _describe_truth(self, velocities: str) -> None:
-        comment = f"{WORLD}; {_BODY}; true poses, {velocities}, biases not recorded (zeros)"
+        comment = f"{WORLD_AXES}; {_BODY}; true poses, {velocities}, biases not recorded (zeros)"
         self.write(f"{_TRUTH}/sensor.yaml", _head("ground-truth", comment, np.eye(4)))
 
     def _note(
@@ -151,7 +153,11 @@ class Euroc(Recording):
         """Make the folder of a camera; return its name and its index."""
         (self.folder / "mav0" / name / "data").mkdir(parents=True)
         info = camera.info
-        head = _head(kind, f"{camera.source}; x right, y down, z forward", mounting(camera))
+        head = _head(
+            kind,
+            f"{camera.source}; x right, y down, z forward",
+            pose_matrix(camera.position, camera.orientation),
+        )
         middle = ", ".join(map(real, (info.fx, info.fy, info.cx, info.cy)))
         lens = ", ".join(map(real, info.distortion[:4]))
         text = (

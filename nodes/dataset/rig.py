@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from events import Announcement, CameraAnnouncement, ImuAnnouncement
+
+WORLD_AXES = "world: x north, y west, z up; origin on the ground"
+"""The world of a data set, for the heads of its files: z up, as their readers expect it.
+
+Bodies stay FRD and cameras optical, so measurements and mountings stay as they are."""
 
 
 class Rig(msgspec.Struct, frozen=True):
@@ -57,15 +59,6 @@ def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
 def body_of(source: str) -> str:
     """Return the source of the body that carries a sensor: ``drone`` for ``drone/front``."""
     return source.rpartition("/")[0] or source
-
-
-def mounting(camera: CameraAnnouncement) -> npt.NDArray[np.float64]:
-    """Return the transform from the camera's optical frame to its body, shape (4, 4)."""
-    matrix = np.eye(4)
-    rotation = Rotation.from_quat(camera.orientation, scalar_first=True)
-    matrix[:3, :3] = rotation.as_matrix()
-    matrix[:3, 3] = camera.position
-    return matrix
 
 
 def _belongs(camera: CameraAnnouncement, named: str) -> bool:

@@ -10,11 +10,11 @@ import functools
 from pathlib import Path
 
 from events import DepthImage, Image, Imu, Odometry, PoseStamped
+from events.frames import flip_yz, rotation_to_nwu
 from nodes.dataset.pictures import PictureFile, in_16_bits, in_colour
 from nodes.dataset.recording import Recording, real
-from nodes.dataset.rig import Rig
+from nodes.dataset.rig import WORLD_AXES, Rig
 from nodes.dataset.rows import RowFile
-from nodes.dataset.world import WORLD, rotation_to_nwu, vector_to_nwu
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.table import seconds_text
 
@@ -39,7 +39,7 @@ class TumRgbd(Recording):
         self._files = {
             "rgb": self._index("rgb", "color images" if colour else "grey images"),
             "groundtruth": self._rows(
-                "groundtruth", "ground truth trajectory", f"{WORLD}; camera: {_OPTICAL}",
+                "groundtruth", "ground truth trajectory", f"{WORLD_AXES}; camera: {_OPTICAL}",
                 "timestamp tx ty tz qx qy qz qw",
             ),
         }  # fmt: skip
@@ -71,7 +71,7 @@ class TumRgbd(Recording):
     def pose(self, event: PoseStamped) -> None:
         """Note where the camera is."""
         if event.source == self._camera.source:
-            pose = vector_to_nwu(event.position), rotation_to_nwu(event.orientation)
+            pose = flip_yz(event.position), rotation_to_nwu(event.orientation)
             self._files["groundtruth"].add(event.stamp, tum_row(self.epoch + event.stamp, *pose))
 
     def odometry(self, event: Odometry) -> None:

@@ -9,13 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from events import PoseEstimate, Quaternion, Vector3
-from nodes.estimation import pose_matrix, pose_tuples
-from nodes.evaluation.metrics import position_error, rotation_error
+from events.poses import Pose, pose_matrix, pose_tuples
+from events.rotations import angle_between
+from nodes.evaluation.metrics import position_error
 
 SECOND = 1_000_000_000
 HISTORY = 10 * SECOND
-
-Pose = tuple[Vector3, Quaternion]
 
 
 class RecentTruth:
@@ -75,7 +74,7 @@ class LiveErrors:
         distance = position_error(truth[0], position)
         self.count += 1
         self.sum_of_squares += distance * distance
-        return distance, rotation_error(truth[1], orientation)
+        return distance, angle_between(truth[1], orientation)
 
     @property
     def mean_square(self) -> float:

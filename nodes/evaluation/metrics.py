@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from events import Quaternion, Vector3
+from events import Vector3
 from nodes.trajectory import Trajectory
 
 Floats = npt.NDArray[np.float64]
@@ -199,20 +199,6 @@ def rotation_errors(truth: Floats, estimate: Floats) -> Floats:
 def position_error(truth: Vector3, estimate: Vector3) -> float:
     """Return the distance between two positions, metres; for one pose in a running node."""
     return math.dist(truth, estimate)
-
-
-def rotation_error(truth: Quaternion, estimate: Quaternion) -> float:
-    """Return the angle between two orientations, radians in [0, π]; for one pose likewise.
-
-    From both parts of the quaternion between them, as an arc cosine would lose small angles.
-    """
-    aw, ax, ay, az = truth
-    bw, bx, by, bz = estimate
-    w = aw * bw + ax * bx + ay * by + az * bz
-    x = aw * bx - ax * bw - ay * bz + az * by
-    y = aw * by - ay * bw - az * bx + ax * bz
-    z = aw * bz - az * bw - ax * by + ay * bx
-    return 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
 
 
 def same_stamps(truth: Trajectory, estimate: Trajectory) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from array import array
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,12 +19,12 @@ from events import (
     PlannedPose,
     PoseEstimate,
     PositionSetpoint,
-    Quaternion,
     Score,
     TrackedFeatures,
     TrackingEvent,
     VehicleAnnouncement,
 )
+from events.rotations import from_yaw
 from nodes.evaluation.album import Album
 from nodes.evaluation.judging import Judgement, Thresholds, beside_the_plan, judge
 from nodes.evaluation.live import LiveErrors, RecentTruth
@@ -113,8 +112,7 @@ class Evaluation(Node[EvaluationConfig]):
     def planned(self, event: PlannedPose | PositionSetpoint) -> None:
         """Note where the pilot means to be."""
         rows = self._plan if isinstance(event, PlannedPose) else self._setpoints
-        heading: Quaternion = (math.cos(event.yaw / 2), 0.0, 0.0, math.sin(event.yaw / 2))
-        rows.add(event.stamp, event.position, heading)
+        rows.add(event.stamp, event.position, from_yaw(event.yaw))
 
     @on(PoseEstimate)
     def estimated(self, event: PoseEstimate) -> None:

@@ -32,7 +32,7 @@ from events import (
     Vector3,
     VehicleAnnouncement,
 )
-from nodes.estimation import pose_matrix, pose_tuples
+from events.poses import pose_matrix, pose_tuples
 from nodes.evaluation.live import RecentTruth
 from nodes.foxglove_server.messages import IMU_SCHEMA, SCORE_SCHEMA, Messages
 from nodes.foxglove_server.scene import ESTIMATES, PLAN, TRUTH, Colour, Trail

@@ -20,7 +20,8 @@ from events import (
     PoseStamped,
     TransformStamped,
 )
-from nodes.estimation import WORKER_ENVIRONMENT, pose_matrix
+from events.poses import pose_matrix
+from nodes.estimation import WORKER_ENVIRONMENT
 from nodes.mapping.mapper import Mapper
 from nodes.mapping.transforms import TransformError, TransformTree
 from nodes.trajectory.growing import part_name

@@ -16,12 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from events import Odometry, PoseStamped, Quaternion, TransformStamped, Vector3
-from nodes.estimation import pose_matrix
+from events import Odometry, PoseStamped, TransformStamped
+from events.poses import Pose, pose_matrix
 
 Floats = npt.NDArray[np.float64]
-
-_Pose = tuple[Vector3, Quaternion]
 
 HISTORY = 10.0
 """Seconds."""
@@ -163,7 +161,7 @@ class TransformTree:
             matrix = self._edges[child].at(stamp) @ matrix
         return matrix
 
-    def _add(self, parent: str, child: str, stamp: int, pose: _Pose, static: bool = False) -> None:
+    def _add(self, parent: str, child: str, stamp: int, pose: Pose, static: bool = False) -> None:
         where = f"{parent} → {child}"
         edge = self._edges.get(child)
         if edge is None:
@@ -192,9 +190,9 @@ class _Edge:
         self.child = child
         self.static = static
         self.stamps: list[int] = []
-        self.poses: list[_Pose] = []
+        self.poses: list[Pose] = []
 
-    def add(self, stamp: int, pose: _Pose, history: int | None) -> None:
+    def add(self, stamp: int, pose: Pose, history: int | None) -> None:
         """Put a pose in its place; one of the same stamp gives way."""
         stamps, poses = self.stamps, self.poses
         if self.static:

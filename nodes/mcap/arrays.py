@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from events.frames import Axes, convert_points
 from nodes.mcap.native import Shape
 from nodes.ros_messages.depth import COMPRESSED, DEPTH_HEAD
-from nodes.ros_messages.frames import Axes, turn_points
 from nodes.ros_messages.typestore import TypeStore
 
 Array = npt.NDArray[Any]
@@ -58,7 +58,7 @@ def arrays(
 def _cloud(message: Any, shapes: list[Shape], axes: Axes) -> list[Array]:
     """Return points, and colours if there is room for them: all are white where there were none."""
     rows = np.frombuffer(message.data, _POINT, shapes[0].shape[0])
-    points = turn_points(axes, np.ascontiguousarray(rows["xyz"]))
+    points = convert_points(axes, np.ascontiguousarray(rows["xyz"]))
     counts = [colors.shape[0] for colors in shapes[1:]]
     return [points, *(np.ascontiguousarray(rows["bgr"][:count, ::-1]) for count in counts)]
 

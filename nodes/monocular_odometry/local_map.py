@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from events.poses import inverse
 from nodes.monocular_odometry.beginning import FirstMap
 from nodes.monocular_odometry.bundle import Indices, adjust
 from nodes.monocular_odometry.flow import new_corners
@@ -14,7 +15,7 @@ from nodes.monocular_odometry.keyframes import Keyframe
 from nodes.monocular_odometry.settings import MonocularSettings
 from nodes.monocular_odometry.tracks import Tracks, View
 from nodes.monocular_odometry.views import parallax, rays, reprojection_errors, triangulate
-from nodes.visual_odometry.tracker import Floats, Grey, inverse
+from nodes.visual_odometry.tracker import Floats, Grey
 
 _GOOD = 2.0
 """Pixels of reprojection error up to which a landmark is kept."""

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
+from events.poses import inverse
 from nodes.monocular_odometry.beginning import Beginning
 from nodes.monocular_odometry.bundle import Indices
 from nodes.monocular_odometry.flow import follow_both_ways, inside
@@ -26,7 +27,7 @@ from nodes.monocular_odometry.keyframes import Keyframe, find_again
 from nodes.monocular_odometry.local_map import LocalMap
 from nodes.monocular_odometry.settings import MonocularSettings
 from nodes.visual_odometry.pose import Observations, Solution, solve_pose
-from nodes.visual_odometry.tracker import Floats, Grey, inverse
+from nodes.visual_odometry.tracker import Floats, Grey
 
 SECOND = 1_000_000_000
 _AGREES = 6.0

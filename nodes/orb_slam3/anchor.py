@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+
+from events.poses import pose_matrix
 
 Floats = npt.NDArray[np.float64]
 
@@ -98,8 +99,5 @@ def first_key_frame(trajectory: Path) -> KeyFrame | None:
         words = lines.readline().split()
     if len(words) != 8:
         return None
-    stamp, *position, qx, qy, qz, qw = map(float, words)
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat((qx, qy, qz, qw)).as_matrix()
-    pose[:3, 3] = position
-    return KeyFrame(stamp, pose)
+    stamp, x, y, z, qx, qy, qz, qw = map(float, words)
+    return KeyFrame(stamp, pose_matrix((x, y, z), (qw, qx, qy, qz)))

@@ -10,10 +10,9 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import msgspec
-import numpy as np
-from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, ImuAnnouncement
+from events.poses import pose_matrix
 
 Mode = Literal["rgbd", "monocular", "rgbd_inertial", "monocular_inertial"]
 
@@ -139,9 +138,7 @@ def _inertial(mode: Mode, camera: CameraAnnouncement, imu: ImuAnnouncement | Non
             f"mode {mode!r}: expected an IMU in {camera.parent_frame_id}, on which "
             f"{camera.source} is mounted, found {imu.source} in {imu.frame_id}"
         )
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(camera.orientation, scalar_first=True).as_matrix()
-    pose[:3, 3] = camera.position
+    pose = pose_matrix(camera.position, camera.orientation)
     return [
         # A noise of 0 would make its covariances singular.
         f"IMU.NoiseGyro: {_real(max(imu.gyroscope_noise_density, 1e-5))}",

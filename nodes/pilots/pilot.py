@@ -32,6 +32,7 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
+from events.rotations import yaw_of
 from nodes.pilots.waypoint_path import WaypointPath, plan
 from runtime import Duration, Node, NodeConfig, Output, on
 
@@ -146,7 +147,6 @@ class Pilot(Node[C], ABC):
     def _plan(self, start: Odometry | PoseEstimate) -> WaypointPath | None:
         """Return the path from here; `None` if the only waypoint is where the vehicle is."""
         config = self.config
-        w, x, y, z = start.orientation
         points = [start.position]
         for waypoint in config.waypoints:
             if math.dist(points[-1], waypoint) > 0.05:
@@ -158,7 +158,7 @@ class Pilot(Node[C], ABC):
             speed=config.speed,
             acceleration=config.acceleration,
             radius=config.corner_radius,
-            yaw=math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+            yaw=yaw_of(start.orientation),
             turn_time=config.turn_time,
             step=1 / config.rate,
         )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from events import Hover, PlannedPose, PoseEstimate, Quaternion, Vector3, VelocitySetpoint
+from events import Hover, PlannedPose, PoseEstimate, Vector3, VelocitySetpoint
+from events.rotations import yaw_of
 from nodes.pilots.pilot import Pilot, PilotConfig, Positive
 from nodes.pilots.waypoint_path import WaypointPath
 from runtime import Duration, Output, on
@@ -91,7 +92,7 @@ class VisualPilot(Pilot[VisualPilotConfig]):
             if size > config.max_correction:
                 correction *= config.max_correction / size
             north, east, down = (path.velocity[index] + correction).tolist()
-            yaw_error = _wrap(float(path.yaw[then]) - heading(self.pose.orientation))
+            yaw_error = _wrap(float(path.yaw[then]) - yaw_of(self.pose.orientation))
             # The estimated heading now: the path's, less the error.
             velocity = _turned((north, east, down), yaw_error - yaw)
             self.setpoints.send(
@@ -126,12 +127,6 @@ class VisualPilot(Pilot[VisualPilotConfig]):
                 return None
             await self.clock.sleep(1 / self.config.rate)
         return self.clock.now() - start
-
-
-def heading(orientation: Quaternion) -> float:
-    """Return where the x axis points, radians clockwise from north seen from above."""
-    w, x, y, z = orientation
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def _turned(vector: Vector3, angle: float) -> Vector3:

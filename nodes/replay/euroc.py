@@ -26,15 +26,14 @@ from events import (
     ImuAnnouncement,
     Odometry,
 )
-from nodes.estimation import pose_tuples
+from events.frames import flip_yz, rotation_to_ned
+from events.poses import pose_tuples
+from events.rotations import rotate_inverse
 from nodes.replay.folders import (
     in_order,
     read_depth,
     read_image,
-    rotation_to_ned,
     standing,
-    to_child,
-    vector_to_ned,
     while_seen,
 )
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
@@ -173,9 +172,9 @@ class Euroc(Reader):
             stamp=stamp - self._origin,
             source=self._vehicle,
             child_frame_id=_BODY,
-            position=vector_to_ned((x, y, z)),
+            position=flip_yz((x, y, z)),
             orientation=rotation_to_ned((qw, qx, qy, qz)),
-            linear_velocity=to_child((qw, qx, qy, qz), (u, v, w)),
+            linear_velocity=rotate_inverse((qw, qx, qy, qz), (u, v, w)),
             angular_velocity=(0.0, 0.0, 0.0),
         )
 

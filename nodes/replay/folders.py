@@ -13,32 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from events import DepthImage, Event, Image, Quaternion, Vector3, VehicleAnnouncement
-from nodes.dataset.world import vector_to_nwu
 from nodes.replay.reader import ReplayError, Timed
 
 R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
-
-vector_to_ned = vector_to_nwu
-"""Take a vector from north, west, up to NED; the same half turn goes both ways."""
-
-
-def rotation_to_ned(rotation: Quaternion) -> Quaternion:
-    """Take a rotation from a child frame to NWU to the rotation from that frame to NED."""
-    w, x, y, z = rotation
-    return (x, -w, z, -y)  # the inverse of (0, 1, 0, 0) ⊗ rotation
-
-
-def to_child(rotation: Quaternion, vector: Vector3) -> Vector3:
-    """Take a vector from the parent to the child frame of a unit quaternion."""
-    w, qx, qy, qz = rotation
-    qx, qy, qz = -qx, -qy, -qz
-    x, y, z = vector
-    tx, ty, tz = 2 * (qy * z - qz * y), 2 * (qz * x - qx * z), 2 * (qx * y - qy * x)
-    return (
-        x + w * tx + qy * tz - qz * ty,
-        y + w * ty + qz * tx - qx * tz,
-        z + w * tz + qx * ty - qy * tx,
-    )
 
 
 def while_seen(truth: list[R], first: int, last: int) -> list[R]:

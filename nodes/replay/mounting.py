@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from events import Quaternion, Vector3
-from nodes.ros_messages.frames import multiply, rotate, turn_rotation, turn_vector, unit
-
-Pose = tuple[Vector3, Quaternion]
+from events.frames import convert_rotation, convert_vector
+from events.poses import Pose
+from events.rotations import multiply, normalize, rotate
 
 LONGEST = 16
 """Transforms between a camera and the body, at most: more would go in circles."""
@@ -30,7 +29,7 @@ class Mountings:
                 t, r = each.transform.translation, each.transform.rotation
                 pose = (
                     (float(t.x), float(t.y), float(t.z)),
-                    unit((float(r.w), float(r.x), float(r.y), float(r.z))),
+                    normalize((float(r.w), float(r.x), float(r.y), float(r.z))),
                 )
                 self._parents[each.child_frame_id] = each.header.frame_id, pose
 
@@ -39,7 +38,9 @@ class Mountings:
         frame, (position, rotation) = optical, _HERE
         for _ in range(LONGEST):
             if frame == body:
-                return turn_vector("body", position), turn_rotation("body", "optical", rotation)
+                return convert_vector("body", position), convert_rotation(
+                    "body", "optical", rotation
+                )
             if frame not in self._parents:
                 return None
             frame, (offset, turn) = self._parents[frame]

@@ -25,20 +25,18 @@ from events import (
     Quaternion,
     Vector3,
 )
+from events.frames import OPTICAL_TO_FRD, flip_yz, rotation_to_ned
+from events.rotations import inverse, multiply
 from nodes.replay.euroc import noted_epoch, read_sensor
 from nodes.replay.folders import (
     in_order,
     read_depth,
     read_image,
-    rotation_to_ned,
     standing,
-    vector_to_ned,
     while_seen,
 )
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.replay.settings import Pinhole
-from nodes.ros_messages.calibration import OPTICAL_IN_BODY
-from nodes.ros_messages.frames import conjugate, multiply
 from nodes.trajectory.table import read_rows
 
 FARTHEST = 20_000_000
@@ -145,7 +143,7 @@ class TumRgbd(Reader):
             stamp=stamp - self._origin,
             source=self._vehicle,
             position=position,
-            orientation=multiply(optical, conjugate(OPTICAL_IN_BODY)),
+            orientation=multiply(optical, inverse(OPTICAL_TO_FRD)),
             linear_velocity=(0.0, 0.0, 0.0),
             angular_velocity=(0.0, 0.0, 0.0),
         )
@@ -195,7 +193,7 @@ class TumRgbd(Reader):
                 frame_id=self._frame_id,
                 parent_frame_id="base_link",
                 position=(0.0, 0.0, 0.0),
-                orientation=OPTICAL_IN_BODY,
+                orientation=OPTICAL_TO_FRD,
             )
         ]
         if self._truth:
@@ -216,7 +214,7 @@ class TumRgbd(Reader):
         found = []
         for row in read_rows(path, None, (8,), "timestamp tx ty tz qx qy qz qw"):
             x, y, z, qx, qy, qz, qw = row.numbers(1, 8)
-            pose = vector_to_ned((x, y, z)), rotation_to_ned((qw, qx, qy, qz))
+            pose = flip_yz((x, y, z)), rotation_to_ned((qw, qx, qy, qz))
             found.append((row.seconds(), *pose))
         return sorted(found)
 

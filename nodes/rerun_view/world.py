@@ -22,7 +22,7 @@ from events import (
     TrackedFeatures,
     Vector3,
 )
-from nodes.estimation import pose_matrix, pose_tuples
+from events.poses import pose_matrix, pose_tuples
 from nodes.evaluation.live import RecentTruth
 from nodes.rerun_view import entities
 from nodes.rerun_view.recording import Colour, Numbered, Recording

@@ -35,13 +35,13 @@ from events import (
     Vector3,
     VehicleAnnouncement,
 )
+from events.frames import convert_points, convert_rotation, convert_vector
 from nodes.ros2_bridge.outgoing_topic import Telling, Writing
 from nodes.ros2_bridge.plan import NAMES, Publication, What, announced, publication
 from nodes.ros2_bridge.session import Publisher, Session
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
 from nodes.ros_messages.depth import CompressedDepthWriter
 from nodes.ros_messages.frame_names import FrameNames
-from nodes.ros_messages.frames import turn_points, turn_rotation, turn_vector
 from nodes.ros_messages.images import CloudWriter, CompressedWriter, ImageWriter
 from nodes.ros_messages.messages import Messages, Time
 from nodes.ros_messages.paths import Path
@@ -204,7 +204,7 @@ class Publishing:
         """Put a cloud."""
         if publisher := self._publisher("cloud", event.source):
             frame = self._names.name(event.frame_id, event.source)
-            points = turn_points(self._names.axes(event.frame_id), event.points)
+            points = convert_points(self._names.axes(event.frame_id), event.points)
             writer = CloudWriter(self._store, frame)
             publisher.put(writer.write(self._time(event.stamp), points, event.colors))
 
@@ -212,7 +212,7 @@ class Publishing:
         """Put a sweep of a lidar."""
         if publisher := self._publisher("lidar", event.source):
             frame = self._names.name(event.frame_id, event.source)
-            points = turn_points(self._names.axes(event.frame_id), event.points)
+            points = convert_points(self._names.axes(event.frame_id), event.points)
             writer = CloudWriter(self._store, frame, "xyz")
             publisher.put(writer.write(self._time(event.stamp), points))
 
@@ -320,12 +320,12 @@ class Publishing:
             path = Path(self._store, frame, config.path_step, config.path_length)
             self._paths[event.source] = (path, due)
         axes = self._names.axes(event.frame_id)
-        position: Vector3 = turn_vector(axes, event.position)
+        position: Vector3 = convert_vector(axes, event.position)
         far = path.far(position)
         if not far and event.stamp < due:
             return
         child_axes = self._names.axes(child)
-        rotation: Quaternion = turn_rotation(axes, child_axes, event.orientation)
+        rotation: Quaternion = convert_rotation(axes, child_axes, event.orientation)
         time = self._time(event.stamp)
         if far:
             path.add(time, position, rotation)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from math import isfinite
 from typing import Any
 
-from events import CameraAnnouncement, CameraInfo, Quaternion
-
-OPTICAL_IN_BODY: Quaternion = (0.5, 0.5, 0.5, 0.5)
-"""Rotation from the optical frame of a camera that looks ahead to the body (FRD)."""
+from events import CameraAnnouncement, CameraInfo
+from events.frames import OPTICAL_TO_FRD
 
 
 def camera_announcement(
@@ -35,7 +33,7 @@ def camera_announcement(
         frame_id=frame_id or message.header.frame_id,
         parent_frame_id="base_link",
         position=(0.0, 0.0, 0.0),
-        orientation=OPTICAL_IN_BODY,
+        orientation=OPTICAL_TO_FRD,
     )
 
 

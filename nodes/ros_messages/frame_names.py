@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from events import CameraAnnouncement
-from nodes.ros_messages.frames import Axes, axes_of
+from events.frames import Axes, axes_of
 from nodes.ros_messages.topics import ros_name
 
 

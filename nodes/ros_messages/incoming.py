@@ -8,7 +8,7 @@ alike. World ENU becomes NED, body FLU FRD; optical axes stay. See `frames`. Pic
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import atan2, isfinite
+from math import isfinite
 from typing import Any
 
 import msgspec
@@ -25,13 +25,8 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from nodes.ros_messages.frames import (
-    axes_of,
-    turn_covariance,
-    turn_rotation,
-    turn_vector,
-    unit,
-)
+from events.frames import axes_of, convert_covariance, convert_rotation, convert_vector
+from events.rotations import normalize, yaw_of
 from nodes.ros_messages.images import read_depth, read_image
 from nodes.ros_messages.stamps import Stamps
 
@@ -94,8 +89,8 @@ def odometry(message: Any, reading: Reading) -> Event:
         child_frame_id=child,
         position=position,
         orientation=orientation,
-        linear_velocity=turn_vector(axes, _vector(twist.linear)),
-        angular_velocity=turn_vector(axes, _vector(twist.angular)),
+        linear_velocity=convert_vector(axes, _vector(twist.linear)),
+        angular_velocity=convert_vector(axes, _vector(twist.angular)),
     )
 
 
@@ -113,12 +108,11 @@ def stamped_velocity(message: Any, reading: Reading) -> Event:
 def position(message: Any, reading: Reading) -> Event:
     """Read a PoseStamped as a place to be at, with its heading."""
     place, orientation = _pose_in_map(message, reading)
-    w, x, y, z = orientation
     return PositionSetpoint(
         stamp=reading.stamp(message.header),
         source=reading.source,
         position=place,
-        yaw=atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+        yaw=yaw_of(orientation),
     )
 
 
@@ -141,8 +135,8 @@ def imu(message: Any, reading: Reading) -> Event:
         stamp=reading.stamp(message.header),
         source=reading.source,
         frame_id=frame_id,
-        angular_velocity=turn_vector(axes, _vector(message.angular_velocity)),
-        linear_acceleration=turn_vector(axes, _vector(message.linear_acceleration)),
+        angular_velocity=convert_vector(axes, _vector(message.angular_velocity)),
+        linear_acceleration=convert_vector(axes, _vector(message.linear_acceleration)),
     )
 
 
@@ -184,7 +178,7 @@ def _estimate(
 ) -> Event:
     frame_id = reading.frame(header, "odom")
     place, orientation = _pose(pose, frame_id, child)
-    given = turn_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
+    given = convert_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
     return PoseEstimate(
         stamp=reading.stamp(header),
         source=reading.source,
@@ -197,7 +191,7 @@ def _estimate(
 
 
 def _velocity(twist: Any, stamp: int, frame_id: str, reading: Reading) -> Event:
-    turned = turn_vector("world" if frame_id == "map" else "body", _vector(twist.linear))
+    turned = convert_vector("world" if frame_id == "map" else "body", _vector(twist.linear))
     return VelocitySetpoint(
         stamp=stamp,
         source=reading.source,
@@ -216,10 +210,10 @@ def _pose_in_map(message: Any, reading: Reading) -> tuple[Vector3, Quaternion]:
 
 def _pose(pose: Any, parent: str, child: str) -> tuple[Vector3, Quaternion]:
     q, axes = pose.orientation, axes_of(parent)
-    rotation = unit((float(q.w), float(q.x), float(q.y), float(q.z)))
+    rotation = normalize((float(q.w), float(q.x), float(q.y), float(q.z)))
     return (
-        turn_vector(axes, _vector(pose.position)),
-        turn_rotation(axes, axes_of(child), rotation),
+        convert_vector(axes, _vector(pose.position)),
+        convert_rotation(axes, axes_of(child), rotation),
     )
 
 

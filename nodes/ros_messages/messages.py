@@ -22,8 +22,8 @@ from events import (
     Score,
     Vector3,
 )
+from events.frames import Axes, convert_covariance, convert_rotation, convert_vector
 from nodes.ros_messages.frame_names import FrameNames
-from nodes.ros_messages.frames import Axes, turn_covariance, turn_rotation, turn_vector
 from nodes.ros_messages.images import make_header
 from nodes.ros_messages.typestore import TypeStore
 
@@ -72,8 +72,8 @@ class Messages:
         """Return a nav_msgs/Odometry: the pose in its parent, the twist in the body."""
         make, axes = self._make, self._frames.axes(event.child_frame_id)
         twist = make["twist"](
-            linear=self._vector(turn_vector(axes, event.linear_velocity)),
-            angular=self._vector(turn_vector(axes, event.angular_velocity)),
+            linear=self._vector(convert_vector(axes, event.linear_velocity)),
+            angular=self._vector(convert_vector(axes, event.angular_velocity)),
         )
         pose = self._pose(event.frame_id, axes, event.position, event.orientation)
         message = self._store.message("nav_msgs/msg/Odometry")(
@@ -97,7 +97,7 @@ class Messages:
         covariance = _ZEROS_36
         if event.covariance:
             axes = self._frames.axes(event.frame_id)
-            covariance = turn_covariance(axes, np.array(event.covariance))
+            covariance = convert_covariance(axes, np.array(event.covariance))
         pose = self._pose(event.frame_id, child, event.position, event.orientation)
         message = self._store.message("geometry_msgs/msg/PoseWithCovarianceStamped")(
             header=self._header(time, event.frame_id, event.source),
@@ -119,9 +119,9 @@ class Messages:
             header=self._header(time, event.frame_id, event.source),
             orientation=self._make["quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
             orientation_covariance=_UNKNOWN,
-            angular_velocity=self._vector(turn_vector(axes, event.angular_velocity)),
+            angular_velocity=self._vector(convert_vector(axes, event.angular_velocity)),
             angular_velocity_covariance=gyroscope,
-            linear_acceleration=self._vector(turn_vector(axes, event.linear_acceleration)),
+            linear_acceleration=self._vector(convert_vector(axes, event.linear_acceleration)),
             linear_acceleration_covariance=accelerometer,
         )
         return self._store.serialize(message)
@@ -199,7 +199,7 @@ class Messages:
         """Return a sensor_msgs/MagneticField; its covariance of zeros says: not known."""
         message = self._store.message("sensor_msgs/msg/MagneticField")(
             header=self._header(time, "base_link", event.source),
-            magnetic_field=self._vector(turn_vector("body", event.magnetic_field)),
+            magnetic_field=self._vector(convert_vector("body", event.magnetic_field)),
             magnetic_field_covariance=_ZEROS_9,
         )
         return self._store.serialize(message)
@@ -228,10 +228,10 @@ class Messages:
 
     def _pose(self, parent: str, child: Axes, position: Vector3, orientation: Quaternion) -> Any:
         axes = self._frames.axes(parent)
-        x, y, z = turn_vector(axes, position)
+        x, y, z = convert_vector(axes, position)
         return self._make["pose"](
             position=self._make["point"](x=x, y=y, z=z),
-            orientation=self._quaternion(turn_rotation(axes, child, orientation)),
+            orientation=self._quaternion(convert_rotation(axes, child, orientation)),
         )
 
     def _vector(self, vector: Vector3) -> Any:

@@ -12,26 +12,16 @@ from events import (
     Odometry,
     PoseEstimate,
     PoseStamped,
-    Quaternion,
     TransformStamped,
-    Vector3,
     VehicleAnnouncement,
 )
+from events.frames import OPTICAL_TO_FLU, Axes, convert_rotation, convert_vector
+from events.poses import Pose, relative
+from events.rotations import inverse, multiply
 from nodes.ros_messages.frame_names import FrameNames
-from nodes.ros_messages.frames import (
-    OPTICAL_IN_LINK,
-    Axes,
-    conjugate,
-    multiply,
-    relative,
-    turn_rotation,
-    turn_vector,
-)
 from nodes.ros_messages.messages import Transform
 
-Pose = tuple[Vector3, Quaternion]
-
-_LINK_IN_OPTICAL = conjugate(OPTICAL_IN_LINK)
+_LINK_IN_OPTICAL = inverse(OPTICAL_TO_FLU)
 
 
 class Transforms:
@@ -94,7 +84,7 @@ class Transforms:
                 found.append(self._link(parent, optical, pose, source))
             frames = self._names.camera(optical)
             assert frames is not None
-            found.append(Transform(frames.link, frames.optical, (0.0, 0.0, 0.0), OPTICAL_IN_LINK))
+            found.append(Transform(frames.link, frames.optical, (0.0, 0.0, 0.0), OPTICAL_TO_FLU))
         return found
 
     def odometry(self, event: Odometry) -> list[Transform]:
@@ -141,15 +131,15 @@ class Transforms:
 
     def _turned(self, parent: str, child: str, pose: Pose, source: str) -> Transform:
         to, of = self._names.axes(parent), self._names.axes(child)
-        rotation = turn_rotation(to, of, pose[1])
+        rotation = convert_rotation(to, of, pose[1])
         names = self._names.name(parent, source), self._names.name(child, source)
-        return Transform(*names, turn_vector(to, pose[0]), rotation)
+        return Transform(*names, convert_vector(to, pose[0]), rotation)
 
     def _link(self, parent: str, optical: str, pose: Pose, source: str) -> Transform:
         """Return a camera's body in its parent, from its optical frame's pose."""
         axes: Axes = self._names.axes(parent)
         frames = self._names.camera(optical)
         assert frames is not None
-        rotation = multiply(turn_rotation(axes, "optical", pose[1]), _LINK_IN_OPTICAL)
+        rotation = multiply(convert_rotation(axes, "optical", pose[1]), _LINK_IN_OPTICAL)
         name = self._names.name(parent, source)
-        return Transform(name, frames.link, turn_vector(axes, pose[0]), rotation)
+        return Transform(name, frames.link, convert_vector(axes, pose[0]), rotation)

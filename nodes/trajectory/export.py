@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Quaternion, Vector3
-from nodes.estimation import pose_matrix
+from events.frames import OPTICAL_TO_FRD
+from events.poses import pose_matrix
 from nodes.trajectory.formats import read_tum, write_euroc, write_kitti, write_tum
 from nodes.trajectory.table import EPOCH, epoch_of
 from nodes.trajectory.trajectory import Trajectory
@@ -126,7 +127,7 @@ def _mounting(run: Path) -> npt.NDArray[np.float64]:
     for each in announced:
         if each.type == "CameraAnnouncement" and each.parent_frame_id != "map":
             return pose_matrix(each.position, each.orientation)
-    return pose_matrix((0.0, 0.0, 0.0), (0.5, 0.5, 0.5, 0.5))
+    return pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
 
 
 class _Announced(msgspec.Struct):
@@ -135,7 +136,7 @@ class _Announced(msgspec.Struct):
     type: str
     parent_frame_id: str = "map"
     position: Vector3 = (0.0, 0.0, 0.0)
-    orientation: Quaternion = (0.5, 0.5, 0.5, 0.5)
+    orientation: Quaternion = OPTICAL_TO_FRD
 
 
 class _Summary(msgspec.Struct):

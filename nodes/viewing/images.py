@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo, DepthImage, Image, PoseStamped
-from nodes.estimation import pose_matrix
+from events.poses import pose_matrix
 from nodes.mapping.cloud import back_project, rays_of
 
 SECOND = 1_000_000_000

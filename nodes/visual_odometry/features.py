@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
+from events.poses import inverse
 from nodes.visual_odometry.corners import find_corners, squares
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import Rows, find_patches, half_width
@@ -30,7 +31,6 @@ from nodes.visual_odometry.tracker import (
     Grey,
     Tracked,
     grey_and_depth,
-    inverse,
     refuse_distortion,
 )
 

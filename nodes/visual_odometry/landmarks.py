@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from events.poses import inverse
 from nodes.visual_odometry.patches import Patches, Rows
 from nodes.visual_odometry.surfaces import Surfaces, rays
-from nodes.visual_odometry.tracker import Depth, Floats, inverse
+from nodes.visual_odometry.tracker import Depth, Floats
 
 _SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5
 """How much smaller, larger or more slanted than at first sight a landmark may look."""

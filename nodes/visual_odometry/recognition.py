@@ -13,8 +13,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from events.poses import inverse
 from nodes.visual_odometry.surfaces import rays, surfaces_at
-from nodes.visual_odometry.tracker import Depth, Floats, Grey, inverse
+from nodes.visual_odometry.tracker import Depth, Floats, Grey
 
 _POINTS = 500
 _NEAREST = 3.0

@@ -91,11 +91,3 @@ def _check_size(
             f"{name}: expected {info.width}×{info.height} pixels, as the camera announced, "
             f"found shape {array.shape}"
         )
-
-
-def inverse(pose: Floats) -> Floats:
-    """Return the inverse of a rigid transform, shape (4, 4)."""
-    result = np.eye(4)
-    result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return result

@@ -7,8 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Quaternion, Vector3
+from events.frames import flip_yz, flip_yz_rotation
+from events.rotations import normalize
 from sims.cameras.spec import CameraSpec, add_camera
-from sims.frames import half_turn_quaternion, half_turn_vector, normalize
 
 
 def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ...]) -> str:
@@ -49,8 +50,8 @@ def pose_to_qpos(position: Vector3, orientation: Quaternion) -> npt.NDArray[np.f
     Raises:
         ValueError: The quaternion is zero.
     """
-    turn = half_turn_quaternion(normalize(orientation))
-    return np.array([*half_turn_vector(position), *turn])
+    turn = flip_yz_rotation(normalize(orientation))
+    return np.array([*flip_yz(position), *turn])
 
 
 def qvel_between(

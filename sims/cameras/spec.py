@@ -14,16 +14,14 @@ import mujoco
 
 import events
 from events.base import Quaternion, Vector3
+from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation
+from events.rotations import from_rpy, multiply
 from runtime.parameters import Changeable
 from runtime.units import Latency
-from sims.frames import from_euler, half_turn_quaternion, half_turn_vector, multiply
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=8192)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
-
-OPTICAL_TO_CAMERA: Quaternion = (0.5, 0.5, 0.5, 0.5)
-"""Optical axes (right, down, forward) to camera body axes (forward, right, down): REP 103."""
 
 
 class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -104,7 +102,7 @@ def camera_info(spec: CameraSpec) -> events.CameraInfo:
 def optical_in_body(spec: CameraSpec) -> tuple[Vector3, Quaternion]:
     """Return the optical frame's pose on the body: metres in FRD, rotation optical to body."""
     roll, pitch, yaw = (math.radians(angle) for angle in spec.orientation)
-    return spec.position, multiply(from_euler(yaw, pitch, roll), OPTICAL_TO_CAMERA)
+    return spec.position, multiply(from_rpy(roll, pitch, yaw), OPTICAL_TO_FRD)
 
 
 def optical_frame(spec: CameraSpec, prefix: str) -> str:
@@ -173,8 +171,8 @@ def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: s
     # rotation takes optical-in-FRD to camera-in-FLU.
     body.add_camera(
         name=name,
-        pos=half_turn_vector(position),
-        quat=half_turn_quaternion(orientation),
+        pos=flip_yz(position),
+        quat=flip_yz_rotation(orientation),
         fovy=vertical_fov(spec),
     )
     screen = world.visual.global_

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Quaternion, Vector3
+from events.frames import flip_yz, flip_yz_rotation
 from sims.cameras.graphics import open_context
-from sims.frames import half_turn_quaternion, half_turn_vector
 
 Floats = npt.NDArray[np.float64]
 Colours = npt.NDArray[np.uint8]
@@ -137,8 +137,8 @@ class Stage:
             quat = -quat  # the same rotation; one sign for it, so that logs read smoothly
         w, x, y, z = quat.tolist()
         # The half turn about x on both sides also turns MuJoCo's camera (-z ahead) into optical.
-        position = half_turn_vector(tuple(self._data.cam_xpos[camera_id].tolist()))
-        return position, half_turn_quaternion((w, x, y, z))
+        position = flip_yz(tuple(self._data.cam_xpos[camera_id].tolist()))
+        return position, flip_yz_rotation((w, x, y, z))
 
     def close(self) -> None:
         """Give the GL context back. Further calls do nothing."""

@@ -42,7 +42,7 @@ from events import (
     VehicleEvent,
     VelocitySetpoint,
 )
-from sims.frames import yaw_of
+from events.rotations import yaw_of
 from sims.vehicle.control import Controller, Motors
 from sims.vehicle.gains import Gains, Limits
 from sims.vehicle.model import VehicleParameters

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from events import Vector3
-from sims.frames import half_turn_vector
+from events.frames import flip_yz
 from sims.vehicle.model import STANDING_HEIGHT
 
 DEPTH = 0.02
@@ -44,7 +44,7 @@ class Clearance:
 
     def at(self, place: Vector3) -> str:
         """Return the name of what the vehicle would be stuck in, level; empty for nothing."""
-        self._place[:] = half_turn_vector(place)
+        self._place[:] = flip_yz(place)
         mujoco.mj_fwdPosition(self._model, self._data)
         contact, body_of = self._data.contact, self._model.geom_bodyid
         deepest = -DEPTH
@@ -72,7 +72,7 @@ class Clearance:
         if length < 1e-6:
             return None, None
         x, y, z = (component / length for component in way)
-        direction = np.array(half_turn_vector((x, y, z)))
+        direction = np.array(flip_yz((x, y, z)))
         hit = np.zeros(1, np.int32)
         groups = self._model.geom_group.copy()
         self._model.geom_group[:] = self._only_seen
@@ -80,7 +80,7 @@ class Clearance:
             distance = mujoco.mj_ray(
                 self._model,
                 self._data,
-                np.array(half_turn_vector(start)),
+                np.array(flip_yz(start)),
                 direction,
                 np.array([1, 0, 0, 0, 0, 0], np.uint8),
                 1,

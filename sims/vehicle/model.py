@@ -14,7 +14,8 @@ import mujoco
 import numpy as np
 
 from events import Vector3
-from sims import frames
+from events.frames import flip_yz, flip_yz_rotation
+from events.rotations import from_yaw
 
 TIMESTEP_NS = 1_000_000
 """Nanoseconds of one physics step."""
@@ -98,8 +99,8 @@ def attach_vehicle(world: mujoco.MjSpec, name: str, position: Vector3, yaw: floa
         raise ValueError(f"the world already has a vehicle named {name!r}")
     vehicle = mujoco.MjSpec.from_file(str(_VEHICLE))
     frame = world.worldbody.add_frame(
-        pos=frames.half_turn_vector(position),
-        quat=frames.half_turn_quaternion(frames.from_euler(yaw, 0.0, 0.0)),
+        pos=flip_yz(position),
+        quat=flip_yz_rotation(from_yaw(yaw)),
     )
     world.attach(vehicle, prefix=f"{name}/", frame=frame)
     option: Any = world.option

@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import asin, atan2, cos, pi, sin, sqrt, tan
 
 from events import Quaternion, Vector3
-from sims.frames import from_euler, yaw_of
+from events.rotations import from_rpy, yaw_of
 from sims.vehicle.gains import Gains, Limits
 from sims.vehicle.model import VehicleParameters
 from sims.vehicle.physics import State
@@ -223,10 +223,10 @@ class PositionController:
         c = cos(yaw)
         s = sin(yaw)
         norm = sqrt(ax * ax + ay * ay + lift * lift)
-        target = from_euler(
-            yaw,
-            atan2(-(c * ax + s * ay), lift),
+        target = from_rpy(
             asin((c * ay - s * ax) / norm),
+            atan2(-(c * ax + s * ay), lift),
+            yaw,
         )
         # Only the part of it along the body's present z axis is thrust in the right direction.
         qw, qx, qy, qz = state.orientation

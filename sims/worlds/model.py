@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from events.rotations import from_rpy
 from sims.worlds.patterns import Picture, to_bytes
 from sims.worlds.shapes import Surface, Window
 
@@ -129,7 +130,7 @@ class Model:
             meshname=name,
             material=material.name,
             pos=place,
-            quat=_rotation(turn, tilt),
+            quat=from_rpy(0.0, math.radians(tilt), math.radians(turn)),
             contype=0,
             conaffinity=0,
             group=LOOK_GROUP,
@@ -149,7 +150,7 @@ class Model:
         quat = np.empty(4)
         mujoco.mju_mulQuat(
             quat,
-            np.asarray(_rotation(turn, tilt)),
+            np.asarray(from_rpy(0.0, math.radians(tilt), math.radians(turn))),
             np.array([math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0]),
         )
         self.spec.worldbody.add_geom(
@@ -194,14 +195,3 @@ class Model:
             attenuation=[1.0, 0.0, fall_off],
             castshadow=False,
         )
-
-
-def _rotation(turn: float, tilt: float) -> list[float]:
-    """Return the quaternion of a turn about z after a tilt about y, degrees."""
-    a, b = math.radians(turn) / 2.0, math.radians(tilt) / 2.0
-    return [
-        math.cos(a) * math.cos(b),
-        -math.sin(a) * math.sin(b),
-        math.cos(a) * math.sin(b),
-        math.sin(a) * math.cos(b),
-    ]

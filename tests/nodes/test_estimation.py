@@ -27,7 +27,8 @@ from events import (
     TrackingRegained,
     VehicleAnnouncement,
 )
-from nodes.estimation import Estimator, RgbdFrame, pose_matrix, pose_tuples
+from events.poses import pose_matrix, pose_tuples
+from nodes.estimation import Estimator, RgbdFrame
 from runtime import Bundle
 from runtime.errors import NodeError, RefusedError
 from runtime.testing import NodeResult, run_nodes, spec

@@ -20,7 +20,8 @@ from events import (
     TrackingLost,
     TrackingRegained,
 )
-from nodes.estimation import Estimator, pose_matrix
+from events.poses import pose_matrix
+from nodes.estimation import Estimator
 from nodes.pilots import VisualPilot
 from runtime import Input
 from runtime.testing import NodeResult, run_nodes, spec

@@ -30,11 +30,11 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
     VelocitySetpoint,
+    rotations,
 )
 from runtime.config import NodeSpec
 from runtime.errors import ConfigError, NodeError, RefusedError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
-from sims import frames
 from sims.multirotor import Multirotor
 from sims.vehicle import STANDING_HEIGHT
 from tests.runtime.samples_runs import supervise
@@ -129,7 +129,7 @@ def test_exposures_are_equidistant_and_true_at_their_own_stamps(
     truth = {e.stamp: e for e in moves}
     for pose in result.of(PoseStamped):
         body = truth[pose.stamp]
-        ahead = frames.rotate(body.orientation, (0.2, 0.0, 0.0))
+        ahead = rotations.rotate(body.orientation, (0.2, 0.0, 0.0))
         place = [a + b for a, b in zip(body.position, ahead, strict=True)]
         assert pose.position == pytest.approx(place, abs=1e-9)
     for index, event in enumerate(result.sent):

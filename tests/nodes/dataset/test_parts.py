@@ -7,39 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from events import Announcement, Quaternion
+from events import Announcement
 from nodes.dataset.pictures import Picture, PictureFile, in_16_bits, in_colour, in_grey
-from nodes.dataset.rig import choose, mounting
+from nodes.dataset.rig import choose
 from nodes.dataset.rows import RowFile
-from nodes.dataset.world import rotation_to_nwu, to_parent, vector_to_nwu
 from tests.nodes.dataset.samples import camera, image, imu_announcement, png
-
-HALF_TURN = np.diag([1.0, -1.0, -1.0])
-
-
-def quaternion(seed: int) -> Quaternion:
-    w, x, y, z = Rotation.random(rng=np.random.default_rng(seed)).as_quat(scalar_first=True)
-    return (w, x, y, z)
-
-
-def matrix(rotation: Quaternion) -> object:
-    return Rotation.from_quat(rotation, scalar_first=True).as_matrix()
-
-
-def test_the_world_is_turned_about_x_and_the_body_is_not() -> None:
-    for seed in range(5):
-        q = quaternion(seed)
-        assert matrix(rotation_to_nwu(q)) == pytest.approx(HALF_TURN @ matrix(q))
-    assert vector_to_nwu((1.0, 2.0, -3.0)) == (1.0, -2.0, 3.0)
-
-
-def test_vectors_turn_as_scipy_turns_them() -> None:
-    for seed in range(5):
-        q = quaternion(seed)
-        expected = Rotation.from_quat(q, scalar_first=True).apply([1.0, -2.0, 3.0])
-        assert to_parent(q, (1.0, -2.0, 3.0)) == pytest.approx(expected)
 
 
 def test_depth_that_16_bits_cannot_hold_is_none() -> None:
@@ -127,9 +100,3 @@ def test_a_camera_that_is_not_there_is_an_error_that_names_those_that_are() -> N
         choose(ANNOUNCED[:3], None)
     with pytest.raises(ValueError, match=r"rgb or grey images, found none"):
         choose([], None)
-
-
-def test_a_camera_ahead_has_its_axis_along_the_bodys() -> None:
-    found = mounting(camera())
-    assert found @ [0.0, 0.0, 1.0, 1.0] == pytest.approx([1.15, 0.0, 0.05, 1.0])
-    assert found @ [1.0, 0.0, 0.0, 1.0] == pytest.approx([0.15, 1.0, 0.05, 1.0])

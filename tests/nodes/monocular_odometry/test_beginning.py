@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from events.poses import inverse
 from nodes.monocular_odometry.beginning import Beginning, FirstMap
 from nodes.monocular_odometry.settings import MonocularSettings
-from nodes.visual_odometry.tracker import inverse
 from tests.nodes.monocular_odometry.world import (
     FLAT,
     MATRIX,

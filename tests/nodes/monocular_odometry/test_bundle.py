@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from events.poses import inverse
 from nodes.monocular_odometry.bundle import adjust, linearise
-from nodes.visual_odometry.tracker import inverse
 from tests.nodes.monocular_odometry.world import MATRIX, Floats, pose
 
 NOISE = 0.5

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from events.poses import inverse
 from nodes.monocular_odometry.beginning import FirstMap
 from nodes.monocular_odometry.local_map import LocalMap
 from nodes.monocular_odometry.settings import MonocularSettings
-from nodes.visual_odometry.tracker import inverse
 from tests.nodes.monocular_odometry.world import MATRIX, Floats, Grey, pose
 
 BLANK: Grey = np.zeros((192, 256), np.uint8)

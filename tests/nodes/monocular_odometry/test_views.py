@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from events.poses import inverse
 from nodes.monocular_odometry.views import (
     centre,
     hypotheses,
@@ -15,7 +16,6 @@ from nodes.monocular_odometry.views import (
     reprojection_errors,
     triangulate,
 )
-from nodes.visual_odometry.tracker import inverse
 from tests.nodes.monocular_odometry.world import MATRIX, Floats, pose
 
 K = np.array([[100.0, 0.0, 50.0], [0.0, 200.0, 40.0], [0.0, 0.0, 1.0]])

@@ -23,17 +23,17 @@ from events import (
     PoseStamped,
     VehicleAnnouncement,
 )
+from events.poses import pose_matrix
+from events.rotations import rotate
 from nodes.dataset.euroc import Euroc
 from nodes.dataset.pictures import in_grey
 from nodes.dataset.rig import choose
 from nodes.dataset.tum_rgbd import TumRgbd
-from nodes.estimation import pose_matrix
 from nodes.replay.choice import Choice
 from nodes.replay.euroc import read_sensor
 from nodes.replay.formats import open_reader
 from nodes.replay.reader import Reader, ReplayError
 from nodes.replay.settings import ReplayConfig
-from nodes.ros_messages.frames import rotate
 from nodes.trajectory.table import epoch_of
 from tests.nodes.dataset.samples import (
     camera,

@@ -19,10 +19,10 @@ from events import (
     PositionSetpoint,
     VelocitySetpoint,
 )
+from events.rotations import normalize
 from nodes.ros2_bridge.settings import Subscription
 from nodes.ros_messages.calibration import camera_announcement
 from nodes.ros_messages.frame_names import FrameNames
-from nodes.ros_messages.frames import unit
 from nodes.ros_messages.images import make_header
 from nodes.ros_messages.incoming import READERS, Reading
 from nodes.ros_messages.messages import Messages
@@ -110,7 +110,7 @@ def test_what_is_published_comes_back_as_it_was(
         source="s",
         frame_id=frame_id,
         position=position,
-        orientation=unit(rotation),
+        orientation=normalize(rotation),
         covariance=covariance,
     )
     data = messages.pose_with_covariance((3, 7), estimate, "body")
@@ -125,7 +125,7 @@ def test_what_is_published_comes_back_as_it_was(
         source="s",
         frame_id=frame_id,
         position=position,
-        orientation=unit(rotation),
+        orientation=normalize(rotation),
         linear_velocity=position,
         angular_velocity=position,
     )

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from events import PoseEstimate, PoseStamped, TransformStamped
-from nodes.estimation import pose_matrix
+from events.poses import pose_matrix
 from nodes.ros_messages.frame_names import FrameNames
 from nodes.ros_messages.messages import Transform
 from nodes.ros_messages.transforms import Transforms

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from events.poses import inverse
 from nodes.visual_odometry.corners import find_corners, squares
 from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import find_patches
 from nodes.visual_odometry.surfaces import inverse_depth, rays, surfaces_at
-from nodes.visual_odometry.tracker import Floats, inverse
+from nodes.visual_odometry.tracker import Floats
 from tests.nodes.visual_odometry.world import INFO, look, pose
 
 CAMERA = (INFO.fx, INFO.fy, INFO.cx, INFO.cy)

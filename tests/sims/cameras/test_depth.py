@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from events.rotations import from_rpy, rotate
 from sims.cameras import CameraRenderer, Frame, camera_info, pose_to_qpos
-from sims.frames import from_euler, rotate
 from sims.worlds import TOURS
 from tests.sims.cameras.scenes import ALL, CAMERAS, Scene, scene
 
@@ -35,7 +35,7 @@ def exposures(renderer: CameraRenderer, name: str) -> Iterator[Frame]:
     points = TOURS[name]
     for number, (a, b) in enumerate(pairwise(points)):
         yaw = math.atan2(b[1] - a[1], b[0] - a[0])
-        turn = from_euler(yaw, 0.15 * math.sin(number), 0.2 * math.cos(number))
+        turn = from_rpy(0.2 * math.cos(number), 0.15 * math.sin(number), yaw)
         yield renderer.render(0, pose_to_qpos(a, turn), ("all",))["all"]
 
 
@@ -103,7 +103,7 @@ def test_nothing_hit_is_infinite_and_has_no_number(
 ) -> None:
     """Depth is inf and the number -1 in the same pixels: in the sky, and only there."""
     _, renderer, name = world
-    up = renderer.render(0, pose_to_qpos((0.0, 0.0, -1.5), from_euler(0.3, 0.9, 0.0)), ("all",))
+    up = renderer.render(0, pose_to_qpos((0.0, 0.0, -1.5), from_rpy(0.0, 0.9, 0.3)), ("all",))
     frame = up["all"]
     assert frame.depth is not None
     assert frame.segmentation is not None

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from events.rotations import from_rpy
 from sims.cameras import (
     CameraRenderer,
     CameraSpec,
@@ -23,7 +24,6 @@ from sims.cameras import (
     qvel_between,
 )
 from sims.cameras.optics import defocused, mean, moments
-from sims.frames import from_euler
 
 EXPOSURE = 0.02
 PLAIN = CameraSpec(
@@ -106,7 +106,7 @@ def test_an_open_shutter_sees_the_mean_of_the_motion(
 
     def pose(seconds: float) -> npt.NDArray[np.float64]:
         x, y, z = (v * seconds for v in velocity)
-        return pose_to_qpos((x, y, z), from_euler(yaw_rate * seconds, 0.0, 0.0))
+        return pose_to_qpos((x, y, z), from_rpy(0.0, 0.0, yaw_rate * seconds))
 
     qvel = qvel_between(pose(-1e-3), pose(1e-3), 2e-3)
     expected = mean([rgb(take(renderer, "plain", pose(t))) for t in moments(EXPOSURE, pixels)])
@@ -216,12 +216,12 @@ def test_a_velocity_of_the_wrong_length_is_named(renderer: CameraRenderer) -> No
 
 def test_velocity_between_two_poses() -> None:
     """Along north, west and up; turning about the body's own axes, in MuJoCo's."""
-    before = pose_to_qpos((1.0, 2.0, 3.0), from_euler(0.4, 0.0, 0.0))
-    after = pose_to_qpos((1.2, 2.0, 2.9), from_euler(0.5, 0.0, 0.0))
+    before = pose_to_qpos((1.0, 2.0, 3.0), from_rpy(0.0, 0.0, 0.4))
+    after = pose_to_qpos((1.2, 2.0, 2.9), from_rpy(0.0, 0.0, 0.5))
     found = qvel_between(before, after, 0.1)
     np.testing.assert_allclose(found, [2.0, 0.0, 1.0, 0.0, 0.0, -1.0], atol=1e-9)
-    nose_up = from_euler(math.pi / 2, 0.1, 0.0)
+    nose_up = from_rpy(0.0, 0.1, math.pi / 2)
     before, after = (
-        pose_to_qpos((0.0, 0.0, 0.0), q) for q in (from_euler(math.pi / 2, 0, 0), nose_up)
+        pose_to_qpos((0.0, 0.0, 0.0), q) for q in (from_rpy(0, 0, math.pi / 2), nose_up)
     )
     np.testing.assert_allclose(qvel_between(before, after, 0.1)[3:], [0.0, -1.0, 0.0], atol=1e-9)

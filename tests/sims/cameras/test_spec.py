@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from events.rotations import rotate
 from sims.cameras import (
     CameraSpec,
     add_camera,
@@ -18,7 +19,6 @@ from sims.cameras import (
     optical_in_body,
     pose_to_qpos,
 )
-from sims.frames import rotate
 
 
 def test_a_toml_table_becomes_a_spec() -> None:

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from events import Vector3
-from sims import frames
+from events import Vector3, rotations
 from sims.vehicle import STANDING_HEIGHT, Physics, PhysicsDivergedError, State
 from tests.sims.vehicle.flight import UP, compiled
 
@@ -189,7 +188,7 @@ def test_accelerometer_and_gyroscope_agree_with_the_motion_that_follows() -> Non
         assert rates == pytest.approx(before.angular_velocity, abs=1e-12)
         physics.advance_to((tick + 1) * MS)
         after = physics.state().velocity
-        felt = frames.rotate(before.orientation, force)
+        felt = rotations.rotate(before.orientation, force)
         expected = [(b - a) / 1e-3 for a, b in zip(before.velocity, after, strict=True)]
         assert (felt[0], felt[1], felt[2] + 9.81) == pytest.approx(expected, abs=1e-6)
 
@@ -216,7 +215,7 @@ def _momentum_and_energy(physics: Physics) -> tuple[Vector3, float]:
     state = physics.state()
     parameters = physics.parameters
     spin = [j * w for j, w in zip(parameters.inertia, state.angular_velocity, strict=True)]
-    momentum = frames.rotate(state.orientation, (spin[0], spin[1], spin[2]))
+    momentum = rotations.rotate(state.orientation, (spin[0], spin[1], spin[2]))
     energy = (
         0.5 * parameters.mass * sum(v * v for v in state.velocity)
         + 0.5 * sum(s * w for s, w in zip(spin, state.angular_velocity, strict=True))

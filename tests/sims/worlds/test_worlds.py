@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from events.rotations import from_rpy
 from sims.cameras import CameraRenderer, model_to_bytes, pose_to_qpos
-from sims.frames import from_euler
 from sims.worlds import CLEARANCE, TOURS, load_world, tour_length
 from tests.sims.cameras.scenes import CAMERAS, fresh, scene
 
@@ -176,7 +176,7 @@ def test_there_are_corners_everywhere(probe: tuple[str, Probe]) -> None:
     renderer = CameraRenderer(built.packed, CAMERAS, built.prefix, seed=0)
     good = []
     for place, heading in views(name, measure):
-        qpos = pose_to_qpos(place, from_euler(heading, 0.0, 0.0))
+        qpos = pose_to_qpos(place, from_rpy(0.0, 0.0, heading))
         image = renderer.render(0, qpos, ("wide",))["wide"].rgb
         assert image is not None
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

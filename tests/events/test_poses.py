@@ -1,0 +1,44 @@
+"""Poses: tuples and matrices are the same transforms."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from events import Quaternion, Vector3
+from events.poses import inverse, pose_matrix, pose_tuples, relative
+from events.rotations import from_rpy, rotate
+
+numbers = st.floats(-1e3, 1e3)
+vectors = st.tuples(numbers, numbers, numbers)
+angles = st.floats(-3.1, 3.1)
+orientations = st.builds(from_rpy, angles, st.floats(-1.5, 1.5), angles)
+
+
+@given(vectors, orientations, vectors)
+def test_a_matrix_takes_points_where_the_quaternion_does(
+    position: Vector3, orientation: Quaternion, point: Vector3
+) -> None:
+    expected = np.add(rotate(orientation, point), position)
+    found = pose_matrix(position, orientation) @ [*point, 1.0]
+    np.testing.assert_allclose(found[:3], expected, atol=1e-8)
+
+
+@given(vectors, orientations)
+def test_tuples_come_back_from_the_matrix(position: Vector3, orientation: Quaternion) -> None:
+    matrix = pose_matrix(position, orientation)
+    place, turn = pose_tuples(matrix)
+    assert place == position
+    assert turn[0] >= 0.0
+    np.testing.assert_allclose(pose_matrix(place, turn), matrix, atol=1e-12)
+    np.testing.assert_allclose(inverse(matrix) @ matrix, np.eye(4), atol=1e-9)
+
+
+@given(vectors, orientations, vectors, orientations)
+def test_a_relative_pose_is_what_leads_from_its_base_to_the_pose(
+    base: Vector3, turned: Quaternion, place: Vector3, rotation: Quaternion
+) -> None:
+    found = pose_matrix(*relative((base, turned), (place, rotation)))
+    expected = pose_matrix(place, rotation)
+    np.testing.assert_allclose(pose_matrix(base, turned) @ found, expected, atol=1e-8)
