@@ -25,7 +25,8 @@ import numpy.typing as npt
 from bench.peers.zenoh_peer import config, free_locator, publisher, subscribe
 from events import Event, Image
 from runtime import Input, Node, Output
-from runtime.config import Config, parse
+from runtime.config.model import Config
+from runtime.config.reading import parse
 from runtime.execute import execute
 
 BLOCK = 50

@@ -28,7 +28,7 @@ from nodes.ros2_bridge.keys import data_key
 from nodes.ros_messages.topics import Topic
 from nodes.ros_messages.typestore import TypeStore
 from runtime import Node, Output, Tick, every
-from runtime.config import parse
+from runtime.config.reading import parse
 from runtime.execute import execute
 
 RATE = 10_000.0

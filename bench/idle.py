@@ -7,7 +7,7 @@ import time
 import msgspec
 
 from runtime import Node, Tick, every
-from runtime.config import parse
+from runtime.config.reading import parse
 from runtime.execute import execute
 
 

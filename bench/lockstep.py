@@ -18,7 +18,7 @@ import numpy as np
 
 from events import Takeoff, VelocitySetpoint
 from runtime import Node, Output, Tick, every
-from runtime.config import parse
+from runtime.config.reading import parse
 from runtime.execute import execute
 from sims.vehicle import (
     STANDING_HEIGHT,

@@ -15,10 +15,10 @@ import uvloop
 from bench.messages import Ping, Pong
 from bench.peers.parts import payloads
 from bench.system import Case, Samples, System
-from runtime import Input, Node, NodeConfig, Output, on, steps
-from runtime.config import Config, RunConfig
+from runtime import Input, Node, NodeConfig, Output, on, tasks
+from runtime.config.model import Config, RunConfig
 from runtime.digest import Digest
-from runtime.realtime import RealClock
+from runtime.real_clock import RealClock
 from runtime.supervisor import Supervisor
 from runtime.testing import spec
 
@@ -134,7 +134,7 @@ def measure(case: Case, digest: bool = False) -> Samples:
 
     async def main() -> Any:
         loop = asyncio.get_running_loop()
-        steps.install(loop)
+        tasks.install(loop)
         clock = RealClock(loop)
         supervisor = Supervisor(config, clock, [Digest()] if digest else [])
         await supervisor.main()

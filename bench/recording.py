@@ -17,7 +17,7 @@ import numpy as np
 
 from events import Takeoff
 from runtime import Node, NodeConfig, Output, Tick, every
-from runtime.config import parse
+from runtime.config.reading import parse
 from runtime.execute import execute
 
 

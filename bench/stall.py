@@ -30,7 +30,7 @@ import numpy as np
 from bench.slow_server import slow_server
 from events import Odometry, Takeoff
 from runtime import Input, Node, NodeConfig, Output, Tick, Worker, every
-from runtime.config import parse
+from runtime.config.reading import parse
 from runtime.execute import execute
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.worlds import load_world

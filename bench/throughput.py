@@ -15,11 +15,11 @@ import uvloop
 
 from bench.messages import Ping
 from events import Event, Image, PoseEstimate, Quaternion, Vector3
-from runtime import steps
-from runtime.realtime import RealClock
+from runtime import tasks
+from runtime.real_clock import RealClock
 from runtime.sender import Listener, Sender
 from runtime.streams import Stream
-from runtime.worker import Worker
+from runtime.workers.worker import Worker
 
 
 class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -69,7 +69,7 @@ def measure(bursts: int = 400) -> list[ThroughputRow]:
 
 
 async def _measure(bursts: int) -> list[ThroughputRow]:
-    steps.install(asyncio.get_running_loop())
+    tasks.install(asyncio.get_running_loop())
     event = Ping(stamp=0, source="one", receiver=2, number=0)
     picture = np.zeros((512, 512, 3), np.uint8)
     image = Image(stamp=0, source="drone/front", frame_id="f", data=picture)

@@ -13,14 +13,14 @@ folder), `config` and `paths` (the file), `preflight` (what `check` says of it),
 from runtime import neighbours as _neighbours  # noqa: F401  # first, as it checks `events`
 from runtime.bundles import Bundle
 from runtime.clock import Clock
+from runtime.config.parameters import Changeable
 from runtime.errors import RefusedError, VisnavError
 from runtime.node import Node, NodeConfig
-from runtime.parameters import Changeable
 from runtime.ports import Input, Output, every, on
 from runtime.schedule import Tick
 from runtime.streams import Stream
 from runtime.units import Duration
-from runtime.worker import Worker
+from runtime.workers.worker import Worker
 
 __all__ = [
     "Bundle",

@@ -1,6 +1,6 @@
 """The run's clock, which is all that a node knows of time.
 
-Two implementations: `runtime.lockstep` (simulated time that jumps) and `runtime.realtime`.
+Two implementations: `runtime.lockstep` (simulated time that jumps) and `runtime.real_clock`.
 """
 
 from __future__ import annotations

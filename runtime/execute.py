@@ -18,21 +18,21 @@ import msgspec
 import numpy as np
 
 from events import Event
-from runtime import driver, results, steps
+from runtime import event_loop, results, tasks
 from runtime.clock import Clock
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.digest import Digest
 from runtime.errors import NodeError, VisnavError
-from runtime.life import log_error, with_place, wrap
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.logs import file_handler, logging_to
 from runtime.node import Node
-from runtime.realtime import RealClock
+from runtime.node_runner import log_error, with_place, wrap
+from runtime.real_clock import RealClock
 from runtime.sender import Sender, Tap
-from runtime.standstill import Standstill
 from runtime.summary import Summary, summarise
 from runtime.supervisor import Supervisor
-from runtime.watchdog import Stall, Watchdog
+from runtime.watchdogs.loop import Stall, Watchdog
+from runtime.watchdogs.progress import Standstill
 
 if TYPE_CHECKING:
     from runtime.peers.peers import Peers
@@ -71,7 +71,7 @@ def execute(
         handlers.append(file_handler(out / "log.txt"))
     run = _Run(config, out, log_events, watch, only)
     with logging_to(handlers, config.run.log, run.now):
-        summary = driver.run_to_end(run.loop, run.main(), run.escaped)
+        summary = event_loop.run_to_end(run.loop, run.main(), run.escaped)
         if out is not None:
             run.conclude(out, summary)
     if run.supervisor.error is not None:
@@ -133,7 +133,7 @@ class _Run:
     async def main(self) -> Summary:
         """Run the nodes to their end, and put together what there is to say of it."""
         loop, run = asyncio.get_running_loop(), self._config.run
-        steps.install(loop)
+        tasks.install(loop)
         clock = self._clock = make_clock(run, loop)
         self.supervisor = supervisor = Supervisor(
             self._config, clock, self._taps, self._out, self._only
@@ -226,7 +226,7 @@ def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> It
         supervisor.asked = names[signal.Signals(number)]
         loop.call_soon_threadsafe(supervisor.stop, supervisor.asked)
 
-    def interrupt(*_: Any) -> None:  # whoever blocks the loop; see `runtime.standstill`
+    def interrupt(*_: Any) -> None:  # whoever blocks the loop; see `runtime.watchdogs.progress`
         error, supervisor.interruption = supervisor.interruption, None
         if error is not None:
             raise error

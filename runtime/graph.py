@@ -12,7 +12,7 @@ from typing import Any
 from runtime.links import Link
 from runtime.node import Node, senders
 from runtime.sender import Deliver, Listener, Tap
-from runtime.steps import Fault
+from runtime.tasks import Fault
 
 Sources = Mapping[str, Mapping[str, str]]
 """Node to port to the source that the port is narrowed to."""

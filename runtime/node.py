@@ -25,13 +25,13 @@ from events import Announcement
 from runtime.bundles import Bundle, Matcher
 from runtime.clock import Clock
 from runtime.errors import DeclarationError
+from runtime.json_values import plain
 from runtime.logs import NodeLogger
-from runtime.plain import plain
 from runtime.ports import Handles, Input, Output, Ticks
 from runtime.schedule import SECOND, Tick, Ticker
 from runtime.sender import Sender
 from runtime.streams import Stream
-from runtime.worker import Worker
+from runtime.workers.worker import Worker
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -210,7 +210,7 @@ class Node(Generic[C]):
     def on_change(self, before: C) -> None:
         """Hear that `config` is a new one: somebody changed a setting while the run goes on.
 
-        Called between two steps. Only settings marked as `runtime.parameters.Changeable` change.
+        Called between two steps. Only settings marked as `runtime.Changeable` change.
 
         Args:
             before: The settings until now.

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from runtime.config import Config, to_builtins
+from runtime.config.model import Config, to_builtins
 from runtime.errors import ResultsError
 from runtime.summary import Summary
 

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import msgspec
 
-from runtime.lateness import Lateness
+from runtime.histogram import Lateness
 
 SECOND = 1_000_000_000
 

@@ -14,8 +14,8 @@ from typing import Any, Generic, TypeVar
 
 from events import Event
 from runtime.errors import ChannelClosedError, ChannelThreadError, ChannelTypeError
-from runtime.steps import FanOut, Fault
 from runtime.streams import Stream
+from runtime.tasks import FanOut, Fault
 
 T = TypeVar("T", bound=Event)
 

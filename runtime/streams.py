@@ -2,7 +2,7 @@
 
 A stream has one reader. An event that finds the reader waiting goes straight to it; any other
 is kept up to a bound, beyond which the input's declared policy decides. A reader in a task of
-ours is resumed inside `offer` (`runtime.steps`); a reader in anybody else's task is woken
+ours is resumed inside `offer` (`runtime.tasks`); a reader in anybody else's task is woken
 through the loop, for which a stream looks enough like a future.
 """
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from runtime.costs import Costs
 from runtime.digest import Digest, combined
+from runtime.json_values import plain
 from runtime.node import matchers, senders, streams
-from runtime.plain import plain
 from runtime.schedule import SECOND
-from runtime.watchdog import Stall
+from runtime.watchdogs.loop import Stall
+from runtime.workers.costs import Costs
 
 if TYPE_CHECKING:
     from runtime.supervisor import Supervisor

@@ -27,20 +27,20 @@ from typing import TYPE_CHECKING, Any
 from typing_extensions import TypeVar
 
 from events import Announcement, Event, Shutdown, WindowClosed
-from runtime import graph, places
-from runtime.changing import Changing
+from runtime import code_location, graph
 from runtime.clock import Clock
-from runtime.config import Config
-from runtime.costs import Costs
+from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
-from runtime.life import Life, log_error, wrap
+from runtime.instruments import Probes
 from runtime.links import Link
 from runtime.node import Node
-from runtime.probes import Probes
+from runtime.node_runner import Life, log_error, wrap
+from runtime.parameter_server import Changing
 from runtime.schedule import SECOND, Once, Tick, Ticker
 from runtime.sender import Deliver, Listener, Tap
 from runtime.streams import Stream
-from runtime.worker import Worker
+from runtime.workers.costs import Costs
+from runtime.workers.worker import Worker
 
 if TYPE_CHECKING:
     from runtime.peers.peers import Peers
@@ -235,7 +235,7 @@ class Supervisor:
 
     def escaped(self, error: BaseException) -> None:
         """Deal with an exception that came out of the loop: some task or callback let it."""
-        name, place = places.of_error(error)
+        name, place = code_location.of_error(error)
         if name in self._lives:
             self.fault(name, error)
             return
@@ -251,7 +251,7 @@ class Supervisor:
             return
         wrapped = wrap(name, error)
         fatal = (
-            isinstance(places.leaf(error), FatalError)
+            isinstance(code_location.leaf(error), FatalError)
             or life.spec.on_error == "stop"
             or not self._running
         )
@@ -446,7 +446,7 @@ class Supervisor:
                 life.hear(self.announcements)
                 await life.ready(self._config.run.startup_limit)
             except NodeError as error:
-                if isinstance(places.leaf(error.__cause__ or error), FatalError):
+                if isinstance(code_location.leaf(error.__cause__ or error), FatalError):
                     log_error(error, last=True)
                     self.stop(f"{name} failed", error)
                     return

@@ -17,8 +17,9 @@ from typing import Any, TypeVar
 import msgspec
 
 from events import Announcement, Event
-from runtime import steps
-from runtime.config import Config, NodeSpec, OnError, RunConfig, convert
+from runtime import tasks
+from runtime.config.model import Config, NodeSpec, OnError, RunConfig
+from runtime.config.reading import convert
 from runtime.links import LinkConfig
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.node import Node
@@ -61,7 +62,7 @@ def run_in_lockstep(main: Coroutine[Any, Any, R]) -> R:
 
     async def prepared() -> R:
         loop = asyncio.get_running_loop()
-        steps.install(loop)
+        tasks.install(loop)
         return await loop.create_task(main)
 
     with asyncio.Runner(loop_factory=LockstepLoop) as runner:

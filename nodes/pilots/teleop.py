@@ -25,8 +25,8 @@ from events import (
 )
 from nodes.window.keys import KEYS
 from runtime import Node, NodeConfig, Output, Tick, every, on
+from runtime.config.parameters import Changeable
 from runtime.errors import suggest
-from runtime.parameters import Changeable
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 

@@ -9,7 +9,7 @@ from events.rotations import yaw_of
 from nodes.pilots.pilot import Pilot, PilotConfig, Positive
 from nodes.pilots.waypoint_path import WaypointPath
 from runtime import Duration, Output, on
-from runtime.parameters import Changeable
+from runtime.config.parameters import Changeable
 
 
 class VisualPilotConfig(PilotConfig):

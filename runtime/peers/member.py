@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 from events import Event
 from runtime.errors import VisnavError, WireError
-from runtime.peers.line import Line, Put
-from runtime.peers.memory import Incoming, Outgoing
+from runtime.peers.authentication import Sealing
+from runtime.peers.clock_offsets import Exchanges
 from runtime.peers.messages import Ack, Announced, Begin, Hello, OfTheRun, Said, Wanted
-from runtime.peers.offsets import Exchanges
-from runtime.peers.seal import Sealing
+from runtime.peers.outbox import Line, Put
+from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.summary import ProcessSummary, Summary
 from runtime.wire import unpack
 

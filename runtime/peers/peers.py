@@ -12,14 +12,14 @@ import msgspec
 
 from events import Announcement, Event
 from runtime.clock import Clock
-from runtime.config import Config
+from runtime.config.model import Config
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
 from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.peers.crossing import Crossing, hearing
-from runtime.peers.ending import Ending
-from runtime.peers.following import Following, compare
-from runtime.peers.meeting import name_of
+from runtime.peers.clock_sync import Following, compare
+from runtime.peers.compatibility import name_of
+from runtime.peers.joint_shutdown import Ending
 from runtime.peers.member import Member
+from runtime.peers.membership import Roster
 from runtime.peers.messages import (
     Announced,
     Begin,
@@ -38,12 +38,12 @@ from runtime.peers.messages import (
     Stop,
     Turn,
 )
-from runtime.peers.roster import Roster
-from runtime.peers.turns import Turns
-from runtime.realtime import RealClock
+from runtime.peers.remote_events import Crossing, hearing
+from runtime.peers.time_token import Turns
+from runtime.real_clock import RealClock
 from runtime.sender import Listener
-from runtime.steps import Fault
 from runtime.summary import Summary
+from runtime.tasks import Fault
 from runtime.wire import pack, unpack
 
 log = logging.getLogger("visnav.runtime")

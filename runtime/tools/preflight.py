@@ -24,14 +24,14 @@ from typing import Any, NoReturn
 import msgspec
 
 from events import Announcement
-from runtime import steps
+from runtime import tasks
 from runtime.clock import Clock
-from runtime.config import Config, NodeSpec
+from runtime.config.model import Config, NodeSpec
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
 from runtime.execute import make_clock, make_loop
 from runtime.graph import heard_types, unconnected
-from runtime.life import Life
 from runtime.node import Node
+from runtime.node_runner import Life
 from runtime.paths import written
 from runtime.schedule import Tick, Ticker
 from runtime.sender import Listener
@@ -89,14 +89,14 @@ async def _rehearse(
     warnings: list[str],
 ) -> None:
     loop = asyncio.get_running_loop()
-    steps.install(loop)
+    tasks.install(loop)
     clock = make_clock(config.run, loop)
     host = _DryHost(config.run.seed, clock)
-    tasks: set[asyncio.Task[Any]] = set()
+    created: set[asyncio.Task[Any]] = set()
 
     def create(coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
         task = loop.create_task(coro, name=name)
-        tasks.add(task)
+        created.add(task)
         return task
 
     lives = [Life(spec, create) for spec in config.nodes]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from runtime.config import load
+from runtime.config.reading import load
 from sims.worlds import load_world
 from tests.runtime.peers.samples import free_port
 

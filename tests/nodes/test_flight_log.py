@@ -12,7 +12,7 @@ import pytest
 from events import Collision, Event, Image, Odometry
 from nodes.flight_log import FlightLog
 from runtime import Duration, Tick, every
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError
 from runtime.execute import execute
 from runtime.testing import run_node, run_nodes, spec

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from runtime.config import load
+from runtime.config.reading import load
 from runtime.execute import execute
 from runtime.testing import spec
 from tests.runs.witness import Witness

@@ -6,7 +6,7 @@ import functools
 
 import pytest
 
-from runtime import realtime
+from runtime import real_clock
 from tests.runtime.loops import LOOPS, Run
 from tests.runtime.walls import RunClock, Wall, on_clock
 
@@ -27,7 +27,7 @@ def run(request: pytest.FixtureRequest) -> Run:
 def run_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> RunClock:
     """Run on each clock; the real one's wall clock and alarm are injected."""
     wall = Wall()
-    monkeypatch.setattr(realtime, "time", wall)
-    monkeypatch.setattr(realtime, "TimerFd", wall.alarm)
+    monkeypatch.setattr(real_clock, "time", wall)
+    monkeypatch.setattr(real_clock, "TimerFd", wall.alarm)
     speed = 2.0 if request.param == "real at double speed" else 1.0
     return functools.partial(on_clock, request.param == "lockstep", speed)

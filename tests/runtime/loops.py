@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import uvloop
 
-from runtime import steps
+from runtime import tasks
 from runtime.lockstep import LockstepLoop
 
 R = TypeVar("R")
@@ -35,7 +35,7 @@ class Run:
             loop = asyncio.get_running_loop()
             loop.set_exception_handler(lambda _, context: reported.append(context))
             if self.ours:
-                steps.install(loop)
+                tasks.install(loop)
             return await loop.create_task(main)
 
         debug = self.loop == "asyncio"

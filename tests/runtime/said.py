@@ -12,7 +12,7 @@ from runtime.clock import Clock
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.node import Node, NodeConfig, make_node
 from runtime.schedule import Tick, Ticker
-from runtime.worker import Worker
+from runtime.workers.worker import Worker
 
 N = TypeVar("N", bound=Node[Any])
 W = TypeVar("W")

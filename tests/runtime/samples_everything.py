@@ -11,8 +11,8 @@ import msgspec
 
 from events import Event
 from runtime import Input, Node, NodeConfig, Output, Tick, every, on
-from runtime.parameters import Changeable
-from runtime.worker import Worker
+from runtime.config.parameters import Changeable
+from runtime.workers.worker import Worker
 
 
 class Word(Event):

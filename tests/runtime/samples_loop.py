@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from events import Event, Image, ParameterChanged, PoseEstimate, VelocitySetpoint
-from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on, steps
-from runtime.config import Config, NodeSpec, RunConfig
+from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on, tasks
+from runtime.config.model import Config, NodeSpec, RunConfig
+from runtime.config.parameters import Changeable
 from runtime.digest import Digest
 from runtime.execute import make_clock, make_loop
 from runtime.node import senders
-from runtime.parameters import Changeable
 from runtime.sender import Sender
 from runtime.supervisor import Supervisor
 
@@ -174,7 +174,7 @@ def look(
         digest(sender, event)
 
     async def main() -> None:
-        steps.install(loop)
+        tasks.install(loop)
         supervisor = Supervisor(config, make_clock(config.run, loop), [tap])
         beside = loop.create_task(after_start(supervisor, body)) if body else None
         with watch(supervisor) if watch else contextlib.nullcontext():

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from events import Event
-from runtime import Duration, steps
-from runtime.config import Config, NodeSpec, RunConfig
+from runtime import Duration, tasks
+from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.execute import make_clock, make_loop
 from runtime.sender import Sender
 from runtime.supervisor import Supervisor
@@ -40,7 +40,7 @@ def supervise(
         sent.append(event)
 
     async def main() -> Outcome:
-        steps.install(loop)
+        tasks.install(loop)
         clock = make_clock(config.run, loop)
         supervisor = Supervisor(config, clock, [tap], out)
         try:

@@ -237,7 +237,7 @@ def test_an_input_of_the_same_node_is_served_as_before() -> None:
 
 
 def test_the_file_cannot_name_a_field_that_there_is_not() -> None:
-    from runtime.config import parse
+    from runtime.config.reading import parse
 
     table = {"nodes": [{"name": "n", "type": f"{__name__}:Reader", "inputs": {"sets.z": "x"}}]}
     with pytest.raises(ConfigError, match=r"sets\.z.*did you mean"):

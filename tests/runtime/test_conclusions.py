@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from runtime import Node, NodeConfig
-from runtime.config import parse
+from runtime.config.reading import parse
 from runtime.execute import execute
 
 

@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 
 from events import Event
 from runtime import Duration, Node, Output
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.digest import Digest
 from runtime.errors import ChannelTypeError, NodeError
 from runtime.execute import execute

@@ -9,7 +9,7 @@ import pytest
 
 from events import Announcement, Event
 from runtime import Input, Node, Output, Tick, every, on
-from runtime.config import OnError
+from runtime.config.model import OnError
 from runtime.errors import ChannelFullError, FatalError, NodeError
 from runtime.testing import run_nodes, spec
 from tests.runtime.samples import Offer, Ping, Pong

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.errors import ResultsError
 from runtime.execute import execute
 from runtime.results import MARKER, claim, write

@@ -12,7 +12,8 @@ import pytest
 
 from events import Announcement
 from runtime import Duration, Input, Node, Tick, every
-from runtime.config import Config, RunConfig, find_node
+from runtime.config.model import Config, RunConfig
+from runtime.config.reading import find_node
 from runtime.errors import ConfigError, NodeError
 from runtime.execute import execute
 from runtime.links import LinkConfig

@@ -121,7 +121,7 @@ def test_an_error_behind_a_delay_is_the_nodes() -> None:
 
 
 def test_mistakes_in_the_file() -> None:
-    from runtime.config import parse
+    from runtime.config.reading import parse
 
     def read(links: Any) -> None:
         parse({"nodes": [{"name": "n", "type": f"{__name__}:Ear", "links": links}]}, "c.toml")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from runtime import Duration, Node, NodeConfig, Tick, every
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.errors import FatalError
 from runtime.execute import execute
 from runtime.logs import LEVELS, NodeLogger, file_handler, logging_to

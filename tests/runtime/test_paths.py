@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime import Changeable, Node, NodeConfig
-from runtime.config import load, to_builtins
+from runtime.config.model import to_builtins
+from runtime.config.reading import load
 from runtime.paths import InputPath, NameOrPath, OutputPath, file_names, resolve, written
 
 

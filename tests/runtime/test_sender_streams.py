@@ -10,8 +10,8 @@ import pytest
 
 from runtime.errors import ChannelFullError
 from runtime.sender import Listener, Sender
-from runtime.steps import DEPTH_LIMIT
 from runtime.streams import Stream
+from runtime.tasks import DEPTH_LIMIT
 from tests.runtime.loops import Run, turns
 from tests.runtime.said import Shouted, shouted
 

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from runtime import Duration, Input, Node
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.errors import ResultsError
 from runtime.execute import execute
 from runtime.summary import Summary

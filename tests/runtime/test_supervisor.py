@@ -13,7 +13,7 @@ import pytest
 
 from events import Announcement, Event, Shutdown, WindowClosed
 from runtime import Input, Node, NodeConfig, Output, RefusedError, Tick, every, on
-from runtime.config import NodeSpec
+from runtime.config.model import NodeSpec
 from runtime.errors import NodeError, NodeTimeoutError
 from runtime.testing import run_node, run_nodes, spec
 from tests.runtime.samples import DIARY, Diarist, Echo, Ender, Offer, Ping, Pong, Speaker

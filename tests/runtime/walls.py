@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol, TypeVar
 
-from runtime import steps
+from runtime import tasks
 from runtime.clock import Clock
 from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.realtime import RealClock
+from runtime.real_clock import RealClock
 from runtime.schedule import SECOND
 from tests.runtime.loops import turns
 
@@ -66,7 +66,7 @@ def on_clock(lockstep: bool, speed: float, main: Callable[[Clock], Coroutine[Any
 
     async def prepared() -> R:
         loop = asyncio.get_running_loop()
-        steps.install(loop)
+        tasks.install(loop)
         clock = LockstepClock(loop) if isinstance(loop, LockstepLoop) else RealClock(loop, speed)
         assert clock.now() == 0
         clock.start()

@@ -32,7 +32,7 @@ from events import (
     VelocitySetpoint,
     rotations,
 )
-from runtime.config import NodeSpec
+from runtime.config.model import NodeSpec
 from runtime.errors import ConfigError, NodeError, RefusedError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from sims.multirotor import Multirotor

@@ -6,7 +6,7 @@ import importlib
 import pkgutil
 from typing import Any
 
-from runtime.config import is_base
+from runtime.config.reading import is_base
 from runtime.errors import MissingDependencyError
 from runtime.node import Node
 

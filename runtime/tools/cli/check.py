@@ -17,7 +17,7 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     and that start and waypoints are in free space. Nothing is rendered, written or sent. Ends
     with 0, or with 2 if there is a mistake; what may be meant is a warning.
     """
-    from runtime.config import load
+    from runtime.config.reading import load
     from runtime.graph import edges
     from runtime.tools import preflight
     from runtime.tools.cli.run import leave_behind, warn

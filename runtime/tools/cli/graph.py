@@ -19,7 +19,7 @@ def graph(
     ] = None,
 ) -> None:
     """Show which node hears which, through which ports."""
-    from runtime.config import load
+    from runtime.config.reading import load
     from runtime.graph import edges
 
     settings = load(config, overrides or [])

@@ -62,7 +62,7 @@ def _add_settings(tree: Tree, config: type[Any]) -> None:
     import msgspec
     from rich.markup import escape
 
-    from runtime.parameters import is_marked
+    from runtime.config.parameters import is_marked
 
     for field in msgspec.structs.fields(config):
         inner = _struct(field.type)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from runtime.config import RunConfig
+from runtime.config.model import RunConfig
 from runtime.schedule import SECOND
 from runtime.summary import count_events
 from runtime.supervisor import Supervisor

@@ -19,7 +19,7 @@ from runtime.tools.cli.common import ConfigFile, Overrides
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from runtime.config import Config
+    from runtime.config.model import Config
     from runtime.summary import Summary, Verdict
     from runtime.tools.preflight import Findings
 
@@ -86,7 +86,7 @@ def run(
     SIGHUP or a closed window (a second Ctrl-C is immediate); with 1 if a threshold of the run was
     not met; with 2 if something failed.
     """
-    from runtime.config import load
+    from runtime.config.reading import load
     from runtime.execute import execute
     from runtime.tools.cli.watching import Lookers
 
@@ -196,14 +196,14 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
         code: The exit code.
         last: Printed at the end, to standard error.
     """
-    from runtime import driver
+    from runtime import event_loop
 
     threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node", "zenoh"))]
     until = time.monotonic() + _LAST_WAIT
     for thread in threads:
         thread.join(max(until - time.monotonic(), 0.0))
     stuck = [thread.name for thread in threads if thread.is_alive()]
-    stuck += dict.fromkeys(task.get_name() for task in driver.LEFT)
+    stuck += dict.fromkeys(task.get_name() for task in event_loop.LEFT)
     if stuck:
         print(f"warning: still busy, left behind: {', '.join(stuck)}", file=sys.stderr)
     if last:

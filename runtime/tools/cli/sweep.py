@@ -57,7 +57,7 @@ def sweep(
 
     from rich.console import Console
 
-    from runtime.config import load
+    from runtime.config.reading import load
     from runtime.tools import sweep as sweeping
     from runtime.tools.cli.run import look_at
     from runtime.tools.sweep.console import Display, summary_table

@@ -31,7 +31,8 @@ def vocabulary(
     """
     import msgspec
 
-    from runtime.config import Config, NodeSpec, convert, find_node, load
+    from runtime.config.model import Config, NodeSpec
+    from runtime.config.reading import convert, find_node, load
     from runtime.errors import ConfigError
     from runtime.execute import execute
     from runtime.logs import terminal_handler

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from runtime.config import Config
+    from runtime.config.model import Config
     from runtime.supervisor import Supervisor
     from runtime.tools.monitor.records import LastRecords
 

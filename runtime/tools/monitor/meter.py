@@ -8,7 +8,7 @@ from typing import Any
 
 from events import Event
 from runtime.clock import Clock
-from runtime.probes import Call
+from runtime.instruments import Call
 from runtime.sender import Sender, Tap
 from runtime.tools.monitor.window import Amount
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import msgspec
 
-from runtime.config import Config
+from runtime.config.model import Config
+from runtime.config.parameters import settings
 from runtime.errors import CommandError, suggest
-from runtime.life import Life
 from runtime.node import NodeConfig, senders, streams
-from runtime.parameters import settings
+from runtime.node_runner import Life
 from runtime.schedule import SECOND
 from runtime.summary import count_drops
 from runtime.supervisor import Supervisor

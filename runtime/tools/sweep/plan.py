@@ -10,7 +10,8 @@ from pathlib import Path
 import msgspec
 import tomli_w
 
-from runtime.config import Config, load, to_builtins
+from runtime.config.model import Config, to_builtins
+from runtime.config.reading import load
 from runtime.errors import ConfigError
 from runtime.tools.sweep.values import Parameter, parameter
 

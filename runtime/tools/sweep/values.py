@@ -8,8 +8,8 @@ from typing import Any
 
 import msgspec
 
+from runtime.config.override import given
 from runtime.errors import ConfigError
-from runtime.override import given
 from runtime.units import Duration
 
 _CLOSING = {"[": "]", "{": "}"}

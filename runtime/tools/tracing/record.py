@@ -17,9 +17,9 @@ from typing import Any
 from events import Event
 from runtime.clock import Clock
 from runtime.errors import ConfigError
+from runtime.instruments import Call
 from runtime.node import Node
-from runtime.probes import Call
-from runtime.realtime import RealClock
+from runtime.real_clock import RealClock
 from runtime.sender import Sender, Tap
 from runtime.supervisor import Supervisor
 from runtime.tools.tracing.spool import CHUNK, Pace, Spool

@@ -13,7 +13,7 @@ import pytest
 from nodes.dataset import DatasetWriter
 from nodes.trajectory.formats import read_euroc, read_tum
 from runtime import Duration
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.execute import execute
 from runtime.testing import spec
 from sims.computer_vision import FreeCamera

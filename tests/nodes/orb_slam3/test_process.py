@@ -23,7 +23,7 @@ from nodes.orb_slam3.vocabulary_file import write_vocabulary
 from runtime.errors import MissingDependencyError
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.testing import run_in_lockstep
-from runtime.worker import Worker
+from runtime.workers.worker import Worker
 from tests.nodes.orb_slam3.scene import CAMERA, IMU, INFO, View, views
 
 ROOT = Path(__file__).parents[3]

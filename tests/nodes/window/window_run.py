@@ -16,7 +16,7 @@ import numpy as np
 
 from events import Event, Image, KeyPressed, KeyReleased, WindowClosed, WindowResized
 from runtime import Node, NodeConfig, Output, Tick, VisnavError, every, on
-from runtime.config import parse
+from runtime.config.reading import parse
 from runtime.execute import execute
 
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)

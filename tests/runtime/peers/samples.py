@@ -15,7 +15,8 @@ import numpy as np
 
 from events import Announcement, Event, Image
 from runtime import Input, Node, NodeConfig, Output, RefusedError, Tick, every, on
-from runtime.config import Config, parse
+from runtime.config.model import Config
+from runtime.config.reading import parse
 from runtime.execute import execute
 from runtime.summary import Summary
 from runtime.supervisor import Supervisor

@@ -17,8 +17,9 @@ import msgspec
 import pytest
 import zenoh
 
-from runtime.config import Config
+from runtime.config.model import Config
 from runtime.execute import execute
+from runtime.peers.authentication import Seal
 from runtime.peers.messages import (
     NEVER,
     Ack,
@@ -42,7 +43,6 @@ from runtime.peers.messages import (
     Wanted,
     encode,
 )
-from runtime.peers.seal import Seal
 from tests.runtime.peers.samples import Process, free_port, settings
 from tests.runtime.peers.test_runs import THREE
 

@@ -9,8 +9,8 @@ import pytest
 
 from runtime.errors import PeerError
 from runtime.execute import execute
-from runtime.peers.line import Line
 from runtime.peers.messages import Message, Parted
+from runtime.peers.outbox import Line
 from tests.runtime.peers.samples import Process, apart, settings
 
 THREE: tuple[tuple[str, str, dict[str, Any]], ...] = (

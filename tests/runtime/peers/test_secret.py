@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from runtime.config import Config, NetworkConfig, parse, to_builtins
+from runtime.config.model import Config, NetworkConfig, to_builtins
+from runtime.config.reading import parse
 from runtime.errors import PeerError
 from runtime.peers.secret import secret_of
 

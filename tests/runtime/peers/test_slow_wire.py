@@ -7,7 +7,7 @@ import re
 import msgspec
 import pytest
 
-from runtime.config import Config
+from runtime.config.model import Config
 from runtime.execute import execute
 from tests.runtime.peers.relay import slow_wire
 from tests.runtime.peers.samples import Process, settings

@@ -10,7 +10,7 @@ import pytest
 
 from events import Announcement, EstimatorAnnouncement, Image, Score
 from runtime import Input, Node, NodeConfig, Output
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.errors import UncheckableError
 from runtime.paths import OutputPath
 from runtime.testing import run_nodes, spec

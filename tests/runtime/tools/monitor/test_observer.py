@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from runtime import Duration
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
 from runtime.supervisor import Supervisor
 from runtime.testing import spec

@@ -12,7 +12,7 @@ from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from runtime.config import Config, RunConfig
+from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
 from runtime.supervisor import Supervisor
 from runtime.testing import spec

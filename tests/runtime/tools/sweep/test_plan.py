@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runtime.config import load
+from runtime.config.reading import load
 from runtime.errors import ConfigError
 from runtime.tools.sweep import make_plan
 from tests.runtime.tools.sweep.samples import judge_file, plan_in

@@ -1,0 +1,97 @@
+"""Where code stands or has failed: the node, and the line of it.
+
+Of a thread (by its frame), of a task that waits, of an exception. Not here: watching over a loop
+(`runtime.watchdogs.loop`) or a run (`runtime.watchdogs.progress`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from runtime.node import Node
+
+
+def line(frame: FrameType, number: int | None = None) -> str:
+    """Return ``file:line in function``, the file with its whole path."""
+    return f"{frame.f_code.co_filename}:{number or frame.f_lineno} in {frame.f_code.co_name}"
+
+
+def short(place: str) -> str:
+    """Return a place with no more of the file's path than its folder."""
+    file, colon, rest = place.partition(":")
+    return "/".join(Path(file).parts[-2:]) + colon + rest
+
+
+def of_thread(frame: FrameType | None) -> tuple[str, str]:
+    """Return the node and the line of it in which a thread is; else ``runtime`` and its line."""
+    frames = []
+    while frame is not None:
+        frames.append((frame, frame.f_lineno))
+        frame = frame.f_back
+    return _innermost(frames)
+
+
+def of_task(task: asyncio.Task[Any]) -> tuple[str, str]:
+    """Return the node and the line of it at which a task waits; else ``runtime`` and a line."""
+    return _innermost(list(_awaiting(task))[::-1])
+
+
+def ready_on(loop: asyncio.AbstractEventLoop) -> list[tuple[str, str]]:
+    """Return node and line of each task that a loop of asyncio's own is about to go on with."""
+    callbacks = [handle._callback for handle in list(loop._ready)]  # type: ignore[attr-defined]
+    owners = [getattr(callback, "__self__", None) for callback in callbacks]
+    return [of_task(owner) for owner in owners if isinstance(owner, asyncio.Task)]
+
+
+def of_error(error: BaseException) -> tuple[str, str]:
+    """Return the node and the line of it that raised an exception; else ``runtime`` and a line."""
+    frames = []
+    trace = leaf(error).__traceback__
+    while trace is not None:
+        frames.append((trace.tb_frame, trace.tb_lineno))
+        trace = trace.tb_next
+    return _innermost(frames[::-1])
+
+
+def leaf(error: BaseException) -> BaseException:
+    """Return the exception that a group of one holds; any other as it is."""
+    while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
+        error = error.exceptions[0]
+    return error
+
+
+def waits_for(task: asyncio.Task[Any], future: asyncio.Future[Any]) -> bool:
+    """Tell whether a task waits for this future."""
+    return getattr(task, "_fut_waiter", None) is future
+
+
+def _awaiting(task: asyncio.Task[Any]) -> Iterator[tuple[FrameType, int]]:
+    """Yield the frames of a task's coroutine and of what it awaits, the outermost first."""
+    coro: Any = task.get_coro()
+    while coro is not None:
+        for kind in ("cr", "gi", "ag"):
+            if (frame := getattr(coro, f"{kind}_frame", None)) is not None:
+                yield frame, frame.f_lineno
+                coro = getattr(coro, "gi_yieldfrom" if kind == "gi" else f"{kind}_await", None)
+                break
+        else:
+            return
+
+
+def _innermost(frames: Iterable[tuple[FrameType, int]]) -> tuple[str, str]:
+    """Return the node and line of the first frame that is a node's own, given the innermost first.
+
+    If none is: ``runtime``, and the line of the first.
+    """
+    innermost = "?"
+    for frame, number in frames:
+        if innermost == "?":
+            innermost = line(frame, number)
+        owner = frame.f_locals.get("self") if "self" in frame.f_code.co_varnames else None
+        if isinstance(owner, Node) and not frame.f_code.co_filename.endswith("runtime/node.py"):
+            return owner.name, line(frame, number)
+    return "runtime", innermost

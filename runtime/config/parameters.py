@@ -1,0 +1,206 @@
+"""Settings that can change while a run goes on.
+
+    class PilotConfig(NodeConfig):
+        waypoints: tuple[Vector3, ...]
+        gain: Changeable[float] = 1.0
+
+A node finds the new value in `self.config`, and may say in `on_change` what is to be done about
+it. Whatever the file accepts there is accepted, and nothing else. Here is only what becomes of
+the settings; who asks for it is in `runtime.tools.monitor`, and who does it in
+`runtime.supervisor`.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin
+
+import msgspec
+import tomli_w
+
+from runtime.config.override import override
+from runtime.config.reading import convert
+from runtime.errors import ConfigError
+from runtime.node import NodeConfig
+from runtime.paths import unmarked
+from runtime.units import plain
+
+T = TypeVar("T")
+
+_MARK = "changeable"
+
+Changeable = Annotated[T, msgspec.Meta(extra={_MARK: True})]
+"""Around the type of a setting that can change in a run: ``Changeable[float]``. Within a table or
+a list of tables it says so of one setting (``drone.cameras.front.loss``), around one, of all."""
+
+
+class Change(NamedTuple):
+    """What becomes of a node's settings.
+
+    Attributes:
+        node: Its name; empty if nothing does.
+        config: The new settings.
+        values: Each new value, as TOML, by key: ``gain``, ``cameras.front.loss``.
+    """
+
+    node: str
+    config: NodeConfig
+    values: dict[str, str]
+
+
+def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
+    """Change a setting of one of several nodes.
+
+    Args:
+        configs: The nodes' settings, by name.
+        text: ``node.key=value``, as for ``--set``; ``front.loss`` does for
+            ``drone.cameras.front.loss`` if nothing else has that name.
+
+    Raises:
+        ConfigError: There is no such setting, it cannot change, or not to this value.
+    """
+    text = text.strip()
+    first = text.partition("=")[0].strip().partition(".")[0]
+    if first in {"run", "network"}:
+        raise ConfigError(f"{text}: expected node.key=value: what [{first}] says holds to its end")
+    before = {name: _table(config) for name, config in configs.items()}
+    tables = [{"name": name} | copy.deepcopy(table) for name, table in before.items()]
+    try:
+        override({"nodes": tables}, text)
+    except ConfigError as error:
+        raise ConfigError(str(error).removeprefix("--set ")) from None
+    for (name, config), table in zip(configs.items(), tables, strict=True):
+        if table.pop("name") != name:
+            raise ConfigError(f"{text}: expected node.key=value: a node's name cannot change")
+        if table != before[name]:
+            return _checked(name, config, convert(unmarked(table), type(config), name))
+    return Change("", NodeConfig(), {})
+
+
+def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
+    """Return the keys of the settings that can change; ``cameras.*.loss`` is every camera's."""
+    found = []
+    for field in _fields(type_):
+        key = f"{before}{field.encode_name}"
+        inner = _struct_in(field.type)
+        if is_marked(field.type):
+            found.append(key)
+        elif inner is not None:
+            found += changeable(inner, f"{key}." if inner is field.type else f"{key}.*.")
+    return found
+
+
+def _checked(name: str, before: NodeConfig, after: NodeConfig) -> Change:
+    """Return a change if all that differs may."""
+    values = {}
+    for path, value in _differences(_table(before), _table(after)):
+        key = ".".join(path)
+        if not _may_change(type(before), path):
+            listed = ", ".join(changeable(type(before))) or "nothing"
+            raise ConfigError(
+                f"{name}.{key}: cannot change while the run goes on: of {name}, {listed} can"
+            )
+        values[key] = toml(value)
+    return Change(name, after, values)
+
+
+def toml(value: Any) -> str:
+    """Return a value as it would stand in the file behind the equals sign, in one line."""
+    if isinstance(value, list):
+        return f"[{', '.join(toml(each) for each in value)}]"
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {toml(each)}' for key, each in value.items())} }}"
+    return tomli_w.dumps({"v": value}).strip().removeprefix("v = ")
+
+
+def _table(config: msgspec.Struct) -> dict[str, Any]:
+    """Return settings as `tomllib` would read them; what is not set is left out."""
+    found: dict[str, Any] = _without_none(msgspec.to_builtins(config, enc_hook=plain))
+    return found
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_none(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(v) for v in value]
+    return value
+
+
+def _differences(before: Any, after: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield where two tables differ, and what is there in the second."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in dict.fromkeys([*before, *after]):
+            for path, value in _differences(before.get(key), after.get(key)):
+                yield (key, *path), value
+    elif _names(before) and _names(before) == _names(after):
+        for one, other in zip(before, after, strict=True):
+            for path, value in _differences(one, other):
+                yield (one["name"], *path), value
+    elif before != after:
+        yield (), after
+
+
+def _names(value: Any) -> list[str]:
+    """Return the names of a list of tables that all have one."""
+    if not isinstance(value, list) or not all(isinstance(v, dict) and "name" in v for v in value):
+        return []
+    return [v["name"] for v in value]
+
+
+def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
+    """Tell whether the setting at a path, or what it stands in, is marked."""
+    struct = type_
+    for name in path:
+        if struct is None:
+            return False
+        field = next((f for f in _fields(struct) if f.encode_name == name), None)
+        if field is None:  # the name of an entry of a list
+            continue
+        if is_marked(field.type):
+            return True
+        struct = _struct_in(field.type)
+    return False
+
+
+@functools.cache  # reading annotations takes some tenths of a millisecond
+def _fields(type_: type[msgspec.Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    return msgspec.structs.fields(type_)
+
+
+def is_marked(type_: Any) -> bool:
+    """Tell whether a setting of this type can change in a run."""
+    marks = type_.__metadata__ if get_origin(type_) is Annotated else ()
+    return any(isinstance(m, msgspec.Meta) and (m.extra or {}).get(_MARK) for m in marks)
+
+
+def _struct_in(type_: Any) -> Any:
+    """Return the struct that a type is, or is a list of."""
+    while type_ is not None and not hasattr(type_, "__struct_fields__"):
+        type_ = next(iter(get_args(type_)), None)
+    return type_
+
+
+def settings(config: NodeConfig) -> dict[str, str]:
+    """Return the settings that can change with their values, as `Change.values`."""
+    found: dict[str, str] = {}
+
+    def walk(type_: Any, value: Any, before: str) -> None:
+        for field in _fields(type_):
+            key, inner = f"{before}{field.encode_name}", value.get(field.encode_name)
+            struct = _struct_in(field.type)
+            if inner is None:
+                continue
+            if is_marked(field.type):
+                found[key] = toml(inner)
+            elif isinstance(inner, dict) and struct is not None:
+                walk(struct, inner, f"{key}.")
+            elif names := _names(inner):
+                for name, entry in zip(names, inner, strict=True):
+                    walk(struct, entry, f"{key}.{name}.")
+
+    if changeable(type(config)):
+        walk(type(config), _table(config), "")
+    return found

@@ -1,0 +1,286 @@
+"""From a TOML file to typed settings, with errors that say where, what was expected and found.
+
+[run]                                   # -> RunConfig
+clock = "lockstep"
+
+[network]                               # -> NetworkConfig, for a run in several processes
+
+[[nodes]]                               # -> NodeSpec, one a node, in order
+name = "drone"
+type = "sims.multirotor:Multirotor"     # module:Class
+on_error = "stop"                       # optional, like `inputs`
+inputs = { setpoints = "tour" }         # narrow a port to a source
+links = { setpoints = { delay = "80ms" } }  # make the way there worse than perfect
+rate = 30                               # all other keys: the node's own settings
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import math
+import re
+import sys
+import tomllib
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from runtime.config.messages import explain, show
+from runtime.config.model import Config, NetworkConfig, NodeSpec, OnError, RunConfig
+from runtime.config.override import override
+from runtime.errors import ConfigError, DeclarationError, VisnavError, suggest
+from runtime.links import LinkConfig
+from runtime.node import Node
+from runtime.paths import resolve, unmarked
+from runtime.ports import MAX_HZ
+from runtime.units import Duration
+
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+class _NodeHead(msgspec.Struct, frozen=True, kw_only=True):
+    name: str
+    type: str
+    on_error: OnError = "stop"
+    inputs: dict[str, str] = {}
+    links: dict[str, Any] = {}
+
+
+def load(path: Path, overrides: Sequence[str] = ()) -> Config:
+    """Read a file.
+
+    Args:
+        path: The TOML file. Its folder is where relative paths in it start, and where modules of
+            its nodes are looked for, too.
+        overrides: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word.
+
+    Raises:
+        ConfigError: Something in it is wrong.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: expected a readable file, found: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: expected UTF-8 text, found {error.reason}") from None
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: expected TOML, found: {error}") from None
+    except ValueError as error:  # of Python's int()
+        raise ConfigError(f"{path}: expected numbers of a usual size, found: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: expected TOML, found brackets nested too deep") from None
+    folder = path.resolve().parent
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+    for change in overrides:
+        override(table, change)
+    return parse(table, path.name, folder)
+
+
+def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> Config:
+    """Turn a table, as `tomllib` gives it, into settings.
+
+    Args:
+        table: Of the whole file.
+        where: Begins the message of an error.
+        folder: Where relative paths start; the working directory if not given.
+
+    Raises:
+        ConfigError: Something in it is wrong.
+    """
+    folder = folder or Path.cwd()
+    _refuse_extremes(table, where)
+    for key in table:
+        if key not in {"run", "network", "nodes"}:
+            raise ConfigError(
+                f"{where}: expected tables [run], [network] and [[nodes]], found {key!r}"
+                + suggest(key, ["run", "network", "nodes"])
+            )
+    run = convert(unmarked(table.get("run", {})), RunConfig, f"{where}: run")
+    if not run.name.strip() or "/" in run.name or "\0" in run.name or run.name.startswith("."):
+        raise ConfigError(
+            f"{where}: run.name: expected a name for a folder, without / and not beginning with "
+            f"a dot, found {show(run.name)}"
+        )
+    if run.clock == "real" and run.speed in {"max", math.inf}:
+        raise ConfigError(
+            f'{where}: run.speed: expected a number with clock "real", found {show(run.speed)}'
+        )
+    nodes = table.get("nodes", [])
+    if not isinstance(nodes, list) or not nodes:
+        raise ConfigError(f"{where}: nodes: expected at least one [[nodes]] table, found none")
+    specs: list[NodeSpec] = []
+    for index, entry in enumerate(nodes):
+        spec = _node(entry, f"{where}: nodes[{index}]", folder)
+        if spec.name in {other.name for other in specs}:
+            raise ConfigError(
+                f"{where}: nodes[{index}].name: expected a name that no other node has, "
+                f"found {show(spec.name)} a second time"
+            )
+        specs.append(spec)
+    network = convert(
+        resolve(table.get("network", {}), NetworkConfig, folder), NetworkConfig, f"{where}: network"
+    )
+    if not re.fullmatch(r"\w+/.+", network.meet):
+        raise ConfigError(
+            f"{where}: network.meet: expected a Zenoh endpoint such as tcp/192.168.0.7:7450, "
+            f"found {show(network.meet)}"
+        )
+    return Config(run=run, nodes=tuple(specs), network=network)
+
+
+def _refuse_extremes(table: Mapping[str, Any], where: str) -> None:
+    """Refuse what TOML does not promise to hold, and nothing after this expects."""
+    left: list[tuple[Any, int]] = [(table, 0)]
+    while left:
+        value, depth = left.pop()
+        if isinstance(value, Mapping):
+            left += [(each, depth + 1) for each in value.values()]
+        elif isinstance(value, list):
+            left += [(each, depth + 1) for each in value]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ConfigError(f"{where}: expected whole numbers of 64 bits, found a larger one")
+        if depth > _DEEPEST:
+            raise ConfigError(
+                f"{where}: expected tables and lists at most {_DEEPEST} deep, found deeper ones"
+            )
+
+
+_DEEPEST = 32
+
+
+def find_node(type_: str, where: str) -> type[Node[Any]]:
+    """Import the class that ``module:Class`` names.
+
+    Raises:
+        ConfigError: There is no such module or class, or it is not a node.
+    """
+    module_name, _, class_name = type_.partition(":")
+    if not re.fullmatch(r"\w+(\.\w+)*:\w+", type_):
+        raise ConfigError(f'{where}: expected "module:Class", found {show(type_)}')
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not module_name.startswith(error.name):
+            raise ConfigError(f"{where}: {module_name} needs a module {error.name!r}") from error
+        raise ConfigError(
+            f"{where}: expected a module that can be imported, found {show(module_name)}"
+            + suggest(module_name, _known_modules())
+        ) from None
+    except ImportError as error:
+        raise ConfigError(f"{where}: {module_name} cannot be imported: {error}") from error
+    except DeclarationError as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        here = str(Path(__file__).parent)
+        last = [frame for frame in frames if not frame.filename.startswith(here)][-1]
+        place = f"{last.filename}, line {last.lineno}"
+        raise ConfigError(f"{where}: {module_name}: {error} ({place})") from error
+    except VisnavError:
+        raise
+    except Exception as error:  # whatever a module of the user's does
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        place = "" if isinstance(error, SyntaxError) else f" ({last.filename}, line {last.lineno})"
+        raise ConfigError(
+            f"{where}: {module_name} cannot be imported: {type(error).__name__}: {error}{place}"
+        ) from error
+    known = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Node) and not is_base(value)
+    }
+    if class_name not in known:
+        raise ConfigError(
+            f"{where}: expected a node of {module_name}, found {show(class_name)}"
+            + suggest(class_name, known)
+        )
+    return known[class_name]
+
+
+def is_base(cls: type[Node[Any]]) -> bool:
+    """Tell whether a class is there to be subclassed, and no node for a file."""
+    return cls is Node or inspect.isabstract(cls)
+
+
+def convert(value: Any, type_: type[S], where: str) -> S:
+    """Turn a table into a struct.
+
+    Raises:
+        ConfigError: A key is unknown or missing, or a value is of the wrong type or size.
+    """
+    try:
+        return msgspec.convert(value, type_, dec_hook=_decode)
+    except msgspec.ValidationError as error:
+        raise ConfigError(explain(str(error), value, type_, where)) from None
+
+
+def _node(entry: Any, where: str, folder: Path) -> NodeSpec:
+    if not isinstance(entry, dict):
+        raise ConfigError(f"{where}: expected a table, found {show(entry)}")
+    keys = {f.name for f in msgspec.structs.fields(_NodeHead)}
+    head = convert(unmarked({k: v for k, v in entry.items() if k in keys}), _NodeHead, where)
+    if not re.fullmatch(r"[A-Za-z_][\w-]*", head.name):
+        raise ConfigError(
+            f"{where}.name: expected a letter, then letters, digits, _ and -, "
+            f"found {show(head.name)}"
+        )
+    if head.name in {"run", "network"}:
+        raise ConfigError(
+            f"{where}.name: expected any name but those of the file's other tables, found "
+            f"{show(head.name)}"
+        )
+    where = f"{where} ({head.name})"
+    cls = find_node(head.type, f"{where}: type")
+    rest = {k: v for k, v in entry.items() if k not in keys}
+    config = convert(resolve(rest, cls.config_type, folder), cls.config_type, where)
+    ports = [*cls.declared.listening, *cls.declared.bundle_fields()]
+    for key, port in [("inputs", p) for p in head.inputs] + [("links", p) for p in head.links]:
+        if port not in ports:
+            raise ConfigError(
+                f"{where}: {key}: expected an input or handler of {head.type}, "
+                f"found {show(port)}" + suggest(port, ports)
+            )
+    for method, ticks in cls.declared.ticks.items():
+        if isinstance(ticks.hz, str):
+            rate = getattr(config, ticks.hz, None)
+            if not isinstance(rate, int | float) or not 0 < rate <= MAX_HZ:
+                raise ConfigError(
+                    f"{where}: {ticks.hz}: expected a rate above 0, up to {MAX_HZ} Hz, "
+                    f"for {method}, found {show(rate)}"
+                )
+    return NodeSpec(
+        name=head.name,
+        type_name=head.type,
+        on_error=head.on_error,
+        inputs=head.inputs,
+        links={
+            port: convert(link, LinkConfig, f"{where}: links.{port}")
+            for port, link in head.links.items()
+        },
+        node=cls,
+        config=config,
+    )
+
+
+def _decode(type_: type[Any], value: Any) -> Any:
+    if issubclass(type_, Duration):
+        return type_.parse(value)
+    raise NotImplementedError(f"settings of type {type_}")
+
+
+def _known_modules() -> list[str]:
+    """Return the names of the modules in our rooms for nodes, without importing them."""
+    names = []
+    for room in ("sims", "nodes"):
+        spec = importlib.util.find_spec(room)
+        for folder in (spec and spec.submodule_search_locations) or ():
+            for file in Path(folder).rglob("*.py"):
+                inside = file.relative_to(folder).with_suffix("").parts
+                names.append(".".join((room, *inside)).removesuffix(".__init__"))
+    return names

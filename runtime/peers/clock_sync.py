@@ -1,0 +1,116 @@
+"""Real time on several machines: beginning together, and staying so though quartzes differ.
+
+Two machines' clocks part by some 20 µs a second. Ours runs a little quicker or slower until it
+shows what the other one does, and never jumps.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from runtime.peers.clock_offsets import KEPT
+from runtime.peers.member import Member
+from runtime.peers.messages import Ping
+from runtime.real_clock import RealClock
+from runtime.schedule import SECOND
+
+PERIOD = 0.1
+"""Seconds between two exchanges."""
+
+EXCHANGES = 10
+"""Of which the quickest says how late our clock is."""
+
+LIMIT = 500e-6
+"""How much quicker or slower our clock may run, as NTP has it; quartzes differ by a tenth of it."""
+
+
+async def compare(
+    member: Member, until: Callable[[Callable[[], bool]], Coroutine[Any, Any, None]]
+) -> None:
+    """Learn how far the monotonic clock of another process is from ours.
+
+    Args:
+        member: The process.
+        until: Waits for something that other processes bring about.
+    """
+    for _ in range(KEPT):
+        count = member.exchanges.count
+        ask(member)
+        await until(lambda n=count: member.exchanges.count > n)  # type: ignore[misc]
+
+
+def ask(member: Member) -> None:
+    """Ask what time it is there."""
+    member.line.send(Ping(time.monotonic_ns()))
+
+
+class Pursuit:
+    """How quickly to run to catch up with a clock: a phase-locked loop of the second order.
+
+    It is critically damped and settles in half a minute. (As in RFC 5905, section 11.3.)
+
+    Attributes:
+        drift: How much quicker the other clock is, as far as is known.
+    """
+
+    PROPORTIONAL = 0.2  # a second
+    INTEGRAL = PROPORTIONAL**2 / 4
+
+    def __init__(self) -> None:
+        self.drift = 0.0
+
+    def factor(self, late: float, seconds: float) -> float:
+        """Return how quickly to run from here on.
+
+        Args:
+            late: Seconds by which our clock is late.
+            seconds: Since the last time.
+        """
+        drift = self.drift + self.INTEGRAL * late * seconds
+        wanted = drift + self.PROPORTIONAL * late
+        if abs(wanted) < LIMIT:  # else this is more than drift
+            self.drift = drift
+        return 1.0 + min(max(wanted, -LIMIT), LIMIT)
+
+
+class Following:
+    """Keeps our clock with that of another process.
+
+    Args:
+        clock: Ours.
+        member: The other process.
+    """
+
+    def __init__(self, clock: RealClock, member: Member) -> None:
+        self.member = member
+        self._clock = clock
+        self._pursuit = Pursuit()
+        self._loop = asyncio.get_running_loop()
+        self._asked = 0
+        self._handle = self._loop.call_later(PERIOD, self._ask)
+
+    def stop(self) -> None:
+        """Look no more."""
+        self._handle.cancel()
+
+    def go_on_alone(self) -> None:
+        """Look no more, and run as quickly as the other clock did."""
+        self.stop()
+        self._clock.steer(1.0 + self._pursuit.drift)
+
+    def _ask(self) -> None:
+        ask(self.member)
+        self._asked += 1
+        if self._asked % EXCHANGES == 0:
+            self._steer()
+        self._handle = self._loop.call_later(PERIOD, self._ask)
+
+    def _steer(self) -> None:
+        best = self.member.exchanges.best(EXCHANGES - 1)  # the last was asked for just now
+        if best is not None:
+            late = best.late / self._clock.speed / SECOND
+            self._clock.steer(self._pursuit.factor(late, PERIOD * EXCHANGES))
+            self.member.drift_ppm = self._pursuit.drift * 1e6

@@ -1,0 +1,210 @@
+"""Greetings: how two processes that see each other come to a session.
+
+Each greets the other with a nonce; who answers ours with the seal of the run is there now, and
+knows the secret: then a session begins, and only what it seals is heard. A greeting that answers
+nothing may be an old one, and changes nothing. A new session ends the one before: the other
+process had lost us.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import threading
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from runtime.errors import PeerError, VisnavError, WireError
+from runtime.peers.authentication import NONCE, ForgedError, Sealing, hello_seal
+from runtime.peers.member import Member
+from runtime.peers.messages import Hello, decode, encode
+from runtime.peers.zenoh_session import Heard, Session
+
+if TYPE_CHECKING:
+    from runtime.peers.membership import Roster
+
+log = logging.getLogger("visnav.runtime")
+
+GREET_EVERY = 0.2
+"""Seconds between two greetings of a process that has not answered."""
+
+STRANGERS = 256
+"""Processes without a session that are greeted; of more than these, the others are not seen."""
+
+
+class Contact:
+    """A process that shows itself, whoever it may be.
+
+    Attributes:
+        nonce: In our greetings, until one is answered.
+        member: Who it is, while there is a session.
+        doubt: Nonce of a greeting of another session than ours, until it is replied to.
+    """
+
+    def __init__(self) -> None:
+        self.nonce = secrets.token_bytes(NONCE)
+        self.member: Member | None = None
+        self.doubt = b""
+
+
+class Greeting:
+    """All processes that show themselves, and our sessions with them.
+
+    Zenoh calls while it holds locks of its own: what asks it for something is left to the loop.
+
+    Args:
+        key: Of the run.
+        session: With Zenoh.
+        roster: Says who we are, and is told whom we meet.
+
+    Attributes:
+        id: By which the others know us.
+        refused: Messages that were left out, since nobody of the run wrote them.
+    """
+
+    def __init__(self, key: bytes, session: Session, roster: Roster) -> None:
+        self.id = session.id
+        self.refused = 0
+        self._key = key
+        self._session = session
+        self._roster = roster
+        self._lock = threading.Lock()
+        self._contacts: dict[str, Contact] = {}
+        self._complained: set[str] = set()
+        self._enough = threading.Event()
+
+    def begin(self, heard: Heard) -> None:
+        """Show ourselves, and greet those who do not answer again and again."""
+        self._session.appear(heard, self.see)
+        threading.Thread(target=self._greet, name="greet", daemon=True).start()
+
+    async def close(self) -> None:
+        """Say the last words, and leave."""
+        self._enough.set()
+        for member in self.members():
+            await asyncio.to_thread(member.line.close)
+        await asyncio.to_thread(self._session.close)
+
+    def member(self, sender: str) -> Member | None:
+        """Return the process with which there is a session."""
+        contact = self._contacts.get(sender)
+        return None if contact is None else contact.member
+
+    def members(self) -> list[Member]:
+        """Return all processes with which there is a session."""
+        with self._lock:
+            return [c.member for c in self._contacts.values() if c.member is not None]
+
+    def see(self, other: str, here: bool) -> None:
+        """Take in that a process appears or disappears."""
+        with self._lock:
+            contact = self._contact(other) if here else self._contacts.pop(other, None)
+            if not here:
+                self._complained.add(other)  # its last words may come late
+        if contact is None:
+            return
+        if here:
+            self._roster.soon(self._greet_one, other, contact.nonce)
+        elif contact.member is not None:
+            self._roster.soon(self._roster.went, contact.member)
+
+    def hear(self, sender: str, sealed: bytes) -> None:
+        """Take in a greeting; begin a session if it is a fresh one.
+
+        Raises:
+            ForgedError: It is none of the run's.
+            PeerError: It is of another version.
+        """
+        seal = hello_seal(self._key, sender, self.id)
+        try:
+            hello = decode(seal.take_off(0, sealed))
+        except ForgedError:
+            raise
+        except WireError as error:
+            raise PeerError(f"expected a process that speaks as we do: {error}") from None
+        if not isinstance(hello, Hello):
+            raise ForgedError("expected a hello of a process without a session")
+        soon = self._roster.soon
+        with self._lock:
+            contact = self._contact(sender)
+            if contact is None:
+                return
+            before = contact.member
+            if hello.seen == contact.nonce and (
+                before is None or hello.session != before.sealing.tag
+            ):
+                sealing = Sealing(self._key, (self.id, contact.nonce), (sender, hello.nonce))
+                contact.member = member = Member(
+                    sender,
+                    hello,
+                    sealing,
+                    lambda message, payload: self._session.put(sender, message, payload),
+                    lambda error: self._roster.unsent(member, error),
+                )
+                contact.nonce, contact.doubt = secrets.token_bytes(NONCE), b""
+                # Before anything that the loop seals for the session.
+                soon(self._greet_one, sender, sealing.nonce, sealing.seen, sealing.tag)
+                if before is not None:
+                    soon(self._roster.went, before, "their process had lost us")
+                soon(self._roster.met, member)
+            elif before is None:
+                soon(self._greet_one, sender, contact.nonce, hello.nonce)
+            elif hello.session == before.sealing.tag:
+                pass  # all is well, or it is an old one
+            elif hello.nonce == before.sealing.seen:  # ours did not get there
+                mine = before.sealing
+                soon(self._greet_one, sender, mine.nonce, mine.seen, mine.tag)
+            else:
+                contact.doubt = hello.nonce
+
+    def refuse(self, sender: str, error: VisnavError) -> None:
+        """Say, once of each of so many, who is not heard."""
+        self.refused += 1
+        if sender not in self._complained and len(self._complained) < STRANGERS:
+            self._complained.add(sender)
+            log.warning("from %s: %s (network.secret): left out", sender, error)
+
+    def end(self, sender: str, error: WireError) -> None:
+        """End a session in which something went wrong; there may be another."""
+        with self._lock:
+            contact = self._contacts.get(sender)
+            member = None if contact is None else contact.member
+            if contact is None or member is None:
+                return
+            contact.member = None
+        self._roster.soon(self._roster.went, member, f"their process is not understood: {error}")
+
+    def greet_again(self) -> None:
+        """Greet those who have not answered, and those who may be in another session than we."""
+        due = []
+        with self._lock:
+            for other, contact in self._contacts.items():
+                if contact.member is None:
+                    due.append((other, contact.nonce, b"", b""))
+                elif contact.doubt:
+                    tag = contact.member.sealing.tag
+                    due.append((other, contact.nonce, contact.doubt, tag))
+                contact.doubt = b""
+        for each in due:
+            self._greet_one(*each)
+
+    def _greet(self) -> None:
+        while not self._enough.wait(GREET_EVERY):
+            self.greet_again()
+
+    def _greet_one(self, other: str, nonce: bytes, seen: bytes = b"", tag: bytes = b"") -> None:
+        hello = msgspec.structs.replace(self._roster.hello, nonce=nonce, seen=seen, session=tag)
+        seal = hello_seal(self._key, self.id, other)
+        with contextlib.suppress(PeerError):  # the session is closed
+            self._session.put(other, seal.put_on(0, encode(hello)), b"")
+
+    def _contact(self, other: str) -> Contact | None:
+        """Return what is known of a process, noted if it is new; `None` if too many are."""
+        if other not in self._contacts:
+            if sum(c.member is None for c in self._contacts.values()) >= STRANGERS:
+                return None
+            self._contacts[other] = Contact()
+        return self._contacts[other]

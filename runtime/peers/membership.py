@@ -1,0 +1,364 @@
+"""Who is there: the processes that have met, those that come, and those that go.
+
+What Zenoh's threads bring is handed to the loop here; of the rest of this room only greetings and
+lines know of threads.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import os
+import socket
+import time
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from events import Event
+from runtime.config.model import Config
+from runtime.errors import PeerError, VisnavError, WireError
+from runtime.peers.authentication import ForgedError, derive, is_hello
+from runtime.peers.clock_offsets import Exchange
+from runtime.peers.compatibility import check_fits, missing, name_of, say_missing, what_all_share
+from runtime.peers.handshake import Greeting
+from runtime.peers.member import Member
+from runtime.peers.messages import (
+    Ack,
+    Hello,
+    Mapped,
+    Memory,
+    Message,
+    OfTheRun,
+    Ping,
+    Pong,
+    Said,
+    Stop,
+    decode,
+)
+from runtime.peers.secret import secret_of
+from runtime.peers.shared_memory import Incoming, Outgoing
+from runtime.peers.zenoh_session import Session, certified
+from runtime.time_limits import real_time_limit
+
+if TYPE_CHECKING:
+    from runtime.peers.peers import Peers
+
+log = logging.getLogger("visnav.runtime")
+
+NAMED_EVERY = 5.0
+"""Real seconds after which those who are waited for are named, again and again."""
+
+
+class Roster:
+    """The processes of a run.
+
+    Args:
+        config: The whole file.
+        only: Nodes that run here.
+        peers: Told, on the loop, of messages and losses.
+
+    Attributes:
+        nodes: Of the whole file, in order.
+        here: Those that run in this process, in order.
+        me: Number of this process. They are numbered by their first nodes, once all have met.
+        count: How many processes there are in all.
+        hello: Who we are.
+        ended: Once the run ends, what those are told who come anew.
+    """
+
+    def __init__(self, config: Config, only: Iterable[str], peers: Peers) -> None:
+        chosen = set(only)
+        self.nodes = [spec.name for spec in config.nodes]
+        self.here = tuple(name for name in self.nodes if name in chosen)
+        self.me = 0
+        self.count = 0
+        self.hello = Hello(
+            nodes=self.here,
+            config=what_all_share(config),
+            place=f"{socket.gethostname()}, process {os.getpid()}",
+            began=time.time(),
+        )
+        self._run = config.run.name
+        self._network = config.network
+        self._peers = peers
+        self._loop = asyncio.get_running_loop()
+        self._greeting: Greeting | None = None
+        self.ended: Stop | None = None
+        self._numbers: dict[tuple[str, ...], int] = {}
+        self._numbered: dict[int, Member] = {}
+        self._waiting: set[asyncio.Future[None]] = set()
+        self._broken: VisnavError | None = None
+
+    async def meet(self) -> int:
+        """Wait until all nodes of the file are there, and number their processes.
+
+        Returns:
+            How often a process with our nodes was in this run before.
+
+        Raises:
+            PeerError: They are not within the limit, or somebody runs another file or our nodes.
+        """
+        network = self._network
+        by_certificate = not network.secret and certified(network)
+        secret = b"known by certificate" if by_certificate else secret_of(network.secret)
+        session = await asyncio.to_thread(Session, self._run, network, secret)
+        self._greeting = Greeting(derive(secret, "run", self._run), session, self)
+        await asyncio.to_thread(self._greeting.begin, self._hear)
+        if absent := self._missing():
+            log.info("waiting for %s at %s", name_of(absent), network.meet)
+        try:
+            async with real_time_limit(float(network.wait)):
+                await self.until(lambda: not self._missing())
+        except TimeoutError:
+            text = say_missing(self._missing(), float(network.wait), network.meet)
+            raise PeerError(text) from None
+        return self.number()
+
+    def number(self) -> int:
+        """Give the processes that are there numbers; return how often ours was there before."""
+        others = self._fitting()
+        everybody = sorted(
+            [self.here, *(m.nodes for m in others)], key=lambda nodes: self.nodes.index(nodes[0])
+        )
+        self._numbers = {nodes: number for number, nodes in enumerate(everybody)}
+        self.me, self.count = self._numbers[self.here], len(everybody)
+        for member in others:
+            member.number = self._numbers[member.nodes]
+            self._numbered[member.number] = member
+        running = [m.hello for m in others if m.hello.running]
+        return max((max(h.lost.count(self.here[0]), 1) for h in running), default=0)
+
+    def owners(self) -> dict[str, int]:
+        """Return the number of the process that has each node."""
+        return {node: number for nodes, number in self._numbers.items() for node in nodes}
+
+    def present(self) -> list[Member]:
+        """Return the other processes of the run that are there, in the order of their numbers."""
+        return [member for _, member in sorted(self._numbered.items())]
+
+    def numbered(self, number: int) -> Member | None:
+        """Return the process with a number, if it is there."""
+        return self._numbered.get(number)
+
+    @property
+    def id(self) -> str:
+        """The id by which the others know this process."""
+        assert self._greeting is not None
+        return self._greeting.id
+
+    def tell(self, message: Message) -> None:
+        """Send a message to all other processes of the run that are there."""
+        for member in self.present():
+            member.line.send(message)
+
+    def forget(self, member: Member) -> None:
+        """Go on as if a process were gone."""
+        member.unfit = True
+        self._numbered.pop(member.number, None)
+
+    def settle(self, *, lost: Iterable[str] = (), left_out: Iterable[str] = ()) -> None:
+        """Say from now on that the run goes on, that these are lost, and that it left these out."""
+        lost, left_out = (*self.hello.lost, *lost), (*self.hello.left_out, *left_out)
+        self.hello = msgspec.structs.replace(self.hello, running=True, lost=lost, left_out=left_out)
+
+    async def close(self) -> None:
+        """Say the last words, and leave."""
+        if self._greeting is not None:
+            await self._greeting.close()
+
+    # Waiting for what others say.
+
+    async def until(
+        self,
+        condition: Callable[[], bool],
+        *,
+        despite: bool = False,
+        whom: Callable[[Member], bool] | None = None,
+        limit: float = math.inf,
+    ) -> None:
+        """Wait for something that others bring about.
+
+        Args:
+            condition: Looked at whenever something has come.
+            despite: Go on waiting though something has failed: the run ends anyway.
+            whom: Tells who is waited for; they are named when it takes long.
+            limit: Real seconds after which it takes too long, if `whom` is given.
+
+        Raises:
+            PeerError: It takes too long.
+            VisnavError: It will not come; see `fail`.
+        """
+        begin = time.monotonic()
+        while True:
+            if self._broken is not None and not despite:
+                raise self._broken
+            if condition():
+                return
+            future = self._loop.create_future()
+            self._waiting.add(future)
+            try:
+                if whom is None:
+                    await future
+                else:
+                    async with real_time_limit(NAMED_EVERY):
+                        await future
+            except TimeoutError:
+                assert whom is not None
+                absent = [f"{name_of(m.nodes)} ({m.place})" for m in self.present() if whom(m)]
+                if time.monotonic() - begin > limit:
+                    text = f"expected a word within {limit:g} s of {'; '.join(absent)}, found none"
+                    raise PeerError(text) from None
+                log.info("still waiting for %s", "; ".join(absent))
+            finally:
+                self._waiting.discard(future)
+
+    def notify(self) -> None:
+        """Have all who wait look again."""
+        for future in list(self._waiting):
+            if not future.done():
+                future.set_result(None)
+
+    def fail(self, error: VisnavError) -> None:
+        """Let all who wait fail."""
+        self._broken = self._broken or error
+        self.notify()
+
+    # In threads of Zenoh's and of lines.
+
+    def _hear(self, sender: str, sealed: bytes, payload: bytes) -> None:
+        received = time.monotonic_ns()
+        greeting = self._greeting
+        assert greeting is not None
+        member = greeting.member(sender)
+        try:
+            if member is None or is_hello(sealed):
+                greeting.hear(sender, sealed)
+                return
+            data = member.sealing.open(sealed, payload)
+            message = decode(data)
+        except ForgedError as error:
+            greeting.refuse(sender, error)
+            return
+        except PeerError as error:  # another version
+            self.soon(self._misfit, error)
+            return
+        except WireError as error:
+            greeting.end(sender, error)
+            return
+        event = None
+        if isinstance(message, Said):
+            try:
+                event = member.event(message, payload)
+            except Exception as error:  # it is counted all the same: in lockstep, all are awaited
+                log.warning("from %s: %s", member.place, error)
+        if isinstance(message, Ack):
+            member.acknowledged(message)
+            return
+        match message:
+            case Ping():  # answered here: a detour by the loop would take time
+                member.line.send(Pong(message.sent, received, self._peers.now()))
+            case Pong():
+                half = (received - message.sent) // 2
+                offset = message.here - message.sent - half
+                late = message.now - self._peers.now(ago=half)
+                member.exchanges.add(Exchange(received - message.sent, offset, late))
+                self.soon(self.notify)
+            case Hello():
+                pass
+            case Memory():
+                member.incoming = Incoming.found(message) if self._network.shared else None
+                if member.incoming is not None:
+                    member.line.send(Mapped())
+            case Mapped():
+                member.line.memory = member.outgoing
+            case _:
+                self.soon(self._take, member, message, event)
+        member.acknowledge(len(data) + len(payload))
+
+    def soon(self, call: Callable[..., Any], *args: Any) -> None:
+        """Have something called on the loop, if it is not closed."""
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(call, *args)
+
+    def unsent(self, member: Member, error: VisnavError) -> None:
+        """Hand on what could not be sent."""
+        self.soon(self._peers.unsent, member, error)
+
+    # On the loop.
+
+    def _take(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+        try:
+            if member.held is not None:
+                member.held.append((message, event))
+            elif member.unfit or member.over:
+                log.debug("from %s, who is no part of this run: %s", member.place, message)
+            else:
+                self._peers.heard(member, message, event)
+        except WireError as error:
+            log.warning("from %s: %s", member.place, error)
+        self.notify()
+
+    def _misfit(self, error: PeerError) -> None:
+        """Deal with somebody with whom there can be no run."""
+        if self.hello.running:
+            log.warning("left alone: %s", error)
+        else:
+            self.fail(error)
+
+    def met(self, member: Member) -> None:
+        """Take in who somebody is."""
+        try:
+            check_fits(self.hello, member.hello, self.nodes)
+        except PeerError as error:
+            if self.hello.began < member.hello.began:  # the newcomer gives up
+                log.warning("left alone: %s", error)
+            else:
+                self._misfit(error)
+            return
+        if self.ended is not None:
+            member.line.send(self.ended)
+            return
+        if self._network.shared and member.outgoing is None:
+            member.outgoing = Outgoing()
+            member.line.send(member.outgoing.offer())
+        if self._numbers:
+            number = self._numbers.get(member.nodes, -1)
+            if number in self._numbered:  # the one before has gone, but we do not know yet
+                member.held = member.held or []
+                return
+            if number < 0:
+                return
+            member.number = number
+            self._numbered[number] = member
+        member.unfit = False
+        if member.number >= 0 and member.hello.running and self.hello.running:
+            self._peers.found_again(member)
+        held, member.held = member.held, None
+        for message, event in held or ():
+            self._take(member, message, event)
+        self.notify()
+
+    def went(self, member: Member, why: str = "their process is gone") -> None:
+        """Do without somebody with whom the session has ended."""
+        if member.over:
+            return
+        member.over = why
+        member.line.abandon()
+        if self._numbered.get(member.number) is member:
+            del self._numbered[member.number]
+            self._peers.lost(member)
+            for other in self._greeting.members() if self._greeting else ():
+                if other.held is not None and other.nodes == member.nodes:
+                    self.met(other)
+        self.notify()
+
+    def _fitting(self) -> list[Member]:
+        members = self._greeting.members() if self._greeting else []
+        return [m for m in members if not (m.unfit or m.over)]
+
+    def _missing(self) -> list[str]:
+        return missing([self.hello, *(m.hello for m in self._fitting())], self.nodes)

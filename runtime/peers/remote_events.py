@@ -1,0 +1,141 @@
+"""Outputs here that are heard in other processes, and outputs there that are heard here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from events import Event
+from runtime.config.model import NodeSpec
+from runtime.errors import WireError
+from runtime.peers.messages import Wanted
+from runtime.sender import Listener, Sender
+from runtime.tasks import Fault
+from runtime.wire import event_type, kind_of
+
+Leave = Callable[[int, str, Event, bool], None]
+"""Sends an event to a process: its number, the output, the event, and whether a newer one may
+take its place on the way."""
+
+
+class Crossing:
+    """What crosses between this process and the others.
+
+    Args:
+        specs: All nodes of the file.
+        owners: The number of the process that has each node.
+        me: The number of this one.
+        leave: Sends an event to a process.
+    """
+
+    def __init__(
+        self, specs: Iterable[NodeSpec], owners: dict[str, int], me: int, leave: Leave
+    ) -> None:
+        self._leave = leave
+        self._wanted: dict[int, tuple[Wanted, ...]] = {}
+        self._arrivals: dict[str, tuple[int, Sender[Any]]] = {}
+        for spec in specs:
+            if owners[spec.name] != me:
+                for port, output in spec.node.declared.outputs.items():
+                    name = f"{spec.name}.{port}"
+                    self._arrivals[name] = (owners[spec.name], Sender(name, output.event))
+
+    def wants(self, process: int, wanted: tuple[Wanted, ...]) -> None:
+        """Note what a process hears; nothing, if it is gone.
+
+        Raises:
+            WireError: It hears a kind of event that is not known here.
+        """
+        for each in wanted:
+            for kind in each.kinds:
+                event_type(kind)
+        self._wanted[process] = wanted
+
+    def listeners(self, output: str) -> list[Listener]:
+        """Return the listeners in other processes for an output of this one.
+
+        They come before those in this process, so that a handler here ends no delivery there.
+        """
+        return [
+            Far(process, output, wanted, self._leave)
+            for process, wanted in sorted(self._wanted.items())
+        ]
+
+    def connect(self, listeners: Iterable[Listener], fault: Fault) -> None:
+        """Say who hears here what is said elsewhere."""
+        listeners = list(listeners)
+        for _, sender in self._arrivals.values():
+            sender.connect(listeners, fault=fault)
+
+    def arrive(self, process: int, output: str, event: Event) -> None:
+        """Deliver an event of another process.
+
+        Raises:
+            WireError: It has no such output, or that sends no such event.
+        """
+        owner, sender = self._arrivals.get(output, (None, None))
+        if sender is None or owner != process:
+            raise WireError(f"expected an output of process {process}, found {output!r}")
+        if not isinstance(event, sender.event):
+            raise WireError(
+                f"{output}: expected {sender.event.__name__}, found {type(event).__name__}"
+            )
+        sender.send(event)
+
+
+class Far(Listener):
+    """All inputs and handlers of another process, as one listener of an output here."""
+
+    __slots__ = ("_heard", "_leave", "_may_skip", "_output", "_process", "name")
+
+    def __init__(self, process: int, output: str, wanted: tuple[Wanted, ...], leave: Leave) -> None:
+        super().__init__("", self.offer, ())
+        self.name = output  # whose fault it is if it cannot leave
+        self._process = process
+        self._output = output
+        self._leave = leave
+        self._heard = [
+            (Listener("", _nothing, tuple(map(event_type, each.kinds)), each.source), each.latest)
+            for each in wanted
+        ]
+        self._may_skip: dict[tuple[type[Event], str], bool] = {}
+
+    def may_hear(self, event: type[Event]) -> bool:
+        """Tell whether anything there can hear an output of this type."""
+        return any(listener.may_hear(event) for listener, _ in self._heard)
+
+    def hears_all(self, event: type[Event]) -> bool:
+        """Tell whether something there hears whatever an output of this type sends."""
+        return any(listener.hears_all(event) for listener, _ in self._heard)
+
+    def hears(self, event: type[Event], source: str) -> bool:
+        """Tell whether anything there hears events of this very type from this source."""
+        return any(listener.hears(event, source) for listener, _ in self._heard)
+
+    def offer(self, event: Event) -> None:
+        """Send an event there."""
+        key = (type(event), event.source)
+        skip = self._may_skip.get(key)
+        if skip is None:
+            skip = all(latest for listener, latest in self._heard if listener.hears(*key))
+            self._may_skip[key] = skip
+        self._leave(self._process, self._output, event, skip)
+
+
+def hearing(listeners: Iterable[Listener]) -> tuple[Wanted, ...]:
+    """Return what these listeners hear, for other processes."""
+    found = {
+        Wanted(
+            kinds=tuple(kind_of(event) for event in listener.events),
+            source=listener.source,
+            latest=listener.stream is not None
+            and listener.stream.bound == 1
+            and listener.stream.overflow == "drop_oldest",
+        ): None
+        for listener in listeners
+    }
+    return tuple(found)
+
+
+def _nothing(_: Any) -> None:
+    pass

@@ -1,0 +1,139 @@
+"""Large events between processes of one machine: put once into memory that both see.
+
+A process offers the other a nameless file, by the way to it in ``/proc`` and a key that stands at
+its beginning. Who can open that file and finds the key is on the same machine, and reads frames
+where they stand; the others get them over the network. A block is used again once the last array
+on it is gone. The file cannot shrink: what is mapped stays readable, whatever its owner does.
+"""
+
+from __future__ import annotations
+
+import collections
+import fcntl
+import logging
+import os
+import re
+import secrets
+import stat
+import weakref
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from runtime.errors import WireError
+from runtime.peers.messages import Memory
+from runtime.wire import Packed
+from runtime.workers.shared_memory import Arena, Window, anonymous_file
+
+log = logging.getLogger("visnav.runtime")
+
+LIMIT = 1 << 28
+"""Bytes of a file at most; what does not fit crosses the network."""
+
+KEY = 32
+
+
+class Outgoing:
+    """Memory into which this process puts what is large for another one.
+
+    `put` is called by one thread at a time, `freed` by any. The file is closed when nobody uses
+    this object any more.
+    """
+
+    def __init__(self) -> None:
+        self._fd = anonymous_file()
+        self._arena = Arena(self._fd, LIMIT)
+        weakref.finalize(self, self._arena.close)
+        self._key = secrets.token_bytes(KEY)
+        self._arena.put(memoryview(self._key))
+        self._freed: collections.deque[int] = collections.deque()
+        self._taken: set[int] = set()
+
+    def offer(self) -> Memory:
+        """Return what the other process needs to find it."""
+        return Memory(machine=machine(), path=f"/proc/{os.getpid()}/fd/{self._fd}", key=self._key)
+
+    def put(self, packed: Packed) -> tuple[int, int] | None:
+        """Put a frame there, and return its place and size; `None` if there is no room."""
+        while self._freed:
+            if (freed := self._freed.popleft()) in self._taken:  # each once, and only ours
+                self._taken.remove(freed)
+                self._arena.free(freed)
+        offset = self._arena.reserve(packed.size)
+        if offset is None:
+            return None
+        self._taken.add(offset)
+        packed.write(self._arena.view(offset, packed.size))
+        return offset, packed.size
+
+    def freed(self, offsets: Iterable[int]) -> None:
+        """Take in which frames the other process reads no more."""
+        self._freed.extend(offsets)
+
+
+class Incoming:
+    """Memory into which another process puts what is large for this one.
+
+    The file is closed when nobody uses this object any more; arrays that stand in it stay valid.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._window = Window(fd)
+        weakref.finalize(self, self._window.close)
+
+    @classmethod
+    def found(cls, offer: Memory) -> Incoming | None:
+        """Return the memory that is offered, or `None` if it is not to be had here."""
+        here = offer.machine and offer.machine == machine()
+        if not (here and re.fullmatch(r"/proc/\d+/fd/\d+", offer.path)):
+            return None
+        try:
+            fd = os.open(offer.path, os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)
+        except OSError as error:
+            log.debug("no memory in common: %s", error)
+            return None
+        try:
+            fits = (
+                stat.S_ISREG(os.fstat(fd).st_mode)
+                and fcntl.fcntl(fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK
+                and secrets.compare_digest(os.pread(fd, KEY, 0), offer.key)
+            )
+        except OSError:
+            fits = False
+        if not fits:
+            os.close(fd)
+            log.debug("no memory in common: %s is another file", offer.path)
+            return None
+        return cls(fd)
+
+    def frame(self, offset: int, size: int) -> memoryview:
+        """Return a frame where it stands.
+
+        Raises:
+            WireError: There is none.
+        """
+        try:
+            block = self._window.view(offset, size)
+        except (OSError, ValueError) as error:
+            text = f"expected {size} bytes of common memory at {offset}, found: {error}"
+            raise WireError(text) from None
+        return np.frombuffer(block, np.uint8).data
+
+    @property
+    def unread(self) -> int:
+        """How many frames nobody here reads any more, but for those that `freed` returned."""
+        return len(self._window.freed)
+
+    def freed(self) -> tuple[int, ...]:
+        """Return which frames nobody here reads any more, each once."""
+        freed = self._window.freed
+        return tuple(freed.popleft() for _ in range(len(freed)))
+
+
+def machine() -> str:
+    """Return what only processes of one machine have in common; "" if there is no such thing."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    except OSError:
+        return ""

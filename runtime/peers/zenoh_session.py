@@ -1,0 +1,219 @@
+"""A Zenoh session between the processes of one run: the only module of this room with zenoh.
+
+Zenoh has threads of its own and no asyncio: what it calls runs there, and must not wait.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import logging
+import re
+import socket
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from runtime.config.model import NetworkConfig
+from runtime.errors import PeerError
+from runtime.peers.authentication import derive
+
+log = logging.getLogger("visnav.runtime")
+
+Heard = Callable[[str, bytes, bytes], None]
+"""Called in Zenoh's thread with who sends, the message, and its payload."""
+
+Seen = Callable[[str, bool], None]
+"""Called in Zenoh's thread when a process appears (True) or disappears."""
+
+CLOSING = 3.0
+"""Seconds; a peer that stands still keeps Zenoh waiting for longer."""
+
+_ENDPOINT = re.compile(r"(\w+)/\[?([^\]#?]+?)\]?:(\d+)([#?].*)?")
+"""Protocol, host and port."""
+
+
+class Session:
+    """A place among the processes of a run.
+
+    Args:
+        run: The run's name; processes of other runs are not seen.
+        network: Where processes meet, and how they talk.
+        secret: That they share. Without a Zenoh file, nobody else can connect.
+
+    Raises:
+        PeerError: The session cannot be opened.
+
+    Attributes:
+        id: By which the other processes know this one.
+    """
+
+    def __init__(self, run: str, network: NetworkConfig, secret: bytes) -> None:
+        configuration = _configuration(network)
+        _warn_if_open(configuration)
+        try:
+            with tempfile.NamedTemporaryFile("w", suffix=".door") as door:  # its user's alone
+                if not network.zenoh:
+                    word = derive(secret, "door").hex()
+                    door.write(f"visnav:{word}\n")
+                    door.flush()
+                    known = {"user": "visnav", "password": word, "dictionary_file": door.name}
+                    configuration.insert_json5("transport/auth/usrpwd", json.dumps(known))
+                self._session = zenoh.open(configuration)
+        except (zenoh.ZError, OSError) as error:
+            raise PeerError(f"expected to meet at {network.meet}, found: {error}") from error
+        self.id = str(self._session.info.zid())
+        self._prefix = f"visnav/{re.sub(r'[^A-Za-z0-9_.-]', '_', run)}"
+        self._publishers: dict[str, Any] = {}
+        self._kept: list[Any] = []
+
+    def appear(self, heard: Heard, seen: Seen) -> None:
+        """Be seen by the others, and see them.
+
+        Args:
+            heard: Told of messages.
+            seen: Told of processes that come and go, this one not included.
+        """
+
+        def take(sample: zenoh.Sample) -> None:
+            head = sample.attachment
+            if head is not None:
+                sender = str(sample.key_expr).rpartition("/")[2]
+                heard(sender, head.to_bytes(), sample.payload.to_bytes())
+
+        def notice(sample: zenoh.Sample) -> None:
+            other = str(sample.key_expr).rpartition("/")[2]
+            if other != self.id:
+                seen(other, sample.kind == zenoh.SampleKind.PUT)
+
+        self._kept = [
+            self._session.declare_subscriber(
+                f"{self._prefix}/to/{self.id}/*", zenoh.handlers.Callback(take, indirect=False)
+            ),
+            self._session.liveliness().declare_token(f"{self._prefix}/here/{self.id}"),
+            self._session.liveliness().declare_subscriber(
+                f"{self._prefix}/here/*",
+                zenoh.handlers.Callback(notice, indirect=False),
+                history=True,
+            ),
+        ]
+
+    def put(self, other: str, message: bytes, payload: bytes) -> None:
+        """Send a message to a process; waits if the network does."""
+        if other not in self._publishers:
+            self._publishers[other] = self._session.declare_publisher(
+                f"{self._prefix}/to/{other}/{self.id}",
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                reliability=zenoh.Reliability.RELIABLE,
+                express=True,
+            )
+        try:
+            self._publishers[other].put(payload, attachment=message)
+        except zenoh.ZError as error:
+            raise PeerError(f"a message could not be sent: {error}") from error
+
+    def close(self) -> None:
+        """Leave. What goes on for longer than `CLOSING` goes on in a thread."""
+        thread = threading.Thread(target=self._session.close, name="zenoh close")
+        thread.start()
+        thread.join(CLOSING)
+
+
+def _configuration(network: NetworkConfig) -> zenoh.Config:
+    """Return the file's configuration, and where that is silent, one that finds who is there."""
+    plain, configuration = zenoh.Config(), zenoh.Config()
+    if network.zenoh:
+        if not Path(network.zenoh).is_file():
+            raise PeerError(f"network.zenoh: expected a file, found none at {network.zenoh}")
+        try:
+            configuration = zenoh.Config.from_file(network.zenoh)
+        except zenoh.ZError as error:
+            raise PeerError(
+                f"network.zenoh: {network.zenoh}: expected a Zenoh configuration, found: {error}"
+            ) from error
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        # Of two that hear of each other only one connects: with passwords, both may fail else.
+        "scouting/gossip/autoconnect_strategy": {
+            "peer": {"to_router": "always", "to_peer": "greater-zid"}
+        },
+        # The first process on that host takes the address, and the others connect to it; each
+        # tells the rest where else it listens.
+        "listen/endpoints": [network.meet, *_beside(network.meet)],
+        "listen/exit_on_failure": False,
+        "listen/timeout_ms": 0,
+        "connect/endpoints": [network.meet],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 400,
+            "period_increase_factor": 2,
+        },
+        "transport/shared_memory/enabled": False,  # we have our own, and nothing is left behind
+    }
+    for key, value in settings.items():
+        if configuration.get_json(key) == plain.get_json(key):
+            configuration.insert_json5(key, json.dumps(value))
+    lease = round(float(network.lease) * 1000)
+    configuration.insert_json5("transport/link/tx/lease", json.dumps(lease))
+    return configuration
+
+
+def certified(network: NetworkConfig) -> bool:
+    """Tell whether a Zenoh file lets only those connect who have a certificate."""
+    configuration = _configuration(network)
+    ends = [*_endpoints(configuration, "listen"), *_endpoints(configuration, "connect")]
+    mutual = json.loads(configuration.get_json("transport/link/tls/enable_mtls"))
+    return bool(network.zenoh and mutual and all(e.startswith(("tls/", "quic/")) for e in ends))
+
+
+def _endpoints(configuration: zenoh.Config, way: str) -> list[str]:
+    found = json.loads(configuration.get_json(f"{way}/endpoints"))
+    return found if isinstance(found, list) else [e for each in found.values() for e in each]
+
+
+def _warn_if_open(configuration: zenoh.Config) -> None:
+    """Warn of an endpoint at which what is said can be read on the way."""
+    bare = [
+        endpoint
+        for endpoint in _endpoints(configuration, "listen")
+        if not (endpoint.startswith(("tls/", "quic/", "unix")) or _is_here(endpoint))
+    ]
+    if bare:
+        log.warning(
+            "%s can be reached from other machines, and what is said there is not encrypted: "
+            "for TLS, name a Zenoh file (network.zenoh)",
+            ", ".join(bare),
+        )
+
+
+def _beside(meet: str) -> list[str]:
+    """Return where to listen besides: a free port at the address by which `meet` is reached."""
+    parts = _ENDPOINT.fullmatch(meet)
+    if parts is None or parts[1] not in {"tcp", "tls", "quic"}:
+        return []
+    protocol, host, port = parts[1], parts[2], int(parts[3])
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.connect(address)  # of datagrams: nothing is sent
+            mine = probe.getsockname()[0]
+    except OSError:  # no way there yet: Zenoh tries on
+        return []
+    return [f"{protocol}/[{mine}]:0" if ":" in mine else f"{protocol}/{mine}:0"]
+
+
+def _is_here(endpoint: str) -> bool:
+    """Tell whether only processes of this machine reach an endpoint."""
+    parts = _ENDPOINT.fullmatch(endpoint)
+    host = parts[2] if parts else ""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,203 @@
+"""Says what a run waits for when nothing goes on: which node, which line, which wait.
+
+A thread looks at the run a few times per limit. When it finds that neither the run's time nor its
+phase has changed for half of it, it asks the loop to explain. A loop that runs without time
+passing says whose tasks are ready, again and again; one that does not answer is blocked, and the
+thread says where. A node that blocks the loop beyond the limit of its start or end is interrupted,
+for no task of the run could do that. Short stalls: `runtime.watchdogs.loop`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from runtime import code_location
+from runtime.errors import NodeTimeoutError
+from runtime.lockstep import LockstepLoop
+from runtime.watchdogs.loop import idle
+
+if TYPE_CHECKING:
+    from runtime.supervisor import Supervisor
+
+log = logging.getLogger("visnav.runtime")
+
+_LONGEST_PAUSE = 0.25
+_LOOK = 0.01
+"""Real seconds between two looks at what a busy loop does."""
+
+_MOST_NAMED = 3
+
+
+class Standstill:
+    """Watches a run of the thread that makes it; a context as long as the run.
+
+    Args:
+        supervisor: Of the run.
+        loop: Its loop.
+        limit: Real seconds without progress after which there is something to say; 0 for never.
+    """
+
+    def __init__(
+        self, supervisor: Supervisor, loop: asyncio.AbstractEventLoop, limit: float
+    ) -> None:
+        self._supervisor = supervisor
+        self._loop = loop
+        self._limit = limit
+        self._thread_id = threading.get_ident()
+        self._main = threading.current_thread() is threading.main_thread()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="standstill", daemon=True)
+
+    def __enter__(self) -> None:
+        if self._limit > 0:
+            self._thread.start()
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _watch(self) -> None:
+        mark: Any = None
+        since, due, interrupted = 0.0, 0.0, 0.0
+        while not self._end.wait(min(self._limit / 8, _LONGEST_PAUSE)):
+            found, now = self._mark(), time.monotonic()
+            if found != mark:
+                mark, since, due, interrupted = found, now, self._limit, now
+            if now - since < due / 2:
+                continue
+            seen: Counter[tuple[str, str]] = Counter()
+            answer = self._ask(max(min(since + due, now + 1.0), now + self._limit / 4), seen)
+            if self._end.is_set():
+                return
+            if answer == "" or self._mark() != mark:
+                since = now
+                continue
+            if time.monotonic() >= since + due:
+                log.warning("%s", self._told(answer, seen, time.monotonic() - since))
+                due *= 2
+            if self._main and answer is None and time.monotonic() - interrupted > self._patience():
+                interrupted = time.monotonic()
+                self._interrupt()
+
+    def _mark(self) -> tuple[Any, ...]:
+        """Return what is the same for as long as nothing goes on; in any thread."""
+        run = self._supervisor
+        now = self._loop.now if isinstance(self._loop, LockstepLoop) else 0
+        doing = tuple((life.starts, life.doing) for life in list(run._lives.values()))
+        return now, run.first_update, run.ended, run.asked, doing
+
+    def _ask(self, until: float, seen: Counter[tuple[str, str]]) -> str | None:
+        """Let the loop explain, and note where it is meanwhile; `None` if it does not answer."""
+        answers: list[tuple[str, list[tuple[str, str]]]] = []
+        asked = known = 0
+
+        def explain() -> None:
+            answer = self._explain()
+            answers.append((answer, code_location.ready_on(self._loop) if answer == "busy" else []))
+
+        while not self._end.is_set():
+            for _, running in answers[known:]:
+                known += 1
+                seen.update(running)
+            if known and answers[-1][0] != "busy":
+                break
+            if known == asked:
+                asked += 1
+                try:  # a turn later: by then what has woken the loop to ask it is done
+                    self._loop.call_soon_threadsafe(self._loop.call_soon, explain)
+                except RuntimeError:  # closed
+                    return ""
+            frame = sys._current_frames().get(self._thread_id)
+            if not known and frame is not None and not idle(frame):
+                seen[code_location.of_thread(frame)] += 1
+            del frame
+            if time.monotonic() >= until:
+                break
+            self._end.wait(_LOOK)
+        if not seen and (not known or answers[-1][0] == "busy"):  # idle, and only slow to wake up
+            return ""
+        return answers[-1][0] if known else None
+
+    def _explain(self) -> str:
+        """Say who is waited for; ``""`` if all is well, ``"busy"`` if nobody is; on the loop."""
+        run, loop = self._supervisor, self._loop
+        waiting = [life for life in run._lives.values() if life.doing]
+        if waiting:
+            return "; ".join(
+                f"{life.spec.name}: {life.doing}{_at([life.step] if life.step else life.tasks)}"
+                for life in waiting[:_MOST_NAMED]
+            )
+        if run.first_update is None or run.ended is not None:
+            return "the other processes of the run" if run.peers is not None else ""
+        return _explain_time(loop, run) if isinstance(loop, LockstepLoop) else ""
+
+    def _told(self, answer: str | None, seen: Counter[tuple[str, str]], seconds: float) -> str:
+        places_seen = [place for place, _ in seen.most_common()] or [("runtime", "?")]
+        node, line = places_seen[0]
+        if answer is None:
+            where = code_location.short(line)
+            return f"the loop has not turned for {seconds:.1f} s: {node}, at {where}"
+        if answer == "busy":
+            of_nodes = [place for place in places_seen if place[0] != "runtime"] or places_seen[:1]
+            names = ", ".join(list(dict(of_nodes))[:_MOST_NAMED])
+            return (
+                f"no time has passed for {seconds:.1f} s, while these run again and again: "
+                f"{names}, at {code_location.short(of_nodes[0][1])}"
+            )
+        return f"for {seconds:.1f} s the run has waited for {answer}"
+
+    def _patience(self) -> float:
+        """Return how long a node may block the loop: as long as the step may take that it is in."""
+        run = self._supervisor
+        if run.ended is not None or run.asked:
+            return run.shutdown_limit()
+        return run._config.run.startup_limit if run.first_update is None else float("inf")
+
+    def _interrupt(self) -> None:
+        """Raise an error in whatever blocks the loop, by a signal."""
+        node, line = code_location.of_thread(sys._current_frames().get(self._thread_id))
+        if node == "runtime":  # it is not a node that blocks, or does no more
+            return
+        error = NodeTimeoutError(node, "expected it to give back the loop, found it blocking it")
+        error.place = line
+        self._supervisor.interruption = error
+        signal.pthread_kill(self._thread_id, signal.SIGUSR2)
+
+
+def _explain_time(loop: LockstepLoop, run: Supervisor) -> str:
+    """Say what simulated time waits for."""
+    if loop.gate is not None:
+        paused = getattr(loop.gate, "paused", False)
+        return "" if paused else "the other processes of the run"
+    if (wait := loop.waits_for()) is None:
+        return "busy"
+    if not isinstance(wait, asyncio.Future):
+        return "" if wait == "pace" else f"nothing: nothing is due any more{_all(run)}"
+    for task in asyncio.all_tasks(loop):
+        if code_location.waits_for(task, wait):
+            node, line = code_location.of_task(task)
+            return f"{node}: slow work, at {code_location.short(line)}"
+    return "slow work beside the loop"
+
+
+def _all(run: Supervisor) -> str:
+    """Return where all nodes wait, as far as there is room."""
+    found = [(life.spec.name, task) for life in run._lives.values() for task in life.tasks]
+    listed = ", ".join(f"{name}{_at([task])}" for name, task in found[:_MOST_NAMED])
+    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    return f" ({listed}{more})" if listed else ""
+
+
+def _at(tasks: Any) -> str:
+    """Return at which line the first of some tasks waits that has not ended."""
+    waiting = [task for task in tasks if not task.done()]
+    return f", at {code_location.short(code_location.of_task(waiting[0])[1])}" if waiting else ""

@@ -1,0 +1,117 @@
+"""What runs in a worker's process: one object, and the calls that arrive for it, in order.
+
+Started by `runtime.workers.worker` as ``python -m runtime.workers.child SOCKET IN OUT LIMIT``:
+inherited file descriptors, and the seconds that a call may take. The process ends with the run,
+however the run ends: in order if it waits for calls; after `_GRACE` if it is in one, and if that
+call does not even let go of Python's lock, once its limit is over.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from runtime.workers.shared_memory import SharedPipe
+
+_GRACE = 5.0
+"""Seconds in which a call may end, and the object close, once the run has gone."""
+
+
+def main(socket_fd: int, in_fd: int, out_fd: int, limit: float) -> None:
+    """Make the object, then answer calls until the other side closes the connection."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the run's business
+    for fd in (socket_fd, in_fd, out_fd):
+        os.set_inheritable(fd, False)  # what the object starts has no part in this
+    connection = socket.socket(fileno=socket_fd)
+    threading.Thread(target=_end_with_the_run, args=(connection,), daemon=True).start()
+    pipe = SharedPipe(connection, out_fd, in_fd)
+    made = False
+    target: Any = None
+    try:
+        sys.path[:] = pipe.receive()  # first, because the next message names what to import
+        message = pipe.read()
+        made, target = _attempt(limit, _make, pipe, message)
+        _answer(pipe, made, None if made else target, 0, 0)
+        cpu = time.process_time_ns()
+        while made:
+            message = pipe.read()
+            begin = time.perf_counter_ns()
+            outcome = _attempt(limit, _call, pipe, message, target)
+            wall = time.perf_counter_ns() - begin
+            before, cpu = cpu, time.process_time_ns()
+            _answer(pipe, *outcome, wall, cpu - before)
+            del outcome  # or the arrays in it would live until the next call has ended
+    except (EOFError, OSError):
+        pass  # the run closed the connection, or is gone
+    finally:
+        if made and hasattr(target, "close"):
+            signal.setitimer(signal.ITIMER_REAL, limit)
+            target.close()
+
+
+def _end_with_the_run(connection: socket.socket) -> None:
+    gone = select.poll()
+    gone.register(connection, 0)  # which leaves POLLHUP
+    gone.poll()
+    time.sleep(_GRACE)
+    os._exit(1)
+
+
+def _make(pipe: SharedPipe, message: bytearray) -> Any:
+    factory, args, niceness, cores = pipe.unpack(message)
+    os.nice(niceness)
+    if cores is not None:  # before any library starts threads, which inherit it
+        os.sched_setaffinity(0, cores)
+    return factory(*args)
+
+
+def _call(pipe: SharedPipe, message: bytearray, target: Any) -> Any:
+    method, args, kwargs = pipe.unpack(message)
+    return getattr(target, method)(*args, **kwargs)
+
+
+def _attempt(limit: float, do: Callable[..., Any], *args: Any) -> tuple[bool, Any]:
+    """Return True and a result, or False and an error; or end the process after `limit` seconds.
+
+    The run has its own eye on that: this is for when there is none any more, so the kernel does it.
+    """
+    signal.setitimer(signal.ITIMER_REAL, limit)
+    try:
+        return True, do(*args)
+    except Exception as error:
+        return False, _portable(error)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def _answer(pipe: SharedPipe, succeeded: bool, result: Any, wall: int, cpu: int) -> None:
+    try:
+        packed = pipe.pack((succeeded, result, wall, cpu))
+    except Exception as error:  # the result cannot be pickled
+        packed = pipe.pack((False, _portable(error), wall, cpu))
+    pipe.write(packed)
+
+
+def _portable(error: Exception) -> Exception:
+    """Return the error with its traceback as text, since tracebacks cannot be pickled."""
+    import pickle
+    import traceback
+
+    error.add_note("in the worker:\n" + "".join(traceback.format_exception(error)))
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301  # made a line above
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
+
+
+if __name__ == "__main__":
+    socket_fd, in_fd, out_fd = map(int, sys.argv[1:4])
+    main(socket_fd, in_fd, out_fd, float(sys.argv[4]))

@@ -1,0 +1,61 @@
+"""What the calls of a worker cost this machine: real time, processor time, memory.
+
+It differs from run to run, so nothing of it enters a digest.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from pathlib import Path
+
+from runtime.histogram import Lateness
+
+
+class Costs:
+    """Costs of all processes that a worker has had, in constant memory; used from any thread.
+
+    Attributes:
+        calls: How many were answered.
+        wall: Real time of each (ns), from its arguments in the process to its result.
+        cpu: Processor time of all threads of the process (ns), since the call before: what they
+            go on doing after an answer is counted with the next one.
+        peak: Most memory (bytes) that one of the processes has had; 0 if unknown.
+        processes: How many there were at once.
+        latency: Seconds of the run's clock that a call was said to take; `None` if it varied.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.calls = 0
+        self.wall = Lateness()
+        self.cpu = Lateness()
+        self.peak = 0
+        self.processes = 0
+        self.latency: float | None = None
+
+    def add(self, wall: int, cpu: int) -> None:
+        """Count one call."""
+        with self._lock:
+            self.calls += 1
+            self.wall.add(wall)
+            self.cpu.add(cpu)
+
+    def look_at(self, pid: int) -> None:
+        """Note how much memory a process has had until now."""
+        peak = peak_memory(pid)
+        with self._lock:
+            self.peak = max(self.peak, peak)
+
+
+def peak_memory(pid: int) -> int:
+    """Return the most memory (resident, bytes) that a process has had; 0 if there is no knowing.
+
+    From ``/proc``: what `resource.getrusage` says begins with the memory of the parent.
+    """
+    try:
+        status = Path(f"/proc/{pid}/status").read_bytes()
+    except OSError:
+        return 0
+    found = re.search(rb"VmHWM:\s+(\d+) kB", status)
+    return int(found[1]) << 10 if found else 0

@@ -1,0 +1,155 @@
+"""Settings that change while a run goes on."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import msgspec
+import pytest
+
+from events import ParameterChanged, VelocitySetpoint
+from runtime import Duration, Node, NodeConfig
+from runtime.config.parameters import Changeable, change, changeable, settings
+from runtime.errors import ConfigError
+from runtime.supervisor import Supervisor
+from runtime.testing import spec
+from tests.runtime.samples_loop import Camera, Estimator, Listener, Pilot, look, until_sent
+
+
+class Lens(msgspec.Struct, frozen=True, kw_only=True):
+    name: str
+    loss: Changeable[Annotated[float, msgspec.Meta(le=1)]] = 0.0
+    width: int = 4
+
+
+class Rig(NodeConfig):
+    lenses: tuple[Lens, ...] = ()
+    speed: Changeable[Annotated[float, msgspec.Meta(gt=0)]] = 1.0
+    wait: Changeable[Duration] = Duration(1)
+    limit: Changeable[float | None] = None
+    place: Changeable[tuple[float, float]] = (0.0, 0.0)
+    height: float = 1.0
+
+
+RIG = Rig(lenses=(Lens(name="front"), Lens(name="rear")))
+NODES = {"rig": RIG, "other": Rig()}
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("rig.speed=2", {"speed": "2.0"}),
+        ("rig.speed = 2.5 ", {"speed": "2.5"}),
+        ("rig.wait=80ms", {"wait": "0.08"}),
+        ("rig.limit=3", {"limit": "3.0"}),
+        ("rig.place=[1, 2]", {"place": "[1.0, 2.0]"}),
+        ("rig.lenses.rear.loss=0.5", {"lenses.rear.loss": "0.5"}),
+        ("front.loss=0.25", {"lenses.front.loss": "0.25"}),
+        ("rig.speed=1.0", {}),
+    ],
+)
+def test_a_change_is_what_the_file_would_say(text: str, values: dict[str, str]) -> None:
+    found = change(NODES, text)
+    assert found.values == values
+    assert found.node == ("rig" if values else "")
+
+
+def test_all_else_stays_and_the_old_settings_too() -> None:
+    found = change(NODES, "rear.loss=0.5").config
+    assert isinstance(found, Rig)
+    assert found.lenses == (RIG.lenses[0], Lens(name="rear", loss=0.5))
+    assert RIG.lenses[1].loss == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rig.speed=-1", "rig.speed: expected a number > 0, found -1"),
+        ("rig.speed=fast", 'rig.speed: expected a number, found "fast"'),
+        ("rig.wait=late", 'rig.wait: expected a duration such as 0.5, "80ms" or "2min", found'),
+        ("rig.sped=1", r"rig: expected one of .*; found unknown key 'sped' \(did you mean 'speed'"),
+        ("rigg.speed=1", r'expected "run" or the name of a node, found "rigg" \(did you mean'),
+        ("rig.height=2", "rig.height: cannot change while the run goes on: of rig, lenses.*.loss,"),
+        ("front.width=2", "rig.lenses.front.width: cannot change while the run goes on"),
+        ("front.loss=2", r"rig.lenses\[0\].loss: expected a number <= 1, found 2"),
+        ("rig", "expected node.key=value"),
+        ("run.seed=2", "what .run. says holds to its end"),
+        ("network.port=2", "what .network. says holds to its end"),
+        ("rig.name=2", "a node's name cannot change"),
+    ],
+)
+def test_what_cannot_be_is_refused_as_in_the_file(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        change(NODES, text)
+
+
+def test_what_can_change_is_listed_with_its_values() -> None:
+    assert changeable(Rig) == ["lenses.*.loss", "speed", "wait", "limit", "place"]
+    found = settings(RIG)
+    assert found["lenses.rear.loss"] == "0.0"
+    assert found["speed"] == "1.0"
+    assert "height" not in found
+
+
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
+def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> None:
+    async def body(supervisor: Supervisor) -> None:
+        await until_sent(supervisor, "pilot", 1)
+        assert supervisor.changing.set("pilot.gain=3") == {"gain": "3.0"}
+        with pytest.raises(ConfigError, match="pilot refuses: expected a gain that brings no"):
+            supervisor.changing.set("pilot.gain=13")
+        if clock == "real":
+            await until_sent(supervisor, "pilot", 1)
+            supervisor.stop("seen enough")
+
+    nodes = [
+        spec(Camera, "drone"),
+        spec(Estimator, "vo"),
+        spec(Pilot, "pilot"),
+        spec(Listener, "listener"),
+    ]
+    looked = look(nodes, body, clock=clock, duration=0.4 if clock == "lockstep" else 60)
+    (changed,) = [e for e in looked.sent if isinstance(e, ParameterChanged)]
+    assert (changed.source, changed.key, changed.value) == ("pilot", "gain", "3.0")
+    gains = [e.velocity[0] for e in looked.sent if isinstance(e, VelocitySetpoint)]
+    assert sorted(gains) == gains
+    assert set(gains) == {1.0, 3.0}
+    listener = looked.supervisor.ever[3]
+    assert isinstance(listener, Listener)
+    assert listener.heard == ["pilot.gain=3.0"]
+    if clock == "lockstep":
+        assert looked.digest != look(nodes, duration=0.4).digest
+
+
+def test_a_node_that_restarts_keeps_what_was_changed() -> None:
+    async def body(supervisor: Supervisor) -> None:
+        await supervisor.clock.sleep(0.2)
+        supervisor.changing.set("pilot.gain=3")
+        supervisor.restart("pilot", anyway=True)
+
+    looked = look([spec(Pilot, "pilot")], body)
+    first, second = looked.supervisor.ever
+    assert first is not second
+    assert isinstance(second, Pilot)
+    assert second.config.gain == 3.0
+
+
+def test_a_node_that_has_not_started_cannot_change() -> None:
+    class First(Node):
+        async def on_startup(self) -> None:
+            supervisor: Any = self._host
+            with pytest.raises(ConfigError, match="pilot does not just now"):
+                supervisor.changing.set("pilot.gain=3")
+
+    look([spec(First, "first"), spec(Pilot, "pilot")], duration=0.1)
+
+
+def test_a_node_that_does_not_run_cannot_change() -> None:
+    async def body(supervisor: Supervisor) -> None:
+        await supervisor.clock.sleep(0.2)
+        supervisor.restart("pilot", anyway=True)
+        await supervisor.clock.sleep(0.2)
+        with pytest.raises(ConfigError, match="expected a node that runs"):
+            supervisor.changing.set("pilot.gain=3")
+
+    look([spec(Pilot, "pilot")], body)

@@ -1,0 +1,75 @@
+"""Processes come together in any order, or say why they do not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from runtime.errors import PeerError
+from runtime.peers.compatibility import check_fits, missing, say_missing, what_all_share
+from runtime.peers.messages import Hello
+from tests.runtime.peers.samples import Process, settings
+
+TWO: tuple[tuple[str, str, dict[str, Any]], ...] = (("asker", "Asker", {}), ("one", "Answerer", {}))
+NODES = ["drone", "tour", "odometry"]
+
+
+def hello(*nodes: str, config: object = None, left_out: tuple[str, ...] = ()) -> Hello:
+    return Hello(
+        nodes=nodes,
+        config={"nodes": [{"name": "drone", "rate": config}]},
+        place="host, process 1",
+        began=0.0,
+        left_out=left_out,
+    )
+
+
+def test_nodes_that_nobody_has_are_named_with_the_command() -> None:
+    absent = missing([hello("tour")], NODES)
+    assert absent == ["drone", "odometry"]
+    assert say_missing(absent, 2.0, "tcp/x:1").endswith("start them with --only drone,odometry")
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        (hello("tour", config=2), "found nodes[0].rate = 2 there, nothing here"),
+        (hello("drone", "tour"), "found drone at host, process 1, too"),
+        (hello("tour", left_out=("drone",)), "goes on without drone"),
+    ],
+)
+def test_a_process_that_does_not_fit_is_told_why(other: Hello, said: str) -> None:
+    mine = hello("drone")
+    mine.config["nodes"][0].pop("rate")
+    if other.config["nodes"][0]["rate"] is None:
+        other.config["nodes"][0].pop("rate")
+    with pytest.raises(PeerError) as raised:
+        check_fits(mine, other, NODES)
+    assert said in str(raised.value)
+
+
+def test_a_run_that_waits_in_vain_says_for_whom() -> None:
+    config = settings(*TWO, wait=0.3)
+    process = Process(config, "asker").done()
+    assert isinstance(process.error, PeerError)
+    assert "found none of one" in str(process.error)
+    assert "--only one" in str(process.error)
+
+
+def test_another_file_is_refused_and_the_right_one_still_welcome() -> None:
+    right = settings(*TWO)
+    wrong = settings(TWO[0], ("one", "Answerer", {"takes": 0.5}), meet=right.network.meet)
+    first = Process(right, "asker").up()
+    refused = Process(wrong, "one").done()
+    assert "found nodes[1].takes = 0.005 there, 0.5 here" in str(refused.error)
+    Process(right, "one").ended()
+    assert first.ended().outputs["one.answers"] > 0
+
+
+def test_how_each_process_gets_there_and_what_it_logs_may_differ() -> None:
+    """Through a tunnel, say, or with other certificates."""
+    here = settings(*TWO, log="debug", stall=0, shared=False)
+    there = settings(*TWO, meet="tcp/10.0.0.1:4711", wait=1.0)
+    assert what_all_share(here) == what_all_share(there)
+    assert what_all_share(here) != what_all_share(settings(*TWO, seed=1))

@@ -1,0 +1,68 @@
+"""A line goes on, whatever goes wrong with one message."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+
+from events import Image
+from runtime.errors import VisnavError
+from runtime.peers.messages import Message, Ready, Said, decode
+from runtime.peers.outbox import Line
+from runtime.peers.shared_memory import Outgoing
+from tests.runtime.peers.test_shared_memory import picture
+
+LARGE = 1000
+"""Side of a picture that a line's thread writes."""
+
+
+def line_of(put: Any) -> tuple[Line, list[VisnavError]]:
+    wrong: list[VisnavError] = []
+    return Line("x", put, wrong.append), wrong
+
+
+def test_it_goes_on_though_a_library_fails() -> None:
+    said: list[Message] = []
+
+    def put(head: bytes, payload: bytes) -> None:
+        if not said and payload:
+            said.append(Ready())
+            raise RuntimeError("of the library's own")
+        said.append(decode(head))
+
+    line, wrong = line_of(put)
+    large: Image = picture(1, side=LARGE)
+    line.send(Said("a.b"), large)
+    line.send(Said("c.d"), large)
+    line.close()
+    assert said[1:] == [Said("c.d")]
+    assert "RuntimeError: of the library's own" in str(wrong[0])
+
+
+def test_what_cannot_be_put_into_memory_is_counted_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In lockstep all that was sent is awaited, though it is without its event."""
+    said: list[tuple[Message, bytes]] = []
+
+    def full(*_: Any) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Outgoing, "put", full)
+    line, wrong = line_of(lambda head, payload: said.append((decode(head), payload)))
+    line.memory = Outgoing()
+    line.send(Said("a.b", 7), picture(1, side=LARGE))
+    line.send(Ready())
+    line.close()
+    assert said == [(Said("a.b", 7), b""), (Ready(), b"")]
+    assert "no space left" in str(wrong[0])
+
+
+def test_it_has_no_thread_before_it_needs_one() -> None:
+    before = threading.active_count()
+    line, _ = line_of(lambda *_: None)
+    line.send(Ready())
+    assert threading.active_count() == before
+    line.close()

@@ -1,0 +1,179 @@
+"""What large events pass through between processes of one machine."""
+
+from __future__ import annotations
+
+import gc
+import os
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from events import Image
+from runtime.errors import WireError
+from runtime.peers import shared_memory
+from runtime.peers.messages import Mapped, Said, decode
+from runtime.peers.outbox import SMALL, Line
+from runtime.peers.shared_memory import Incoming, Outgoing
+from runtime.wire import Packed, pack, unpack
+from runtime.workers.shared_memory import anonymous_file
+from tests.runtime.peers.samples import apart, settings
+from tests.runtime.peers.test_runs import THREE
+
+
+def picture(value: int = 0, side: int = 100) -> Image:
+    data = np.full((side, side, 3), value, np.uint8)
+    return Image(stamp=value, source="camera", frame_id="f", data=data)
+
+
+def both() -> tuple[Outgoing, Incoming]:
+    outgoing = Outgoing()
+    incoming = Incoming.found(outgoing.offer())
+    assert incoming is not None
+    return outgoing, incoming
+
+
+def put(outgoing: Outgoing, event: Image) -> tuple[int, int]:
+    place = outgoing.put(pack(event))
+    assert place is not None
+    return place
+
+
+def test_an_event_arrives_as_it_was() -> None:
+    outgoing, incoming = both()
+    sent = picture(7)
+    got = unpack(incoming.frame(*put(outgoing, sent)))
+    assert pack(got).frame() == pack(sent).frame()
+    assert isinstance(got, Image)
+    assert not got.data.flags.writeable
+
+
+def test_a_frame_stays_until_its_last_array_is_gone_and_then_its_place_is_used_again() -> None:
+    outgoing, incoming = both()
+    place = put(outgoing, picture(1))
+    got = unpack(incoming.frame(*place))
+    assert isinstance(got, Image)
+    part = got.data[5]
+    del got
+    assert incoming.unread == 0
+    others = {put(outgoing, picture(n)) for n in range(2, 5)}
+    assert place not in others
+    assert (part == 1).all()
+    del part
+    assert incoming.unread == 1
+    outgoing.freed(incoming.freed())
+    assert incoming.unread == 0
+    assert put(outgoing, picture(9)) == place
+
+
+def test_there_is_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_memory, "LIMIT", 100_000)
+    outgoing, _ = both()
+    packed = pack(picture())
+    assert [outgoing.put(packed) is None for _ in range(4)] == [False, False, True, True]
+
+
+def test_who_is_elsewhere_or_finds_another_file_does_without(tmp_path: Path) -> None:
+    offer = Outgoing().offer()
+    outgoing = Outgoing()  # so that the first one's descriptor may be another's now
+    gc.collect()
+    assert Incoming.found(offer) is None
+    offer = outgoing.offer()
+    assert Incoming.found(offer) is not None
+    other = tmp_path / "other"
+    other.write_bytes(offer.key)
+    for wrong in (
+        {"machine": "another"},
+        {"machine": ""},
+        {"key": bytes(len(offer.key))},
+        {"path": str(other)},  # it could shrink while it is read
+        {"path": str(tmp_path)},
+        {"path": "/dev/zero"},
+        {"path": "/proc/1/fd/4711"},
+    ):
+        assert Incoming.found(msgspec.structs.replace(offer, **wrong)) is None
+
+
+def test_no_descriptor_is_left() -> None:
+    def opened() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    gc.collect()
+    before = opened()
+    outgoing, incoming = both()
+    got = unpack(incoming.frame(*put(outgoing, picture(3))))
+    del outgoing, incoming
+    assert isinstance(got, Image)
+    assert (got.data == 3).all()
+    del got
+    assert opened() == before
+
+
+@pytest.mark.parametrize("place", [(1 << 30, 10), (0, 1 << 30), (-1, 10), (0, -5), (0, 10)])
+def test_a_wrong_place_is_an_error_of_the_wire(place: tuple[int, int]) -> None:
+    outgoing, incoming = both()
+    put(outgoing, picture())
+    with pytest.raises(WireError):
+        unpack(incoming.frame(*place))
+
+
+def test_nobody_can_shrink_the_file() -> None:
+    fd = anonymous_file()
+    os.ftruncate(fd, 5000)
+    with pytest.raises(PermissionError):
+        os.ftruncate(fd, 100)
+    os.close(fd)
+
+
+def lined(outgoing: Outgoing | None) -> tuple[Line, list[tuple[Any, bytes]]]:
+    said: list[tuple[Any, bytes]] = []
+    line = Line("x", lambda head, payload: said.append((decode(head), payload)), said.append)  # type: ignore[arg-type]
+    line.memory = outgoing
+    return line, said
+
+
+def test_a_line_puts_a_picture_there_at_once_and_a_larger_one_in_its_thread() -> None:
+    outgoing, incoming = both()
+    line, said = lined(outgoing)
+    line.send(Said("a.b"), picture(1))
+    ((first, payload),) = said  # already
+    assert payload == b""
+    got = unpack(incoming.frame(*first.place))
+    line.send(Said("a.b"), picture(2, side=1000))
+    line.send(Mapped())
+    line.close()
+    second = unpack(incoming.frame(*said[1][0].place))
+    assert [got.stamp, second.stamp] == [1, 2]
+    assert isinstance(said[2][0], Mapped)
+
+
+def test_a_line_without_room_there_sends_the_frame_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Outgoing, "put", lambda self, packed: None)
+    line, said = lined(Outgoing())
+    packed = pack(picture(1))
+    assert packed.size > SMALL
+    line.send(Said("a.b"), picture(1))
+    line.close()
+    assert said == [(Said("a.b"), packed.frame())]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_pictures_pass_through_it_if_the_file_says_so(
+    shared: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placed: list[int] = []
+    put = Outgoing.put
+
+    def noted(outgoing: Outgoing, packed: Packed) -> tuple[int, int] | None:
+        placed.append(packed.size)
+        return put(outgoing, packed)
+
+    monkeypatch.setattr(Outgoing, "put", noted)
+    monkeypatch.setattr("runtime.peers.outbox.SMALL", 4096)  # less than a picture of the sample
+    config = settings(*THREE, shared=shared)
+    one, other = apart(config, "asker", "one,other")
+    assert one.outputs == other.outputs
+    assert one.outputs["asker.pictures"] == 5
+    assert len(placed) == (5 if shared else 0)
