@@ -178,7 +178,7 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
         raise ConfigError(f"{where}: {module_name} cannot be imported: {error}") from error
     except DeclarationError as error:
         frames = traceback.extract_tb(error.__traceback__)
-        here = str(Path(__file__).parent)
+        here = str(Path(__file__).parents[1])
         last = [frame for frame in frames if not frame.filename.startswith(here)][-1]
         place = f"{last.filename}, line {last.lineno}"
         raise ConfigError(f"{where}: {module_name}: {error} ({place})") from error

@@ -18,7 +18,7 @@ from runtime.config.reading import load
 from runtime.errors import ConfigError
 from runtime.tools.cli import main
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "config.toml").read_text(encoding="utf-8")
 TOKENS = [
     "=", "[", "]", "[[", "]]", "{", "}", '"', "'", ",", "\n", "#", ".", "-", "0", "1", "1e999",

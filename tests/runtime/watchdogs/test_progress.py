@@ -64,7 +64,7 @@ class Spinning(Node):
 )
 def test_a_run_that_stands_still_names_the_node_and_the_line(node: type[Node], wanted: str) -> None:
     Told.lines.clear()
-    Told.wanted = wanted + r"runtime/test_standstill\.py:\d+ in run"
+    Told.wanted = wanted + r"watchdogs/test_progress\.py:\d+ in run"
     run = RunConfig(duration=Duration(0.1), progress_limit=Duration(0.2), stall=Duration(0))
     nodes = (spec(Busy, "busy"), spec(node, node.__name__.lower()))
     summary = execute(Config(run=run, nodes=nodes), handlers=[Told(logging.WARNING)])
