@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.config import load
+from runtime.config.reading import load
 from tests.runtime.tools.samples_cli import command_here
 
 ROOT = Path(__file__).parents[1]

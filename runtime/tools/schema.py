@@ -17,10 +17,10 @@ from typing import Any, Literal, get_args
 import msgspec
 from msgspec import inspect as types
 
-from runtime.config import NetworkConfig, OnError, RunConfig
+from runtime.config.model import NetworkConfig, OnError, RunConfig
+from runtime.config.parameters import is_marked
 from runtime.links import LinkConfig
 from runtime.node import Node
-from runtime.parameters import is_marked
 from runtime.units import Duration, plain
 
 Schema = dict[str, Any]
