@@ -16,7 +16,7 @@ import events
 from events.base import Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation
 from events.rotations import from_rpy, multiply
-from runtime.parameters import Changeable
+from runtime.config.parameters import Changeable
 from runtime.units import Latency
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
