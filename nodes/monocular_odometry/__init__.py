@@ -1,7 +1,7 @@
-"""Where a single camera has gone: sparse, semi-direct, with local bundle adjustment.
+"""Visual odometry of a single camera: sparse, semi-direct, with local bundle adjustment.
 
-`odometry` is the whole, `beginning` its first map and `local_map` how that grows; `tracks` and
-`flow` are the corners, `views` and `bundle` the geometry, `node` the node.
+`odometry` is the method, `initialization` makes its first map, `local_map` extends it; `tracks` has
+the corners, `views` and `bundle` the geometry, `node` the node.
 """
 
 from nodes.monocular_odometry.node import MonocularOdometry, MonocularOdometryConfig

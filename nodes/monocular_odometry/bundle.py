@@ -1,4 +1,4 @@
-"""Bundle adjustment of a few key frames and the landmarks that they see.
+"""Bundle adjustment: poses of a few key frames and their landmarks, optimized together.
 
 Gauss-Newton on reprojection errors with Huber weights and a little damping; landmarks are
 eliminated by the Schur complement (B. Triggs et al., "Bundle adjustment: a modern synthesis",
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from nodes.visual_odometry.tracker import Floats
+from nodes.odometry.images import Floats
 
 Indices = npt.NDArray[np.int64]
 
@@ -32,19 +32,19 @@ def adjust(
     noise: float,
     steps: int = 4,
 ) -> tuple[Floats, Floats, Floats]:
-    """Return poses and landmarks that fit all observations better, and the errors that are left.
+    """Return poses and landmarks that fit all observations better, and the remaining errors.
 
     Args:
         poses: World to camera, shape (k, 4, 4).
         landmarks: Points in the world, shape (l, 3).
-        frame: Which pose each observation is of, shape (m,).
-        landmark: Which landmark, not falling, shape (m,): each has observations, at most one in
-            each frame.
-        pixels: Where it was seen, shape (m, 2).
+        frame: Index of the pose of each observation, shape (m,).
+        landmark: Index of its landmark, in ascending order, shape (m,): each has observations, at
+            most one in each frame.
+        pixels: Column and row of each observation, shape (m, 2).
         matrix: K, shape (3, 3).
-        fixed: How many of the first poses stay; two of them hold place, turn and scale.
+        fixed: Number of first poses that stay; two of them fix position, rotation and scale.
         noise: Standard deviation of an observation, pixels.
-        steps: Of Gauss-Newton.
+        steps: Steps of Gauss-Newton.
 
     Returns:
         Poses, landmarks, and reprojection errors in pixels, shape (m,).
@@ -105,15 +105,15 @@ def linearise(
     target: Floats,
     scale: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return what all observations miss, and how that changes with poses and landmarks.
+    """Return the residuals of all observations, and their derivatives.
 
     Args:
         poses: World to camera, shape (k, 4, 4).
         landmarks: Points in the world, shape (l, 3).
-        frame: Which pose each observation is of, shape (m,).
-        landmark: Which landmark, shape (m,).
-        target: Where it was seen, as a ray with z = 1, shape (m, 2).
-        scale: Standard deviations to a unit of that, shape (2,).
+        frame: Index of the pose of each observation, shape (m,).
+        landmark: Index of its landmark, shape (m,).
+        target: Each observation as a ray with z = 1, shape (m, 2).
+        scale: Standard deviations in a unit of that, shape (2,).
 
     Returns:
         Residuals in standard deviations, shape (m, 2); their derivatives by a small motion of the

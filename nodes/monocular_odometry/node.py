@@ -1,4 +1,4 @@
-"""Monocular odometry as a node: which camera it reads, and when it speaks."""
+"""Monocular odometry as a node: the images it reads, and the estimates it sends."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime import Bundle
 
 
 class Frame(NamedTuple):
-    """One picture."""
+    """One image."""
 
     image: Image
 
@@ -23,14 +23,14 @@ class MonocularOdometryConfig(EstimatorConfig):
     """Settings of monocular odometry.
 
     Attributes:
-        settings: Of the method.
+        settings: Settings of the method.
     """
 
     settings: MonocularSettings = MonocularSettings()
 
 
 class MonocularOdometry(Estimator[MonocularOdometryConfig]):
-    """Where a single camera has gone, in a unit of length of its own."""
+    """Estimates the pose of a single camera, in a unit of length of its own."""
 
     needs = frozenset({"grey"})
     method = "monocular odometry"
@@ -49,11 +49,11 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
         )
 
     async def run(self) -> None:
-        """Track each image; say nothing until there is a map."""
+        """Track each image; nothing is sent until there is a map."""
         async for (image,) in self.frames:
-            tracked = await self._odometry.call(Odometry.track, image.stamp, image.data)
-            if tracked.initialised or tracked.lost:
-                self.publish(image, tracked)
+            result = await self._odometry.call(Odometry.track, image.stamp, image.data)
+            if result is not None:
+                self.publish(image, result)
 
 
 def make_odometry(info: CameraInfo, settings: MonocularSettings) -> Odometry:

@@ -1,11 +1,11 @@
-"""Corners on their way through key frames: where each was seen, and where it is in the world."""
+"""Corners followed through key frames: their pixels in each, and their points in the world."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from nodes.visual_odometry.tracker import Floats
+from nodes.odometry.images import Floats
 
 Mask = npt.NDArray[np.bool_]
 View = tuple[float, float]
@@ -15,9 +15,9 @@ class Tracks:
     """Corners that are followed.
 
     Attributes:
-        pixels: Where the newest key frame has them: column, row, shape (n, 2).
-        points: In the world, shape (n, 3); not a number while that is not known.
-        views: For each, its pixels by key frame.
+        pixels: Column and row in the newest key frame, shape (n, 2).
+        points: Points in the world, shape (n, 3); not a number while they are unknown.
+        views: Pixels of each by key frame.
     """
 
     def __init__(self, pixels: Floats, keyframe: int) -> None:
@@ -30,11 +30,11 @@ class Tracks:
 
     @property
     def known(self) -> Mask:
-        """Which have a place in the world, shape (n,)."""
+        """Which have a known point in the world, shape (n,)."""
         return np.asarray(np.isfinite(self.points[:, 0]))
 
     def keep(self, rows: npt.NDArray[np.int64]) -> list[tuple[Floats, dict[int, View]]]:
-        """Keep some; return points and views of the others that have a place."""
+        """Keep some; return points and views of those others whose point is known."""
         kept = np.zeros(len(self), np.bool_)
         kept[rows] = True
         gone = np.flatnonzero(~kept & self.known)
@@ -49,8 +49,8 @@ class Tracks:
         self.views = [self.views[row] for row in np.flatnonzero(kept).tolist()]
         self.pixels, self.points = self.pixels[kept], self.points[kept]
 
-    def see(self, keyframe: int, pixels: Floats) -> None:
-        """Note where a new key frame has them, shape (n, 2)."""
+    def add_view(self, keyframe: int, pixels: Floats) -> None:
+        """Add their pixels in a new key frame, shape (n, 2)."""
         self.pixels = pixels
         for views, (x, y) in zip(self.views, pixels.tolist(), strict=True):
             views[keyframe] = (x, y)

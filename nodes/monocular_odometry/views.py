@@ -1,4 +1,4 @@
-"""Geometry of several views: rays, triangulation, reprojection; and the first two views of all.
+"""Geometry of several views: triangulation, reprojection, and the motion between two views.
 
 Poses are world to camera, shape (4, 4); lengths are in the map's own unit.
 """
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from nodes.visual_odometry.tracker import Floats
+from nodes.odometry.images import Floats
 
 _PLANE = 3.0
 """Pixels up to which a corner fits a homography."""
@@ -19,15 +19,8 @@ _EPIPOLAR = 1.0
 """Pixels up to which it fits an essential matrix."""
 
 
-def rays(pixels: Floats, matrix: Floats) -> Floats:
-    """Return directions in the optical frame with z = 1, shape (n, 3), of pixels, shape (n, 2)."""
-    x = (pixels[:, 0] - matrix[0, 2]) / matrix[0, 0]
-    y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
-    return np.stack([x, y, np.ones(len(pixels))], axis=1)
-
-
 def triangulate(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
-    """Return the points halfway between pairs of rays, where those pass each other closest.
+    """Return the midpoints between pairs of rays where these are closest to each other.
 
     Args:
         first: Pose of the first camera.
@@ -59,12 +52,12 @@ def parallax(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
 
 
 def reprojection_errors(pose: Floats, points: Floats, pixels: Floats, matrix: Floats) -> Floats:
-    """Return how far points are seen from where they should be.
+    """Return the distances between projected points and their observed pixels.
 
     Args:
-        pose: Of the camera.
-        points: In the world, shape (n, 3).
-        pixels: Where they should be, shape (n, 2).
+        pose: Pose of the camera.
+        points: Points in the world, shape (n, 3).
+        pixels: Their observed pixels, shape (n, 2).
         matrix: K, shape (3, 3).
 
     Returns:
@@ -79,7 +72,7 @@ def reprojection_errors(pose: Floats, points: Floats, pixels: Floats, matrix: Fl
 
 
 def centre(pose: Floats) -> Floats:
-    """Return where a camera is, shape (3,)."""
+    """Return the position of a camera, shape (3,)."""
     return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
 
 

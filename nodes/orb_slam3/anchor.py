@@ -1,9 +1,9 @@
-"""One frame for all of ORB-SLAM3's maps, whose own it turns, scales, leaves and merges.
+"""One frame for all of ORB-SLAM3's maps, whose own frames it rotates, scales and merges.
 
-ORB-SLAM3's world is that of its present map: when it has been lost for long it begins another one
-at identity, when it knows a place again it merges the two, and when the IMU's scale and gravity
+ORB-SLAM3's world is that of its present map: when it has been lost for long it starts another one
+at identity, when it recognizes a place it merges the two, and when the IMU's scale and gravity
 become known it turns the world upright. What stays is the map's first key frame, whose present
-pose is asked of it whenever the world may have changed.
+pose is read whenever the world may have changed.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class KeyFrame(NamedTuple):
 class Anchor:
     """Takes poses from ORB-SLAM3's worlds to the frame of the very first key frame.
 
-    A map that begins after tracking was lost is put where the camera was last known to be, since
-    nothing better is known: so the way in between is missing, until the maps are merged.
+    A map that starts after tracking was lost is put at the last known pose of the camera, since
+    nothing better is known: so the motion in between is missing, until the maps are merged.
 
     Attributes:
         map: Stamp of the present map's first key frame (seconds); -1 before there is one.

@@ -1,4 +1,4 @@
-"""ORB-SLAM3 as a node: what it reads in each of its modes, and where its vocabulary is."""
+"""ORB-SLAM3 as a node: its inputs in each of its modes, and its vocabulary."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from runtime.paths import InputPath
 
 
 class Frame(NamedTuple):
-    """A picture, and its depth if the camera gives it."""
+    """An image, and its depth if the camera gives it."""
 
     image: Image
     depth: DepthImage | None
@@ -30,23 +30,23 @@ class OrbSlam3Config(EstimatorConfig):
     """Settings of ORB-SLAM3.
 
     Attributes:
-        mode: Which sensors it uses.
+        mode: The sensors that are used.
         vocabulary: File in DBoW2's text format; if empty, the one that
             ``python -m runtime vocabulary CONFIG`` has made.
-        orb: What else ORB-SLAM3 can be told.
-        patience: Real seconds that its mapping gets for each picture, at most, before the next.
+        orb: ORB-SLAM3's own settings.
+        mapping_timeout: Real time that its mapping gets for each image, at most, before the next.
     """
 
     mode: Mode = "rgbd"
     vocabulary: InputPath = ""
     orb: OrbSettings = OrbSettings()
-    patience: Duration = Duration(0.02)  # immutable
+    mapping_timeout: Duration = Duration(0.02)  # immutable
 
 
 class OrbSlam3(Estimator[OrbSlam3Config]):
-    """Where a camera has gone, by ORB-SLAM3 in a process of its own.
+    """Estimates the pose of a camera by ORB-SLAM3, in a process of its own.
 
-    Its threads make it vary from run to run, so the digest of a run with it is not promised.
+    Because of its threads the results vary from run to run, and so does the digest.
     """
 
     deterministic: ClassVar[bool] = False
@@ -66,10 +66,10 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         super().on_announcement(announcement)
         if isinstance(announcement, ImuAnnouncement) and self._imu is None:
             self._imu = announcement
-            self.narrow("measured", announcement.source)
+            self.narrow("imu", announcement.source)
 
     def check(self) -> Iterable[str]:
-        """Say if there is no camera, or no vocabulary."""
+        """Return the errors: no camera, or no vocabulary."""
         yield from super().check()
         try:
             find_vocabulary(self.config.vocabulary)
@@ -77,8 +77,8 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
             yield str(error)
 
     @on(Imu)
-    def measured(self, event: Imu) -> None:
-        """Keep what the IMU says until the next picture."""
+    def imu(self, event: Imu) -> None:
+        """Keep the samples of the IMU until the next image."""
         if "inertial" in self.config.mode:
             self._samples.append(event)
 
@@ -89,28 +89,29 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
             OrbSlam3Process,
             make_settings(config.mode, self.the_camera(), self._imu, config.orb),
             self._vocabulary(),
-            float(config.patience),
+            float(config.mapping_timeout),
             latency=config.latency,
         )
 
     async def run(self) -> None:
-        """Track each image; skip those that come meanwhile."""
-        began = False
+        """Track each image; those that arrive meanwhile are skipped."""
+        initialized = False
         async for image, depth in self.frames:
             if ("rgbd" in self.config.mode) != (depth is not None):
                 if depth is None:
                     continue
                 depth = None
-            said = await self._slam.call(
+            result = await self._slam.call(
                 OrbSlam3Process.track,
                 image.stamp,
                 image.data,
                 None if depth is None else depth.data,
                 self._take_samples(image.stamp),
             )
-            began = began or not said.lost
-            if began:
-                self.publish(image, said, origin=said.began if said.began >= 0 else None)
+            initialized = initialized or not result.lost
+            if initialized:
+                first = result.first_keyframe
+                self.publish(image, result, origin=first if first >= 0 else None)
 
     def _vocabulary(self) -> Path:
         """Return the vocabulary's file.
@@ -124,7 +125,7 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
             self.log.fatal("%s", error)
 
     def _take_samples(self, until: int) -> npt.NDArray[np.float64] | None:
-        """Return what was measured since the last picture, shape (n, 7)."""
+        """Return the samples since the last image, shape (n, 7)."""
         if "inertial" not in self.config.mode:
             return None
         rows = []

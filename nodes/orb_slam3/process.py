@@ -1,7 +1,7 @@
 """ORB-SLAM3 itself, by `pyorbslam3`. For a worker's process: it is GPL, and it may end or crash it.
 
     slam = await self.worker(OrbSlam3Process, settings, vocabulary, latency=…)
-    tracked = await slam.call(OrbSlam3Process.track, stamp, image, depth)
+    result = await slam.call(OrbSlam3Process.track, stamp, image, depth)
 
 The library is imported when an object is made, so that others may import this module for its
 names. It prints much, to standard output, which a worker gathers.
@@ -14,11 +14,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from nodes.estimation import TrackingResult
 from nodes.orb_slam3.anchor import Anchor, first_key_frame
 from nodes.orb_slam3.cloud import Cloud
 from nodes.orb_slam3.settings import Settings
@@ -33,40 +33,30 @@ INSTALL = (
     "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6"
 )
 
-_NO_POINTS = np.empty((0, 2), np.float32)
-
 _REACH = 6.0
 """Pixels between a map point, projected, and the corner that it was found at; a corner high in
 the pyramid is known to a few pixels only."""
 
 
-class Tracked(msgspec.Struct, frozen=True, eq=False):
-    """What ORB-SLAM3 says of one image.
+class OrbSlam3Result(TrackingResult, frozen=True, eq=False):
+    """What ORB-SLAM3 finds in one image.
+
+    The pose is in the optical camera at the first key frame; the points are all corners, without
+    distortion, and the inliers those that agree with the map.
 
     Attributes:
-        pose: The optical camera now, in the optical camera at the first key frame, shape (4, 4);
-            metres, or, without depth and IMU, its own unit.
-        lost: Whether the pose is not known; `pose` is then the last one that was.
-        reason: Why it is lost, or what happened to the map.
         state: ORB-SLAM3's own word (OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …), or RESET when
-            it has just thrown its map away.
-        points: float32 pixels (column, row) of all corners, without distortion, shape (n, 2).
-        inliers: bool, shape (n,): those that agree with the map.
-        matches: How many map points were found in the image.
-        map_points: How many points `OrbSlam3Process.map_points` has by now.
-        began: Stamp of the first key frame (ns); -1 before there is one.
-        maps: How many maps it has begun. What lies between two is guessed: see `Anchor`.
+            it has just discarded its map.
+        matches: Number of map points that were found in the image.
+        map_points: Number of points that `OrbSlam3Process.map_points` returns now.
+        first_keyframe: Stamp of the first key frame (ns); -1 before there is one.
+        maps: Number of maps so far. The motion between two is guessed: see `Anchor`.
     """
 
-    pose: Floats
-    lost: bool
-    reason: str = ""
     state: str = ""
-    points: Points = _NO_POINTS
-    inliers: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
     matches: int = 0
     map_points: int = 0
-    began: int = -1
+    first_keyframe: int = -1
     maps: int = 0
 
 
@@ -76,16 +66,16 @@ class OrbSlam3Process:
     Args:
         settings: Mode, settings file, size of images.
         vocabulary: In DBoW2's text format, its name ending with ``.txt``.
-        patience: Real seconds that `track` leaves the other threads, at most, to be done with the
-            image before. Without any, images that come faster than a camera takes them make the
-            map poorer, and lose it sooner without depth.
+        mapping_timeout: Real seconds for which `track` waits at most until the other threads have
+            finished with the previous image. Without any, images that come faster than a camera
+            takes them make the map poorer, and without depth it is lost sooner.
 
     Raises:
         MissingDependencyError: `pyorbslam3` cannot be imported.
         ValueError: The vocabulary is none.
     """
 
-    def __init__(self, settings: Settings, vocabulary: Path, patience: float = 0.02) -> None:
+    def __init__(self, settings: Settings, vocabulary: Path, mapping_timeout: float = 0.02) -> None:
         try:
             import pyorbslam3
         except ImportError as error:  # also where one of the system's libraries is missing
@@ -94,12 +84,12 @@ class OrbSlam3Process:
             ) from error
         check_vocabulary(vocabulary)
         self._settings = settings
-        self._patience = patience
+        self._mapping_timeout = mapping_timeout
         self._left_alone = time.monotonic()
         self._anchor = Anchor()
         self._was_ok = self._new = False
         self._stamps: list[int] = []
-        self._began = -1
+        self._first_keyframe = -1
         self._cloud = Cloud()
         self._folder = tempfile.TemporaryDirectory(prefix="orb_slam3_")
         file = Path(self._folder.name) / "settings.yaml"
@@ -114,15 +104,15 @@ class OrbSlam3Process:
         image: npt.NDArray[np.uint8],
         depth: npt.NDArray[np.float32] | None = None,
         imu: Floats | None = None,
-    ) -> Tracked:
-        """Follow the camera by one image.
+    ) -> OrbSlam3Result:
+        """Return the pose of the next image.
 
         Args:
-            stamp: Of the exposure (ns); later than the last one.
+            stamp: Stamp of the exposure (ns); later than the last one.
             image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
             depth: Metres along the optical axis, shape (h, w); ``inf`` where there is none. For
                 modes with depth only.
-            imu: For inertial modes: what was measured since the last image up to this one, in
+            imu: For inertial modes: the measurements since the last image up to this one, in
                 order, shape (n, 7): stamp (ns), angular velocity (rad/s), specific force (m/s²).
 
         Raises:
@@ -134,7 +124,7 @@ class OrbSlam3Process:
             # Compared with the first key frame by its words, which another thread must have
             # found by now: if not, it is lost at once.
             time.sleep(max(self._left_alone + _FIRST - time.monotonic(), 0.0))
-        _wait_for_other_threads(self._left_alone + self._patience)
+        _wait_for_other_threads(self._left_alone + self._mapping_timeout)
         chunk = None if imu is None else imu * (1e-9, 1, 1, 1, 1, 1, 1)
         if depth is None:
             result = self._slam.track_monocular(image, stamp * 1e-9, chunk)
@@ -142,15 +132,15 @@ class OrbSlam3Process:
             # 0 is how ORB-SLAM3 knows that there is no depth.
             known = np.where(np.isfinite(depth), depth, np.float32(0))
             result = self._slam.track_rgbd(image, known, stamp * 1e-9, chunk)
-        tracked = self._tracked(result)
+        found = self._result(result)
         self._left_alone = time.monotonic()
-        return tracked
+        return found
 
     def map_points(self) -> Points:
         """Return the points of the map seen so far, shape (n, 3), one in each 5 cm cell.
 
-        In the optical camera at the first key frame, as the poses. The library only tells which
-        points an image shows: this is the last that was heard of each place.
+        In the optical camera at the first key frame, as the poses. The library only gives the
+        points that an image shows; of each place this is the last one.
         """
         return self._cloud.points()
 
@@ -160,7 +150,7 @@ class OrbSlam3Process:
             self._slam.shutdown()
         self._folder.cleanup()
 
-    def _tracked(self, result: Any) -> Tracked:
+    def _result(self, result: Any) -> OrbSlam3Result:
         state = result.state.name
         valid = result.pose_valid and (state != "RECENTLY_LOST" or self._slam.imu_initialized())
         if valid and self._was_ok and np.array_equal(result.pose_wc, np.eye(4)):
@@ -173,7 +163,7 @@ class OrbSlam3Process:
             pose = np.asarray(result.pose_wc, np.float64)
             before = self._anchor.maps
             if not self._was_ok or before > 1 or self._slam.inertial:
-                self._look_at_the_map(pose)  # (it does not tell when it has merged two)
+                self._update_map(pose)  # (it does not say when it has merged two)
             self._anchor.place(pose)
             reason = ""
             if self._anchor.maps > before > 0:
@@ -183,7 +173,7 @@ class OrbSlam3Process:
                 inliers[self._corners_of(points, pose, corners)] = True
                 self._cloud.add(self._anchor.map, self._anchor.place_points(points))
         self._new, self._was_ok = valid and not self._was_ok, valid
-        return Tracked(
+        return OrbSlam3Result(
             pose=self._anchor.last,
             lost=not valid,
             reason=reason,
@@ -192,12 +182,12 @@ class OrbSlam3Process:
             inliers=inliers,
             matches=int(result.num_tracked_points) if valid else 0,
             map_points=len(self._cloud),
-            began=self._began,
+            first_keyframe=self._first_keyframe,
             maps=self._anchor.maps,
         )
 
-    def _look_at_the_map(self, pose: Floats) -> None:
-        """Ask for the first key frame of the present map, which only its trajectory tells."""
+    def _update_map(self, pose: Floats) -> None:
+        """Ask for the first key frame of the present map, which only its trajectory gives."""
         file = Path(self._folder.name) / "key_frames.tum"
         self._slam.save_keyframe_trajectory_tum(str(file))
         first = first_key_frame(file)
@@ -205,13 +195,13 @@ class OrbSlam3Process:
             left, maps = self._anchor.map, self._anchor.maps
             self._anchor.world_may_have_changed(first, pose)
             if self._anchor.map != left and self._anchor.maps == maps:
-                self._cloud.forget(left)  # merged: now it is known where they lay
-            if self._began < 0:
+                self._cloud.forget(left)  # merged: these points are now elsewhere
+            if self._first_keyframe < 0:
                 nearest = np.abs(np.array(self._stamps) - first.stamp * 1e9).argmin()
-                self._began = self._stamps[nearest]
+                self._first_keyframe = self._stamps[nearest]
 
     def _corners_of(self, points: Points, pose: Floats, corners: Points) -> npt.NDArray[np.int64]:
-        """Return which corners map points (n, 3) of ORB-SLAM3's world were found at."""
+        """Return the corners at which map points (n, 3) of ORB-SLAM3's world were found."""
         seen = (points - pose[:3, 3]) @ pose[:3, :3]
         ahead = seen[seen[:, 2] > 0]
         fx, fy, cx, cy = self._settings.intrinsics
@@ -226,7 +216,7 @@ def check_arrays(
     depth: npt.NDArray[np.float32] | None,
     imu: Floats | None,
 ) -> None:
-    """Refuse what ORB-SLAM3 would end the process for, or not notice.
+    """Refuse arrays for which ORB-SLAM3 would end the process, or which it would not notice.
 
     Raises:
         ValueError: An array is missing, superfluous, or of the wrong shape.
@@ -253,7 +243,7 @@ def check_arrays(
 def _wait_for_other_threads(until: float) -> None:
     """Return when this process computes next to nothing, or at a time (`time.monotonic`).
 
-    ORB-SLAM3's threads look for work every 3 and 5 ms, and do not tell when they have none.
+    ORB-SLAM3's threads look for work every 3 and 5 ms, and do not say when they have none.
     """
     while time.monotonic() + _QUIET < until:
         before = time.process_time()
@@ -277,10 +267,10 @@ _SENSORS = {
 
 _REASONS = {
     "SYSTEM_NOT_READY": "not ready yet",
-    "NO_IMAGES_YET": "a new map has not begun yet",
-    "NOT_INITIALIZED": "the map has not begun yet",
-    "RESET": "the map has been thrown away: the IMU's scale or gravity was not to be had from it",
+    "NO_IMAGES_YET": "a new map has not been initialized yet",
+    "NOT_INITIALIZED": "the map has not been initialized yet",
+    "RESET": "the map has been discarded: it did not give the IMU's scale or gravity",
     "RECENTLY_LOST": "too few matches with the map; looking for a place seen before",
     "LOST": "too few matches with the map",
 }
-"""What ORB-SLAM3's states mean to whoever reads a log."""
+"""Meanings of ORB-SLAM3's states, for the log."""

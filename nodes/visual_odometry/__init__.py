@@ -1,4 +1,4 @@
-"""Where an RGB-D camera has gone, from its pictures: by features, or by all pixels."""
+"""Visual odometry of an RGB-D camera: by features, or by all pixels."""
 
 from nodes.visual_odometry.node import VisualOdometry, VisualOdometryConfig
 

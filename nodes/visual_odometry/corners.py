@@ -1,4 +1,4 @@
-"""Corners for landmarks: the best of each square of the picture that has none yet.
+"""Corners for landmarks: the best of each square of the image that has none yet.
 
 J. Shi and C. Tomasi, "Good Features to Track", CVPR 1994: where the smaller eigenvalue of the
 structure tensor is large, a patch cannot slide unnoticed.
@@ -9,12 +9,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from nodes.visual_odometry.tracker import Floats, Grey
+from nodes.odometry.images import Floats, Grey
 
 RIM = 12
-"""Pixels at the edge of the picture that hold no corner: patches need a neighbourhood."""
+"""Pixels at the edge of the image without corners: patches need a neighbourhood."""
 _APART = 10
-"""Pixels between a new corner and one there is."""
+"""Least distance of a new corner from another one, pixels."""
 _BLOCK = 5
 _TEXTURE = 1.5e-4
 """Least eigenvalue of a corner, as OpenCV scales it: more than noise of two grey levels gives."""
@@ -32,7 +32,7 @@ def find_corners(image: Grey, spacing: int, taken: Floats) -> Floats:
     Args:
         image: Grey, shape (h, w).
         spacing: Side of a square, pixels.
-        taken: Corners there are, column and row, shape (m, 2).
+        taken: Other corners, column and row, shape (m, 2).
     """
     strength = np.asarray(cv2.cornerMinEigenVal(image, _BLOCK))
     height, width = image.shape

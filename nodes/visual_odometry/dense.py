@@ -14,45 +14,38 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from nodes.visual_odometry.tracker import (
-    Depth,
-    Floats,
-    Tracked,
-    grey_and_depth,
-    refuse_distortion,
-)
-
-SECOND = 1_000_000_000
+from nodes.estimation import TrackingResult
+from nodes.odometry.images import Depth, Floats, grey_and_depth, refuse_distortion
 
 
 class DenseSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the dense method.
 
     Attributes:
-        width: Pixels to which the pictures are reduced, if they are wider. Much less than 250 is
-            too little for the library's four levels.
-        reach: Metres beyond which depth is not used. (The library takes a picture with more than
-            10 m in it for one in units of a five-thousandth of a metre.)
-        every: Pictures from one key frame to the next.
-        share: Of the pixels that are compared, at most; time grows with it.
-        step: Metres by which a point's depth may change between key frame and picture.
-        patience: Seconds without a pose after which it begins anew from its last one.
+        width: Pixels to which wider images are reduced. Much less than 250 is too little for the
+            library's four levels.
+        max_depth: Metres beyond which depth is not used. (The library takes an image with more
+            than 10 m in it for one in units of a five-thousandth of a metre.)
+        keyframe_interval: Images from one key frame to the next.
+        pixel_share: Share of the pixels that are compared, at most; time grows with it.
+        max_depth_change: Metres by which a point's depth may change between key frame and image.
+        reset_timeout: Seconds without a pose after which a new map starts at the last pose.
     """
 
     width: Annotated[int, msgspec.Meta(ge=32)] = 256
-    reach: Annotated[float, msgspec.Meta(gt=0, lt=10)] = 9.9
-    every: Annotated[int, msgspec.Meta(ge=1)] = 2
-    share: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.3
-    step: Annotated[float, msgspec.Meta(gt=0)] = 0.3
-    patience: Annotated[float, msgspec.Meta(ge=0)] = 1.0
+    max_depth: Annotated[float, msgspec.Meta(gt=0, lt=10)] = 9.9
+    keyframe_interval: Annotated[int, msgspec.Meta(ge=1)] = 2
+    pixel_share: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.3
+    max_depth_change: Annotated[float, msgspec.Meta(gt=0)] = 0.3
+    reset_timeout: Annotated[float, msgspec.Meta(ge=0)] = 1.0
 
 
 class DenseOdometry:
-    """Follows an RGB-D camera from key frame to key frame. Equal pictures give equal poses.
+    """Tracks an RGB-D camera from key frame to key frame. Equal images give equal poses.
 
     Args:
-        info: Intrinsics of the pictures, which must be free of distortion.
-        settings: Of the method.
+        info: Intrinsics of the images, which must be free of distortion.
+        settings: Settings of the method.
     """
 
     def __init__(self, info: CameraInfo, settings: DenseSettings | None = None) -> None:
@@ -70,54 +63,54 @@ class DenseOdometry:
         self._age = 0
         self._lost_since: int | None = None
 
-    def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> Tracked:
-        """Follow the camera by one picture; see `Tracker.track`."""
+    def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> TrackingResult:
+        """Return the pose of the next image; see `Tracker.track`."""
         grey, depth = grey_and_depth(self._info, image, depth)
         step = self._step
         depth = depth[step // 2 :: step, step // 2 :: step]
-        usable = np.isfinite(depth) & (depth > 0) & (depth < self._settings.reach)
+        usable = np.isfinite(depth) & (depth > 0) & (depth < self._settings.max_depth)
         if usable.mean() < 0.05:
-            return self._lose(stamp, "less than a twentieth of the picture has depth")
+            return self._lose(stamp, "less than a twentieth of the image has depth")
         height, width = depth.shape
         small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
         frame = cv2.OdometryFrame(np.where(usable, depth, np.nan).astype(np.float32), small)
         self._odometry.prepareFrame(frame)
         if self._keyframe is None:
-            self._begin(frame)
-            return Tracked(self._pose)
-        pose = self._against(frame, self._keyframe, self._keyframe_pose)
+            self._make_keyframe(frame)
+            return TrackingResult(self._pose)
+        pose = self._align(frame, self._keyframe, self._keyframe_pose)
         if pose is None and self._before is not None:
-            pose = self._against(frame, self._before, self._pose)
-            self._age = self._settings.every  # the key frame is no good any more
+            pose = self._align(frame, self._before, self._pose)
+            self._age = self._settings.keyframe_interval  # the key frame cannot be used any more
         if pose is None:
-            lost = self._lose(stamp, "the pictures could not be aligned")
-            if stamp - (self._lost_since or stamp) < self._settings.patience * SECOND:
+            lost = self._lose(stamp, "the images could not be aligned")
+            if stamp - (self._lost_since or stamp) < self._settings.reset_timeout * 1e9:
                 return lost
-            self._begin(frame)
+            self._make_keyframe(frame)
             self._lost_since = None
-            return Tracked(self._pose, reason="by a new map, begun at the last pose")
+            return TrackingResult(self._pose, reason="by a new map, started at the last pose")
         reason = "against a key frame" if self._lost_since is not None else ""
         self._lost_since = None
         self._pose = pose
         self._before = frame
         self._age += 1
-        if self._age >= self._settings.every:
-            self._begin(frame)
-        return Tracked(pose, reason=reason)
+        if self._age >= self._settings.keyframe_interval:
+            self._make_keyframe(frame)
+        return TrackingResult(pose, reason=reason)
 
-    def _begin(self, frame: Any) -> None:
+    def _make_keyframe(self, frame: Any) -> None:
         """Make this the key frame."""
         self._keyframe, self._keyframe_pose, self._age = frame, self._pose, 0
 
-    def _against(self, frame: Any, other: Any, pose: Floats) -> Floats | None:
+    def _align(self, frame: Any, other: Any, pose: Floats) -> Floats | None:
         found, motion = self._odometry.compute(frame, other)
         return np.asarray(pose @ motion) if found and np.isfinite(motion).all() else None
 
-    def _lose(self, stamp: int, reason: str) -> Tracked:
+    def _lose(self, stamp: int, reason: str) -> TrackingResult:
         if self._lost_since is None:
             self._lost_since = stamp
         self._before = None
-        return Tracked(self._pose, lost=True, reason=reason)
+        return TrackingResult(self._pose, lost=True, reason=reason)
 
     def _library_settings(self) -> Any:
         info, step = self._info, self._step
@@ -127,9 +120,9 @@ class DenseOdometry:
         matrix[:2, 2] = (matrix[:2, 2] - (step - 1) / 2) / step
         matrix[0, 0], matrix[1, 1] = info.fx / step, info.fy / step
         settings.setCameraMatrix(matrix.astype(np.float32))
-        settings.setMaxDepth(self._settings.reach)
-        settings.setMaxDepthDiff(self._settings.step)
-        settings.setMaxPointsPart(self._settings.share)
+        settings.setMaxDepth(self._settings.max_depth)
+        settings.setMaxDepthDiff(self._settings.max_depth_change)
+        settings.setMaxPointsPart(self._settings.pixel_share)
         settings.setMaxTranslation(1.0)
         settings.setMaxRotation(30.0)
         return settings

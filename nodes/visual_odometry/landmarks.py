@@ -1,4 +1,4 @@
-"""The map: landmarks, each with the key frame it was first seen in, and its depth there.
+"""The map: landmarks, each with the key frame in which it was first seen, and its depth there.
 
 Rows are in the order of age, so that forgetting the oldest key frame is cutting off the front.
 """
@@ -8,18 +8,19 @@ from __future__ import annotations
 import numpy as np
 
 from events.poses import inverse
+from nodes.odometry.images import Depth, Floats
+from nodes.odometry.pose import intrinsics, rays
 from nodes.visual_odometry.patches import Patches, Rows
-from nodes.visual_odometry.surfaces import Surfaces, rays
-from nodes.visual_odometry.tracker import Depth, Floats
+from nodes.visual_odometry.surfaces import Surfaces
 
 _SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5
-"""How much smaller, larger or more slanted than at first sight a landmark may look."""
+"""Limits of how much smaller, larger or more slanted a landmark may look than at first."""
 _MEAN_OF = 20.0
-"""Readings of depth after which a landmark's mean goes on moving, the newest a twentieth."""
+"""Readings of depth after which the mean of a landmark's depth becomes a moving one."""
 _CONTRADICTS = 5.0
 """Standard deviations by which a reading of depth may differ from a landmark's."""
 _HIDES = 0.05
-"""Share of a landmark's inverse depth by which a surface there must differ to be another one."""
+"""Share of a landmark's inverse depth by which another surface must differ from it."""
 
 
 class Landmarks:
@@ -28,7 +29,7 @@ class Landmarks:
     Attributes:
         places: Metres in the world, shape (n, 3).
         keyframes: Number of the key frame each was first seen in, ascending, shape (n,).
-        pixels: Where that shows it, shape (n, 2).
+        pixels: Its pixels there, shape (n, 2).
     """
 
     _COLUMNS = (
@@ -41,23 +42,22 @@ class Landmarks:
         "_slopes",
         "_readings",
         "_missed",
-        "_rests_until",
+        "_inactive_until",
     )
 
-    def __init__(self, camera: tuple[float, ...]) -> None:
-        self._camera = camera
+    def __init__(self, matrix: Floats) -> None:
+        self._matrix = matrix
         self.places = np.empty((0, 3))
         self.keyframes: Rows = np.empty(0, np.int64)
         self.pixels = np.empty((0, 2))
-        self._directions = np.empty(
-            (0, 3, 3)
-        )  # columns: one column, one row, the ray, in the world
+        # In the world: the change by one column, that by one row, and the ray.
+        self._directions = np.empty((0, 3, 3))
         self._origins = np.empty((0, 3))
         self._inverse = np.empty(0)
         self._slopes = np.empty((0, 2))
         self._readings = np.empty(0)
         self._missed: Rows = np.empty(0, np.int64)
-        self._rests_until: Rows = np.empty(0, np.int64)
+        self._inactive_until: Rows = np.empty(0, np.int64)
 
     def __len__(self) -> int:
         return len(self.places)
@@ -68,14 +68,14 @@ class Landmarks:
         Args:
             number: Of the key frame; no less than any before.
             pose: World to camera, shape (4, 4).
-            pixels: Where it shows them, shape (n, 2).
-            seen: Their surfaces, all whole.
+            pixels: Their pixels there, shape (n, 2).
+            seen: Their surfaces, all continuous.
         """
         back, count, before = inverse(pose), len(pixels), len(self)
-        fx, fy, *_ = self._camera
+        fx, fy, *_ = intrinsics(self._matrix)
         axes = np.zeros((count, 3, 3))
         axes[:, 0, 0], axes[:, 1, 1] = 1 / fx, 1 / fy
-        axes[:, :, 2] = rays(pixels, self._camera)
+        axes[:, :, 2] = rays(pixels, self._matrix)
         directions = back[:3, :3] @ axes
         origins = np.tile(back[:3, 3], (count, 1))
         places = origins + directions[:, :, 2] / seen.inverse[:, None]
@@ -89,7 +89,7 @@ class Landmarks:
         self._slopes = np.concatenate([self._slopes, seen.slope])
         self._readings = np.concatenate([self._readings, np.ones(count)])
         self._missed = np.concatenate([self._missed, none])
-        self._rests_until = np.concatenate([self._rests_until, none])
+        self._inactive_until = np.concatenate([self._inactive_until, none])
         return np.arange(before, len(self))
 
     def forget_before(self, number: int) -> int:
@@ -100,7 +100,7 @@ class Landmarks:
         return gone
 
     def in_view(self, pose: Floats, size: tuple[int, int], margin: float, rows: Rows) -> Rows:
-        """Return which of some landmarks fall into a picture, or miss it by `margin` at most.
+        """Return which of some landmarks fall into an image, or miss it by `margin` at most.
 
         Args:
             pose: World to camera, shape (4, 4).
@@ -113,8 +113,8 @@ class Landmarks:
         return rows[inside & (z > 0.05)]
 
     def project(self, pose: Floats, rows: Rows) -> tuple[Floats, Floats]:
-        """Return where landmarks fall, shape (n, 2), and their depth, metres, shape (n,)."""
-        fx, fy, cx, cy = self._camera
+        """Return the pixels of landmarks, shape (n, 2), and their depth, metres, shape (n,)."""
+        fx, fy, cx, cy = intrinsics(self._matrix)
         points = self.places[rows] @ pose[:3, :3].T + pose[:3, 3]
         z = points[:, 2]
         ahead = np.where(z > 0.05, z, 1.0)
@@ -135,16 +135,16 @@ class Landmarks:
         off = np.abs(there - 1.0 / z)
         return np.asarray(rows[(there <= 0) | (off < np.maximum(_HIDES / z, 4 * noise))])
 
-    def awake(self, now: int, rows: Rows) -> Rows:
-        """Return those of some landmarks that do not rest because they were not found."""
-        return np.asarray(rows[self._rests_until[rows] <= now])
+    def active(self, now: int, rows: Rows) -> Rows:
+        """Return those of some landmarks that are looked for now, as `update_found` says."""
+        return np.asarray(rows[self._inactive_until[rows] <= now])
 
     def patches(self, pose: Floats, rows: Rows) -> tuple[Rows, Patches]:
-        """Return what to look for, and the rows that look enough as they did at first.
+        """Return the patches to look for, and the rows whose look has not changed too much.
 
         The warp is the derivative, at the landmark, of the homography that its plane induces.
         """
-        fx, fy, *_ = self._camera
+        fx, fy, *_ = intrinsics(self._matrix)
         expected, z = self.project(pose, rows)
         x = (self.places[rows] @ pose[:3, :3].T + pose[:3, 3]) / z[:, None]
         turn = pose[:3, :3] @ self._directions[rows, :, :2]
@@ -166,11 +166,14 @@ class Landmarks:
         rows = rows[good]
         return rows, Patches(self.keyframes[rows], self.pixels[rows], expected[good], warps[good])
 
-    def judge(self, now: int, found: Rows, missed: Rows) -> None:
-        """Let landmarks that were not found rest, the longer the more often that was in a row."""
+    def update_found(self, now: int, found: Rows, missed: Rows) -> None:
+        """Note which landmarks were found; the others are left out for a while.
+
+        That is the longer, the more often they were missed in a row.
+        """
         self._missed[found] = 0
         self._missed[missed] += 1
-        self._rests_until[missed] = now + 1 + self._missed[missed] ** 2
+        self._inactive_until[missed] = now + 1 + self._missed[missed] ** 2
 
     def fuse(self, pose: Floats, rows: Rows, read: Surfaces, noise: float) -> None:
         """Move landmarks along their first rays to the mean of all readings of their depth.
@@ -178,11 +181,11 @@ class Landmarks:
         Args:
             pose: World to camera, shape (4, 4).
             rows: Landmarks seen.
-            read: Their surfaces as this picture has them.
+            read: Their surfaces in this image.
             noise: Standard deviation of a reading, 1/m.
         """
         _, z = self.project(pose, rows)
-        use = read.whole & (np.abs(read.inverse - 1.0 / z) < _CONTRADICTS * noise)
+        use = read.continuous & (np.abs(read.inverse - 1.0 / z) < _CONTRADICTS * noise)
         rows, now = rows[use], read.inverse[use]
         origin = self._origins[rows] @ pose[2, :3] + pose[2, 3]
         ahead = self._directions[rows, :, 2] @ pose[2, :3]

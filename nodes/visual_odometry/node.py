@@ -1,17 +1,41 @@
-"""RGB-D visual odometry as a node: which camera it reads, and which method it runs beside."""
+"""RGB-D visual odometry as a node: the images it reads, and the method that it runs."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Protocol
 
 import cv2
+import numpy as np
+import numpy.typing as npt
 
 from events import CameraInfo
-from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig, RgbdFrame
+from nodes.estimation import (
+    WORKER_ENVIRONMENT,
+    Estimator,
+    EstimatorConfig,
+    RgbdFrame,
+    TrackingResult,
+)
+from nodes.odometry.images import Depth
 from nodes.visual_odometry.dense import DenseOdometry, DenseSettings
 from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
-from nodes.visual_odometry.tracker import Tracker
 from runtime import Bundle
+
+
+class Tracker(Protocol):
+    """A method of RGB-D odometry."""
+
+    def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> TrackingResult:
+        """Return the pose of the next image.
+
+        Args:
+            stamp: Stamp of the exposure (ns).
+            image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
+            depth: Metres along the optical axis, shape (h, w); ``inf`` where nothing was measured.
+
+        Raises:
+            ValueError: The size is not that of the camera.
+        """
 
 
 class VisualOdometryConfig(EstimatorConfig):
@@ -20,8 +44,8 @@ class VisualOdometryConfig(EstimatorConfig):
     Attributes:
         method: ``features``: corners, followed by optical flow, and their depth; ``dense``: every
             pixel, by OpenCV's ``cv2.Odometry``.
-        features: Of the first method.
-        dense: Of the second.
+        features: Settings of the method ``features``.
+        dense: Settings of the method ``dense``.
     """
 
     method: Literal["features", "dense"] = "features"
@@ -30,7 +54,7 @@ class VisualOdometryConfig(EstimatorConfig):
 
 
 class VisualOdometry(Estimator[VisualOdometryConfig]):
-    """Where a camera with depth has gone, from its pictures alone."""
+    """Estimates the pose of a camera with depth from its images alone."""
 
     needs = frozenset({"grey", "depth"})
 
@@ -50,7 +74,7 @@ class VisualOdometry(Estimator[VisualOdometryConfig]):
         )
 
     async def run(self) -> None:
-        """Track each image; skip those that come meanwhile."""
+        """Track each image; those that arrive meanwhile are skipped."""
         async for image, depth in self.frames:
             self.publish(
                 image, await self._tracker.call(Tracker.track, image.stamp, image.data, depth.data)

@@ -1,7 +1,7 @@
-"""Reading depth at corners: where the surface is whole, between the pixels, as inverse depth.
+"""Inverse depth at corners, interpolated between pixels where the surface is continuous.
 
 On a plane inverse depth is an affine function of the pixel, and a triangulating sensor's noise is
-the same at every distance in it; so that is what is smoothed, fitted, checked and weighted.
+the same at every distance in it; so inverse depth is smoothed, fitted, checked and weighted.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.visual_odometry.tracker import Depth, Floats
+from nodes.odometry.images import Depth, Floats
 
 REACH = 6
-"""Pixels around a corner over which its surface must be whole: what optical flow compares."""
+"""Pixels around a corner over which its surface must be continuous: optical flow compares them."""
 NEAREST = 0.05
-"""Metres; what is closer is dirt on the lens."""
+"""Metres; depth below it is ignored, as that of dirt on the lens."""
 _FARTHEST = 0.02
-"""1/m: beyond 50 m depth says nothing of a metre's motion."""
+"""1/m: beyond 50 m depth says nothing about a motion of metres."""
 _HOLE = -200.0
 """1/m: stands for no depth; so low that smoothing leaves a neighbour of a hole below zero."""
 _TORN = 0.02
@@ -36,16 +36,16 @@ class Surfaces(msgspec.Struct, frozen=True, eq=False):
     Attributes:
         inverse: Inverse depth at each, 1/m, shape (n,).
         slope: Its change by a column and by a row, 1/m, shape (n, 2).
-        whole: Where there is one, shape (n,): elsewhere depth is torn or missing.
+        continuous: Where there is one, shape (n,): elsewhere depth is torn or missing.
     """
 
     inverse: Floats
     slope: Floats
-    whole: npt.NDArray[np.bool_]
+    continuous: npt.NDArray[np.bool_]
 
     def take(self, rows: npt.NDArray[np.bool_]) -> Surfaces:
         """Return some of them."""
-        return Surfaces(self.inverse[rows], self.slope[rows], self.whole[rows])
+        return Surfaces(self.inverse[rows], self.slope[rows], self.continuous[rows])
 
 
 def inverse_depth(depth: Depth) -> Depth:
@@ -70,15 +70,7 @@ def surfaces_at(inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
     mean = around.mean(axis=1)
     slope = around @ _GRID / _SPREAD
     bend = np.abs(around - mean[:, None] - slope @ _GRID.T).max(axis=1)
-    whole = (around.min(axis=1) > 0) & (bend < np.maximum(_TORN * mean, _NOISY * noise))
+    continuous = (around.min(axis=1) > 0) & (bend < np.maximum(_TORN * mean, _NOISY * noise))
     value = mean + ((pixels - centre) * slope).sum(axis=1)
-    whole &= value > _FARTHEST
-    return Surfaces(np.where(whole, value, 0.0), slope, whole)
-
-
-def rays(pixels: Floats, camera: tuple[float, ...]) -> Floats:
-    """Return what pixels look at, 1 m along the optical axis, shape (n, 3)."""
-    fx, fy, cx, cy = camera
-    return np.stack(
-        [(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1
-    )
+    continuous &= value > _FARTHEST
+    return Surfaces(np.where(continuous, value, 0.0), slope, continuous)

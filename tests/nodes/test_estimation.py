@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,7 +26,7 @@ from events import (
     VehicleAnnouncement,
 )
 from events.poses import pose_matrix, pose_tuples
-from nodes.estimation import Estimator, RgbdFrame
+from nodes.estimation import Estimator, RgbdFrame, TrackingResult
 from runtime import Bundle
 from runtime.errors import NodeError, RefusedError
 from runtime.testing import NodeResult, run_nodes, spec
@@ -37,14 +35,6 @@ LOOKING_AHEAD = (0.5, 0.5, 0.5, 0.5)
 """Optical axes right, down, forward to body axes forward, right, down."""
 MS = 1_000_000
 INFO = CameraInfo.from_fov(8, 6, math.pi / 2)
-
-
-class Said(msgspec.Struct):
-    pose: npt.NDArray[np.float64]
-    lost: bool = False
-    reason: str = ""
-    points: npt.NDArray[np.float32] = np.zeros((0, 2), np.float32)
-    inliers: npt.NDArray[np.bool_] = np.zeros(0, np.bool_)
 
 
 class Scripted(Estimator):
@@ -63,7 +53,7 @@ class Scripted(Estimator):
             pose = np.eye(4)
             pose[2, 3] = count
             dark = not image.data.any()
-            self.publish(image, Said(pose, dark, "dark" if dark else ""))
+            self.publish(image, TrackingResult(pose, dark, "dark" if dark else ""))
             count += 1
 
 
@@ -285,7 +275,7 @@ def test_whatever_happens_an_estimate_in_map_is_true(
                 if image.data.any():
                     first = flown[image.stamp] if first is None else first
                     pose[2, 3] = flown[image.stamp] - first
-                self.publish(image, Said(pose, lost=not image.data.any()))
+                self.publish(image, TrackingResult(pose, lost=not image.data.any()))
 
     seen = camera("drone/front", "rgb", "depth", rate=100.0)
     result = run_nodes(

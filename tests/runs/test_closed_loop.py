@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from events import (
@@ -21,7 +19,7 @@ from events import (
     TrackingRegained,
 )
 from events.poses import pose_matrix
-from nodes.estimation import Estimator
+from nodes.estimation import Estimator, TrackingResult
 from nodes.pilots import VisualPilot
 from runtime import Input
 from runtime.testing import NodeResult, run_nodes, spec
@@ -32,14 +30,6 @@ FAILS = 6.0
 FLOOR = """<mujoco><worldbody>
   <light pos="0 0 4"/><geom name="floor" type="plane" size="9 9 1"/>
 </worldbody></mujoco>"""
-
-
-class Said(msgspec.Struct):
-    pose: npt.NDArray[np.float64]
-    lost: bool = False
-    reason: str = ""
-    points: npt.NDArray[np.float32] = np.zeros((0, 2), np.float32)
-    inliers: npt.NDArray[np.bool_] = np.zeros(0, np.bool_)
 
 
 class Ideal(Estimator):
@@ -73,7 +63,7 @@ class Ideal(Estimator):
                 encoding="mono8",
                 data=np.zeros((6, 8), np.uint8),
             )
-            self.publish(image, Said(first @ body))
+            self.publish(image, TrackingResult(first @ body))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from events.poses import inverse
-from nodes.monocular_odometry.beginning import FirstMap
+from nodes.monocular_odometry.initialization import InitialMap
 from nodes.monocular_odometry.local_map import LocalMap
 from nodes.monocular_odometry.settings import MonocularSettings
 from tests.nodes.monocular_odometry.world import MATRIX, Floats, Grey, pose
@@ -29,7 +29,7 @@ PLACES = [pose(0.2 * i, 0.02 * i, 0.01 * i, yaw=i) for i in range(14)]
 def begin() -> LocalMap:
     """Return a map of the first two places, in which half of the corners have no place yet."""
     pixels = np.stack([project(PLACES[0]), project(PLACES[1])])
-    found = FirstMap(BLANK, inverse(PLACES[1]), pixels, POINTS)
+    found = InitialMap(BLANK, inverse(PLACES[1]), pixels, POINTS)
     made = LocalMap.first(found, BLANK, np.eye(4), 1.0, MATRIX, SETTINGS)
     made.tracks.points[40:] = np.nan
     return made
@@ -38,7 +38,7 @@ def begin() -> LocalMap:
 def test_the_first_map_is_put_where_it_begins_and_in_the_worlds_unit() -> None:
     start = pose(3.0, 1.0, -2.0, yaw=30, pitch=10)
     pixels = np.stack([project(PLACES[0]), project(PLACES[1])])
-    found = FirstMap(BLANK, inverse(PLACES[1]), pixels, POINTS)
+    found = InitialMap(BLANK, inverse(PLACES[1]), pixels, POINTS)
     made = LocalMap.first(found, BLANK, start, 2.0, MATRIX, SETTINGS)
     second = PLACES[1].copy()
     second[:3, 3] *= 2.0
@@ -52,7 +52,7 @@ def test_the_first_map_is_put_where_it_begins_and_in_the_worlds_unit() -> None:
 
 def test_corners_of_no_known_place_are_supposed_at_the_median_depth() -> None:
     made = begin()
-    supposed = made.supposed()
+    supposed = made.approximate_points()
     np.testing.assert_array_equal(supposed[:40], POINTS[:40])
     seen = supposed[40:] @ made.pose[:3, :3].T + made.pose[:3, 3]
     np.testing.assert_allclose(seen[:, 2], made.depth)
@@ -100,7 +100,7 @@ def test_key_frames_that_nothing_needs_are_forgotten() -> None:
         if number == 4:
             rows = rows[40:]
             made.tracks.views = [{3: next(iter(views.values()))} for views in made.tracks.views]
-            made.tracks.see(3, project(PLACES[3], POINTS))
+            made.tracks.add_view(3, project(PLACES[3], POINTS))
         points = POINTS[40:] if number >= 4 else POINTS
         made.add_keyframe(BLANK, inverse(place), rows, project(place, points))
     assert made.newest == 13

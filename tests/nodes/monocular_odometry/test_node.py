@@ -69,7 +69,8 @@ def test_it_says_that_its_scale_is_free_and_nothing_before_it_has_a_map() -> Non
 
 
 @pytest.mark.parametrize(
-    "settings", [{"corners": 10}, {"keep": 1.0}, {"keyframes": 2}, {"patience": -1.0}]
+    "settings",
+    [{"corners": 10}, {"keyframe_overlap": 1.0}, {"keyframes": 2}, {"reset_timeout": -1.0}],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):

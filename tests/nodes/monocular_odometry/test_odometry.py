@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from nodes.monocular_odometry.odometry import MonocularOdometry, Tracked
+from nodes.estimation import TrackingResult
+from nodes.monocular_odometry.odometry import MonocularOdometry
 from nodes.monocular_odometry.settings import MonocularSettings
 from tests.nodes.monocular_odometry.world import (
     BOARD,
@@ -26,6 +27,8 @@ from tests.nodes.monocular_odometry.world import (
 Place = tuple[float, ...]
 """As `pose` takes it."""
 FRAME = 33_000_000
+NO_MAP = TrackingResult(np.eye(4), lost=True)
+"""Stands for images before there is a map."""
 DARK = np.zeros((INFO.height, INFO.width), np.uint8)
 RIGHT: list[Place] = [(0.05 * i,) for i in range(24)]
 seen = cache(lambda place, tiles=RELIEF: look(pose(*place), tiles))
@@ -35,8 +38,8 @@ def pictures(path: list[Place], tiles: tuple[Tile, ...] = RELIEF) -> list[Grey]:
     return [seen(place, tiles) for place in path]
 
 
-def follow(odometry: MonocularOdometry, images: list[Grey], start: int = 0) -> list[Tracked]:
-    return [odometry.track((start + i) * FRAME, image) for i, image in enumerate(images)]
+def follow(odometry: MonocularOdometry, images: list[Grey], start: int = 0) -> list[TrackingResult]:
+    return [odometry.track((start + i) * FRAME, image) or NO_MAP for i, image in enumerate(images)]
 
 
 def angle(a: Floats, b: Floats) -> float:
@@ -50,7 +53,7 @@ def turned(a: Floats, b: Floats) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def unit(said: Tracked, place: Place) -> float:
+def unit(said: TrackingResult, place: Place) -> float:
     """Return what the odometry's unit of length is in metres, from how far it has come."""
     return float(np.linalg.norm(pose(*place)[:3, 3]) / np.linalg.norm(said.pose[:3, 3]))
 
@@ -70,7 +73,6 @@ MOTIONS: dict[str, list[Place]] = {
 @pytest.mark.parametrize("path", MOTIONS.values(), ids=MOTIONS)
 def test_a_motion_has_its_direction_and_its_turn(path: list[Place]) -> None:
     *_, last = follow(MonocularOdometry(INFO), pictures(path))
-    assert last.initialised
     assert not last.lost
     true = pose(*path[-1])
     assert angle(last.pose[:3, 3], true[:3, 3]) < 0.6
@@ -82,7 +84,7 @@ def test_a_motion_has_its_direction_and_its_turn(path: list[Place]) -> None:
 def test_the_unit_of_length_stays(tiles: tuple[Tile, ...]) -> None:
     path: list[Place] = [(0.07 * i, 0.005 * i, 0.004 * i, 0.2 * i) for i in range(34)]
     said = follow(MonocularOdometry(INFO), pictures(path, tiles))
-    known = [i for i, each in enumerate(said) if each.initialised]
+    known = [i for i, each in enumerate(said) if each is not NO_MAP]
     assert known[0] < 14
     units = [unit(said[i], path[i]) for i in known]
     np.testing.assert_allclose(units, units[-1], rtol=0.02)
@@ -107,7 +109,7 @@ def test_a_camera_that_hurries_is_followed() -> None:
 def test_landmarks_that_leave_are_replaced_by_far_ones_in_time() -> None:
     path: list[Place] = [(0.06 * i,) for i in range(50)]
     said = follow(MonocularOdometry(INFO), pictures(path, BOARD))
-    known = [each for each in said if each.initialised]
+    known = [each for each in said if each is not NO_MAP]
     assert not any(each.lost for each in known)
     assert unit(known[-1], path[-1]) == pytest.approx(
         unit(known[20], path[-len(known) + 20]), rel=0.05
@@ -124,25 +126,22 @@ def test_what_moves_by_itself_does_not_agree() -> None:
         row = 60 + (2 * (i - 22) if i > 22 else 0)
         column = 150 - round(3.8 * i)
         moving[row : row + 80, column : column + 80] = thing  # at first as if it lay on the floor
-        said = odometry.track(i * FRAME, moving)
-    (x, y), agree = said.points.T, said.inliers
+        found = odometry.track(i * FRAME, moving)
+    assert found is not None
+    (x, y), agree = found.points.T, found.inliers
     on_it = (x > column + 8) & (x < column + 72) & (y > row + 8) & (y < row + 72)
-    assert not said.lost
+    assert not found.lost
     assert on_it.sum() > 5
     assert agree[on_it].mean() < 0.2
     assert agree[~on_it].mean() > 0.8
-    assert unit(said, on[-1]) == pytest.approx(2.0, rel=0.02)
+    assert unit(found, on[-1]) == pytest.approx(2.0, rel=0.02)
 
 
 def test_nothing_is_known_before_there_is_a_map() -> None:
     said = follow(MonocularOdometry(INFO), [DARK, DARK, *pictures(RIGHT)])
-    first = next(i for i, each in enumerate(said) if each.initialised)
+    first = next(i for i, each in enumerate(said) if each is not NO_MAP)
     assert first > 5
-    for each in said[:first]:
-        assert not each.lost
-        assert (each.reason, each.matches, len(each.points)) == ("initialising", 0, 0)
-        np.testing.assert_array_equal(each.pose, np.eye(4))
-    assert all(each.initialised and not each.lost for each in said[first:])
+    assert not any(each.lost for each in said[first:])
     assert {each.reason for each in said[first:]} == {""}
 
 
@@ -150,13 +149,13 @@ def test_nothing_is_known_before_there_is_a_map() -> None:
     "path", [[(0.0,)] * 12, [(0.0, 0.0, 0.0, 3.0 * i) for i in range(12)]], ids=["rest", "turning"]
 )
 def test_without_a_way_there_is_no_map(path: list[Place]) -> None:
-    assert not any(each.initialised for each in follow(MonocularOdometry(INFO), pictures(path)))
+    assert all(each is NO_MAP for each in follow(MonocularOdometry(INFO), pictures(path)))
 
 
 def test_a_camera_that_turned_first_begins_once_it_moves() -> None:
     turn: list[Place] = [(0.0, 0.0, 0.0, 2.0 * i) for i in range(8)]
     away: list[Place] = [(0.05 * i, 0.0, 0.0, 14.0) for i in range(16)]
-    assert follow(MonocularOdometry(INFO), pictures(turn + away))[-1].initialised
+    assert follow(MonocularOdometry(INFO), pictures(turn + away))[-1] is not NO_MAP
 
 
 def test_equal_pictures_give_equal_bits() -> None:
@@ -173,21 +172,21 @@ def test_colour_is_seen_as_grey() -> None:
     images = pictures(RIGHT[:16])
     *_, a = follow(grey, images)
     *_, b = follow(colour, [np.repeat(image[..., None], 3, axis=2) for image in images])
-    assert a.initialised
+    assert a is not NO_MAP
     np.testing.assert_array_equal(a.pose, b.pose)
 
 
 def test_it_tells_what_it_followed() -> None:
     *_, last = follow(MonocularOdometry(INFO), pictures(RIGHT))
     assert last.points.shape == (len(last.inliers), 2)
-    assert last.matches == last.inliers.sum() > 60
+    assert last.inliers.sum() > 60
 
 
 def test_a_dark_moment_is_lost_and_regained_with_the_same_unit() -> None:
     odometry = MonocularOdometry(INFO)
     *_, before = follow(odometry, pictures(RIGHT))
     dark = follow(odometry, [DARK] * 3, 24)
-    assert all(each.lost and each.initialised and each.reason for each in dark)
+    assert all(each.lost and each is not NO_MAP and each.reason for each in dark)
     np.testing.assert_array_equal(dark[-1].pose, before.pose)
     on: list[Place] = [(1.15 + 0.05 * i,) for i in range(1, 12)]
     after = follow(odometry, pictures(on), 27)
@@ -209,18 +208,18 @@ def elsewhere(count: int) -> list[Grey]:
 
 
 @pytest.mark.slow
-def test_a_new_map_waits_for_patience_says_so_and_goes_on_from_the_last_pose() -> None:
-    odometry = MonocularOdometry(INFO, MonocularSettings(patience=0.15))
+def test_a_new_map_waits_for_the_timeout_says_so_and_goes_on_from_the_last_pose() -> None:
+    odometry = MonocularOdometry(INFO, MonocularSettings(reset_timeout=0.15))
     *_, before = follow(odometry, pictures(DOWN_AND_ASIDE, FLAT))
     assert not before.lost
     said = follow(odometry, elsewhere(20), len(DOWN_AND_ASIDE))
     new = next(i for i, each in enumerate(said) if not each.lost)
     assert new * FRAME > 0.15e9
     assert "new map" in said[new].reason
-    assert all(each.initialised for each in said)
+    assert NO_MAP not in said
     assert not any(each.lost or each.reason for each in said[new + 1 :])
     relative = [np.linalg.inv(before.pose) @ each.pose for each in said[new:]]
-    assert np.linalg.norm(relative[0][:3, 3]) < 0.3  # it moved while it was beginning
+    assert np.linalg.norm(relative[0][:3, 3]) < 0.3  # it moved during initialization
     for each in relative:
         assert angle(each[:3, 3], np.array([1.0, 0.0, 0.0])) < 1.5
         assert turned(each, np.eye(4)) < 0.5
@@ -230,15 +229,15 @@ def test_a_new_map_waits_for_patience_says_so_and_goes_on_from_the_last_pose() -
 
 
 @pytest.mark.slow
-def test_before_patience_ends_there_is_no_new_map() -> None:
-    odometry = MonocularOdometry(INFO, MonocularSettings(patience=10.0))
+def test_before_the_timeout_there_is_no_new_map() -> None:
+    odometry = MonocularOdometry(INFO, MonocularSettings(reset_timeout=10.0))
     follow(odometry, pictures(RIGHT, FLAT))
     assert all(each.lost for each in follow(odometry, elsewhere(8), 24))
 
 
 @pytest.mark.slow
-def test_a_known_place_is_better_than_a_new_map_even_after_patience() -> None:
-    odometry = MonocularOdometry(INFO, MonocularSettings(patience=0.1))
+def test_a_known_place_is_better_than_a_new_map_even_after_the_timeout() -> None:
+    odometry = MonocularOdometry(INFO, MonocularSettings(reset_timeout=0.1))
     *_, before = follow(odometry, pictures(RIGHT))
     assert all(each.lost for each in follow(odometry, [DARK] * 20, 24))
     *_, after = follow(odometry, pictures(RIGHT[-1:] * 3), 44)

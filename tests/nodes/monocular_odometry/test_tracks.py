@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from nodes.monocular_odometry.flow import SPACING, follow_both_ways, inside, new_corners
+from nodes.monocular_odometry.corners import SPACING, new_corners
 from nodes.monocular_odometry.tracks import Tracks
+from nodes.odometry.flow import follow_both_ways
+from nodes.odometry.images import inside
 from tests.nodes.monocular_odometry.world import FLAT, INFO, look, pose
 
 HERE, THERE = look(pose(), FLAT), look(pose(x=0.1), FLAT)
@@ -19,7 +21,7 @@ def test_tracks_remember_their_views_and_hand_over_landmarks_that_leave() -> Non
     tracks.points[:2] = [[0, 0, 1], [0, 0, 2]]
     gone = tracks.keep(np.array([1, 2]))
     assert [(point.tolist(), views) for point, views in gone] == [([0, 0, 1], {0: (1, 2)})]
-    tracks.see(1, np.array([[3.5, 4.0], [5.5, 6.0]]))
+    tracks.add_view(1, np.array([[3.5, 4.0], [5.5, 6.0]]))
     tracks.add(np.array([[9.0, 9.0]]), 1)
     assert tracks.views == [{0: (3, 4), 1: (3.5, 4)}, {0: (5, 6), 1: (5.5, 6)}, {1: (9, 9)}]
     assert tracks.known.tolist() == [True, False, False]

@@ -12,10 +12,10 @@ from nodes.monocular_odometry.views import (
     centre,
     hypotheses,
     parallax,
-    rays,
     reprojection_errors,
     triangulate,
 )
+from nodes.odometry.pose import rays
 from tests.nodes.monocular_odometry.world import MATRIX, Floats, pose
 
 K = np.array([[100.0, 0.0, 50.0], [0.0, 200.0, 40.0], [0.0, 0.0, 1.0]])

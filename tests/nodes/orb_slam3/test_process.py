@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nodes.orb_slam3.process import OrbSlam3Process, Tracked, check_arrays
+from nodes.orb_slam3.process import OrbSlam3Process, OrbSlam3Result, check_arrays
 from nodes.orb_slam3.settings import Mode, OrbSettings, make_settings
 from nodes.orb_slam3.training import describe
 from nodes.orb_slam3.vocabulary import TreeShape, train
@@ -43,7 +43,7 @@ class Flight:
     """What ORB-SLAM3 said of some pictures, what it knew at the end, and what it printed."""
 
     def __init__(self, mode: Mode, vocabulary: Path, seen: Sequence[View]) -> None:
-        self.tracked: list[Tracked] = []
+        self.tracked: list[OrbSlam3Result] = []
         self.printed: list[str] = []
         self.seen = seen
         try:
@@ -90,7 +90,7 @@ def test_the_pose_is_the_camera_in_its_first_frame_in_metres(flight: Flight) -> 
     first, last = flight.tracked[0], flight.tracked[29]
     assert not any(t.lost for t in flight.tracked[:30])
     np.testing.assert_allclose(first.pose, np.eye(4), atol=1e-6)
-    assert (first.began, first.maps, first.state) == (0, 1, "OK")
+    assert (first.first_keyframe, first.maps, first.state) == (0, 1, "OK")
     # The camera went 35 cm to the right and 23 cm ahead, and turned left by 10 degrees.
     np.testing.assert_allclose(last.pose[:3, 3], flight.seen[29].pose[:3, 3], atol=0.01)
     metres, degrees = Flight.errors(flight)
@@ -157,7 +157,7 @@ def test_without_depth_the_way_is_right_but_for_its_scale(vocabulary: Path) -> N
     assert len(known) > 25
     assert known[-1] == 44
     stamps = [v.stamp for v in flight.seen]
-    began = stamps.index(flight.tracked[-1].began)
+    began = stamps.index(flight.tracked[-1].first_keyframe)
     assert began < known[0]
     start = np.linalg.inv(flight.seen[began].pose)
     true = np.array([(start @ flight.seen[k].pose)[:3, 3] for k in known])

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from events.poses import inverse
+from nodes.odometry.images import Floats
+from nodes.odometry.pose import rays
 from nodes.visual_odometry.corners import find_corners, squares
 from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import find_patches
-from nodes.visual_odometry.surfaces import inverse_depth, rays, surfaces_at
-from nodes.visual_odometry.tracker import Floats
+from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
 from tests.nodes.visual_odometry.world import INFO, look, pose
 
-CAMERA = (INFO.fx, INFO.fy, INFO.cx, INFO.cy)
+MATRIX = INFO.matrix()
 SIZE = INFO.width, INFO.height
 
 
@@ -24,8 +25,8 @@ def mapped(number: int = 0, seen_from: Floats | None = None) -> Landmarks:
     image, depth = look(where)
     corners = find_corners(image, 28, np.empty((0, 2)))
     seen = surfaces_at(inverse_depth(depth), corners, 0.002)
-    landmarks = Landmarks(CAMERA)
-    landmarks.add(number, inverse(where), corners[seen.whole], seen.take(seen.whole))
+    landmarks = Landmarks(MATRIX)
+    landmarks.add(number, inverse(where), corners[seen.continuous], seen.take(seen.continuous))
     return landmarks
 
 
@@ -53,7 +54,7 @@ def test_a_corner_by_an_edge_or_a_hole_has_no_surface() -> None:
         [[edge, 120], [edge - 5, 120], [160, 120], [30, 30], [161, 61], [170, 60]], dtype=float
     )
     seen = surfaces_at(inverse_depth(depth), pixels, 0.0015)
-    assert seen.whole.tolist() == [False, False, True, True, False, True]
+    assert seen.continuous.tolist() == [False, False, True, True, False, True]
     assert seen.inverse[[2, 3]] == pytest.approx([1 / 2.0, 1 / 3.0], rel=1e-4)
 
 
@@ -61,14 +62,14 @@ def test_a_hole_far_away_is_no_surface_either() -> None:
     depth = np.full((40, 60), 30.0, np.float32)
     depth[20, 30] = np.inf
     seen = surfaces_at(inverse_depth(depth), np.array([[30.0, 20.0], [31.0, 21.0]]), 0.0025)
-    assert not seen.whole.any()
+    assert not seen.continuous.any()
 
 
 def test_the_slope_of_a_slanted_wall_is_that_of_its_inverse_depth() -> None:
     columns, rows = np.meshgrid(np.arange(60), np.arange(40))
     depth = (1.0 / (0.2 + 0.002 * columns - 0.001 * rows)).astype(np.float32)
     seen = surfaces_at(inverse_depth(depth), np.array([[30.0, 20.0], [25.4, 18.7]]), 0.0015)
-    assert seen.whole.all()
+    assert seen.continuous.all()
     assert seen.slope == pytest.approx(np.array([[0.002, -0.001]] * 2), abs=1e-5)
     assert seen.inverse == pytest.approx([0.24, 0.2 + 0.0508 - 0.0187], abs=1e-5)
 
@@ -80,7 +81,7 @@ def test_warps_are_what_a_pixel_beside_a_landmark_does() -> None:
     wall = landmarks.places[rows, 2] > 2.5
     rows, patches = rows[wall], patches.take(np.flatnonzero(wall))
     for axis in (0, 1):
-        beside = rays(patches.pixels + 0.01 * np.eye(2)[axis], CAMERA) @ first[:3, :3].T
+        beside = rays(patches.pixels + 0.01 * np.eye(2)[axis], MATRIX) @ first[:3, :3].T
         place = beside * (3.0 / beside[:, 2:])
         there = (place - then[:3, 3]) @ then[:3, :3]
         pixels = there[:, :2] / there[:, 2:] * (INFO.fx, INFO.fy) + (INFO.cx, INFO.cy)
@@ -126,10 +127,10 @@ def test_readings_of_depth_from_elsewhere_average_out() -> None:
     image, depth = look(pose())
     noisy = (1 / (1 / depth + random.normal(0, 0.01, depth.shape))).astype(np.float32)
     corners = find_corners(image, 28, np.empty((0, 2)))
-    corners = corners[surfaces_at(inverse_depth(depth), corners, 0.01).whole]
+    corners = corners[surfaces_at(inverse_depth(depth), corners, 0.01).continuous]
     seen = surfaces_at(inverse_depth(noisy), corners, 0.02)
-    corners, seen = corners[seen.whole], seen.take(seen.whole)
-    landmarks = Landmarks(CAMERA)
+    corners, seen = corners[seen.continuous], seen.take(seen.continuous)
+    landmarks = Landmarks(MATRIX)
     rows = landmarks.add(0, np.eye(4), corners, seen)
     wall = np.where(landmarks.places[:, 2] > 2.5, 3.0, 2.0)
     first = np.abs(landmarks.places[:, 2] - wall).mean()
@@ -146,14 +147,14 @@ def test_readings_of_depth_from_elsewhere_average_out() -> None:
 def test_a_landmark_that_is_missed_rests_and_comes_back() -> None:
     landmarks, row = mapped(), np.array([3])
     none = np.empty(0, np.int64)
-    landmarks.judge(10, none, row)
-    assert len(landmarks.awake(11, row)) == 0
-    assert len(landmarks.awake(12, row)) == 1
-    landmarks.judge(12, none, row)
-    assert len(landmarks.awake(16, row)) == 0
-    landmarks.judge(20, row, none)
-    landmarks.judge(21, none, row)
-    assert len(landmarks.awake(23, row)) == 1
+    landmarks.update_found(10, none, row)
+    assert len(landmarks.active(11, row)) == 0
+    assert len(landmarks.active(12, row)) == 1
+    landmarks.update_found(12, none, row)
+    assert len(landmarks.active(16, row)) == 0
+    landmarks.update_found(20, row, none)
+    landmarks.update_found(21, none, row)
+    assert len(landmarks.active(23, row)) == 1
 
 
 def test_forgetting_a_key_frame_leaves_the_others_as_they_were() -> None:
@@ -170,7 +171,7 @@ def test_forgetting_a_key_frame_leaves_the_others_as_they_were() -> None:
 
 
 def test_few_key_frames_remembered_do_for_a_path() -> None:
-    tracker = FeatureOdometry(INFO, FeatureSettings(keyframes=2, shift=8.0))
+    tracker = FeatureOdometry(INFO, FeatureSettings(keyframes=2, keyframe_shift=8.0))
     for index in range(30):
         there = pose(x=0.02 * index, yaw=0.2 * index)
         said = tracker.track(index * 33_000_000, *look(there))
@@ -188,7 +189,7 @@ def test_pictures_without_depth_are_followed_on_the_map_there_is() -> None:
 
 
 def test_a_lost_camera_finds_a_key_frame_that_optical_flow_does_not_reach() -> None:
-    tracker = FeatureOdometry(INFO, FeatureSettings(shift=30.0))
+    tracker = FeatureOdometry(INFO, FeatureSettings(keyframe_shift=30.0))
     for index in range(28):
         tracker.track(index * 33_000_000, *look(pose(x=0.12 * index)))
     dark = np.zeros((240, 320), np.uint8), np.full((240, 320), np.inf, np.float32)

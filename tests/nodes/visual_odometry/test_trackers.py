@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from events import CameraInfo
+from nodes.estimation import TrackingResult
+from nodes.odometry.images import Floats
 from nodes.visual_odometry.dense import DenseOdometry
 from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
-from nodes.visual_odometry.tracker import Floats, Tracked, Tracker
+from nodes.visual_odometry.node import Tracker
 from tests.nodes.visual_odometry.world import INFO, look, pose
 
 Make = Callable[[CameraInfo], Tracker]
@@ -19,11 +21,11 @@ METHODS = pytest.mark.parametrize("make", [FeatureOdometry, DenseOdometry])
 FRAME = 33_000_000
 
 
-def follow(tracker: Tracker, path: list[Floats], start: int = 0) -> list[Tracked]:
+def follow(tracker: Tracker, path: list[Floats], start: int = 0) -> list[TrackingResult]:
     return [tracker.track((start + i) * FRAME, *look(each)) for i, each in enumerate(path)]
 
 
-def off(said: Tracked, true: Floats) -> tuple[float, float]:
+def off(said: TrackingResult, true: Floats) -> tuple[float, float]:
     """Return the errors of a pose: metres, degrees."""
     between = np.linalg.inv(true) @ said.pose
     cosine = np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1)
@@ -127,7 +129,7 @@ def test_features_find_a_place_again_that_they_were_carried_to() -> None:
 
 
 def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
-    settings = FeatureSettings(patience=0.1)
+    settings = FeatureSettings(reset_timeout=0.1)
     tracker = FeatureOdometry(INFO, settings)
     follow(tracker, RIGHT)
     strange = pose(x=40.0)  # past the wall's end there is none
@@ -142,4 +144,4 @@ def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
 def test_features_tell_what_they_followed() -> None:
     *_, said = follow(FeatureOdometry(INFO), RIGHT)
     assert said.points.shape == (len(said.inliers), 2)
-    assert said.matches == said.inliers.sum() > 50
+    assert said.inliers.sum() > 50

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from events.poses import inverse
-from nodes.monocular_odometry.beginning import Beginning, FirstMap
+from nodes.monocular_odometry.initialization import Initialization, InitialMap
 from nodes.monocular_odometry.settings import MonocularSettings
 from tests.nodes.monocular_odometry.world import (
     FLAT,
@@ -21,11 +21,11 @@ from tests.nodes.monocular_odometry.world import (
 )
 
 
-def begin(path: list[Floats], tiles: tuple[Tile, ...]) -> tuple[FirstMap, int]:
+def begin(path: list[Floats], tiles: tuple[Tile, ...]) -> tuple[InitialMap, int]:
     """Return the first map and the number of its second picture."""
-    beginning = Beginning(MATRIX, MonocularSettings())
+    initialization = Initialization(MATRIX, MonocularSettings())
     for number, place in enumerate(path):
-        found = beginning.see(look(place, tiles))
+        found = initialization.add(look(place, tiles))
         if found is not None:
             return found, number
     pytest.fail("no map")
@@ -59,21 +59,23 @@ def test_landmarks_are_seen_where_the_map_says() -> None:
 
 
 def test_it_waits_for_the_motion_that_is_asked_for() -> None:
-    beginnings = [Beginning(MATRIX, MonocularSettings(shift=shift)) for shift in (15.0, 35.0)]
+    initializations = [
+        Initialization(MATRIX, MonocularSettings(keyframe_shift=shift)) for shift in (15.0, 35.0)
+    ]
     numbers = [
-        next(number for number, place in enumerate(WAY) if beginning.see(look(place, FLAT)))
-        for beginning in beginnings
+        next(number for number, place in enumerate(WAY) if initialization.add(look(place, FLAT)))
+        for initialization in initializations
     ]
     assert numbers[0] < numbers[1]
 
 
 def test_too_few_corners_begin_anew_with_the_next_picture() -> None:
     dark: Grey = np.zeros((192, 256), np.uint8)
-    beginning = Beginning(MATRIX, MonocularSettings())
-    assert beginning.see(look(WAY[0])) is None
-    assert beginning.see(dark) is None
+    initialization = Initialization(MATRIX, MonocularSettings())
+    assert initialization.add(look(WAY[0])) is None
+    assert initialization.add(dark) is None
     found = None
     for place in WAY[4:]:
-        found = found or beginning.see(look(place))
+        found = found or initialization.add(look(place))
     assert found is not None
     np.testing.assert_array_equal(found.first, look(WAY[4]))

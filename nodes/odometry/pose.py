@@ -1,4 +1,4 @@
-"""The pose that explains where landmarks are seen, and how far away: robust Gauss-Newton.
+"""The pose of a camera from the pixels and depths of landmarks: robust Gauss-Newton.
 
 Residuals of each landmark are its two pixels and its inverse depth, each in units of its noise, as
 a stereo camera's three coordinates would be (R. Mur-Artal and J. D. Tardós, "ORB-SLAM2", IEEE
@@ -7,12 +7,15 @@ T-RO 2017, section III-A); weights are Huber's.
 
 from __future__ import annotations
 
+from typing import Any
+
+import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from nodes.visual_odometry.tracker import Floats
+from nodes.odometry.images import Floats
 
 _HUBER = 2.0
 """Standard deviations beyond which a residual counts linearly."""
@@ -21,13 +24,13 @@ _SMALL = 1e-7
 
 
 class Observations(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks as one picture shows them.
+    """Landmarks as one image shows them.
 
     Attributes:
         landmarks: Metres in the world, shape (n, 3).
         pixels: Column and row, shape (n, 2).
         inverse: Measured inverse depth, 1/m, shape (n,).
-        measured: Where there is one, shape (n,).
+        measured: Which have a measured inverse depth, shape (n,).
     """
 
     landmarks: Floats
@@ -35,15 +38,15 @@ class Observations(msgspec.Struct, frozen=True, eq=False):
     inverse: Floats
     measured: npt.NDArray[np.bool_]
 
-    def take(self, rows: npt.NDArray[np.bool_]) -> Observations:
-        """Return some of them."""
-        return Observations(
-            self.landmarks[rows], self.pixels[rows], self.inverse[rows], self.measured[rows]
-        )
+    @classmethod
+    def without_depth(cls, landmarks: Floats, pixels: Floats) -> Observations:
+        """Return observations of pixels only."""
+        count = len(landmarks)
+        return cls(landmarks, pixels, np.zeros(count), np.zeros(count, np.bool_))
 
 
 class Solution(msgspec.Struct, frozen=True, eq=False):
-    """A pose and how well it explains each landmark.
+    """A pose, and the errors of the landmarks under it.
 
     Attributes:
         pose: World to camera, shape (4, 4).
@@ -57,7 +60,7 @@ class Solution(msgspec.Struct, frozen=True, eq=False):
 def solve_pose(
     seen: Observations,
     start: Floats,
-    camera: tuple[float, ...],
+    matrix: Floats,
     pixel_noise: float,
     depth_noise: float,
 ) -> Solution:
@@ -65,12 +68,12 @@ def solve_pose(
 
     Args:
         seen: At least four landmarks.
-        start: World to camera, to begin with, shape (4, 4).
-        camera: fx, fy, cx, cy.
+        start: Initial pose, world to camera, shape (4, 4).
+        matrix: K, shape (3, 3).
         pixel_noise: Standard deviation of a coordinate, pixels.
         depth_noise: Standard deviation of inverse depth, 1/m.
     """
-    fx, fy, cx, cy = camera
+    fx, fy, cx, cy = intrinsics(matrix)
     pose = start.copy()
     target = (seen.pixels - (cx, cy)) / (fx, fy)
     a, b = fx / pixel_noise, fy / pixel_noise
@@ -108,3 +111,23 @@ def solve_pose(
 
 def _huber(errors: Floats) -> Floats:
     return np.asarray(np.minimum(1.0, _HUBER / np.maximum(errors, _HUBER)))
+
+
+def intrinsics(matrix: Floats) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy of K, shape (3, 3)."""
+    return matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+
+
+def rays(pixels: Floats, matrix: Floats) -> Floats:
+    """Return directions in the optical frame with z = 1, shape (n, 3), of pixels, shape (n, 2)."""
+    fx, fy, cx, cy = intrinsics(matrix)
+    return np.stack(
+        [(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1
+    )
+
+
+def from_rotation_vector(rotation: npt.NDArray[Any], translation: npt.NDArray[Any]) -> Floats:
+    """Return the transform, shape (4, 4), of a rotation vector and a translation, as OpenCV's."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+    return pose

@@ -1,4 +1,4 @@
-"""The first map: corners are followed until two views tell how the camera has moved."""
+"""Initialization: corners are followed until two views show how the camera has moved."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ import msgspec
 import numpy as np
 
 from nodes.monocular_odometry.bundle import adjust
-from nodes.monocular_odometry.flow import follow_both_ways, new_corners
+from nodes.monocular_odometry.corners import new_corners
 from nodes.monocular_odometry.settings import MonocularSettings
 from nodes.monocular_odometry.views import (
     hypotheses,
     parallax,
-    rays,
     reprojection_errors,
     triangulate,
 )
-from nodes.visual_odometry.pose import Observations, solve_pose
-from nodes.visual_odometry.tracker import Floats, Grey
+from nodes.odometry.flow import follow_both_ways
+from nodes.odometry.images import Floats, Grey
+from nodes.odometry.pose import Observations, rays, solve_pose
 
 _SNAPSHOT = 5.0
-"""Median pixels of motion between the views that are remembered on the way."""
+"""Median pixels of motion between the views that are stored."""
 _GOOD = 2.0
-"""Pixels of reprojection error up to which a corner fits a motion."""
+"""Pixels of reprojection error up to which a corner agrees with a motion."""
 
 
-class FirstMap(msgspec.Struct, frozen=True, eq=False):
-    """Two key frames and what both see; the median depth from the first is 1.
+class InitialMap(msgspec.Struct, frozen=True, eq=False):
+    """Two key frames and the landmarks that both see; the median depth from the first is 1.
 
     Attributes:
-        first: The first picture; its camera is the world.
+        first: The first image; its camera is the world.
         second: Pose of the second, world to camera, shape (4, 4).
-        pixels: In the first and in the second picture, shape (2, n, 2).
+        pixels: Pixels in the first and in the second image, shape (2, n, 2).
         points: Landmarks in the world, shape (n, 3).
     """
 
@@ -40,12 +40,12 @@ class FirstMap(msgspec.Struct, frozen=True, eq=False):
     points: Floats
 
 
-class Beginning:
-    """Follows corners from a first picture until there is a map.
+class Initialization:
+    """Follows corners from a first image until there is a map.
 
     Args:
         matrix: K, shape (3, 3).
-        settings: Of the odometry.
+        settings: Settings of the odometry.
     """
 
     def __init__(self, matrix: Floats, settings: MonocularSettings) -> None:
@@ -56,11 +56,11 @@ class Beginning:
         self._views: list[Floats] = []  # of the corners still followed; the first, …, the newest
         self._count = 0
 
-    def see(self, image: Grey) -> FirstMap | None:
-        """Take the next picture, grey; return a map once there is one.
+    def add(self, image: Grey) -> InitialMap | None:
+        """Add the next image, grey; return a map once there is one.
 
-        It begins again with this picture if too few corners are left, or if a long motion gave no
-        map: turning alone does not.
+        It starts again with this image if too few corners are left, or if a long motion gave no
+        map, as rotation alone does not.
         """
         if self._first is None or self._before is None:
             self._restart(image)
@@ -75,7 +75,7 @@ class Beginning:
         self._before = image
         self._views = [view[good] for view in self._views]
         newest = there[good]
-        if good.sum() < max(self._settings.least, 0.5 * self._count):
+        if good.sum() < max(self._settings.min_inliers, 0.5 * self._count):
             self._restart(image)
             return None
         if len(self._views) > 1 and _median_shift(self._views[-2], newest) < _SNAPSHOT:
@@ -83,10 +83,10 @@ class Beginning:
         else:
             self._views.append(newest)
         moved = _median_shift(self._views[0], newest)
-        if moved < self._settings.shift:
+        if moved < self._settings.keyframe_shift:
             return None
         found = self._build()
-        if found is None and moved > 4 * self._settings.shift:
+        if found is None and moved > 4 * self._settings.keyframe_shift:
             self._restart(image)
         return found
 
@@ -96,8 +96,8 @@ class Beginning:
         self._views = [corners]
         self._count = len(corners)
 
-    def _build(self) -> FirstMap | None:
-        """Try all motions that the first and the newest view allow, and keep the one that fits."""
+    def _build(self) -> InitialMap | None:
+        """Try all motions that the first and the newest view allow, and keep the best one."""
         first, *between, last = self._views
         assert self._first is not None
         best: tuple[float, Floats, Floats] | None = None
@@ -130,13 +130,13 @@ class Beginning:
         )
         good = errors.reshape(count, len(poses)).max(axis=1) < _GOOD
         second = adjusted[1]
-        wide = parallax(np.eye(4), second, a[fits], b[fits]) > 0.5 * self._settings.parallax
+        wide = parallax(np.eye(4), second, a[fits], b[fits]) > 0.5 * self._settings.min_parallax
         good &= (points[:, 2] > 0) & wide
-        if good.sum() < max(self._settings.least, 0.4 * len(first)):
+        if good.sum() < max(self._settings.min_inliers, 0.4 * len(first)):
             return None
         unit = float(np.median(points[good, 2]))
         second[:3, 3] /= unit
-        return FirstMap(
+        return InitialMap(
             self._first, second, np.stack([views[0][good], views[1][good]]), points[good] / unit
         )
 
@@ -146,9 +146,9 @@ class Beginning:
         return np.asarray((first < _GOOD) & (last < _GOOD))
 
     def _cost(self, points: Floats, pose: Floats) -> float | None:
-        """Return how badly a motion explains all views, or `None` if it explains too little."""
+        """Return the error of a motion over all views; `None` if too few corners agree with it."""
         fits = self._fits(points, pose)
-        if fits.sum() < max(self._settings.least, 0.5 * len(points)):
+        if fits.sum() < max(self._settings.min_inliers, 0.5 * len(points)):
             return None
         total = float(np.sum(~fits)) * _GOOD**2 * len(self._views)
         for view in self._views[1:]:
@@ -158,11 +158,8 @@ class Beginning:
         return total
 
     def _pose_of(self, points: Floats, pixels: Floats) -> Floats:
-        matrix = self._matrix
-        camera = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-        none = np.zeros(len(points))
-        seen = Observations(points, pixels, none, none.astype(np.bool_))
-        return solve_pose(seen, np.eye(4), camera, self._settings.pixel_noise, 1.0).pose
+        seen = Observations.without_depth(points, pixels)
+        return solve_pose(seen, np.eye(4), self._matrix, self._settings.pixel_noise, 1.0).pose
 
 
 def _median_shift(before: Floats, after: Floats) -> float:

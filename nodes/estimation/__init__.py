@@ -1,0 +1,19 @@
+"""Estimators: the base class of nodes that estimate poses from images."""
+
+from nodes.estimation.estimator import (
+    WORKER_ENVIRONMENT,
+    Estimator,
+    EstimatorConfig,
+    RgbdFrame,
+)
+from nodes.estimation.mount import Mount
+from nodes.estimation.tracking import TrackingResult
+
+__all__ = [
+    "WORKER_ENVIRONMENT",
+    "Estimator",
+    "EstimatorConfig",
+    "Mount",
+    "RgbdFrame",
+    "TrackingResult",
+]

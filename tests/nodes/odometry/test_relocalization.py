@@ -1,0 +1,54 @@
+"""A lost camera is relocalized by a key frame, and not by one of another place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nodes.monocular_odometry.corners import new_corners
+from nodes.odometry.images import Floats
+from nodes.odometry.pose import rays
+from nodes.odometry.relocalization import (
+    DescribedPoints,
+    describe,
+    detect_and_describe,
+    relocalize,
+)
+from tests.nodes.visual_odometry.world import INFO, look, pose
+
+
+def keyframe() -> DescribedPoints:
+    """Return the corners of the image at the origin, placed where its depth has them."""
+    image, depth = look(pose())
+    pixels = new_corners(image, np.empty((0, 2)), 300)
+    column, row = np.rint(pixels).astype(int).T
+    return describe(image, pixels, rays(pixels, INFO.matrix()) * depth[row, column][:, None])
+
+
+def find(there: Floats) -> Floats | None:
+    return relocalize(*detect_and_describe(look(there)[0], 1000), keyframe(), INFO.matrix())
+
+
+@pytest.mark.parametrize("there", [pose(), pose(x=-0.15, yaw=3.0), pose(z=0.4)])
+def test_a_key_frame_is_recognized_from_elsewhere(there: Floats) -> None:
+    found = find(there)
+    assert found is not None
+    np.testing.assert_allclose(np.linalg.inv(found)[:3, 3], there[:3, 3], atol=0.12)
+
+
+def test_what_is_not_in_the_image_is_not_recognized() -> None:
+    assert find(pose(x=-6.0, y=6.0)) is None
+
+
+def test_a_blank_image_has_no_points() -> None:
+    pixels, descriptors = detect_and_describe(np.zeros((240, 320), np.uint8), 1000)
+    assert (pixels.shape, descriptors.shape) == ((0, 2), (0, 32))
+    assert relocalize(pixels, descriptors, keyframe(), INFO.matrix()) is None
+
+
+def test_corners_at_the_edge_are_not_described() -> None:
+    image, _ = look(pose())
+    edge = np.array([[2.0, 2.0], [160.0, 120.0]])
+    described = describe(image, edge, np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
+    assert described.points.tolist() == [[2.0, 0.0, 0.0]]
+    assert describe(image, edge[:1], np.ones((1, 3))).points.shape == (0, 3)
