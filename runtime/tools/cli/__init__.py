@@ -1,7 +1,8 @@
 """The command line: ``python -m runtime run config.toml`` and its companions.
 
-One module a command; what a command needs is imported when it runs, so that help comes at once.
-Every error becomes one line on standard error and exit code 2.
+The commands are the entry points of all installed packages (`runtime.tools.plugins`): those about
+running nodes are modules of this package, others stand beside what they use. Every error becomes
+one line on standard error and exit code 2.
 """
 
 from __future__ import annotations
@@ -14,52 +15,16 @@ from typing import NoReturn
 import typer
 
 from runtime.errors import VisnavError
-from runtime.tools.cli.bench import bench
-from runtime.tools.cli.check import check
-from runtime.tools.cli.example import demo, example
-from runtime.tools.cli.export import export
-from runtime.tools.cli.graph import graph
-from runtime.tools.cli.nodes import nodes
-from runtime.tools.cli.recover import recover
-from runtime.tools.cli.report import report
-from runtime.tools.cli.run import leave_behind, run
-from runtime.tools.cli.schema import schema
-from runtime.tools.cli.set import set_
-from runtime.tools.cli.sweep import sweep
-from runtime.tools.cli.top import top
-from runtime.tools.cli.trace import trace
-from runtime.tools.cli.vocabulary import vocabulary
-from runtime.tools.cli.web import web
+from runtime.tools.cli.commands import Commands
 
 app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Fly a simulated vehicle, feed a visual-navigation system, and measure it.",
+    cls=Commands, add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False
 )
-app.command()(run)
-app.command()(demo)
-app.command()(example)
-app.command()(check)
-app.command()(graph)
-app.command()(nodes)
-app.command()(schema)
-app.command()(sweep)
-app.command()(report)
-app.command()(export)
-app.command()(recover)
-app.command()(trace)
-app.command()(top)
-app.command()(web)
-app.command("set")(set_)
-app.command()(vocabulary)
-app.command(  # the arguments, --help among them, are the benchmarks' own
-    context_settings={
-        "ignore_unknown_options": True,
-        "allow_extra_args": True,
-        "help_option_names": [],
-    }
-)(bench)
+
+
+@app.callback()
+def _all() -> None:
+    """Fly a simulated vehicle, feed a visual-navigation system, and measure it."""
 
 
 def main() -> None:
@@ -79,6 +44,8 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(2)
     except Exception as error:
+        from runtime.tools.cli.run import leave_behind
+
         leave_behind(2, f"error: {_described(error)}")
 
 

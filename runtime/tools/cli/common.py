@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -16,3 +17,8 @@ Overrides = Annotated[
         help="Change a setting of a node, or of the run (run.seed=3). May be repeated.",
     ),
 ]
+
+
+def warn(warning: str) -> None:
+    """Print a warning, as a line of its own."""
+    print(f"warning: {warning}", file=sys.stderr)

@@ -17,16 +17,20 @@ def nodes(
         str | None, typer.Argument(help='Only this one: "module:Class", or a part of its name.')
     ] = None,
 ) -> None:
-    """List the nodes that come with the project: their ports and settings."""
+    """List nodes with their ports and settings: those that installed packages offer."""
     from rich.console import Console
 
+    from runtime.config import find_node
     from runtime.errors import ConfigError, suggest
-    from runtime.tools.cli.catalogue import find_nodes
+    from runtime.tools.cli.common import warn
+    from runtime.tools.plugins import find_nodes
 
-    found = find_nodes()
+    found = find_nodes(warn)
     shown = {
         name: cls for name, cls in found.items() if which is None or which.lower() in name.lower()
     }
+    if not shown and which is not None and ":" in which:
+        shown = {which: find_node(which, "nodes")}
     if not shown:
         raise ConfigError(
             f"expected the name of a node, found {which!r}"

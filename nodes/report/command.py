@@ -15,13 +15,10 @@ def report(
 
     A run that was killed, or that nobody evaluated, gives a page that says what is missing.
     """
-    import importlib
-
+    from nodes.report.page import write_report
     from runtime.errors import ConfigError
 
-    # By name, as nodes are: the runtime imports no other room.
-    nodes = importlib.import_module("nodes.report")
     try:
-        print(nodes.write_report(run))
+        print(write_report(run))
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None

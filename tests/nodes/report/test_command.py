@@ -9,8 +9,8 @@ import typer
 from typer.testing import CliRunner
 
 import runtime.tools.cli
+from nodes.report.command import report
 from runtime.errors import ConfigError
-from runtime.tools.cli.report import report
 from tests.nodes.report.folders import summary
 
 app = typer.Typer()

@@ -20,14 +20,11 @@ def recover(
     What can be read is written to a complete file with an index. Such a run has at most its last
     second missing. A file that has its index is only looked through.
     """
-    import importlib
-
+    from nodes.mcap_recorder.recover import recover_file
     from runtime.errors import ConfigError
 
-    # By name, as nodes are: the runtime imports no other room.
-    nodes = importlib.import_module("nodes.mcap_recorder.recover")
     try:
-        done = nodes.recover_file(file, out)
+        done = recover_file(file, out)
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None
     for trouble in done.trouble:

@@ -34,14 +34,11 @@ def export(
     up. kitti has no stamps, so it gives a pair of files for every estimator, pose by pose: those
     of the first camera, from identity.
     """
-    import importlib
-
+    from nodes.trajectory import export as exports
     from runtime.errors import ConfigError
 
-    # By name, as nodes are: the runtime imports no other room.
-    nodes = importlib.import_module("nodes.trajectory.export")
     try:
-        written = nodes.export(run, form.value, out, epoch)
+        written = exports.export(run, form.value, out, epoch)
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from None
     for path in written:

@@ -8,8 +8,8 @@ import pytest
 
 from nodes.mcap import layout
 from nodes.mcap.mcap_file import read
+from nodes.mcap_recorder.command import recover
 from runtime.errors import VisnavError
-from runtime.tools.cli.recover import recover
 from tests.nodes.mcap.test_mcap_file import write
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from runtime.tools.cli.common import ConfigFile, Overrides
 
-_TRAINER = "nodes.orb_slam3.training:VocabularyTrainer"
 _SHUTDOWN_LIMIT = 300.0
 """Seconds; the training is done as the node shuts down."""
 
@@ -31,8 +30,9 @@ def vocabulary(
     """
     import msgspec
 
+    from nodes.orb_slam3.training import VocabularyTrainer, VocabularyTrainerConfig
     from runtime.config.model import Config, NodeSpec
-    from runtime.config.reading import convert, find_node, load
+    from runtime.config.reading import load
     from runtime.errors import ConfigError
     from runtime.execute import execute
     from runtime.logs import terminal_handler
@@ -43,16 +43,14 @@ def vocabulary(
     if out is not None and out.suffix != ".txt":  # ORB-SLAM3 would read it as binary
         raise ConfigError(f"--out: expected a name that ends with .txt, found {out}")
     settings = load(config, overrides or [])
-    trainer = find_node(_TRAINER, "vocabulary")
-    given = {} if out is None else {"path": str(out.resolve())}
-    options: Any = convert(given, trainer.config_type, "vocabulary")
+    options = VocabularyTrainerConfig(path="" if out is None else str(out.resolve()))
     spec = NodeSpec(
         name="vocabulary_trainer",
-        type_name=_TRAINER,
+        type_name="nodes.orb_slam3.training:VocabularyTrainer",
         on_error="stop",
         inputs={},
         links={},
-        node=trainer,
+        node=VocabularyTrainer,
         config=options,
     )
     others = (s for s in settings.nodes if not s.type_name.startswith("nodes.orb_slam3"))

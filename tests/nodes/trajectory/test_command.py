@@ -8,9 +8,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from nodes.trajectory.command import export
 from nodes.trajectory.formats import write_tum
 from runtime.errors import ConfigError
-from runtime.tools.cli.export import export
 from tests.nodes.trajectory.samples import walk
 
 app = typer.Typer()

@@ -1,0 +1,127 @@
+"""The commands that installed packages offer, each imported when it is used.
+
+Help needs no imports: it takes the first sentence of a command's docstring from its source, so
+that it comes at once however much the packages import.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import click
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from runtime.errors import CommandError, ConfigError, suggest
+from runtime.tools.plugins import COMMANDS, OURS, Offer, offers
+
+
+class Commands(TyperGroup):
+    """All commands, by the name of their entry points."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Return the names of all commands: this project's first, then other packages'."""
+        return list(_commands())
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """Return what help shows of a command; it cannot be called."""
+        if cmd_name not in _commands():
+            return None
+        offer = _chosen(cmd_name)
+        panel = None if offer.package == OURS else f"Commands of {offer.package}"
+        return TyperCommand(cmd_name, help=_help(offer), rich_help_panel=panel)
+
+    def resolve_command(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        args: list[str],
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Import and return the command that the arguments call.
+
+        Raises:
+            ConfigError: There is no such command.
+            CommandError: It cannot be imported.
+        """
+        name, *rest = args
+        if name not in _commands():
+            raise ConfigError(
+                f"expected a command ({', '.join(_commands())}), found {name!r}"
+                + suggest(name, _commands())
+            )
+        return name, load(_chosen(name)), rest
+
+
+def load(offer: Offer) -> click.Command:
+    """Import a command.
+
+    Raises:
+        CommandError: It cannot be imported, or is no command.
+    """
+    found = offer.load()
+    if not isinstance(found, typer.Typer):
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        app.command(offer.name)(found)
+        found = app
+    try:
+        return typer.main.get_command(found)
+    except Exception as error:  # whatever Typer does not like
+        raise CommandError(
+            f"{offer.name} of the package {offer.package}: expected {offer.value!r} to be a "
+            f"function as Typer takes it, found: {error}"
+        ) from error
+
+
+@cache
+def _commands() -> dict[str, list[Offer]]:
+    """Return the offers of each command: of one package, unless others chose the same name."""
+    found: dict[str, list[Offer]] = {}
+    for offer in offers(COMMANDS):
+        found.setdefault(offer.name, []).append(offer)
+    return found
+
+
+def _chosen(name: str) -> Offer:
+    """Return the offer that is used for a name; of several the first, with a warning."""
+    used, *others = _commands()[name]
+    for other in others:
+        print(
+            f"warning: the packages {used.package} and {other.package} both offer the command "
+            f"{name}; that of {used.package} is used",
+            file=sys.stderr,
+        )
+    return used
+
+
+def _help(offer: Offer) -> str:
+    """Return the help of a command, or why it cannot be used."""
+    module, _, name = offer.value.partition(":")
+    source = _source(module)
+    if source is not None:
+        for node in ast.parse(source.read_bytes()).body:
+            if isinstance(node, ast.FunctionDef) and node.name == name:
+                return ast.get_docstring(node) or ""
+    try:
+        found = offer.load()
+        return str(found.info.help if isinstance(found, typer.Typer) else load(offer).help or "")
+    except CommandError as error:
+        return f"(cannot be used: {error})"
+
+
+def _source(module: str) -> Path | None:
+    """Return the source file of a module, without importing the packages that it is in."""
+    search: Any = None
+    spec = None
+    parts = module.split(".")
+    for depth in range(1, len(parts) + 1):
+        name = ".".join(parts[:depth])
+        found = (finder.find_spec(name, search) for finder in sys.meta_path)
+        spec = next((each for each in found if each is not None), None)
+        if spec is None:
+            return None
+        search = spec.submodule_search_locations
+    origin = Path(spec.origin) if spec and spec.origin else None
+    return origin if origin and origin.suffix == ".py" and origin.is_file() else None

@@ -1,0 +1,111 @@
+"""What installed packages offer to the command line: commands, and nodes to be listed.
+
+A package names them in its ``pyproject.toml``; this project does the same for its own:
+
+    [project.entry-points."visnav.commands"]
+    fly = "my_package.fly:fly"            # a function as Typer takes it, or a typer.Typer
+
+    [project.entry-points."visnav.nodes"]
+    MyNode = "my_package.nodes:MyNode"
+
+A file may name any node as ``module:Class``; it need not be listed here to run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from runtime.errors import CommandError, VisnavError
+from runtime.node import Node
+
+COMMANDS = "visnav.commands"
+NODES = "visnav.nodes"
+OURS = "visnav-runtime"
+_PROJECT = Path(__file__).parents[2] / "pyproject.toml"
+"""Of a checkout; an installed wheel has none."""
+
+
+class Offer(NamedTuple):
+    """One entry point: which package offers what.
+
+    Attributes:
+        package: The name of the distribution.
+        name: The name of the command, or of the node's class.
+        value: ``module:attribute``.
+    """
+
+    package: str
+    name: str
+    value: str
+
+    def load(self) -> Any:
+        """Import the module and return what the entry point names.
+
+        Raises:
+            CommandError: It cannot be imported, or is not there.
+        """
+        try:
+            return EntryPoint(self.name, self.value, "").load()
+        except Exception as error:  # whatever a package does when it is imported
+            raise CommandError(
+                f"{self.name} of the package {self.package}: expected {self.value!r} to be "
+                f"something to import, found {type(error).__name__}: {error}"
+            ) from error
+
+
+@cache
+def offers(group: str) -> tuple[Offer, ...]:
+    """Return the entry points of a group: this project's first, then other packages' by name.
+
+    In a checkout this project's come from its ``pyproject.toml``, because the metadata of an
+    editable installation is as old as the installation.
+
+    Raises:
+        CommandError: There are none of this project: it is not installed.
+    """
+    found = [
+        Offer(point.dist.name if point.dist else "?", point.name, point.value)
+        for point in entry_points(group=group)
+    ]
+    found.sort(key=lambda offer: (offer.package != OURS, offer.package))
+    ours = _declared(group) or [offer for offer in found if offer.package == OURS]
+    if not ours:
+        raise CommandError(
+            f"expected the package {OURS} to be installed, found no {group} of it: "
+            '"pip install ." in its folder installs it'
+        )
+    return (*ours, *(offer for offer in found if offer.package != OURS))
+
+
+def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
+    """Return ``module:Class`` to class, for all nodes that packages offer, sorted.
+
+    Args:
+        warn: Called with a line for each that cannot be imported; it is left out.
+    """
+    from runtime.config import find_node
+
+    found = {}
+    for package, _, value in offers(NODES):
+        try:
+            found[value] = find_node(value, value)
+        except VisnavError as error:
+            warn(f"a node of the package {package}: {error}")
+    return dict(sorted(found.items()))
+
+
+def _declared(group: str) -> list[Offer]:
+    """Return what the ``pyproject.toml`` of this checkout declares; nothing if there is none."""
+    import tomllib
+
+    if not _PROJECT.is_file():
+        return []
+    project = tomllib.loads(_PROJECT.read_text(encoding="utf-8")).get("project", {})
+    if project.get("name") != OURS:
+        return []
+    declared = project.get("entry-points", {}).get(group, {})
+    return [Offer(OURS, name, value) for name, value in declared.items()]
