@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import click
 import typer
 from typer.core import TyperCommand, TyperGroup
 
@@ -23,11 +22,13 @@ from runtime.tools.plugins import COMMANDS, OURS, Offer, offers
 class Commands(TyperGroup):
     """All commands, by the name of their entry points."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+    # Contexts and commands are of click's, which Typer brings along under a name of its own.
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
         """Return the names of all commands: this project's first, then other packages'."""
         return list(_commands())
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
         """Return what help shows of a command; it cannot be called."""
         if cmd_name not in _commands():
             return None
@@ -35,11 +36,7 @@ class Commands(TyperGroup):
         panel = None if offer.package == OURS else f"Commands of {offer.package}"
         return TyperCommand(cmd_name, help=_help(offer), rich_help_panel=panel)
 
-    def resolve_command(
-        self,
-        ctx: click.Context,  # noqa: ARG002
-        args: list[str],
-    ) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ARG002
         """Import and return the command that the arguments call.
 
         Raises:
@@ -55,7 +52,7 @@ class Commands(TyperGroup):
         return name, load(_chosen(name)), rest
 
 
-def load(offer: Offer) -> click.Command:
+def load(offer: Offer) -> Any:
     """Import a command.
 
     Raises:
