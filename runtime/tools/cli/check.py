@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from runtime.tools.cli.common import ConfigFile, Overrides
+from runtime.tools.cli.common import ConfigFile, Overrides, warn
 
 
 def check(config: ConfigFile, overrides: Overrides = None) -> None:
@@ -20,16 +20,16 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     from runtime.config.reading import load
     from runtime.graph import edges
     from runtime.tools import preflight
-    from runtime.tools.cli.run import leave_behind, warn
+    from runtime.tools.cli.run import leave_behind
 
     settings = load(config, overrides or [])
     found = preflight.of_file(settings)
-    warn(found)
+    if not found.errors:
+        nodes = preflight.of_nodes(settings)
+        found = preflight.Findings(nodes.errors, found.warnings + nodes.warnings)
     errors = found.errors
-    if not errors:
-        found = preflight.of_nodes(settings)
-        warn(found)
-        errors = found.errors
+    for warning in found.warnings:
+        warn(warning)
     for error in errors:
         print(f"error: {config.name}: {error}", file=sys.stderr)
     if not errors:

@@ -16,6 +16,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from runtime.errors import CommandError, ConfigError, suggest
+from runtime.tools.cli.common import warn
 from runtime.tools.plugins import COMMANDS, OURS, Offer, offers
 
 
@@ -85,10 +86,9 @@ def _chosen(name: str) -> Offer:
     """Return the offer that is used for a name; of several the first, with a warning."""
     used, *others = _commands()[name]
     for other in others:
-        print(
-            f"warning: the packages {used.package} and {other.package} both offer the command "
-            f"{name}; that of {used.package} is used",
-            file=sys.stderr,
+        warn(
+            f"the packages {used.package} and {other.package} both offer the command {name}; "
+            f"that of {used.package} is used"
         )
     return used
 

@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from runtime.tools.cli.common import ConfigFile, Overrides
+from runtime.tools.cli.common import ConfigFile, Overrides, warn
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from runtime.config.model import Config
     from runtime.summary import Summary, Verdict
-    from runtime.tools.preflight import Findings
 
 
 _STATES = {
@@ -146,15 +145,10 @@ def look_at(settings: Config, only: Collection[str] = ()) -> None:
     from runtime.tools.preflight import of_file
 
     found = of_file(settings, only)
-    warn(found)
+    for warning in found.warnings:
+        warn(warning)
     if found.errors:
         raise ConfigError("; ".join(found.errors))
-
-
-def warn(findings: Findings) -> None:
-    """Print a line for each warning."""
-    for warning in findings.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
 
 
 def report(summary: Summary, folder: Path) -> None:
