@@ -87,7 +87,7 @@ def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
     Args:
         warn: Called with a line for each that cannot be imported; it is left out.
     """
-    from runtime.config import find_node
+    from runtime.config.reading import find_node
 
     found = {}
     for package, _, value in offers(NODES):

@@ -20,7 +20,7 @@ def nodes(
     """List nodes with their ports and settings: those that installed packages offer."""
     from rich.console import Console
 
-    from runtime.config import find_node
+    from runtime.config.reading import find_node
     from runtime.errors import ConfigError, suggest
     from runtime.tools.cli.common import warn
     from runtime.tools.plugins import find_nodes

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from runtime.config import is_base
+from runtime.config.reading import is_base
 from runtime.errors import CommandError, MissingDependencyError
 from runtime.node import Node
 from runtime.tools import plugins
