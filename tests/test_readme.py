@@ -20,11 +20,11 @@ TARGETS = sorted(set(re.findall(r"(?:^    |`)make ([a-z -]+?)(?:`|  +#|$)", READ
 
 SHORTER = {
     "run": [
-        *("--set", "run.duration=2s", "--set", "evaluation.report=false", "--quiet"),
+        *("--set", "run.duration=2s", "--set", "report.figures=[]", "--quiet"),
         *("--set", "camera.width=128", "--set", "camera.height=128"),
         *("--set", "drone.camera_processes=1"),
     ],
-    "sweep": ["--set", "run.duration=1s", "--set", "evaluation.report=false"],
+    "sweep": ["--set", "run.duration=1s", "--set", "report.figures=[]"],
     "bench": ["--help"],
 }
 """What is added to a command so that it takes a second."""

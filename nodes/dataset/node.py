@@ -61,7 +61,7 @@ class DatasetWriter(Node[DatasetConfig]):
     """
 
     images = Input(Image, bound=_WAITING, overflow="drop_oldest")
-    depths = Input(DepthImage, bound=_WAITING, overflow="drop_oldest")
+    depth_images = Input(DepthImage, bound=_WAITING, overflow="drop_oldest")
 
     async def on_startup(self) -> None:
         """Make room."""
@@ -82,13 +82,13 @@ class DatasetWriter(Node[DatasetConfig]):
         self._open()
         for _ in range(_AT_ONCE):
             self.start(self._write())
-        self.start(self._take_depths())
+        self.start(self._take_depth_images())
         async for image in self.images:
             if (file := self._picture(image)) is not None:
                 await self._queue.put(file)
 
-    async def _take_depths(self) -> None:
-        async for depth in self.depths:
+    async def _take_depth_images(self) -> None:
+        async for depth in self.depth_images:
             if (file := self._depth(depth)) is not None:
                 await self._queue.put(file)
 
@@ -100,19 +100,19 @@ class DatasetWriter(Node[DatasetConfig]):
             self._unwritten.discard(file)
 
     @on(PoseStamped)
-    def posed(self, event: PoseStamped) -> None:
+    def camera_poses(self, event: PoseStamped) -> None:
         """Note where a camera is."""
         if (recording := self._open()) is not None:
             recording.pose(event)
 
     @on(Odometry)
-    def moved(self, event: Odometry) -> None:
+    def odometry(self, event: Odometry) -> None:
         """Note where the vehicle is."""
         if (recording := self._open()) is not None:
             recording.odometry(event)
 
     @on(Imu)
-    def measured(self, event: Imu) -> None:
+    def imu(self, event: Imu) -> None:
         """Note a measurement."""
         if (recording := self._open()) is not None:
             recording.imu(event)
@@ -123,12 +123,12 @@ class DatasetWriter(Node[DatasetConfig]):
             return
         for _ in range(self.images.statistics().buffered):
             self._picture(self.images.receive_nowait())
-        for _ in range(self.depths.statistics().buffered):
-            self._depth(self.depths.receive_nowait())
+        for _ in range(self.depth_images.statistics().buffered):
+            self._depth(self.depth_images.receive_nowait())
         await self.offload(_finish, self._recording, list(self._unwritten))
         for each in self._recording.warnings():
             self.log.warning("%s", each)
-        dropped = self.images.statistics().dropped + self.depths.statistics().dropped
+        dropped = self.images.statistics().dropped + self.depth_images.statistics().dropped
         if dropped:
             self.log.warning("%d pictures are missing: writing was too slow for them", dropped)
         if left_out := self._recording.left_out():

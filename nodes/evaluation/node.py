@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from array import array
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -53,8 +52,7 @@ class EvaluationConfig(NodeConfig):
             any, an estimator is not judged, unless it misses what is asked of everybody (it was
             there for nine tenths of the flight, in one frame, with stamps that rise; its vehicle
             hit nothing).
-        pictures: Sample pictures with features, for each estimator; 0 for none.
-        report: Whether to write ``report.html`` and its pictures at the end.
+        image_count: Sample images with features to keep of each estimator; 0 for none.
     """
 
     alignment: Literal["auto", "none", "origin", "se3", "sim3"] = "auto"
@@ -62,8 +60,7 @@ class EvaluationConfig(NodeConfig):
     delta: Positive = 1.0
     gap: Duration = Duration(0.5)  # immutable
     thresholds: Thresholds = Thresholds()
-    pictures: Annotated[int, msgspec.Meta(ge=0, le=100)] = 12
-    report: bool = True
+    image_count: Annotated[int, msgspec.Meta(ge=0, le=100)] = 12
 
 
 class Evaluation(Node[EvaluationConfig]):
@@ -73,7 +70,7 @@ class Evaluation(Node[EvaluationConfig]):
     verdict put into the run's summary.
     """
 
-    files = ("trajectories", "evaluation", "frames", "plots", "report.html")
+    files = ("trajectories", "evaluation", "frames")
     scores = Output(Score)
 
     async def on_startup(self) -> None:
@@ -86,21 +83,21 @@ class Evaluation(Node[EvaluationConfig]):
         self._live: dict[str, LiveErrors] = {}
         self._frames: dict[str, array[int]] = {}  # stamps by camera
         self._collisions = 0
-        self._album = Album(self.config.pictures)
+        self._album = Album(self.config.image_count)
         self._files: dict[str, GrowingFile] = {}
         self._closed = False
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Take the first vehicle's truth, unless the file names another; expect estimators."""
         if isinstance(announcement, VehicleAnnouncement):
-            self.narrow("moved", announcement.source)
-            self.narrow("collided", announcement.source)
+            self.narrow("odometry", announcement.source)
+            self.narrow("collisions", announcement.source)
         if isinstance(announcement, EstimatorAnnouncement):
             record = EstimatorRecord(announcement.scale_free, announcement.method)
             self._records[announcement.source] = record
 
     @on(Odometry)
-    def moved(self, event: Odometry) -> None:
+    def odometry(self, event: Odometry) -> None:
         """Note the truth."""
         if self._closed:
             return
@@ -109,13 +106,13 @@ class Evaluation(Node[EvaluationConfig]):
         self._append("truth", event)
 
     @on(PlannedPose, PositionSetpoint)
-    def planned(self, event: PlannedPose | PositionSetpoint) -> None:
+    def plans(self, event: PlannedPose | PositionSetpoint) -> None:
         """Note where the pilot means to be."""
         rows = self._plan if isinstance(event, PlannedPose) else self._setpoints
         rows.add(event.stamp, event.position, from_yaw(event.yaw))
 
     @on(PoseEstimate)
-    def estimated(self, event: PoseEstimate) -> None:
+    def estimates(self, event: PoseEstimate) -> None:
         """Note an estimate, and say how good it is."""
         if self._closed:
             return
@@ -135,12 +132,12 @@ class Evaluation(Node[EvaluationConfig]):
         self._say(event, "mean_square_error", live.mean_square, "m^2")
 
     @on(TrackingEvent)
-    def tracking(self, event: TrackingEvent) -> None:
+    def tracking_events(self, event: TrackingEvent) -> None:
         """Note that an estimator lost or regained its way."""
         self._records.setdefault(event.source, EstimatorRecord()).note(event)
 
     @on(Image)
-    def saw(self, event: Image) -> None:
+    def images(self, event: Image) -> None:
         """Note that there was an image; hold it for a while: its features may follow."""
         stamps = self._frames.setdefault(event.source, array("q"))
         if not stamps or event.stamp > stamps[-1]:
@@ -148,13 +145,13 @@ class Evaluation(Node[EvaluationConfig]):
         self._album.see(event)
 
     @on(Collision)
-    def collided(self, event: Collision) -> None:  # noqa: ARG002
+    def collisions(self, event: Collision) -> None:  # noqa: ARG002
         """Count the vehicle's collisions."""
         self._collisions += 1
 
     @on(TrackedFeatures)
-    def followed(self, event: TrackedFeatures) -> None:
-        """Keep a picture and its features now and then."""
+    def features(self, event: TrackedFeatures) -> None:
+        """Keep an image and its features at intervals."""
         self._album.follow(event)
 
     async def on_shutdown(self) -> None:
@@ -171,8 +168,6 @@ class Evaluation(Node[EvaluationConfig]):
             self.conclude(name, rest, passed=figures["passed"])
             if judgement.figures.get("why"):
                 self.log.warning("%s: %s", name, judgement.figures["why"])
-        if self.out is not None and self.config.report:
-            self.after_run(_write_report)
 
     def _finish(self, end: int) -> tuple[dict[str, Judgement], dict[str, Any]]:
         config = self.config
@@ -263,9 +258,3 @@ class Evaluation(Node[EvaluationConfig]):
                 unit=unit,
             )
         )
-
-
-def _write_report(out: Path) -> None:
-    from nodes.report import write_report  # draws with matplotlib, which takes a second to import
-
-    write_report(out)

@@ -31,7 +31,7 @@ from runtime.units import Latency
 
 
 class ColourDepthPose(NamedTuple):
-    """What a camera with depth saw, and where it was: all of one exposure."""
+    """Image, depth image and camera pose of one exposure."""
 
     image: Image
     depth: DepthImage
@@ -128,7 +128,7 @@ class Mapping(Node[MappingConfig]):
             yield self._lacking()
 
     @on(Odometry)
-    def moved(self, event: Odometry) -> None:
+    def odometry(self, event: Odometry) -> None:
         """Note where the vehicle that carries the camera is."""
         camera = self._camera
         if camera is not None and camera.source.startswith(f"{event.source}/"):

@@ -1,5 +1,9 @@
-"""A run, as one page to read: ``report.html`` and its pictures."""
+"""A run as one page to read, ``report.html``, and its figures.
 
-from nodes.report.page import write_report
+`node` writes it when a run ends; `page` is the page, `folder` reads what the run left, and the
+others draw one figure each.
+"""
 
-__all__ = ["write_report"]
+from nodes.report.node import Report, ReportConfig
+
+__all__ = ["Report", "ReportConfig"]

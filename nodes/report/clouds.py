@@ -5,7 +5,6 @@ The painting is done in `nodes.report.splat`; matplotlib only adds axes.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from nodes.report.contents import Run
 from nodes.report.ply import Cloud, read_ply
 from nodes.report.poses import Floats
 from nodes.report.splat import MOST, Shown, View, paint
-from nodes.report.style import DPI, WIDTH, Picture, label, save, sheet
+from nodes.report.style import DPI, WIDTH, Plot, label, sheet
 
 ABREAST = 3
 """Clouds side by side in one picture."""
@@ -35,7 +34,7 @@ _DETAIL = 3.6
 """Metres across of the detail."""
 
 
-def draw_clouds(run: Run, folder: Path) -> list[Picture]:
+def draw_clouds(run: Run) -> list[Plot]:
     """Draw all clouds that can be read; `Run.missing` says which cannot.
 
     If there are many, each picture has the first again to hold the others against.
@@ -58,13 +57,10 @@ def draw_clouds(run: Run, folder: Path) -> list[Picture]:
     first, *others = clouds
     views = _views(first)
     if not others:
-        return [_draw_one(first, views, folder / "clouds_1.png", height)]
+        return [_draw_one(first, views, height)]
     step = ABREAST - 1
     groups = [[first, *others[k : k + step]] for k in range(0, len(others), step)]
-    return [
-        _draw(group, views, folder / f"clouds_{k}.png", height)
-        for k, group in enumerate(groups, start=1)
-    ]
+    return [_draw(group, views, k, height) for k, group in enumerate(groups, start=1)]
 
 
 def _ceiling(run: Run) -> float | None:
@@ -136,7 +132,7 @@ def _busiest(points: Floats, colors: npt.NDArray[np.uint8]) -> Floats:
     return np.asarray(np.median(points[index == best], axis=0))
 
 
-def _draw(clouds: list[Shown], views: list[View], path: Path, height: float | None) -> Picture:
+def _draw(clouds: list[Shown], views: list[View], number: int, height: float | None) -> Plot:
     """Draw clouds side by side: one column a cloud, and one row a view."""
     across = (WIDTH - 0.6) / len(clouds)
     heights = [min(across * _aspect(view), _TALLEST) + _TITLE for view in views]
@@ -147,11 +143,10 @@ def _draw(clouds: list[Shown], views: list[View], path: Path, height: float | No
         dot = None
         for axis, cloud in zip(axes, clouds, strict=True):
             dot = _show(axis, cloud, view, pixels, dot)
-    save(figure, path)
-    return Picture(path, "Clouds", _caption(clouds, height))
+    return Plot(f"clouds_{number}", figure, "Clouds", _caption(clouds, height), raster=True)
 
 
-def _draw_one(cloud: Shown, views: list[View], path: Path, height: float | None) -> Picture:
+def _draw_one(cloud: Shown, views: list[View], height: float | None) -> Plot:
     """Draw a cloud that has none to be held against: the view from above beside the others."""
     above, *others = views
     # Widths of the columns such that both are equally tall.
@@ -167,8 +162,7 @@ def _draw_one(cloud: Shown, views: list[View], path: Path, height: float | None)
     for k, view in enumerate(views):
         wide = tall * (right if k else left)
         _show(axes[str(k)], cloud, view, wide / (view.high - view.low)[0] * DPI, None)
-    save(figure, path)
-    return Picture(path, "Cloud", _caption([cloud], height))
+    return Plot("clouds_1", figure, "Cloud", _caption([cloud], height), raster=True)
 
 
 def _aspect(view: View) -> float:

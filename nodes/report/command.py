@@ -11,7 +11,7 @@ import typer
 def report(
     run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name>.")],
 ) -> None:
-    """Write a run's report.html and the pictures in it (plots/*.png) anew.
+    """Write a run's report.html and its figures (plots/*) anew.
 
     A run that was killed, or that nobody evaluated, gives a page that says what is missing.
     """

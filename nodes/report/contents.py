@@ -78,7 +78,7 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         estimators: By order of the verdict.
         frames: Sample pictures with features, by estimator's file name.
         clouds: Files of clouds.
-        pictures: Pictures that other nodes left.
+        images: Images that other nodes left.
         config: Text of ``config.toml``.
         log: Its warnings and errors.
         missing: Sentences that say what is not there or cannot be read.
@@ -92,7 +92,7 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     estimators: list[Estimator]
     frames: dict[str, list[Path]]
     clouds: list[Path]
-    pictures: list[Path]
+    images: list[Path]
     config: str | None
     log: list[str]
     missing: list[str]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,10 @@ from nodes.evaluation.metrics import path_pairs, relative_errors
 from nodes.report.contents import Estimator, Run
 from nodes.report.poses import Floats, broken
 from nodes.report.style import (
-    Picture,
+    Plot,
     label,
     legend_above,
     number,
-    save,
     sheet,
     thin,
     wide_range,
@@ -38,7 +36,7 @@ _FEWEST = 5
 """Pairs of poses that make a box."""
 
 
-def draw_errors(run: Run, folder: Path) -> Picture | None:
+def draw_errors(run: Run) -> Plot | None:
     """Draw position and rotation error of each estimate over time, lost intervals shaded."""
     known = [(e, e.of_images) for e in run.estimators if e.of_images is not None]
     if not known:
@@ -62,8 +60,6 @@ def draw_errors(run: Run, folder: Path) -> Picture | None:
     axes[0].margins(x=0.01)
     patch = Patch(facecolor="#bbbbbb", alpha=0.5, label=_LOST)
     legend_above(figure, axes[0], *([patch] if lost else []))
-    path = folder / "errors.png"
-    save(figure, path)
     when = "; ".join(
         f"{each.name} "
         + ", ".join(
@@ -74,7 +70,7 @@ def draw_errors(run: Run, folder: Path) -> Picture | None:
     )
     caption = "Each estimate against the truth at the time of its image."
     caption += f" Lost (shaded): {when}." if lost else " Nobody was lost."
-    return Picture(path, "Errors over time", caption)
+    return Plot("errors", figure, "Errors over time", caption)
 
 
 def _shade(run: Run, axis: Any) -> None:
@@ -84,7 +80,7 @@ def _shade(run: Run, axis: Any) -> None:
             axis.axvspan(a, b, facecolor=each.color, alpha=0.18, lw=0, zorder=0.5)
 
 
-def draw_distributions(run: Run, folder: Path) -> Picture | None:
+def draw_distributions(run: Run) -> Plot | None:
     """Draw what share of errors is below a value: at image time and at the control ticks."""
     known = [e for e in run.estimators if e.of_images is not None or e.of_ticks is not None]
     if not known:
@@ -115,10 +111,9 @@ def draw_distributions(run: Run, folder: Path) -> Picture | None:
     axes[1].set(xlabel="rotation error (°)")
     lines = [Line2D([], [], color="#666666", ls=ls, label=what) for what, ls in _STYLES.items()]
     legend_above(figure, axes[0], *lines)
-    path = folder / "distributions.png"
-    save(figure, path)
-    return Picture(
-        path,
+    return Plot(
+        "distributions",
+        figure,
         "Distribution of the errors",
         "Solid: each estimate against the truth at the time of its image. Dashed: the newest pose "
         "a controller had at each of its ticks against the truth at that tick; the distance "
@@ -127,7 +122,7 @@ def draw_distributions(run: Run, folder: Path) -> Picture | None:
     )
 
 
-def draw_latency(run: Run, folder: Path) -> Picture | None:
+def draw_latency(run: Run) -> Plot | None:
     """Draw how long estimates took, and how old the newest was at the control ticks."""
     took = [
         (e, (e.of_images.since - e.of_images.stamps) / MILLISECOND)
@@ -148,10 +143,9 @@ def draw_latency(run: Run, folder: Path) -> Picture | None:
     axes[0].set_title("latency")
     axes[1].set_title("what a controller has to go by")
     legend_above(figure, axes[0] if took else axes[1])
-    path = folder / "latency.png"
-    save(figure, path)
-    return Picture(
-        path,
+    return Plot(
+        "latency",
+        figure,
         "Latency",
         "Left: from the exposure of an image to the arrival of its pose. Right: how long ago that "
         "exposure was, at each tick of the controller. What lies beyond the axis (the last pose of "
@@ -178,7 +172,7 @@ def _histogram(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, y
     axis.set_xlim(bins[0], bins[-1])
 
 
-def draw_relative(run: Run, folder: Path) -> Picture | None:
+def draw_relative(run: Run) -> Plot | None:
     """Draw boxes of the relative errors over several lengths of path."""
     if run.truth is None:
         return None
@@ -209,12 +203,11 @@ def draw_relative(run: Run, folder: Path) -> Picture | None:
     axes[0].set(ylabel="position: error (% of the length)")
     axes[1].set(ylabel="rotation: error (°/m)")
     legend_above(figure, axes[0])
-    path = folder / "relative.png"
-    save(figure, path)
     reached = max(length for *_, length, _ in boxes)
     short = "" if reached == LENGTHS[-1] else f" The path gives none beyond {reached:g} m."
-    return Picture(
-        path,
+    return Plot(
+        "relative",
+        figure,
         "Relative error over path length",
         "How far motions over a length of path are off. Boxes: quartiles and median; whiskers: "
         f"5th and 95th percentile; all pairs of poses that far apart along the true path.{short}",

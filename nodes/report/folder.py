@@ -27,7 +27,7 @@ T = TypeVar("T")
 SIGNS = ("summary.json", "config.toml", "log.txt", "trajectories", "evaluation")
 """A folder with one of these is a run's."""
 
-_PICTURES = ("flight.png", "pictures.png")
+_IMAGES = ("flight.png", "images.png")
 _LOG_LINES = 200
 _NO_ESTIMATES = {"truth", "plan"}
 _ABOUT = 0.25
@@ -81,7 +81,7 @@ class _Reader:
             estimators=self._estimators(verdict, truth),
             frames=_frames(self.folder / "frames"),
             clouds=sorted((self.folder / "clouds").glob("*.ply")),
-            pictures=[p for name in _PICTURES if (p := self.folder / name).is_file()],
+            images=[p for name in _IMAGES if (p := self.folder / name).is_file()],
             config=config,
             log=_loud(log or ""),
             missing=self.missing,

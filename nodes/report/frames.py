@@ -1,4 +1,4 @@
-"""Sheets of the sample pictures in which an evaluation drew what an estimator followed."""
+"""Sheets of the sample images in which an evaluation drew the features of an estimator."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 
 from nodes.report.contents import Run
-from nodes.report.style import DPI, WIDTH, Picture, label, save, sheet
+from nodes.report.style import DPI, WIDTH, Plot, label, sheet
 
 _COLUMNS = 4
 _MOST = 12
@@ -21,18 +22,19 @@ _CAPTION = 26
 """Pixels above each."""
 
 
-def draw_frames(run: Run, folder: Path) -> list[Picture]:
-    """Draw one sheet for each estimator that left pictures."""
+def draw_frames(run: Run) -> list[Plot]:
+    """Draw one sheet for each estimator that left images."""
     names = {e.name.replace("/", "_"): e.name for e in run.estimators}
-    pictures = []
+    plots = []
     for file, paths in run.frames.items():
         step = -(-len(paths) // _MOST)
-        path = folder / f"frames_{file}.png"
-        if _sheet(run, paths[::step], path):
+        figure = _sheet(run, paths[::step])
+        if figure is not None:
             name = names.get(file, file)
             caption = "Rings: tracked features; green agree with the estimated motion, red don't."
-            pictures.append(Picture(path, f"What {name} saw and followed", caption, photo=True))
-    return pictures
+            title = f"Images and features of {name}"
+            plots.append(Plot(f"frames_{file}", figure, title, caption, raster=True, photo=True))
+    return plots
 
 
 def read_picture(path: Path) -> npt.NDArray[Any]:
@@ -49,8 +51,8 @@ def read_picture(path: Path) -> npt.NDArray[Any]:
     return picture
 
 
-def _sheet(run: Run, paths: list[Path], out: Path) -> bool:
-    """Draw a sheet; `False` if there was nothing to draw."""
+def _sheet(run: Run, paths: list[Path]) -> Figure | None:
+    """Draw a sheet; `None` if there was nothing to draw."""
     columns = min(_COLUMNS, len(paths))
     width = (round(WIDTH * DPI) - _GAP * (_COLUMNS - 1)) // _COLUMNS
     shown = []
@@ -64,7 +66,7 @@ def _sheet(run: Run, paths: list[Path], out: Path) -> bool:
         small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
         shown.append((_caption(run, path), small))
     if not shown:
-        return False
+        return None
     tallest = max(picture.shape[0] for _, picture in shown) + _CAPTION + _GAP
     rows = math.ceil(len(shown) / columns)
     canvas = np.full((rows * tallest, columns * (width + _GAP) - _GAP, 3), 255, np.uint8)
@@ -76,8 +78,7 @@ def _sheet(run: Run, paths: list[Path], out: Path) -> bool:
         canvas[top + _CAPTION : top + _CAPTION + picture.shape[0], left : left + width] = picture
         axis.text(left + 2, top + _CAPTION - 6, text, fontsize=9, color="#222222")
     axis.imshow(canvas, interpolation="nearest", aspect="auto")
-    save(figure, out)
-    return True
+    return figure
 
 
 def _caption(run: Run, path: Path) -> str:

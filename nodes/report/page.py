@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,14 @@ from nodes.report.contents import Run
 from nodes.report.curves import draw_distributions, draw_errors, draw_latency, draw_relative
 from nodes.report.folder import read_run
 from nodes.report.frames import draw_frames, read_picture
-from nodes.report.paths import draw_paths
-from nodes.report.style import Picture, drawing
+from nodes.report.style import Plot, drawing
+from nodes.report.trajectories import draw_trajectories
 from runtime.summary import WORKER_COLUMNS
 
 PAGE = "report.html"
 PLOTS = "plots"
 _OURS = ("trajectories", "errors", "distributions", "latency", "relative", "frames_*", "clouds_*")
-"""Names of the pictures; those of an earlier report are taken away."""
+"""Names of the figures; those of an earlier report are removed."""
 
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 88]
 
@@ -37,15 +38,16 @@ _ALIGNED = {
 
 _LEFT = {
     "flight.png": ("The flight", "True path, height and speed, from the flight log.", False),
-    "pictures.png": ("Pictures", "Sample pictures of the cameras, from the flight log.", True),
+    "images.png": ("Images", "Sample images of the cameras, from the flight log.", True),
 }
 
 
-def write_report(out: Path) -> Path:
-    """Write ``report.html`` and its pictures, ``plots/*.png``, anew.
+def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:
+    """Write ``report.html`` and its figures, ``plots/*``, anew.
 
     Args:
         out: The folder of a run, whatever is in it.
+        formats: Of the figures: png (always, if there is any), svg, pdf; none for tables only.
 
     Returns:
         The page's path.
@@ -58,21 +60,29 @@ def write_report(out: Path) -> Path:
     plots = out / PLOTS
     plots.mkdir(exist_ok=True)
     for pattern in _OURS:
-        for old in plots.glob(f"{pattern}.png"):
+        for old in plots.glob(f"{pattern}.*"):
             old.unlink()
-    with drawing():
-        curves = [
-            picture
-            for draw in (draw_paths, draw_errors, draw_distributions, draw_latency, draw_relative)
-            if (picture := draw(run, plots)) is not None
-        ]
-        frames, clouds = draw_frames(run, plots), draw_clouds(run, plots)
+    shown: list[list[dict[str, str]]] = [[], [], []]
+    if formats:
+        curves = (draw_trajectories, draw_errors, draw_distributions, draw_latency, draw_relative)
+        with drawing():
+            for place, found in zip(
+                shown,
+                ((draw(run) for draw in curves), draw_clouds(run), draw_frames(run)),
+                strict=True,
+            ):
+                place += [_written(each, plots, formats) for each in found if each is not None]
     page = out / PAGE
-    page.write_text(render(run, curves, frames, clouds), encoding="utf-8", newline="\n")
+    page.write_text(render(run, *shown), encoding="utf-8", newline="\n")
     return page
 
 
-def render(run: Run, curves: list[Picture], frames: list[Picture], clouds: list[Picture]) -> str:
+def render(
+    run: Run,
+    curves: list[dict[str, str]],
+    clouds: list[dict[str, str]],
+    frames: list[dict[str, str]],
+) -> str:
     """Return the page."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -81,7 +91,7 @@ def render(run: Run, curves: list[Picture], frames: list[Picture], clouds: list[
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    left = [Picture(path, *_LEFT[path.name]) for path in run.pictures if _can_be_read(run, path)]
+    left = [_embedded(path, *_LEFT[path.name]) for path in run.images if _can_be_read(run, path)]
     return environment.get_template("page.html.jinja").render(
         run=run,
         main=tables.figures(run, main=True),
@@ -91,16 +101,16 @@ def render(run: Run, curves: list[Picture], frames: list[Picture], clouds: list[
         workers=tables.workers(run),
         worker_columns=("worker", *WORKER_COLUMNS),
         outputs=tables.outputs(run),
-        curves=[_embedded(p) for p in curves],
-        frames=[_embedded(p) for p in frames],
-        clouds=[_embedded(p) for p in clouds],
-        left=[_embedded(p) for p in left],
+        curves=curves,
+        frames=frames,
+        clouds=clouds,
+        left=left,
         verdicts=[_verdict(e.name, e.figures, e.color) for e in run.estimators],
     )
 
 
 def _can_be_read(run: Run, path: Path) -> bool:
-    """Tell whether a file that another node left is a picture; `Run.missing` says if not."""
+    """Tell whether a file that another node left is an image; `Run.missing` says if not."""
     try:
         read_picture(path)
     except (OSError, ValueError) as error:
@@ -109,15 +119,19 @@ def _can_be_read(run: Run, path: Path) -> bool:
     return True
 
 
-def _embedded(picture: Picture) -> dict[str, str]:
-    data, kind = picture.path.read_bytes(), "png"
-    if picture.photo:
+def _written(plot: Plot, folder: Path, formats: Sequence[str]) -> dict[str, str]:
+    return _embedded(plot.write(folder, formats), plot.title, plot.caption, plot.photo)
+
+
+def _embedded(path: Path, title: str, caption: str, photo: bool) -> dict[str, str]:
+    data, kind = path.read_bytes(), "png"
+    if photo:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if image is not None:
             data, kind = cv2.imencode(".jpg", image, _QUALITY)[1].tobytes(), "jpeg"
     return {
-        "title": picture.title,
-        "caption": picture.caption,
+        "title": title,
+        "caption": caption,
         "source": f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}",
     }
 

@@ -64,26 +64,43 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.4,
     "path.simplify": True,
+    "svg.hashsalt": "report",  # so that equal figures give equal names inside
     "text.parse_math": False,  # names may have dollar signs
     "xtick.color": "#444444",
     "ytick.color": "#444444",
 }
 
 
-class Picture(msgspec.Struct, frozen=True):
-    """A picture of the report.
+class Plot(msgspec.Struct, frozen=True, eq=False):
+    """A figure of the report.
 
     Attributes:
-        path: The PNG.
-        title: What is seen.
+        name: Of its files, without what tells their format.
+        figure: What is drawn.
+        title: What it shows.
         caption: How to read it.
-        photo: Whether it is of photographs, which the page holds as JPEG: a fifth of the size.
+        raster: Whether it is made of pixels, so that an SVG or PDF of it would be no better.
+        photo: Whether it is of camera images, which the page holds as JPEG: a fifth of the size.
     """
 
-    path: Path
+    name: str
+    figure: Figure
     title: str
     caption: str = ""
+    raster: bool = False
     photo: bool = False
+
+    def write(self, folder: Path, formats: Sequence[str]) -> Path:
+        """Write the figure as PNG, and in the other formats; return the PNG's path.
+
+        Equal figures give equal bytes.
+        """
+        path = folder / f"{self.name}.png"
+        self.figure.savefig(path, dpi=DPI, metadata={"Software": None})
+        for each in {"svg", "pdf"}.intersection(() if self.raster else formats):
+            date = {"svg": "Date", "pdf": "CreationDate"}[each]
+            self.figure.savefig(path.with_suffix(f".{each}"), metadata={date: None})
+        return path
 
 
 @contextlib.contextmanager
@@ -113,11 +130,6 @@ def sheet(
     rows = -(-len(names) // legend_columns(names))
     size = (width, height + 0.2 * max(rows - 1, 0))
     return Figure(figsize=size, layout="constrained" if constrained else None)
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write a PNG; equal figures give equal bytes."""
-    figure.savefig(path, dpi=DPI, metadata={"Software": None})
 
 
 def label(name: str) -> str:

@@ -58,7 +58,7 @@ def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
     summary = run("two_cameras", tmp_path, "run.duration=2s")
     assert summary["events"]["DepthImage"] == 30
     assert summary["events"]["Image"] == pytest.approx(30 + 140, abs=2)
-    assert (tmp_path / "pictures.png").stat().st_size > 10_000
+    assert (tmp_path / "images.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_computer_vision_follows_the_trajectory(tmp_path: Path) -> None:
 @pytest.mark.timeout(500)
 def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
     """`closed_loop` lands without a collision, and was where the truth says it should be."""
-    summary = run("closed_loop", tmp_path, "evaluation.report=false")
+    summary = run("closed_loop", tmp_path, "report.figures=[]")
     assert summary["reason"] == "pilot: flight completed"
     assert summary["outputs"]["drone.vehicle_events"] == 4
     figures = summary["verdict"]["estimators"]["odometry"]
@@ -86,7 +86,7 @@ def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
 @pytest.mark.timeout(500)
 def test_a_single_camera_keeps_within_two_percent(tmp_path: Path) -> None:
     """`monocular` at 30 instead of 70 pictures a second, for the sake of time."""
-    summary = run("monocular", tmp_path, "camera.rate=30", "evaluation.report=false")
+    summary = run("monocular", tmp_path, "camera.rate=30", "report.figures=[]")
     figures = summary["verdict"]["estimators"]["odometry"]
     assert figures["alignment"] == "sim3"
     assert figures["ate_percent"] < 2.0
@@ -95,7 +95,7 @@ def test_a_single_camera_keeps_within_two_percent(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_poor_pictures_over_a_poor_link_are_late_and_some_are_missing(tmp_path: Path) -> None:
     """`imperfect` loses one picture in twenty; the estimates are as late as it asks for."""
-    summary = run("imperfect", tmp_path, "run.duration=8s", "evaluation.report=false")
+    summary = run("imperfect", tmp_path, "run.duration=8s", "report.figures=[]")
     figures = summary["verdict"]["estimators"]["odometry"]
     link = summary["links"]["odometry.frames"]
     assert link["lost"] + figures["estimates"] == pytest.approx(summary["events"]["Image"], abs=4)
@@ -106,7 +106,7 @@ def test_poor_pictures_over_a_poor_link_are_late_and_some_are_missing(tmp_path: 
 @pytest.mark.slow
 def test_two_clouds_of_which_one_smears(tmp_path: Path) -> None:
     """`mapping` writes both clouds, and the smeared one fills more cells."""
-    run("mapping", tmp_path, "run.duration=8s", "evaluation.report=false")
+    run("mapping", tmp_path, "run.duration=8s", "report.figures=[]")
     sizes = {p.stem: p.stat().st_size for p in (tmp_path / "clouds").glob("*.ply")}
     assert sizes["latest"] > 1.2 * sizes["matched"] > 100_000
 
@@ -133,11 +133,11 @@ def test_orb_slam3_takes_the_place_of_odometry(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     settings = [f'odometry.vocabulary="{vocabulary}"', "run.duration=15s"]
-    summary = run("orb_slam3", tmp_path / "out", *settings, "evaluation.report=false")
+    summary = run("orb_slam3", tmp_path / "out", *settings, "report.figures=[]")
     assert summary["not_deterministic"] == ["odometry"]
     assert summary["verdict"]["estimators"]["odometry"]["lost_seconds"] == 0.0
     settings = [f'orb_slam3.vocabulary="{vocabulary}"', "run.duration=6s"]
-    summary = run("plain", tmp_path / "plain", *settings, "evaluation.report=false", code=1)
+    summary = run("plain", tmp_path / "plain", *settings, "report.figures=[]", code=1)
     frames = {n: e["frame_id"] for n, e in summary["verdict"]["estimators"].items()}
     assert frames == {"odometry": "map", "orb_slam3": "odom"}, "it begins in the air"
 
@@ -145,14 +145,14 @@ def test_orb_slam3_takes_the_place_of_odometry(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_rerun_leaves_a_recording(tmp_path: Path) -> None:
     """`rerun` writes a file with the whole flight in it."""
-    run("rerun", tmp_path, "run.duration=4s", "evaluation.report=false")
+    run("rerun", tmp_path, "run.duration=4s", "report.figures=[]")
     assert (tmp_path / "flight.rrd").stat().st_size > 500_000
 
 
 @pytest.mark.slow
 def test_foxglove_runs_where_nobody_looks(tmp_path: Path) -> None:
     """`foxglove` flies on without a viewer."""
-    changes = "run.duration=4s", "foxglove.port=0", "evaluation.report=false"
+    changes = "run.duration=4s", "foxglove.port=0", "report.figures=[]"
     summary = run("foxglove", tmp_path, *changes)
     assert summary["events"]["Odometry"] > 300
 
@@ -160,9 +160,9 @@ def test_foxglove_runs_where_nobody_looks(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_recording_takes_the_simulators_place(tmp_path: Path) -> None:
     """`replay` gives the estimates that `record` gave in flight, to the byte."""
-    run("record", tmp_path / "live", "run.duration=4s", "evaluation.report=false")
+    run("record", tmp_path / "live", "run.duration=4s", "report.figures=[]")
     file = f"replay.file={tmp_path / 'live' / 'recording.mcap'}"
-    summary = run("replay", tmp_path / "again", file, "evaluation.report=false")
+    summary = run("replay", tmp_path / "again", file, "report.figures=[]")
     assert summary["reason"] == "the recording ended"
     name = "trajectories/odometry.tum"
     assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()

@@ -74,7 +74,7 @@ def test_pictures_are_drawn(tmp_path: Path) -> None:
     inputs += [image(500_000_000 * k, grey=k % 2 == 1) for k in range(20)]
     inputs.append(collision(9_000_000_000))
     log(tmp_path, sorted(inputs, key=lambda e: e.stamp), interval="500ms")
-    for name in ("flight.png", "pictures.png"):
+    for name in ("flight.png", "images.png"):
         picture = cv2.imread(str(tmp_path / name))
         assert picture is not None
         assert min(picture.shape[:2]) > 300
@@ -91,7 +91,7 @@ def test_the_sheet_never_holds_more_than_it_should() -> None:
             await super().on_shutdown()
 
     frames = [image(100_000_000 * k) for k in range(150)]
-    run_node(Peeking, inputs=frames, config={"pictures": 4, "interval": "1s"}, duration=20)
+    run_node(Peeking, inputs=frames, config={"image_count": 4, "interval": "1s"}, duration=20)
     assert len(kept) <= 4
     assert kept[0] == 0
     assert kept[-1] >= 8_000_000_000
@@ -159,5 +159,5 @@ def test_a_restart_keeps_what_was_written_before(tmp_path: Path) -> None:
     assert len(stamps) > 40
     assert {p.name for p in tmp_path.iterdir()} == {
         "trajectory.tum",
-        *(f"{name}{part}.png" for name in ("flight", "pictures") for part in ("", "-2", "-3")),
+        *(f"{name}{part}.png" for name in ("flight", "images") for part in ("", "-2", "-3")),
     }

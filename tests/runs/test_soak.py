@@ -37,7 +37,6 @@ type = "tests.runs.test_soak:Echo"
 [[nodes]]
 name = "evaluation"
 type = "nodes.evaluation:Evaluation"
-report = false
 
 [[nodes]]
 name = "flight_log"

@@ -55,7 +55,7 @@ def test_a_short_flight_leaves_everything(tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert {p.name for p in out.iterdir()} == {
         *("summary.json", "config.toml", "log.txt", ".visnav-run"),
-        *("trajectory.tum", "flight.png", "pictures.png"),
+        *("trajectory.tum", "flight.png", "images.png"),
     }
     found = summary(out)
     assert (found["sim_seconds"], found["reason"], found["error"]) == (2.0, "duration", None)

@@ -25,7 +25,7 @@ def fly(folder: Path, config: Path, *settings: str, code: int | None = 0) -> dic
 
 @pytest.mark.parametrize("world", ["config.toml", "examples/yard.toml"])
 def test_odometry_keeps_within_a_third_of_a_percent(world: str, tmp_path: Path) -> None:
-    summary = fly(tmp_path, ROOT / world, "evaluation.report=false")
+    summary = fly(tmp_path, ROOT / world, "report.figures=[]")
     assert summary["reason"] == "pilot: flight completed"
     # Armed, taken off, landed, disarmed: no collision among what happened.
     assert summary["outputs"]["drone.vehicle_events"] == 4
@@ -41,7 +41,7 @@ def test_odometry_keeps_within_a_third_of_a_percent(world: str, tmp_path: Path) 
 def test_a_scene_too_heavy_for_the_machine_gives_the_same_estimates(tmp_path: Path) -> None:
     """Two real seconds a picture, or as fast as it goes: the same events, to the byte."""
     short = ["run.duration=5s", "camera.rate=5", "camera.width=256", "camera.height=256"]
-    short.append("evaluation.report=false")
+    short.append("report.figures=[]")
     found = []
     for render_time in ("0s", "2s"):
         folder = tmp_path / render_time

@@ -38,9 +38,9 @@ def judged(out: Path, *groups: list[Event], late: int = 0, **config: Any) -> dic
 def run(out: Path, *groups: list[Event], late: int = 0, **config: Any) -> list[Score]:
     from runtime.testing import run_nodes, spec
 
-    links = {"estimated": {"delay": late / 1e9}, "tracking": {"delay": late / 1e9}}
+    links = {"estimates": {"delay": late / 1e9}, "tracking_events": {"delay": late / 1e9}}
     script = sorted((e for group in groups for e in group), key=lambda e: e.stamp)
-    node = spec(Evaluation, "evaluation", {"report": False, **config}, links=links if late else {})
+    node = spec(Evaluation, "evaluation", config, links=links if late else {})
     return run_nodes([node], inputs=script, duration=11.0, out=out).of(Score)
 
 
@@ -193,7 +193,7 @@ def test_of_many_pictures_a_few_are_kept_with_their_features(tmp_path: Path) -> 
                 inliers=np.array([True, False]),
             )
         )
-    run(tmp_path, announced(), truth(1), events, pictures=4)
+    run(tmp_path, announced(), truth(1), events, image_count=4)
     files = sorted((tmp_path / "frames").iterdir())
     assert 2 <= len(files) <= 4
     drawn = cv2.imread(str(files[0]))
@@ -230,9 +230,7 @@ def test_an_evaluation_that_was_restarted_fails_and_what_was_written_stays(tmp_p
 
     estimates: list[Event] = [estimate(s) for s in FRAMES]
     limits = {"ate_rmse_m": 1.0}
-    node = spec(
-        Restarted, "evaluation", {"report": False, "thresholds": limits}, on_error="restart"
-    )
+    node = spec(Restarted, "evaluation", {"thresholds": limits}, on_error="restart")
     script = sorted([*announced(), *truth(10), *estimates], key=lambda e: e.stamp)
     run_nodes([node], inputs=script, duration=11.0, out=tmp_path)
     verdict = json.loads((tmp_path / "evaluation" / "verdict.json").read_text())

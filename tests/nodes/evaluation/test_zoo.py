@@ -43,7 +43,7 @@ def judged(
     """Fly with these estimators, and return the verdict."""
     asked = standard_thresholds() if thresholds is None else thresholds
     nodes = [spec(Animal, kind, {"kind": kind}, on_error="drop") for kind in kinds]
-    evaluation = spec(Evaluation, "evaluation", {"report": False, "thresholds": asked})
+    evaluation = spec(Evaluation, "evaluation", {"thresholds": asked})
     script = sorted([*truth(SECONDS), *images(), *more], key=lambda e: e.stamp)
     run_nodes(
         [*nodes, evaluation], inputs=[announced()[0], *script], duration=SECONDS + 0.1, out=out

@@ -10,8 +10,8 @@ import pytest
 from events import TrackingLost, TrackingRegained
 from nodes.evaluation.judging import Thresholds
 from nodes.evaluation.record import EstimatorRecord
-from nodes.report import write_report
 from nodes.report.folder import read_run
+from nodes.report.page import write_report
 from nodes.report.style import Floats
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row, write_tum
@@ -82,7 +82,7 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
     (tmp_path / "frames" / "vo_001.jpg").touch()
     (tmp_path / "frames" / "vo_002.jpg").mkdir()
     (tmp_path / "flight.png").write_text("none")
-    (tmp_path / "pictures.png").touch()
+    (tmp_path / "images.png").touch()
     page = Page(write_report(tmp_path))
     for name in (
         "summary.json cannot be read",
@@ -96,7 +96,7 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
         "frames/vo_001.jpg cannot be read: expected a JPEG",
         "frames/vo_002.jpg cannot be read: [Errno 21]",
         "flight.png cannot be read: expected a JPEG or PNG, found b'none'",
-        "pictures.png cannot be read: expected a JPEG or PNG, found b''",
+        "images.png cannot be read: expected a JPEG or PNG, found b''",
     ):
         assert name in page.text
     names = {p.name for p in (tmp_path / "plots").iterdir()}

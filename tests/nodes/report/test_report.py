@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from nodes.evaluation.judging import Thresholds
-from nodes.report import write_report
+from nodes.report.page import write_report
 from nodes.trajectory import Trajectory
 from tests.nodes.report.folders import evaluated, frame, ply, recorded, summary, walk
 
@@ -102,7 +102,7 @@ def test_every_section_has_its_title(page: Page) -> None:
         "Latency",
         "Relative error over path length",
         "Clouds",
-        "What vo saw and followed",
+        "Images and features of vo",
         "The flight",
         "The run",
         "Warnings and errors",
@@ -150,7 +150,7 @@ def test_the_page_needs_nothing_beside_it(page: Page) -> None:
 
 
 def test_every_picture_is_one_and_shows_something(run: Path, page: Page) -> None:
-    pictures = sorted((run / "plots").iterdir())
+    pictures = sorted((run / "plots").glob("*.png"))
     assert [p.name for p in pictures] == [
         "clouds_1.png",
         "distributions.png",

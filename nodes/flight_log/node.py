@@ -1,4 +1,4 @@
-"""What a flight leaves to look at: the true trajectory, a plot of it, and a sheet of pictures.
+"""What a flight leaves to look at: the true trajectory, a plot of it, and a sheet of images.
 
 After a restart the trajectory goes on in the same file; plot and sheet get a number (``flight-2``)
 and show what came after it.
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Collision, Image, Odometry
-from nodes.pictures import Thumbnail, draw_contact_sheet, draw_flight
+from nodes.flight_log.drawing import Thumbnail, draw_contact_sheet, draw_flight
 from nodes.trajectory.growing import GrowingFile, part_name
 from runtime import Duration, Node, NodeConfig, on
 from runtime.paths import OutputPath
@@ -24,7 +24,7 @@ Count = Annotated[int, msgspec.Meta(ge=1, le=100)]
 
 
 _WIDTH = 256
-"""Pixels of a small picture."""
+"""Pixels of a small image."""
 
 
 class FlightLogConfig(NodeConfig):
@@ -33,16 +33,16 @@ class FlightLogConfig(NodeConfig):
     Attributes:
         trajectory: File for the trajectory, in the run's folder.
         plot: File for the plot of the flight.
-        sheet: File for the sheet of pictures.
-        interval: Seconds between two pictures on the sheet; doubled whenever it is full.
-        pictures: How many pictures it holds.
+        sheet: File for the sheet of images.
+        interval: Seconds between two images on the sheet; doubled whenever it is full.
+        image_count: How many images it holds.
     """
 
     trajectory: OutputPath = "trajectory.tum"
     plot: OutputPath = "flight.png"
-    sheet: OutputPath = "pictures.png"
+    sheet: OutputPath = "images.png"
     interval: Duration = Duration(1)  # immutable
-    pictures: Count = 20
+    image_count: Count = 20
 
 
 class FlightLog(Node[FlightLogConfig]):
@@ -53,14 +53,14 @@ class FlightLog(Node[FlightLogConfig]):
         self._thumbnails: list[Thumbnail] = []
         self._collisions: list[Collision] = []
         self._interval = round(self.config.interval * 1e9)
-        self._next_picture: dict[str, int] = {}  # by camera
+        self._next_image: dict[str, int] = {}  # by camera
         self._file: GrowingFile | None = None
         if self.out is not None:
             head = "# timestamp[s] x y z[m, NED] qx qy qz qw (FRD to NED)\n"
             self._file = GrowingFile(self, self.out / self.config.trajectory, head)
 
     @on(Odometry)
-    def moved(self, event: Odometry) -> None:
+    def odometry(self, event: Odometry) -> None:
         """Note where the vehicle is."""
         (x, y, z), (qw, qx, qy, qz) = event.position, event.orientation
         if self._file is not None:
@@ -70,28 +70,28 @@ class FlightLog(Node[FlightLogConfig]):
             self._file.add(f"{seconds}.{rest:09d} {pose}\n")
 
     @on(Image)
-    def saw(self, event: Image) -> None:
-        """Keep a small copy of a picture now and then."""
-        if event.stamp < self._next_picture.get(event.source, 0):
+    def images(self, event: Image) -> None:
+        """Keep a small copy of an image at intervals."""
+        if event.stamp < self._next_image.get(event.source, 0):
             return
-        self._next_picture[event.source] = event.stamp + self._interval
+        self._next_image[event.source] = event.stamp + self._interval
         height, width = event.data.shape[:2]
         scale = _WIDTH / width
         size = (_WIDTH, max(round(height * scale), 1))
         small = cv2.resize(event.data, size, interpolation=cv2.INTER_AREA)
         self._thumbnails.append((event.stamp, event.source, np.atleast_3d(small)))
-        if len(self._thumbnails) > self.config.pictures:
+        if len(self._thumbnails) > self.config.image_count:
             self._interval *= 2
             kept = (t for t in self._thumbnails if t[0] % self._interval < self._interval // 2)
             self._thumbnails = list(kept)
 
     @on(Collision)
-    def hit(self, event: Collision) -> None:
+    def collisions(self, event: Collision) -> None:
         """Note a collision."""
         self._collisions.append(event)
 
     async def on_shutdown(self) -> None:
-        """Close the trajectory and draw the pictures."""
+        """Close the trajectory and draw the plot and the sheet."""
         if self._file is None or self.out is None:
             return
         self._file.close()

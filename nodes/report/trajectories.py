@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,7 +12,7 @@ import numpy.typing as npt
 from nodes.evaluation.coverage import Interval
 from nodes.report.contents import Run
 from nodes.report.poses import Floats, broken
-from nodes.report.style import PLAN, TRUTH, WIDTH, Picture, label, legend_columns, save, sheet, thin
+from nodes.report.style import PLAN, TRUTH, WIDTH, Plot, label, legend_columns, sheet, thin
 from nodes.trajectory import Trajectory
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 0.7, 0.2, 0.5, 0.5
@@ -39,7 +38,7 @@ class _Line(msgspec.Struct, frozen=True, eq=False):
     style: dict[str, Any]
 
 
-def draw_paths(run: Run, folder: Path) -> Picture | None:
+def draw_trajectories(run: Run) -> Plot | None:
     """Draw truth, plan and aligned estimates; `None` if there is none of them.
 
     Both views are of one scale, metre for metre, and share the east axis.
@@ -79,10 +78,8 @@ def draw_paths(run: Run, folder: Path) -> Picture | None:
         bbox_to_anchor=((_LEFT - 0.1) / WIDTH, 1.0 - 0.05 / height),
         ncols=columns,
     )
-    path = folder / "trajectories.png"
-    save(figure, path)
     astray = any(((p < low) | (p > high)).any() for p in (line.points for line in lines))
-    return Picture(path, "Trajectories", _caption(run, astray=astray))
+    return Plot("trajectories", figure, "Trajectories", _caption(run, astray=astray))
 
 
 def _caption(run: Run, *, astray: bool) -> str:
