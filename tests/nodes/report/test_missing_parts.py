@@ -100,7 +100,9 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
     ):
         assert name in page.text
     names = {p.name for p in (tmp_path / "plots").iterdir()}
-    assert names == {"trajectories.png", "relative.png"}
+    assert names == {
+        f"{plot}.{kind}" for plot in ("trajectories", "relative") for kind in ("png", "svg")
+    }
 
 
 def test_the_verdict_of_an_earlier_run_does_not_pass_for_this_one_s(tmp_path: Path) -> None:
