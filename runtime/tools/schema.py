@@ -9,8 +9,6 @@ a camera is announced) is in no schema; ``python -m runtime check`` says that.
 
 from __future__ import annotations
 
-import inspect
-import re
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
@@ -21,6 +19,7 @@ from runtime.config.model import NetworkConfig, OnError, RunConfig
 from runtime.config.parameters import is_marked
 from runtime.links import LinkConfig
 from runtime.node import Node
+from runtime.tools.describe import attribute_docs, summary
 from runtime.units import Duration, plain
 
 Schema = dict[str, Any]
@@ -112,7 +111,7 @@ class _Maker:
         }
         self.definitions[key] = {
             **own,
-            "description": _summary(cls),
+            "description": summary(cls),
             "properties": {**head, **own["properties"]},
             "required": ["name", "type", *own.get("required", [])],
         }
@@ -123,7 +122,7 @@ class _Maker:
         key = f"{cls.__module__}.{cls.__name__}"
         if key not in self.definitions:
             self.definitions[key] = {}  # it may hold itself
-            self.definitions[key] = {"description": _summary(cls), **self._properties(cls)}
+            self.definitions[key] = {"description": summary(cls), **self._properties(cls)}
         return {"$ref": f"#/$defs/{key}"}
 
     def _properties(self, cls: type[msgspec.Struct]) -> Schema:
@@ -194,19 +193,3 @@ def _bounds(info: Any, of: Literal["", "Items", "Length"] = "") -> Schema:
         for name, value in found.items()
         if value is not None
     }
-
-
-def _summary(cls: type) -> str:
-    """Return the first paragraph of a docstring, in one line."""
-    return " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split())
-
-
-def attribute_docs(cls: type) -> dict[str, str]:
-    """Return what the docstrings of a class and its bases say of each attribute, in one line."""
-    found: dict[str, str] = {}
-    for each in reversed(cls.__mro__):
-        section = inspect.cleandoc(each.__doc__ or "").partition("Attributes:\n")[2]
-        section = re.split(r"\n(?=\S)", section)[0]
-        for name, text in re.findall(r"^    (\w+): (.*(?:\n {8}.*|\n)*)", section, re.MULTILINE):
-            found[name] = " ".join(text.split())
-    return found

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from rich.tree import Tree
 
-    from runtime.node import Node
+    from runtime.tools.describe import NodeDescription, SettingDescription
 
 
 def nodes(
@@ -17,12 +18,17 @@ def nodes(
         str | None, typer.Argument(help='Only this one: "module:Class", or a part of its name.')
     ] = None,
 ) -> None:
-    """List nodes with their ports and settings: those that installed packages offer."""
+    """Describe nodes: their ports, and their settings with meaning, range and default.
+
+    Without an argument these are all that installed packages offer. Settings that every file may
+    have, whatever its nodes, are listed by "python -m runtime settings".
+    """
     from rich.console import Console
 
     from runtime.config.reading import find_node
     from runtime.errors import ConfigError, suggest
     from runtime.tools.cli.common import warn
+    from runtime.tools.describe import describe
     from runtime.tools.plugins import find_nodes
 
     found = find_nodes(warn)
@@ -38,69 +44,44 @@ def nodes(
         )
     console = Console()
     for name, cls in shown.items():
-        console.print(_describe(name, cls), highlight=False)
+        console.print(_tree(describe(cls, name)), highlight=False)
 
 
-def _describe(name: str, cls: type[Node[Any]]) -> Tree:
-    import inspect
-
+def _tree(node: NodeDescription) -> Tree:
+    """Return a node as a tree: what it is, its ports, ticks and settings."""
+    from rich.markup import escape
     from rich.tree import Tree
 
-    from runtime.graph import heard_types
-
-    tree = Tree(f"[bold]{name}[/bold]  {(inspect.getdoc(cls) or '').splitlines()[0]}")
-    for port, events in heard_types(cls).items():
-        arrow = "handles" if port in cls.declared.handlers else "reads"
-        tree.add(f"{arrow} {' or '.join(e.__name__ for e in events)} as {port}")
-    for port, output in cls.declared.outputs.items():
-        tree.add(f"sends {output.event.__name__} as {port}")
-    for method, ticks in cls.declared.ticks.items():
-        rate = f"{ticks.hz:g} Hz" if isinstance(ticks.hz, float | int) else f"the rate {ticks.hz!r}"
-        tree.add(f"calls {method} at {rate}")
-    _add_settings(tree, cls.config_type)
+    tree = Tree(f"[bold]{node.type}[/bold]\n{escape(node.doc)}")
+    for title, ports in (("listens to", node.inputs), ("sends", node.outputs)):
+        branch = _branch(tree, title, ports)
+        for port in ports:
+            details = ", ".join(filter(None, [port.kind, port.delivery]))
+            events = " or ".join(port.events)
+            line = f"[bold]{port.name}[/bold]  {events} ({details})"
+            branch.add(f"{line}\n{escape(port.doc)}".rstrip())
+    branch = _branch(tree, "is called", node.ticks)
+    for tick in node.ticks:
+        branch.add(f"[bold]{tick.name}[/bold]  at {tick.rate}\n{escape(tick.doc)}")
+    add_settings(_branch(tree, "settings", node.settings), node.settings)
     return tree
 
 
-def _add_settings(tree: Tree, config: type[Any]) -> None:
-    """Add a line a setting, and below it the settings of a table or of a list of tables."""
-    import msgspec
+def _branch(tree: Tree, title: str, content: Sequence[object]) -> Tree:
+    return tree.add(title) if content else tree
+
+
+def add_settings(tree: Tree, settings: Iterable[SettingDescription]) -> None:
+    """Add settings to a tree, and below each table those in it."""
     from rich.markup import escape
 
-    from runtime.config.parameters import is_marked
-
-    for field in msgspec.structs.fields(config):
-        inner = _struct(field.type)
-        default = "required" if field.required else "" if inner else f"= {_default(field)}"
-        line = f"setting {field.encode_name}: {_type_name(field.type)} {default}".rstrip()
-        if is_marked(field.type):
-            line += "  (can change in a run)"
-        branch = tree.add(escape(line))
-        if inner is not None:
-            _add_settings(branch, inner)
-
-
-def _struct(type_: Any) -> type[Any] | None:
-    """Return the struct that a type is or holds."""
-    if hasattr(type_, "__struct_fields__"):
-        return type_  # type: ignore[no-any-return]
-    return next((s for a in getattr(type_, "__args__", ()) if (s := _struct(a))), None)
-
-
-def _default(field: Any) -> str:
-    import msgspec
-
-    value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _type_name(type_: Any) -> str:
-    if getattr(type_, "__metadata__", None):
-        return _type_name(type_.__origin__)
-    if isinstance(type_, type) and not getattr(type_, "__args__", None):
-        return type_.__name__
-    inner = ", ".join("…" if a is ... else _type_name(a) for a in getattr(type_, "__args__", ()))
-    name = {"tuple": "list of ", "Literal": "one of ", "Union": "", "UnionType": ""}.get(
-        getattr(getattr(type_, "__origin__", type_), "__name__", type(type_).__name__)
-    )
-    return f"{name}{inner}" if name is not None else repr(type_)
+    for setting in settings:
+        default = f"= {setting.default}" if setting.default else ""
+        if len(default) > 60:
+            default = default[:57] + "…"
+        required = "required" if setting.required else ""
+        changeable = "can change in a run" if setting.changeable else ""
+        details = [setting.type, setting.constraint, required, changeable]
+        line = " ".join(filter(None, [default, f"({', '.join(filter(None, details))})"]))
+        line = f"[bold]{setting.name}[/bold]  {escape(line)}"
+        add_settings(tree.add(f"{line}\n{escape(setting.doc)}".rstrip()), setting.settings)

@@ -128,20 +128,44 @@ def test_graph_prints_mermaid_or_draws(tmp_path: Path) -> None:
     assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_nodes_lists_ports_and_settings(tmp_path: Path) -> None:
+def test_nodes_describes_ports_and_settings(tmp_path: Path) -> None:
     done = command_here("nodes", "multirotor", folder=tmp_path)
     assert done.returncode == 0
     assert "sims.multirotor:Multirotor" in done.stdout
     for line in (
-        "sends Imu as imu",
-        "sends Image as images",
-        "calls control at the rate 'control_rate'",
-        "setting imu_rate: float = 200",
+        "imu  Imu (output)",
+        "images  Image (output)",
+        "control  at the setting control_rate",
+        "imu_rate  = 200 (float, > 0, ≤ 1000)",
+        "Rate of the IMU and of the ground truth (`odometry`), Hz.",
     ):
         assert line in done.stdout
 
 
-@pytest.mark.slow
+def test_nodes_describes_any_node_that_can_be_imported(tmp_path: Path) -> None:
+    done = command_here("nodes", "tests.runtime.samples:Speaker", folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "pings  Ping (output)" in done.stdout
+    done = command_here("nodes", "tests.runtime.samples:Nobody", folder=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: nodes: expected a node of tests.runtime.samples, found")
+
+
+def test_settings_describes_what_every_file_may_have(tmp_path: Path) -> None:
+    done = command_here("settings", folder=tmp_path)
+    assert done.returncode == 0
+    for line in (
+        "[run]",
+        "[network]",
+        "[[nodes]]",
+        "[nodes.links.PORT]",
+        "seed  = 0 (integer, ≥ 0)",
+        'on_error  = "stop" ("stop" or "restart" or "drop")',
+        "loss  = 0.0 (float, ≥ 0, ≤ 1)",
+    ):
+        assert line in done.stdout
+
+
 def test_log_events_prints_each_event_with_arrays_by_shape(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Speaker", "Painter", run="duration = 0.25")
     done = command("run", path, "--log", "events", "-q", folder=tmp_path)

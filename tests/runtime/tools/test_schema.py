@@ -12,8 +12,9 @@ import pytest
 
 from events import Image
 from runtime import Changeable, Duration, Input, Node, NodeConfig
+from runtime.tools.describe import attribute_docs
 from runtime.tools.plugins import find_nodes
-from runtime.tools.schema import attribute_docs, schema
+from runtime.tools.schema import schema
 
 ROOT = Path(__file__).parents[3]
 COMMITTED = ROOT / "docs" / "reference" / "config.schema.json"
