@@ -1,4 +1,4 @@
-"""What an estimator believes."""
+"""Events of estimators: poses, tracking, features."""
 
 from __future__ import annotations
 
@@ -13,14 +13,22 @@ from events.sensors import publish
 
 
 class PoseEstimate(Event):
-    """A body's estimated pose at the time of the data it was computed from.
+    """The estimated pose of a body, at the time of the data from which it was computed.
+
+    `stamp` is that of the image (or other measurement), not of the moment of sending: latency is
+    measured as the difference of both.
 
     Attributes:
-        frame_id: Parent frame; an estimator's own origin is ``odom``.
-        child_frame_id: The body whose pose it is.
-        position: Metres in the parent frame (scale-free for monocular estimators).
-        orientation: Rotation from the child to the parent frame.
-        covariance: 36 numbers, row-major, (x, y, z, roll, pitch, yaw); empty if unknown.
+        frame_id: Parent frame, with axes north, east, down. It says what is known about the origin,
+            and so how the estimate is aligned before it is compared with the ground truth: ``map``
+            not at all; ``odom`` (the estimator's own origin), ``odom_1``, … by the first pose. If
+            the estimator announced that it is scale-free, the alignment is a similarity, Sim(3).
+        child_frame_id: Frame of the body, with axes forward, right, down.
+        position: Metres in the parent frame; the estimator's own unit if it is scale-free.
+        orientation: Unit quaternion (w, x, y, z), Hamilton's: rotation from the child to the parent
+            frame.
+        covariance: Covariance of (x, y, z, roll, pitch, yaw), m², m rad and rad², in the parent
+            frame as in ROS's ``PoseWithCovariance``: 36 numbers, row by row; empty if unknown.
     """
 
     category: ClassVar[Category] = Category.ESTIMATE
@@ -36,7 +44,7 @@ class PoseEstimate(Event):
 
 
 class TrackingEvent(Event):
-    """Base of what happens to an estimator's tracking."""
+    """Base of the events of an estimator's tracking."""
 
     category: ClassVar[Category] = Category.ESTIMATE
 
@@ -45,7 +53,7 @@ class TrackingEvent(Event):
 
 
 class TrackingLost(TrackingEvent):
-    """An estimator no longer knows where it is.
+    """An estimator lost track of its pose: from this stamp on it has none.
 
     Attributes:
         reason: Why, if known.
@@ -55,14 +63,14 @@ class TrackingLost(TrackingEvent):
 
 
 class TrackingRegained(TrackingEvent):
-    """An estimator knows again where it is."""
+    """An estimator knows its pose again, from this stamp on."""
 
 
 class TrackedFeatures(Event, eq=False):
-    """What an estimator followed in a picture; `stamp` is the picture's.
+    """The features that an estimator tracked in an image; `stamp` is that of the image.
 
     Attributes:
-        frame_id: Optical frame of the picture.
+        frame_id: Optical frame of the image.
         points: float32 pixels, shape (n, 2): column, row (pixel centres are whole numbers).
         inliers: bool, shape (n,): those that agree with the estimated pose.
     """

@@ -1,16 +1,8 @@
 """An input of several events of one stamp: image, depth and pose that belong together.
 
-    class Frame(NamedTuple):
-        image: Image                 # the first field sets the stamp
-        depth: DepthImage            # must be there
-        pose: PoseStamped | None     # taken if it is there when the others are
-        imu: tuple[Imu, ...]         # all since the set that was read before, up to this stamp
-
-    frames = Bundle(Frame)           # async for image, depth, pose, imu in self.frames
-
-Declared with `Bundle`; what stands behind it at run time is a `Matcher`. A set that does not come
-about, or that the reader skips, leaves its tuples to the next one. (One that a link before the
-bundle loses takes them along.)
+It is declared with `Bundle`; at run time a `Matcher` does the work. A set that is not completed, or
+that the reader skips, leaves its tuples to the next one. (A set that is lost by a link before the
+bundle takes them along.)
 """
 
 from __future__ import annotations
@@ -59,13 +51,25 @@ class Field(NamedTuple):
 
 
 class Bundle(_Port, Generic[B]):
-    """An input whose reader gets matched sets: ``async for image, depth in self.frames``.
+    """An input of several events that belong together: the reader gets sets of one stamp.
+
+    ::
+
+        class Frame(NamedTuple):
+            image: Image                 # the first field sets the stamp
+            depth: DepthImage            # required
+            pose: PoseStamped | None     # taken if it has arrived with the others, else None
+            imu: tuple[Imu, ...]         # all since the previous set, up to this stamp
+
+        frames = Bundle(Frame, keep="latest")
+
+        async for image, depth, pose, imu in self.frames: ...
 
     On an instance this is a `Matcher`. In the file, ``inputs = { frames = "drone/front" }``
     narrows all fields but the tuples to one source, and ``"frames.imu" = "drone/imu"`` one field.
 
     Args:
-        set_type: A `NamedTuple` of events; see above for what its fields may be.
+        set_type: A `NamedTuple` of events, with fields as in the example.
         tolerance: Seconds by which stamps may differ from the first field's; the nearest is taken.
         keep: ``every`` or ``latest``: which *sets* may be skipped, as for `Input`.
         bound: How many sets ``every`` keeps.

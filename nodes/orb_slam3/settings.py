@@ -1,8 +1,8 @@
-"""ORB-SLAM3's settings, made from what cameras and IMUs announce: nobody keeps a second file.
+"""ORB-SLAM3's settings, made from the announcements of cameras and IMUs.
 
-In the older of the two forms that ORB-SLAM3 1.0 reads (the parsers of its ``Tracking.cc``): only
-there can it be told to begin without a shake, which RGB-D with an IMU waits for otherwise. Every
-parameter that it requires is given, since it ends the process where one is missing.
+They are in the older of the two forms that ORB-SLAM3 1.0 reads (the parsers of its
+``Tracking.cc``): only this one has a parameter with which RGB-D with an IMU initializes without a
+quick motion. Every required parameter is given, since it ends the process if one is missing.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ Threshold = Annotated[int, msgspec.Meta(ge=1, le=255)]
 
 
 class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What ORB-SLAM3 can be told besides the calibration.
+    """ORB-SLAM3's own settings, besides the calibration.
 
     Attributes:
-        features: Corners sought in an image. With depth, it begins at the first image in which it
-            finds more than 500.
-        scale_factor: Between two levels of the image pyramid.
-        levels: Of the pyramid.
+        features: Corners looked for in an image. With depth, it initializes with the first image in
+            which it finds more than 500.
+        scale_factor: Factor between two levels of the image pyramid.
+        levels: Levels of the image pyramid.
         fast_threshold: Grey levels by which a corner differs from its surroundings.
-        min_fast_threshold: The same, for regions in which there is none by `fast_threshold`.
-        baseline: Metres between the two cameras of which ORB-SLAM3 takes an RGB-D camera for one.
-            It weighs depth: the variance of an error in it is ``(z² / (baseline fx))²`` square
-            metres per square pixel.
-        close: Metres; a point nearer than this is put into the map from its depth at once, a
-            farther one when it has been seen from two sides. Any depth that is there is used.
+        min_fast_threshold: The same, for regions without corners by `fast_threshold`.
+        baseline: Distance of two cameras, in metres, which ORB-SLAM3 assumes for an RGB-D camera.
+            It gives the weight of depth: the variance of its error is ``(z² / (baseline fx))²``
+            square metres per square pixel.
+        close_depth: Depth in metres up to which a point is put into the map from its depth at once;
+            a farther one when it has been seen from two sides. Any measured depth is used.
         loop_closing: Whether places seen before correct the map.
     """
 
@@ -44,18 +44,18 @@ class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     fast_threshold: Threshold = 20
     min_fast_threshold: Threshold = 7
     baseline: Positive = 0.1
-    close: Positive = 4.0
+    close_depth: Positive = 4.0
     loop_closing: bool = True
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
-    """All that an ORB-SLAM3 process must know to begin.
+    """All that an ORB-SLAM3 process needs to start.
 
     Attributes:
-        mode: Which sensors it uses.
+        mode: The sensors that are used.
         text: The settings file, as YAML.
-        width: Of the images, pixels.
-        height: Of the images, pixels.
+        width: Width of the images, pixels.
+        height: Height of the images, pixels.
         intrinsics: fx, fy, cx, cy, in pixels.
     """
 
@@ -108,7 +108,7 @@ def make_settings(
     if "rgbd" in mode:
         lines += [
             f"Camera.bf: {_real(orb.baseline * info.fx)}",
-            f"ThDepth: {_real(orb.close / orb.baseline)}",  # counted in baselines
+            f"ThDepth: {_real(orb.close_depth / orb.baseline)}",  # counted in baselines
             "DepthMapFactor: 1.0",  # our depth is in metres
         ]
     if "inertial" in mode:

@@ -1,4 +1,4 @@
-"""A node that makes ORB-SLAM3's vocabulary from the images of a run, written when it is over.
+"""A node that trains ORB-SLAM3's vocabulary from the images of a run, and writes it at the end.
 
 ``python -m runtime vocabulary CONFIG`` runs it in place of the ORB-SLAM3 nodes of a file.
 """
@@ -22,14 +22,14 @@ class VocabularyTrainerConfig(NodeConfig):
     """Settings of the training.
 
     Attributes:
-        path: File to write; where ORB-SLAM3 nodes look by themselves if empty.
-        every: Take one of so many images of each camera.
-        features: Corners described in an image.
-        shape: What the vocabulary is like.
+        path: File to write; if empty, the one that ORB-SLAM3 nodes read by default.
+        image_interval: One of this many images of each camera is used.
+        features: Corners described in an image, at most.
+        shape: Shape of the vocabulary's tree.
     """
 
     path: str = ""
-    every: Annotated[int, msgspec.Meta(ge=1)] = 15
+    image_interval: Annotated[int, msgspec.Meta(ge=1)] = 15
     features: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 1000
     shape: TreeShape = TreeShape()
 
@@ -39,7 +39,7 @@ class VocabularyTrainerConfig(NodeConfig):
 
 
 class VocabularyTrainer(Node[VocabularyTrainerConfig]):
-    """Describes what the cameras see, and trains a vocabulary from it at the end."""
+    """Describes the images of all cameras, and trains a vocabulary from them at the end."""
 
     images = Input(Image, keep="latest")
 
@@ -47,11 +47,11 @@ class VocabularyTrainer(Node[VocabularyTrainerConfig]):
         self._descriptors: list[Bytes] = []
 
     async def run(self) -> None:
-        """Describe every so manieth image."""
+        """Describe one of every `image_interval` images."""
         seen: dict[str, int] = {}
         async for image in self.images:
             count = seen[image.source] = seen.get(image.source, -1) + 1
-            if count % self.config.every == 0:
+            if count % self.config.image_interval == 0:
                 found = await self.offload(describe, image.data, self.config.features)
                 self._descriptors.append(found)
 
@@ -72,7 +72,7 @@ def describe(image: Bytes, features: int) -> Bytes:
 
     Args:
         image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
-        features: How many corners, at most.
+        features: Number of corners, at most.
     """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     # 7 grey levels: what ORB-SLAM3 goes down to where there is little to see.

@@ -1,4 +1,4 @@
-"""The bag of visual words that ORB-SLAM3 recognises places with: training, file, and its place.
+"""Training of the bag of visual words by which ORB-SLAM3 recognizes places.
 
 A tree of binary descriptors, made by k-majority (Grana et al., *A fast approach for integrating
 ORB descriptors in the bag of words model*, 2013): k-means with Hamming distance, where a centre's
@@ -23,21 +23,18 @@ Floats = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int64]
 
 _BYTES = 32
-"""Of one ORB descriptor."""
-
-_SCORING, _WEIGHTING = 0, 0
-"""L1 norm and tf-idf, as ORB-SLAM3 expects (DBoW2's ScoringType and WeightingType)."""
+"""Bytes of one ORB descriptor."""
 
 
 class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
-    """What a vocabulary is like.
+    """Shape of a vocabulary's tree.
 
     Attributes:
         branching: Children of a node, at most.
         depth: Levels below the root, at most: up to ``branching ** depth`` words.
         index_level: Level of the nodes by which ORB-SLAM3 sorts features before it compares them
-            one by one; 0 compares all with all. More is quicker and finds fewer matches.
-        seed: Of the choice of the first centres.
+            one by one; 0 compares all with all. A higher one is quicker and gives fewer matches.
+        seed: Seed of the choice of the first centres.
     """
 
     branching: Annotated[int, msgspec.Meta(ge=2, le=20)] = 10
@@ -55,7 +52,7 @@ class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Vocabulary(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """A tree, its nodes in an order in which a parent comes before its children.
+    """A tree of visual words; parents come before their children.
 
     Attributes:
         branching: k of the file.
@@ -99,7 +96,7 @@ def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary
 
     Args:
         images: uint8 (n, 32) each: the descriptors of one image.
-        shape: What it shall be like.
+        shape: Shape of the tree.
 
     Raises:
         ValueError: There are no descriptors, or they are not of ORB's size.

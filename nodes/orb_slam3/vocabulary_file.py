@@ -1,4 +1,4 @@
-"""Vocabularies as files: DBoW2's text format, checks, and where the project keeps its own."""
+"""Vocabularies as files: DBoW2's text format, checks, and the folder of our own ones."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _FIELDS = 2 + 32 + 1
 
 
 def cached_vocabulary(shape: TreeShape, cache_dir: Path | None = None) -> Path:
-    """Return where the vocabulary of this shape is kept, whether it is there or not.
+    """Return the path of the vocabulary of this shape, whether it exists or not.
 
     Args:
-        shape: What it is like; part of the file's name.
+        shape: Shape of its tree, on which the file's name depends.
         cache_dir: ``$XDG_CACHE_HOME``, or ``~/.cache``, if not given.
     """
     base = cache_dir or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
@@ -96,7 +96,7 @@ def read_vocabulary(path: Path) -> Vocabulary:
 
 
 def check_vocabulary(path: Path) -> tuple[int, int]:
-    """Look whether a file can be a vocabulary, quickly also if it is large.
+    """Check quickly whether a file can be a vocabulary.
 
     ORB-SLAM3 ends its process, or reads nonsense, if it is not.
 
@@ -136,7 +136,7 @@ def check_vocabulary(path: Path) -> tuple[int, int]:
 
 
 def _numbers(path: Path, number: int, line: str) -> list[float]:
-    """Return what stands on a node's line."""
+    """Return the numbers of a node's line."""
     try:
         row = [float(word) for word in line.split()]
     except ValueError:

@@ -1,7 +1,7 @@
-"""Pilots: nodes that tell a vehicle where to fly.
+"""Pilots: nodes that fly a vehicle, by set-points and commands.
 
 `WaypointFollower` flies along waypoints by the vehicle's true pose, `VisualPilot` by the pose that
-an estimator gives, and `Teleop` as the keys of a keyboard say.
+an estimator gives, and `Teleop` by the keys of a keyboard.
 """
 
 from nodes.pilots.pilot import Pilot, PilotConfig

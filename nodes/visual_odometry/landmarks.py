@@ -66,7 +66,7 @@ class Landmarks:
         """Add landmarks of a key frame and return their rows.
 
         Args:
-            number: Of the key frame; no less than any before.
+            number: Number of the key frame, not less than any before.
             pose: World to camera, shape (4, 4).
             pixels: Their pixels there, shape (n, 2).
             seen: Their surfaces, all continuous.
@@ -106,7 +106,7 @@ class Landmarks:
             pose: World to camera, shape (4, 4).
             size: Width and height.
             margin: Pixels; below zero for those well inside.
-            rows: Which.
+            rows: Rows of the landmarks.
         """
         pixels, z = self.project(pose, rows)
         inside = (pixels > -margin).all(axis=1) & (pixels < np.array(size) - 1 + margin).all(axis=1)
@@ -126,7 +126,7 @@ class Landmarks:
         Args:
             pose: World to camera, shape (4, 4).
             inverse_depth: As `surfaces.inverse_depth` gives it, shape (h, w).
-            rows: Which.
+            rows: Rows of the landmarks.
             noise: Standard deviation of a reading, 1/m.
         """
         pixels, z = self.project(pose, rows)

@@ -45,7 +45,7 @@ def test_numbers_are_of_the_kind_that_orb_slam3_insists_on(mode: Mode) -> None:
         info=msgspec.structs.replace(INFO, fx=256.0, fy=1e-7, cx=0.0),
         rate=29.97,
     )
-    text = make_settings(mode, camera, IMU, OrbSettings(baseline=2.0, close=4.0)).text
+    text = make_settings(mode, camera, IMU, OrbSettings(baseline=2.0, close_depth=4.0)).text
     stored = read(text)
     whole = {
         "Camera.width", "Camera.height", "Camera.RGB", "ORBextractor.nFeatures", "loopClosing",
@@ -63,7 +63,7 @@ def test_numbers_are_of_the_kind_that_orb_slam3_insists_on(mode: Mode) -> None:
 
 
 def test_depth_is_in_metres_and_near_is_counted_in_baselines() -> None:
-    text = make_settings("rgbd", CAMERA, orb=OrbSettings(baseline=0.2, close=5.0)).text
+    text = make_settings("rgbd", CAMERA, orb=OrbSettings(baseline=0.2, close_depth=5.0)).text
     assert number(text, "DepthMapFactor") == 1.0
     assert number(text, "Camera.bf") == pytest.approx(0.2 * 228.5037, abs=1e-4)
     assert number(text, "ThDepth") == pytest.approx(25.0)

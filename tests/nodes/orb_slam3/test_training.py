@@ -38,7 +38,7 @@ def image(stamp: int, source: str = "drone/front", grey: bool = False) -> Image:
 
 
 def train(path: Path, inputs: list[Event], **config: object) -> None:
-    config = {"path": str(path), "shape": SHAPE, "every": 2, **config}
+    config = {"path": str(path), "shape": SHAPE, "image_interval": 2, **config}
     run_node(VocabularyTrainer, inputs=inputs, config=config)
 
 
