@@ -185,7 +185,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         pilot = self.sources.get("setpoints", announcement.source)
         if announcement.source != pilot and not announcement.source.startswith(f"{pilot}/"):
             return
-        if trouble_at_start(self._clearance, self._start):  # which `check` tells
+        if trouble_at_start(self._clearance, self._start):  # which `check` reports
             return
         if trouble := trouble_on_path(self._clearance, self._start, announcement.waypoints):
             raise ValueError(trouble)

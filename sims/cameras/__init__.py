@@ -1,4 +1,4 @@
-"""Cameras: what they are, where they sit, what they see. Pure functions and one renderer."""
+"""Cameras: settings, mounting, rendering. Pure functions and one renderer."""
 
 from sims.cameras.frame import Frame
 from sims.cameras.free import add_free_camera, pose_to_qpos, qvel_between

@@ -1,4 +1,4 @@
-"""When a picture arrives, and whether it does: a function of seed, camera and stamp."""
+"""Delay and loss of images: a function of seed, camera and stamp."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ def delay_of(spec: CameraSpec, seed: int, stamp_ns: int) -> float | None:
 
     Args:
         spec: The camera.
-        seed: Of the rig.
-        stamp_ns: Of the exposure.
+        seed: Seed of the rig.
+        stamp_ns: Stamp of the exposure.
     """
     # No camera's name has a slash: what is drawn here and the noise are independent.
     random = generator(seed, f"{spec.name}/delivery", stamp_ns)

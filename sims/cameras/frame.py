@@ -1,4 +1,4 @@
-"""What one exposure of one camera gives."""
+"""The images of one exposure of one camera."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from events.base import Quaternion, Vector3
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """One exposure: all its pictures and its pose are of the same instant.
+    """One exposure: all its images and its pose are of the same instant.
 
-    A picture that the camera's spec doesn't ask for is None.
+    Images of kinds that the camera's settings do not name are None.
 
     Attributes:
         stamp: Nanoseconds on the run's clock: the instant of exposure.

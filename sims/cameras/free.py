@@ -16,8 +16,8 @@ def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ..
     """Add a body that carries cameras, meets nothing and falls nowhere.
 
     Args:
-        world: Is changed. Of a world that holds nothing else that moves, the whole state is
-            then `pose_to_qpos`.
+        world: The world, which is changed. If nothing else in it moves, its whole state is then
+            `pose_to_qpos`.
         name: The body's; the cameras are called ``<name>/<camera>``.
         specs: The cameras.
 
@@ -60,9 +60,9 @@ def qvel_between(
     """Return a free camera's velocity, shape (6,), from its qpos at two times.
 
     Args:
-        before: Shape (7,).
-        after: The same, later.
-        seconds: How much later.
+        before: The earlier qpos, shape (7,).
+        after: The later qpos, shape (7,).
+        seconds: Time between them.
     """
     turn = np.empty(3)
     mujoco.mju_subQuat(turn, after[3:], before[3:])

@@ -1,4 +1,4 @@
-"""Opening a GL context without a screen, and saying what is missing where that fails.
+"""Opening a GL context without a screen, with an error that names what is missing.
 
 Nothing happens on import: the environment is changed by `open_context`, which must run in the
 thread that will render, before any other GL context of the process.
@@ -23,12 +23,12 @@ def open_context(width: int, height: int, threads: int) -> Any:
     """Return a current off-screen GL context: EGL's, or OSMesa's where MUJOCO_GL asks for it.
 
     Args:
-        width: Largest picture, pixels.
-        height: Largest picture, pixels.
+        width: Width of the largest image, pixels.
+        height: Height of the largest image, pixels.
         threads: Threads of the software renderer; takes effect with the first context only.
 
     Raises:
-        GraphicsError: There is none to be had; the message says what to install.
+        GraphicsError: There is no GL; the message names what to install.
     """
     # Read by llvmpipe when its first screen is made; by default it takes every core.
     os.environ["LP_NUM_THREADS"] = str(threads)

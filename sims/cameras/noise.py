@@ -1,7 +1,7 @@
-"""Noise of pictures, drawn so that it depends on seed, camera and stamp, and on nothing else.
+"""Noise of images, drawn so that it depends on seed, camera and stamp, and on nothing else.
 
 Normal numbers come from a table of the normal distribution's quantiles, at a place that 16 random
-bits name: no two pixels or pictures share any, and it takes a sixth of the time of drawing them.
+bits name: no two pixels or images share any, and it takes a sixth of the time of drawing them.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def noisy_depth(
 
 
 def grey_of(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return the luma (BT.601) of a colour picture, shape (height, width)."""
+    """Return the luma (BT.601) of a colour image, shape (height, width)."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
@@ -86,6 +86,6 @@ def _quantiles() -> npt.NDArray[np.float32]:
 
 @functools.lru_cache(maxsize=16)
 def _steps(sigma: float) -> npt.NDArray[np.int16]:
-    """Return the same in whole grey levels. More than 255 make no difference to a picture."""
+    """Return the same in whole grey levels. More than 255 make no difference to an image."""
     levels = np.clip(np.rint(sigma * _quantiles()), -255, 255)
     return np.asarray(levels, dtype=np.int16)

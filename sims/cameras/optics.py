@@ -1,4 +1,4 @@
-"""What a lens and a shutter do to a picture. What a sensor adds is in `sims.cameras.noise`."""
+"""Effects of lens and shutter on an image. Those of the sensor are in `sims.cameras.noise`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Picture = npt.NDArray[np.uint8]
+Image = npt.NDArray[np.uint8]
 
 MOST = 9
-"""Renderings of one exposure, at most: each costs as much as a picture without motion blur."""
+"""Renderings of one exposure, at most: each costs as much as an image without motion blur."""
 
 
-def defocused(image: Picture, sigma: float) -> Picture:
+def defocused(image: Image, sigma: float) -> Image:
     """Return the image seen through a lens whose point spread is a Gaussian of `sigma` pixels."""
     if sigma <= 0.0:
         return image
@@ -26,7 +26,7 @@ def moments(exposure: float, shift: float) -> list[float]:
 
     Args:
         exposure: Seconds that the shutter is open.
-        shift: Pixels by which the picture moves meanwhile.
+        shift: Pixels by which the image moves meanwhile.
 
     Returns:
         An odd number of moments, seconds from the middle of the exposure, in order: the middles
@@ -36,9 +36,9 @@ def moments(exposure: float, shift: float) -> list[float]:
     return [exposure * ((k + 0.5) / count - 0.5) for k in range(count)]
 
 
-def mean(pictures: list[Picture]) -> Picture:
-    """Return the mean of pictures of one shape, rounded."""
-    total = np.zeros(pictures[0].shape, np.uint16)
-    for picture in pictures:
-        total += picture
-    return ((total + len(pictures) // 2) // len(pictures)).astype(np.uint8)
+def mean(images: list[Image]) -> Image:
+    """Return the mean of images of one shape, rounded."""
+    total = np.zeros(images[0].shape, np.uint16)
+    for image in images:
+        total += image
+    return ((total + len(images) // 2) // len(images)).astype(np.uint8)

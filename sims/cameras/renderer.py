@@ -1,7 +1,7 @@
-"""Taking pictures: what a camera sees, and what its lens, shutter and sensor make of it.
+"""Rendering: what a camera sees, and the effects of its lens, shutter and sensor.
 
 Made for a worker process (a GL context belongs to the thread that made it), but works in-process.
-The drawing is in `sims.cameras.stage`, what is done to pictures in `sims.cameras.optics` and
+The drawing is in `sims.cameras.stage`, effects on images are in `sims.cameras.optics` and
 `sims.cameras.noise`.
 """
 
@@ -39,19 +39,19 @@ def model_from_bytes(data: bytes) -> Any:
 
 
 class CameraRenderer:
-    """Takes the pictures of the cameras of one model.
+    """Renders the images of the cameras of one model.
 
     Not thread-safe: stay in the thread that made it.
 
     Args:
         model_bytes: From `model_to_bytes`; has a camera `<prefix><name>` for each spec.
-        cameras: What to draw.
-        prefix: Goes before the cameras' names in the model.
-        seed: Of the noise.
-        threads: Of the software renderer, if this is the process's first GL context.
+        cameras: Settings of the cameras.
+        prefix: Prefix of the cameras' names in the model.
+        seed: Seed of the noise.
+        threads: Threads of the software renderer, if this is the process's first GL context.
 
     Raises:
-        GraphicsError: No GL here; the message says what to install.
+        GraphicsError: There is no GL; the message names what to install.
         ValueError: The bytes are no model, or the model lacks one of the cameras.
     """
 
@@ -78,12 +78,12 @@ class CameraRenderer:
         names: tuple[str, ...],
         qvel: Floats | None = None,
     ) -> dict[str, Frame]:
-        """Take a picture with some cameras at one state.
+        """Expose some cameras at one state.
 
         Args:
             stamp_ns: Nanoseconds on the run's clock; goes into the frames and into the noise.
             qpos: The model's generalised positions, shape (nq,).
-            names: Which cameras, by the names in their specs.
+            names: Names of the cameras, as in their settings.
             qvel: Its generalised velocities, shape (nv,), for motion blur; None: at rest.
 
         Returns:
@@ -105,7 +105,7 @@ class CameraRenderer:
             spec, number = self._cameras[name]
             due = time.monotonic() + spec.render_time
             frames[name] = self._expose(stamp_ns, spec, number, qpos, qvel)
-            # Really slow, and not on the run's clock: whether the run stands it is the question.
+            # In real time, and not on the run's clock: it stands for a slow renderer.
             time.sleep(max(due - time.monotonic(), 0.0))
         return frames
 
@@ -158,27 +158,27 @@ class CameraRenderer:
 
         Args:
             spec: The camera.
-            number: Of the camera in the model.
+            number: Number of the camera in the model.
             qpos: The state in the middle of the exposure.
             qvel: Its velocity, taken to be constant meanwhile.
-            middle: What the camera sees in the middle.
-            depth: How far that is.
+            middle: The image in the middle of the exposure.
+            depth: Its depth.
         """
-        pictures = []
+        images = []
         for moment in moments(spec.exposure, self._shift(spec, number, qpos, qvel, depth)):
             if moment == 0.0:
-                pictures.append(middle)
+                images.append(middle)
                 continue
             self._stage.look(number, self._later(qpos, qvel, moment), spec.light)
-            picture, _ = self._stage.colour_and_depth((spec.height, spec.width), True, False)
-            assert picture is not None
-            pictures.append(picture)
-        return mean(pictures)
+            image, _ = self._stage.colour_and_depth((spec.height, spec.width), True, False)
+            assert image is not None
+            images.append(image)
+        return mean(images)
 
     def _shift(
         self, spec: CameraSpec, number: int, qpos: Floats, qvel: Floats, depth: Depths
     ) -> float:
-        """Return by how many pixels, about, the picture moves while the shutter is open."""
+        """Return the approximate motion of the image while the shutter is open, pixels."""
         poses = []
         for moment in (-0.5 * spec.exposure, 0.5 * spec.exposure):
             self._stage.look(number, self._later(qpos, qvel, moment))

@@ -25,30 +25,30 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 
 
 class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A pinhole camera, as it stands in a TOML file: ideal, unless its settings spoil it.
+    """Settings of a pinhole camera: ideal by default, with errors as its settings say.
 
     Attributes:
-        name: Its name, unique on its body.
-        images: What it gives.
-        width: Pixels.
-        height: Pixels.
+        name: Name of the camera, unique on its body.
+        images: Kinds of image that it gives.
+        width: Width of its images, pixels.
+        height: Height of its images, pixels.
         fov: **Horizontal** field of view, degrees.
         rate: Exposures per second, at equal intervals.
-        position: Where it sits on the body, metres in FRD.
-        orientation: Roll, pitch, yaw of the camera's body frame in the body's, degrees, applied
-            yaw first (Z-Y-X). Positive pitch is nose up: -90 looks straight down.
-        light: Factor on all lights of the scene. The sky, and what shines by itself, stay as they
-            are.
+        position: Position on the body, metres forward, right, down (FRD).
+        orientation: Roll, pitch, yaw of the camera in the body's frame, degrees, applied yaw first
+            (Z-Y-X). Positive pitch is upwards: -90 looks straight down.
+        light: Factor on all lights of the scene. The sky, and surfaces that shine by themselves,
+            stay as they are.
         exposure: Seconds that the shutter is open, half of them before the stamp: motion blurs
-            the picture. Depth, segmentation and pose are those of the stamp.
+            the image. Depth, segmentation and pose are those of the stamp.
         blur: Standard deviation, in pixels, of the Gaussian that a point becomes out of focus.
         noise: Standard deviation of additive Gaussian noise, grey levels (0 to 255).
         depth_noise: k in sigma = k z²: standard deviation (metres) of the noise at depth z.
-        latency: Seconds from exposure to delivery.
-        jitter: The delivery comes up to this much later still, at random; the order is kept.
-        loss: Share of exposures of which nothing is delivered, at random.
-        render_time: Real seconds that drawing a frame takes at least: how does a run stand a
-            scene that is too heavy for the machine?
+        latency: Time from exposure to delivery.
+        jitter: Greatest random delay in addition; the order of images is kept.
+        loss: Share of exposures that are not delivered, chosen at random.
+        render_time: Least real time that a frame takes to draw, to test how a run copes with a
+            scene that is too heavy for the machine.
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1, pattern="^[A-Za-z0-9_]+$")]
@@ -113,11 +113,11 @@ def optical_frame(spec: CameraSpec, prefix: str) -> str:
 def announcement(
     spec: CameraSpec, *, source: str, prefix: str, parent_frame_id: str, stamp: int = 0
 ) -> events.CameraAnnouncement:
-    """Say what this camera will provide and where it sits.
+    """Return the announcement of a camera: its images, and its pose on the body.
 
     Args:
         spec: The camera.
-        source: Who says it, and later its images: ``drone/front``.
+        source: Source of the announcement, and of the images: ``drone/front``.
         prefix: Goes before the camera's name in the names of its frames: ``drone/``.
         parent_frame_id: Frame of the body that it is mounted on.
         stamp: Nanoseconds on the run's clock.
@@ -144,10 +144,10 @@ def vertical_fov(spec: CameraSpec) -> float:
 
 
 def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: str) -> str:
-    """Mount a camera on a body of the world and make room for its picture.
+    """Mount a camera on a body of the world, and make the image buffer large enough.
 
     Args:
-        world: Is changed.
+        world: The world, which is changed.
         body_name: The body that carries it; its axes are forward, left, up (FLU), as are all
             bodies' in MuJoCo, whose half turn about x is our FRD.
         spec: The camera.

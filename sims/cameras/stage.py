@@ -1,6 +1,6 @@
 """A model in a GL context, as one of its cameras sees it: colour, depth, numbers, pose.
 
-Here everything is ideal. What lens, shutter and sensor do to a picture is put together in
+Here everything is ideal. What lens, shutter and sensor do to an image is put together in
 `sims.cameras.renderer`; contexts are in `sims.cameras.graphics`.
 """
 
@@ -32,7 +32,7 @@ RANGE = 500.0
 depth; at the rim of the widest view (170°) that is a planar depth of some 600 m."""
 
 LOOK = ".look"
-"""A geom `<name>.look` is the picture of the geom `<name>`, and is numbered as that one is."""
+"""A geom `<name>.look` is the image of the geom `<name>`, and is numbered as that one is."""
 
 
 class Stage:
@@ -41,13 +41,13 @@ class Stage:
     Not thread-safe: stay in the thread that made it.
 
     Args:
-        model: Is changed, to be drawn quickly.
-        width: Of the largest picture, pixels.
-        height: Of the largest picture, pixels.
-        threads: Of the software renderer, if this is the process's first GL context.
+        model: The compiled model, which is changed so that it is drawn quickly.
+        width: Width of the largest image, pixels.
+        height: Height of the largest image, pixels.
+        threads: Threads of the software renderer, if this is the process's first GL context.
 
     Raises:
-        GraphicsError: No GL here; the message says what to install.
+        GraphicsError: There is no GL; the message names what to install.
     """
 
     def __init__(self, model: Any, width: int, height: int, threads: int) -> None:

@@ -1,9 +1,9 @@
-"""Which commands a vehicle obeys when: arming, take-off, flight, landing.
+"""Commands and phases of a vehicle: arming, take-off, flight, landing.
 
 A pure state machine on top of the cascade in `control`. It never looks at a clock: time comes with
 each update.
 
-    phase       on                      goes to       and tells
+    phase       on                      goes to       and sends
     DISARMED    Arm                     ARMED         Armed
     DISARMED    Takeoff                 TAKING_OFF    Armed
     ARMED       Takeoff                 TAKING_OFF
@@ -57,7 +57,7 @@ _FIRST_DT = 0.0025
 
 
 class Phase(enum.Enum):
-    """What the vehicle is about."""
+    """Phases of a flight."""
 
     DISARMED = enum.auto()
     ARMED = enum.auto()
@@ -78,25 +78,25 @@ class Autopilot:
 
     The rules, beyond the table above:
 
-    - A set-point is refused while disarmed, and during take-off and landing: somebody streams
-      set-points at 20 Hz, and those still under way must not undo an order that was given once.
+    - A set-point is refused while disarmed, and during take-off and landing: set-points are sent
+      many times a second, and those under way must not undo a command that was sent once.
       `Hover` ends either manoeuvre, `Land` ends a take-off; then set-points count again.
-    - Armed on the ground, a set-point starts the flight; nobody is told `TakenOff` then.
+    - Armed on the ground, a set-point starts the flight, without a `TakenOff`.
     - A velocity, attitude or body-rate set-point whose stamp is older than `setpoint_timeout` is
-      replaced by `Hover`: a lost link must not fly the vehicle away. A position set-point holds
-      for ever, since it ends at a place.
+      replaced by `Hover`: with a lost link the vehicle must not fly on. A position set-point
+      holds for ever, since it ends at a position.
     - `Land` stops first, then goes down at `descent`.
 
     Args:
-        parameters: Of the vehicle.
-        gains: Of the cascade.
-        limits: Of the flight.
-        setpoint_timeout: Seconds.
+        parameters: Parameters of the vehicle.
+        gains: Gains of the cascade.
+        limits: Limits of the flight.
+        setpoint_timeout: Age at which such set-points end, seconds.
         climb: Metres per second during take-off.
         descent: Metres per second during landing.
 
     Attributes:
-        phase: What the vehicle is about.
+        phase: Present phase of the flight.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class Autopilot:
 
         Args:
             stamp_ns: Nanoseconds on the run's clock; not before the last update's.
-            state: Of the vehicle at that time.
+            state: State of the vehicle at that time.
             touching: Whether it touches anything.
         """
         last = self._last_ns

@@ -1,4 +1,4 @@
-"""Whether a vehicle can be where it is asked to be, told from the world before anything moves.
+"""Whether positions and paths of a vehicle are free, checked in the world before a run.
 
 Places are metres NED, and are those of the origin of ``base_link``.
 """
@@ -104,7 +104,7 @@ class Clearance:
 
 
 def trouble_at_start(world: Clearance, place: Vector3) -> str:
-    """Say why a vehicle cannot stand at a place; empty if it can."""
+    """Return why a vehicle cannot stand at a position; empty if it can."""
     if found := world.at(place):
         return f"expected a free place to start at, found {show(place)} in {found}"
     if world.ground_below(place) is None:
@@ -113,12 +113,12 @@ def trouble_at_start(world: Clearance, place: Vector3) -> str:
 
 
 def trouble_on_path(world: Clearance, start: Vector3, waypoints: Iterable[Vector3]) -> str:
-    """Say why a vehicle cannot fly from point to point; empty if it can.
+    """Return why a vehicle cannot fly from point to point; empty if it can.
 
     Args:
-        world: Where.
-        start: Where the vehicle stands: it first climbs to the height of the first waypoint.
-        waypoints: What it then passes, on straight lines but for its corners.
+        world: Solids of the world.
+        start: Position of the vehicle, which first climbs to the height of the first waypoint.
+        waypoints: The waypoints, connected by straight lines with rounded corners.
     """
     return next(_troubles(world, start, tuple(waypoints)), "")
 

@@ -34,9 +34,9 @@ class Controller:
     and the thrust is theirs.
 
     Args:
-        parameters: Of the vehicle.
-        gains: Of the cascade.
-        limits: Of the flight.
+        parameters: Parameters of the vehicle.
+        gains: Gains of the cascade.
+        limits: Limits of the flight.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Controller:
         """Take a set-point; it replaces the last one.
 
         Args:
-            setpoint: What to do.
+            setpoint: The set-point.
             state: The vehicle now: a velocity set-point without yaw rate keeps its heading.
 
         Raises:
@@ -80,7 +80,7 @@ class Controller:
         match setpoint:
             case PositionSetpoint():
                 self._take_over()
-                self.position.to_place(
+                self.position.to_position(
                     setpoint.position,
                     setpoint.velocity,
                     setpoint.acceleration,
@@ -92,7 +92,7 @@ class Controller:
                 yaw = self.position.yaw if self._in_velocity else yaw_of(state.orientation)
                 self._take_over()
                 self._in_velocity = True
-                self.position.at_velocity(
+                self.position.to_velocity(
                     setpoint.velocity, yaw, setpoint.yaw_rate, setpoint.frame_id == "heading"
                 )
             case AttitudeSetpoint():
@@ -106,9 +106,9 @@ class Controller:
                 self._take_thrust(setpoint.thrust)
 
     def hold(self, position: Vector3, velocity: Vector3, yaw: float) -> None:
-        """Be at a place (m, NED) with a velocity (m/s, NED), as the autopilot's own manoeuvres."""
+        """Fly to a position (m, NED) with a velocity (m/s, NED), for the autopilot's manoeuvres."""
         self._take_over()
-        self.position.to_place(position, velocity, yaw=yaw)
+        self.position.to_position(position, velocity, yaw=yaw)
 
     def brake(self, state: State, vertical_velocity: float = 0.0) -> None:
         """Stop and hold the place, or go on only up or down (m/s, NED), looking where it looks."""
@@ -119,7 +119,7 @@ class Controller:
         """Return the motor commands for now.
 
         Args:
-            state: Of the vehicle.
+            state: State of the vehicle.
             dt: Seconds since the last update, > 0.
         """
         if self._in_position:

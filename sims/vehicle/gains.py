@@ -1,4 +1,4 @@
-"""The numbers a pilot may tune: gains of the cascade and limits of the flight. No behaviour."""
+"""Settings of the controller: gains of the cascade and limits of the flight."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ class Gains(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     Attributes:
         position_xy: Velocity per position error, 1/s.
-        position_z: The same along the vertical.
+        position_z: The same for the vertical, 1/s.
         velocity_xy_p: Acceleration per velocity error, 1/s.
         velocity_xy_i: Acceleration per integrated velocity error, 1/s².
         velocity_xy_d: Acceleration per measured acceleration, which it opposes; without unit.
-        velocity_z_p: Along the vertical, 1/s.
-        velocity_z_i: Along the vertical, 1/s².
-        velocity_z_d: Along the vertical, without unit.
+        velocity_z_p: As `velocity_xy_p`, for the vertical, 1/s.
+        velocity_z_i: As `velocity_xy_i`, for the vertical, 1/s².
+        velocity_z_d: As `velocity_xy_d`, for the vertical, without unit.
         tilt: Body rate per angle of tilt error, 1/s.
         yaw: Body rate per angle of yaw error, 1/s.
         rate_xy_p: Angular acceleration per error in roll or pitch rate, 1/s.
         rate_xy_i: Angular acceleration per integrated error, 1/s².
         rate_xy_d: Angular acceleration per measured angular acceleration, without unit.
-        rate_z_p: The same for the yaw rate, 1/s.
-        rate_z_i: The same for the yaw rate, 1/s².
-        derivative_cutoff: Hertz, of the low-pass filter on every derivative.
+        rate_z_p: As `rate_xy_p`, for the yaw rate, 1/s.
+        rate_z_i: As `rate_xy_i`, for the yaw rate, 1/s².
+        derivative_cutoff: Cut-off frequency of the low-pass filter on every derivative, Hz.
     """
 
     position_xy: float = 1.5
@@ -50,19 +50,19 @@ class Gains(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What the cascade never asks for, whatever the set-point says.
+    """Limits that the cascade keeps, whatever the set-point.
 
     Attributes:
-        tilt: Radians between the thrust and the vertical, in position and velocity flight.
-        speed: Metres per second over ground.
-        climb: Metres per second upwards.
-        descent: Metres per second downwards.
-        approach: Metres per second squared with which it slows down towards a place.
-        integral: Metres per second squared that the velocity integrators may add.
-        tilt_rate: Radians per second about x and y.
-        yaw_rate: Radians per second about z.
-        min_thrust: Least thrust in position and velocity flight, of all motors' maximum.
-        max_thrust: Greatest thrust upwards there, of the same: what is left steers.
+        tilt: Angle between the thrust and the vertical in position and velocity flight, radians.
+        speed: Horizontal speed, metres per second.
+        climb: Speed upwards, metres per second.
+        descent: Speed downwards, metres per second.
+        approach: Deceleration towards a position, metres per second squared.
+        integral: Acceleration that the velocity integrators may add, metres per second squared.
+        tilt_rate: Angular velocity about x and y, radians per second.
+        yaw_rate: Angular velocity about z, radians per second.
+        min_thrust: Least thrust in position and velocity flight, as a share of the motors' maximum.
+        max_thrust: Greatest upward thrust there, as a share of the same; the rest is for steering.
     """
 
     tilt: float = radians(35.0)

@@ -1,4 +1,4 @@
-"""What a real IMU adds to the truth: white noise and a wandering bias. The truth is `physics`'."""
+"""Noise of an IMU: white noise and a bias that is a random walk. True values are in `physics`."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _BLOCK = 512
 
 
 class ImuParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Noise of an IMU, named as in `events.ImuAnnouncement`; by default a usual MEMS.
+    """Noise of an IMU, named as in `events.ImuAnnouncement`; by default that of a usual MEMS.
 
     Attributes:
-        gyroscope_noise_density: rad/s/√Hz.
-        gyroscope_random_walk: rad/s²/√Hz.
-        accelerometer_noise_density: m/s²/√Hz.
-        accelerometer_random_walk: m/s³/√Hz.
+        gyroscope_noise_density: White noise of the angular velocity, rad/s/√Hz.
+        gyroscope_random_walk: Random walk of its bias, rad/s²/√Hz.
+        accelerometer_noise_density: White noise of the acceleration, m/s²/√Hz.
+        accelerometer_random_walk: Random walk of its bias, m/s³/√Hz.
     """
 
     gyroscope_noise_density: float = 1.7e-4
@@ -38,7 +38,7 @@ class ImuNoise:
     navigation*, 2006; the same as Kalibr's "IMU noise model").
 
     Args:
-        parameters: Of the noise.
+        parameters: Parameters of the noise.
         rate: Samples per second.
         generator: Source of the random numbers; equal seeds give equal noise.
 

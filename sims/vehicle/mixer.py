@@ -19,7 +19,7 @@ class Mixer:
     RA-L 2017.)
 
     Args:
-        parameters: Of the vehicle.
+        parameters: Parameters of the vehicle.
 
     Raises:
         ValueError: The motors cannot make all four of thrust and torques, or equal thrust from

@@ -56,7 +56,7 @@ class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         mass: Kilograms.
         inertia: Principal moments about x, y, z (FRD), kg m².
-        motors: In the order of the commands.
+        motors: The motors, in the order of the commands.
         motor_time_constant: Seconds.
         gravity: Metres per second squared.
     """
@@ -86,9 +86,9 @@ def attach_vehicle(world: mujoco.MjSpec, name: str, position: Vector3, yaw: floa
     Args:
         world: The world, in MuJoCo's axes read as NWU. Changed in place.
         name: The vehicle's name, such as ``drone``.
-        position: Where the origin of ``base_link`` starts, metres NED. Standing on flat ground at
+        position: Initial position of ``base_link``, metres NED. Standing on flat ground at
             z = 0 is (x, y, -`STANDING_HEIGHT`).
-        yaw: Where it starts to look, radians clockwise from north seen from above.
+        yaw: Initial heading, radians clockwise from north seen from above.
 
     Raises:
         ValueError: The name is empty, contains a slash, or is taken.

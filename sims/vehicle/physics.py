@@ -1,6 +1,6 @@
 """The physics of one world with one vehicle: stepping, and reading what is true at an instant.
 
-No sensor noise (see `imu`), no control (see `control`), no pictures. Everything that comes out is
+No sensor noise (see `imu`), no control (see `control`), no images. Everything that comes out is
 in our frames: world NED, body FRD.
 """
 

@@ -1,4 +1,4 @@
-"""The outer loops: place or velocity to the attitude and thrust that get there.
+"""The outer loops: from position or velocity to attitude and thrust.
 
 Position P with feed-forward → velocity PID → acceleration → thrust vector and yaw → attitude, in
 NED and all in floats. How the attitude is reached is in `attitude`.
@@ -33,7 +33,7 @@ class PositionController:
     the yaw of the ZYX angles even when tilted, as in PX4.
 
     Attributes:
-        yaw: Where it is told to look now, radians.
+        yaw: Heading of the target, radians.
     """
 
     __slots__ = (
@@ -68,7 +68,7 @@ class PositionController:
         self._lvx = self._lvy = self._lvz = 0.0
         self._started = False
 
-    def to_place(
+    def to_position(
         self,
         position: Vector3,
         velocity: Vector3 = (0.0, 0.0, 0.0),
@@ -76,7 +76,7 @@ class PositionController:
         yaw: float = 0.0,
         yaw_rate: float = 0.0,
     ) -> None:
-        """Be at a place (m, NED) with a velocity, acceleration and yaw expected there."""
+        """Fly to a position (m, NED), with a velocity, acceleration and yaw expected there."""
         self._px, self._py, self._pz = position
         self._vx, self._vy, self._vz = velocity
         self._ax, self._ay, self._az = acceleration
@@ -85,7 +85,7 @@ class PositionController:
         self._hold_xy = self._hold_z = True
         self._braking = self._heading_frame = False
 
-    def at_velocity(
+    def to_velocity(
         self, velocity: Vector3, yaw: float, yaw_rate: float = 0.0, heading_frame: bool = False
     ) -> None:
         """Move at a velocity (m/s), looking to `yaw` and turning on from there at `yaw_rate`.
@@ -106,7 +106,7 @@ class PositionController:
 
     def brake(self, yaw: float, vertical_velocity: float = 0.0) -> None:
         """Stop, and then hold the place where that was; or go on only up or down (m/s, NED)."""
-        self.at_velocity((0.0, 0.0, vertical_velocity), yaw)
+        self.to_velocity((0.0, 0.0, vertical_velocity), yaw)
         self._braking = True
 
     def update(self, state: State, dt: float) -> tuple[Quaternion, float, float]:

@@ -113,7 +113,7 @@ class Builder(Model):
         place: Vector,
         facing: float,
     ) -> None:
-        """Hang up a picture (seen, not felt).
+        """Hang up an image (seen, not felt).
 
         Args:
             name: Its name.

@@ -1,6 +1,6 @@
 """Things that are painted or hung on a surface: posters, crates' faces, windows, letters.
 
-Each function returns a picture (float32 RGB in 0..1) or changes one; the materials below them are
+Each function returns an image (float32 RGB in 0..1) or changes one; the materials below them are
 in `sims.worlds.materials`.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sims.worlds.materials import planks
-from sims.worlds.patterns import Colour, Picture, fractal, mix, shade, share, smooth, specks
+from sims.worlds.patterns import Colour, Image, fractal, mix, shade, share, smooth, specks
 
 WORDS = (
     "DEPTH", "PARALLAX", "HORIZON", "LOOP", "FLOW", "EPIPOLE", "INERTIA", "KEYFRAME", "ORBIT",
@@ -29,13 +29,13 @@ Box = tuple[int, int, int, int]
 """Left, top, right, bottom; pixels."""
 
 
-def letters(picture: Picture, text: str, where: Box, colour: Colour, worn: Picture | None) -> None:
-    """Write `text` as large as `where` allows; `worn` (h, w of the picture) thins the paint."""
+def letters(image: Image, text: str, where: Box, colour: Colour, worn: Image | None) -> None:
+    """Write `text` as large as `where` allows; `worn` (h, w of the image) thins the paint."""
     left, top, right, bottom = where
     face = cv2.FONT_HERSHEY_DUPLEX
     (wide, high), _ = cv2.getTextSize(text, face, 1.0, 2)
     scale = min((right - left) / wide, (bottom - top) / (high * 1.1))
-    stencil = np.zeros(picture.shape[:2], np.uint8)
+    stencil = np.zeros(image.shape[:2], np.uint8)
     start = (
         int((left + right - wide * scale) / 2.0),
         int((top + bottom + high * scale) / 2.0),
@@ -45,10 +45,10 @@ def letters(picture: Picture, text: str, where: Box, colour: Colour, worn: Pictu
     mask = share(stencil)
     if worn is not None:
         mask = mask * worn
-    picture[:] = mix(picture, colour, mask)
+    image[:] = mix(image, colour, mask)
 
 
-def poster(shape: tuple[int, int], random: np.random.Generator, number: int) -> Picture:
+def poster(shape: tuple[int, int], random: np.random.Generator, number: int) -> Image:
     """Return a printed poster: one of several compositions, its inks and word by `number`."""
     height, width = shape
     paper, ink, second = INKS[number % len(INKS)]
@@ -72,7 +72,7 @@ def poster(shape: tuple[int, int], random: np.random.Generator, number: int) -> 
 def _composition(
     shape: tuple[int, int], random: np.random.Generator, number: int
 ) -> npt.NDArray[np.uint8]:
-    """Return a poster's picture: rings, towers, shards or dots; bytes, for soft edges."""
+    """Return a poster's image: rings, towers, shards or dots; bytes, for soft edges."""
     height, width = shape
     paper, ink, second = (
         tuple(round(255 * part) for part in colour) for colour in INKS[number % len(INKS)]
@@ -105,13 +105,13 @@ def _composition(
     return sheet
 
 
-def sheets(pictures: list[Picture], columns: int) -> Picture:
-    """Lay pictures of one size out in rows."""
-    rows = [np.concatenate(pictures[i : i + columns], 1) for i in range(0, len(pictures), columns)]
+def sheets(images: list[Image], columns: int) -> Image:
+    """Lay images of one size out in rows."""
+    rows = [np.concatenate(images[i : i + columns], 1) for i in range(0, len(images), columns)]
     return np.concatenate(rows, 0)
 
 
-def crate_face(size: int, random: np.random.Generator, number: int) -> Picture:
+def crate_face(size: int, random: np.random.Generator, number: int) -> Image:
     """Return one side of a wooden crate: boards, a frame, a brace, a stencilled mark."""
     shape = (size, size)
     tint = random.uniform(0.85, 1.12, 3)
@@ -146,7 +146,7 @@ def crate_face(size: int, random: np.random.Generator, number: int) -> Picture:
     return face
 
 
-def window_pane(shape: tuple[int, int], random: np.random.Generator, lit: bool) -> Picture:
+def window_pane(shape: tuple[int, int], random: np.random.Generator, lit: bool) -> Image:
     """Return a framed window with panes that reflect the sky, or are lit from within."""
     height, width = shape
     fall = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
@@ -172,40 +172,40 @@ def window_pane(shape: tuple[int, int], random: np.random.Generator, lit: bool) 
     return glass
 
 
-def paste(picture: Picture, piece: Picture, left: int, top: int, border: int = 0) -> None:
-    """Put a piece into a picture, with a shadow line around it."""
+def paste(image: Image, piece: Image, left: int, top: int, border: int = 0) -> None:
+    """Put a piece into an image, with a shadow line around it."""
     height, width = piece.shape[:2]
     if border:
         cv2.rectangle(
-            picture,
+            image,
             (left - border, top - border),
             (left + width + border - 1, top + height + border - 1),
             (0.30, 0.28, 0.26),
             -1,
         )
-    picture[top : top + height, left : left + width] = piece
+    image[top : top + height, left : left + width] = piece
 
 
-def stripes(picture: Picture, where: Box, worn: Picture) -> None:
+def stripes(image: Image, where: Box, worn: Image) -> None:
     """Paint yellow and black warning stripes."""
     left, top, right, bottom = where
     ys, xs = np.mgrid[top:bottom, left:right].astype(np.float32)
     phase = ((xs + ys) / 14.0) % 1.0
     soft = smooth(0.42, 0.5, phase) - smooth(0.92, 1.0, phase)
     band = mix(np.full((*phase.shape, 3), (0.88, 0.68, 0.14), np.float32), (0.12, 0.12, 0.12), soft)
-    part = picture[top:bottom, left:right]
+    part = image[top:bottom, left:right]
     part[:] = mix(part, band, worn[top:bottom, left:right] * 0.9)
 
 
-def contact_shadow(picture: Picture, footprints: Picture, reach: float, strength: float) -> Picture:
+def contact_shadow(image: Image, footprints: Image, reach: float, strength: float) -> Image:
     """Darken a floor under and around what stands on it; `footprints` is a mask in 0..1."""
     wide = cv2.GaussianBlur(footprints, (0, 0), reach)
     close = cv2.GaussianBlur(footprints, (0, 0), reach / 4.0)
-    return shade(picture, -strength * np.clip(0.6 * wide + 0.5 * close, 0.0, 1.0))
+    return shade(image, -strength * np.clip(0.6 * wide + 0.5 * close, 0.0, 1.0))
 
 
 def tile(number: int, columns: int, rows: int) -> tuple[float, float, float, float]:
-    """Return the window of one picture of `sheets`, by its number, a hair inside its edges."""
+    """Return the window of one image of `sheets`, by its number, a hair inside its edges."""
     row, column = divmod(number % (columns * rows), columns)
     hair = 0.002
     return (

@@ -7,7 +7,7 @@ import numpy as np
 
 from sims.worlds import materials
 from sims.worlds.decals import INKS, WORDS, letters, paste, window_pane
-from sims.worlds.patterns import Colour, Picture, fractal, mix, shade, smooth
+from sims.worlds.patterns import Colour, Image, fractal, mix, shade, smooth
 
 STOREY = 3.1
 """Height of a storey, metres."""
@@ -25,7 +25,7 @@ def height_of(storeys: int) -> float:
 
 def house(
     width: float, storeys: int, random: np.random.Generator, density: float, number: int
-) -> Picture:
+) -> Image:
     """Return a house front `width` metres wide at `density` pixels per metre."""
     height = height_of(storeys)
     shape = (int(height * density), int(width * density))
@@ -72,7 +72,7 @@ def house(
     return shade(front, foot.astype(np.float32))
 
 
-def _door(front: Picture, left: int, top: int, density: float, random: np.random.Generator) -> None:
+def _door(front: Image, left: int, top: int, density: float, random: np.random.Generator) -> None:
     shape = (front.shape[0] - top, int(1.1 * density))
     leaf = np.full((*shape, 3), PAINTS[int(random.integers(6))], np.float32) * 0.55
     leaf = shade(leaf, 0.12 * fractal(shape, random, coarse=20))
@@ -85,7 +85,7 @@ def _door(front: Picture, left: int, top: int, density: float, random: np.random
     paste(front, leaf, left, top, border=max(2, int(0.08 * density)))
 
 
-def _sign(front: Picture, density: float, random: np.random.Generator, number: int) -> None:
+def _sign(front: Image, density: float, random: np.random.Generator, number: int) -> None:
     """Paint a shop's name between the ground floor and the first."""
     paper, ink, _ = INKS[number % len(INKS)]
     bottom = front.shape[0] - int((STOREY - 0.55) * density)

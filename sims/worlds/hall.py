@@ -1,7 +1,7 @@
 """`hall`: an old brick factory hall, 16 x 12 m and 5 m high, made into a flying arena.
 
 Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres, from the middle of the
-floor. What things are made of is in `materials` and `decals`, the pictures of floor, walls and
+floor. What things are made of is in `materials` and `decals`, the images of floor, walls and
 ceiling in `hall_surfaces`; how they get into the model, in `builder`.
 """
 
@@ -26,7 +26,7 @@ from sims.worlds.hall_surfaces import (
     WEST,
 )
 from sims.worlds.model import Material
-from sims.worlds.patterns import Picture
+from sims.worlds.patterns import Image
 from sims.worlds.shapes import quad
 
 
@@ -53,7 +53,7 @@ def hall(seed: int = 0, bare: bool = False) -> Any:
     return b.spec
 
 
-def _upright(random: np.random.Generator) -> Picture:
+def _upright(random: np.random.Generator) -> Image:
     boards = materials.planks((384, 384), random, 128.0, width=0.14)
     return np.ascontiguousarray(boards.transpose(1, 0, 2))
 

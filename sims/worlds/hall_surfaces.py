@@ -1,4 +1,4 @@
-"""The pictures of `hall`: floor with its shadows, walls, ceiling, pillars, crates, posters.
+"""The images of `hall`: floor with its shadows, walls, ceiling, pillars, crates, posters.
 
 Shadows are painted on the floor, not drawn: they cost nothing per frame. Where things stand is
 therefore said here (x north, y west, metres, as in `sims.worlds.hall`).
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sims.worlds import decals, materials
-from sims.worlds.patterns import Picture, cells, fractal, mix, shade, share, smooth, specks
+from sims.worlds.patterns import Image, cells, fractal, mix, shade, share, smooth, specks
 
 NORTH, WEST, HEIGHT = 8.0, 6.0, 5.0
 DENSITY = 96.0
@@ -31,7 +31,7 @@ BARRELS = (
 )  # fmt: skip
 
 
-def wall(random: np.random.Generator, width: float) -> Picture:
+def wall(random: np.random.Generator, width: float) -> Image:
     """Return brick, painted from 1.1 m up where paint still holds, windows under the ceiling."""
     shape = (int(HEIGHT * DENSITY), int(width * DENSITY))
     bare = materials.brick(shape, random, DENSITY)
@@ -66,7 +66,7 @@ def wall(random: np.random.Generator, width: float) -> Picture:
     )
 
 
-def floor(random: np.random.Generator) -> Picture:
+def floor(random: np.random.Generator) -> Image:
     """Return slabs and cast concrete, lines of a flying course, shadows of what stands there."""
     shape = (int(2 * NORTH * DENSITY), int(2 * WEST * DENSITY))
     slabs = materials.tiles(
@@ -103,7 +103,7 @@ def _pixel(x: float, y: float) -> tuple[int, int]:
     return int((WEST - y) * DENSITY), int((NORTH - x) * DENSITY)
 
 
-def _footprints(shape: tuple[int, int]) -> Picture:
+def _footprints(shape: tuple[int, int]) -> Image:
     mask = np.zeros(shape, np.float32)
     squares = [(x, y, e, e) for x, y, base, e, _ in CRATES if base == 0.0]
     squares += [(x, y, 0.5, 0.5) for x, y in PILLARS]
@@ -120,7 +120,7 @@ def _footprints(shape: tuple[int, int]) -> Picture:
     return mask
 
 
-def ceiling(random: np.random.Generator) -> Picture:
+def ceiling(random: np.random.Generator) -> Image:
     """Return painted boards between the beams, with skylights and water stains."""
     density = CEILING_DENSITY
     shape = (int(2 * NORTH * density), int(2 * WEST * density))
@@ -139,7 +139,7 @@ def ceiling(random: np.random.Generator) -> Picture:
     return boards
 
 
-def columns(random: np.random.Generator) -> Picture:
+def columns(random: np.random.Generator) -> Image:
     """Return sixteen pillar faces side by side: concrete, a number, stripes at the foot."""
     width = int(0.45 * DENSITY)
     faces = []
@@ -162,17 +162,17 @@ def columns(random: np.random.Generator) -> Picture:
     return np.concatenate(faces, 1)
 
 
-def crates(random: np.random.Generator) -> Picture:
+def crates(random: np.random.Generator) -> Image:
     """Return nine crates' faces, three by three."""
     return decals.sheets([decals.crate_face(256, random, n) for n in range(9)], 3)
 
 
-def posters(random: np.random.Generator) -> Picture:
+def posters(random: np.random.Generator) -> Image:
     """Return twelve posters, four by three."""
     return decals.sheets([decals.poster((288, 216), random, n) for n in range(12)], 4)
 
 
-def steel(random: np.random.Generator) -> Picture:
+def steel(random: np.random.Generator) -> Image:
     """Return blue barrels' sides above, red ones' in the middle, bare sheet below."""
     parts = []
     for rows, colour in ((154, (0.20, 0.36, 0.52)), (154, (0.62, 0.24, 0.18)),

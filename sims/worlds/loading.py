@@ -32,7 +32,7 @@ def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
             contains a slash, or is a `Path`).
         seed: Of a built-in world's looks; its geometry is the same for every seed, but for
             what lies on shelves. A file has none.
-        bare: Leave out a built-in world's pictures, and what has a random place in it: the rest
+        bare: Leave out a built-in world's images, and what has a random place in it: the rest
             is there in a tenth of the time.
 
     Raises:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sims.worlds.patterns import (
     Colour,
-    Picture,
+    Image,
     cells,
     cracks,
     fractal,
@@ -45,7 +45,7 @@ def brick(
     palette: tuple[Colour, ...] = RED_BRICK,
     block: tuple[float, float] = (0.12, 0.28),
     mortar: Colour = (0.70, 0.67, 0.61),
-) -> Picture:
+) -> Image:
     """Return masonry in running bond; `block` is a brick's height and length in metres."""
     high, wide = block[0] * density, block[1] * density
     layout = cells(shape, random, high=high, wide=wide, stagger=0.5, uneven=0.12)
@@ -64,7 +64,7 @@ def concrete(
     random: np.random.Generator,
     density: float,
     base: Colour = (0.60, 0.59, 0.56),
-) -> Picture:
+) -> Image:
     """Return cast concrete: clouds, pores, patches of repair, drips, a few cracks."""
     area = shape[0] * shape[1] / density**2
     ground = np.full((*shape, 3), base, np.float32)
@@ -84,8 +84,8 @@ def planks(
     density: float,
     palette: tuple[Colour, ...] = OAK,
     width: float = 0.16,
-) -> Picture:
-    """Return boards that run across the picture, with grain, knots and nails."""
+) -> Image:
+    """Return boards that run across the image, with grain, knots and nails."""
     layout = cells(shape, random, high=width * density, wide=1.9 * density, stagger=1.0, uneven=0.3)
     wood = per_cell(layout, random, palette, 0.13)
     grain = fractal(shape, random, coarse=0.06 * density, fine=2, stretch=(1.0, 14.0), gain=0.9)
@@ -107,7 +107,7 @@ def tiles(
     joint: Colour = (0.30, 0.29, 0.28),
     stagger: float = 0.0,
     spread: float = 0.09,
-) -> Picture:
+) -> Image:
     """Return slabs or tiles of `size` (height, width, metres) with chips, wear and dirty joints."""
     layout = cells(
         shape, random, high=size[0] * density, wide=size[1] * density, stagger=stagger,
@@ -129,8 +129,8 @@ def plaster(
     random: np.random.Generator,
     density: float,
     colour: Colour,
-    under: Picture,
-) -> Picture:
+    under: Image,
+) -> Image:
     """Return old paint over `under` (same shape): it has flaked off in places."""
     coat = np.full((*shape, 3), colour, np.float32)
     coat = shade(coat, 0.06 * fractal(shape, random, coarse=1.2 * density, gain=0.85))
@@ -151,7 +151,7 @@ def metal(
     density: float,
     colour: Colour,
     pitch: float = 0.2,
-) -> Picture:
+) -> Image:
     """Return painted corrugated sheet (ribs every `pitch` metres, upright), scratched and rusty."""
     across = np.arange(shape[1], dtype=np.float32) / np.float32(pitch * density)
     wave = np.abs((across % 1.0) - 0.5) * 2.0
@@ -166,7 +166,7 @@ def metal(
     return mix(sheet, (0.85, 0.83, 0.80), 0.5 * cracks(shape, random, count=int(area)))
 
 
-def grass(shape: tuple[int, int], random: np.random.Generator, density: float) -> Picture:
+def grass(shape: tuple[int, int], random: np.random.Generator, density: float) -> Image:
     """Return a worn lawn: tufts, dry patches, bare soil."""
     tufts = fractal(shape, random, coarse=0.35 * density, fine=2, gain=0.95)
     lawn = np.full((*shape, 3), (0.30, 0.42, 0.18), np.float32)
@@ -177,7 +177,7 @@ def grass(shape: tuple[int, int], random: np.random.Generator, density: float) -
     return mix(lawn, (0.40, 0.31, 0.22), soil * 0.8)
 
 
-def leaves(shape: tuple[int, int], random: np.random.Generator, density: float) -> Picture:
+def leaves(shape: tuple[int, int], random: np.random.Generator, density: float) -> Image:
     """Return dense foliage: light leaves over dark gaps."""
     area = shape[0] * shape[1] / density**2
     green = np.full((*shape, 3), (0.20, 0.31, 0.13), np.float32)
@@ -187,7 +187,7 @@ def leaves(shape: tuple[int, int], random: np.random.Generator, density: float) 
     return mix(green, (0.05, 0.09, 0.04), np.maximum(-near, 0.0) * 0.8)
 
 
-def asphalt(shape: tuple[int, int], random: np.random.Generator, density: float) -> Picture:
+def asphalt(shape: tuple[int, int], random: np.random.Generator, density: float) -> Image:
     """Return old asphalt: grit, patches, sealed cracks, oil."""
     area = shape[0] * shape[1] / density**2
     road = np.full((*shape, 3), (0.47, 0.46, 0.45), np.float32)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from events.rotations import from_rpy
-from sims.worlds.patterns import Picture, to_bytes
+from sims.worlds.patterns import Image, to_bytes
 from sims.worlds.shapes import Surface, Window
 
 LOOK_GROUP, SOLID_GROUP = 0, 3
@@ -44,7 +44,7 @@ class Model:
     Args:
         name: The model's.
         seed: Everything random follows from it.
-        bare: Leave out the pictures, which take seconds to draw, and what has a random place.
+        bare: Leave out the images, which take seconds to draw, and what has a random place.
     """
 
     def __init__(self, name: str, seed: int, bare: bool = False) -> None:
@@ -61,7 +61,7 @@ class Model:
     def material(
         self,
         name: str,
-        draw: Callable[[np.random.Generator], Picture],
+        draw: Callable[[np.random.Generator], Image],
         density: float,
         module: float = 0.0,
         glow: float = 0.0,
@@ -70,17 +70,17 @@ class Model:
 
         Args:
             name: Its name and its texture's.
-            draw: Returns its picture, shape (h, w, 3), given a source of random numbers.
+            draw: Returns its image, shape (h, w, 3), given a source of random numbers.
             density: Pixels per metre.
             module: See `Material`.
             glow: How much it shines by itself, 0..1.
         """
-        picture = np.zeros((64, 64, 3), np.float32) if self.bare else draw(self.random)
-        height, width = picture.shape[:2]
+        image = np.zeros((64, 64, 3), np.float32) if self.bare else draw(self.random)
+        height, width = image.shape[:2]
         texture = self.spec.add_texture(
             name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3
         )
-        texture.data = to_bytes(picture).tobytes()
+        texture.data = to_bytes(image).tobytes()
         material = self.spec.add_material(
             name=name, specular=0.05, shininess=0.1, reflectance=0.0, emission=glow
         )

@@ -1,6 +1,6 @@
 """Patterns that materials are made of: noise, masonry, specks, drips, cracks.
 
-Pictures here are float32 in 0..1, shape (h, w) or (h, w, 3) RGB; sizes are pixels. Materials made
+Images here are float32 in 0..1, shape (h, w) or (h, w, 3) RGB; sizes are pixels. Materials made
 of these are in `sims.worlds.materials`.
 """
 
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Picture = npt.NDArray[Any]
+Image = npt.NDArray[Any]
 """float32; numpy's stubs lose that in sums with plain floats, so it isn't in the type."""
 Colour = tuple[float, float, float]
 
@@ -30,7 +30,7 @@ class Cells:
     """
 
     index: npt.NDArray[np.int32]
-    edge: Picture
+    edge: Image
     count: int
 
 
@@ -42,7 +42,7 @@ def fractal(
     fine: float = 2.0,
     stretch: tuple[float, float] = (1.0, 1.0),
     gain: float = 0.7,
-) -> Picture:
+) -> Image:
     """Return noise with mean 0 and standard deviation 1 that has detail at every scale.
 
     Args:
@@ -107,7 +107,7 @@ def cells(
 
 def per_cell(
     layout: Cells, random: np.random.Generator, palette: tuple[Colour, ...], spread: float
-) -> Picture:
+) -> Image:
     """Colour each cell with one of the palette's colours, its brightness varied by `spread`."""
     colours = np.asarray(palette, np.float32)[random.integers(0, len(palette), layout.count)]
     tone = 1.0 + spread * random.standard_normal((layout.count, 1), dtype=np.float32)
@@ -120,7 +120,7 @@ def specks(
     *,
     count: int,
     radius: tuple[float, float],
-) -> Picture:
+) -> Image:
     """Return soft blots of random size, place and sign, between -1 and 1."""
     height, width = shape
     out = np.zeros(shape, np.float32)
@@ -134,7 +134,7 @@ def specks(
     return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.7), dtype=np.float32)
 
 
-def cracks(shape: tuple[int, int], random: np.random.Generator, *, count: int) -> Picture:
+def cracks(shape: tuple[int, int], random: np.random.Generator, *, count: int) -> Image:
     """Return the strength (0..1) of thin wandering lines."""
     out = np.zeros(shape, np.uint8)  # OpenCV draws soft edges in bytes only
     height, width = shape
@@ -147,12 +147,12 @@ def cracks(shape: tuple[int, int], random: np.random.Generator, *, count: int) -
     return share(out)
 
 
-def share(stencil: npt.NDArray[np.uint8]) -> Picture:
+def share(stencil: npt.NDArray[np.uint8]) -> Image:
     """Return a mask that was drawn in bytes as shares 0..1."""
     return np.asarray(stencil, dtype=np.float32) / np.float32(255.0)
 
 
-def smooth(low: float, high: float, value: Picture) -> Picture:
+def smooth(low: float, high: float, value: Image) -> Image:
     """Return a soft step (Hermite) from 0 where `value` <= low to 1 where it is >= high."""
     out = np.empty(value.shape, np.float32)
     for rows in _strips(out):
@@ -161,8 +161,8 @@ def smooth(low: float, high: float, value: Picture) -> Picture:
     return out
 
 
-def mix(below: Picture, above: Picture | Colour, amount: Picture | float) -> Picture:
-    """Lay a picture or a colour over another; `amount` is 0..1, shape (h, w) or one number."""
+def mix(below: Image, above: Image | Colour, amount: Image | float) -> Image:
+    """Lay an image or a colour over another; `amount` is 0..1, shape (h, w) or one number."""
     if not isinstance(above, np.ndarray):
         # One row of it: numpy is slow where the innermost loop is three long.
         above = np.tile(np.asarray(above, np.float32), (1, below.shape[1], 1))
@@ -175,27 +175,27 @@ def mix(below: Picture, above: Picture | Colour, amount: Picture | float) -> Pic
     return out
 
 
-def shade(picture: Picture, amount: Picture) -> Picture:
-    """Make a picture brighter (amount > 0) or darker, shape (h, w), as a share of itself."""
-    out = np.empty(picture.shape, np.float32)
+def shade(image: Image, amount: Image) -> Image:
+    """Make an image brighter (amount > 0) or darker, shape (h, w), as a share of itself."""
+    out = np.empty(image.shape, np.float32)
     for rows in _strips(out):
-        out[rows] = picture[rows] * _three(1.0 + amount[rows])
+        out[rows] = image[rows] * _three(1.0 + amount[rows])
     return out
 
 
-def _strips(picture: Picture) -> Iterator[slice]:
+def _strips(image: Image) -> Iterator[slice]:
     """Yield runs of rows of about 64 kB, which stay in a processor's cache while worked on."""
-    count = max(1, 65536 // max(picture[:1].nbytes, 1))
-    for top in range(0, len(picture), count):
+    count = max(1, 65536 // max(image[:1].nbytes, 1))
+    for top in range(0, len(image), count):
         yield slice(top, top + count)
 
 
-def _three(amount: Picture) -> Picture:
-    """Repeat a picture of one channel as three."""
+def _three(amount: Image) -> Image:
+    """Repeat an image of one channel as three."""
     flat = np.ascontiguousarray(amount, dtype=np.float32)
     return np.asarray(cv2.merge((flat, flat, flat)), dtype=np.float32)
 
 
-def to_bytes(picture: Picture) -> npt.NDArray[np.uint8]:
+def to_bytes(image: Image) -> npt.NDArray[np.uint8]:
     """Return uint8 RGB, shape (h, w, 3)."""
-    return np.asarray(np.clip(picture * 255.0 + 0.5, 0, 255), dtype=np.uint8)
+    return np.asarray(np.clip(image * 255.0 + 0.5, 0, 255), dtype=np.uint8)

@@ -8,7 +8,7 @@ import cv2
 import mujoco
 import numpy as np
 
-from sims.worlds.patterns import Picture, fractal, mix, smooth, to_bytes
+from sims.worlds.patterns import Image, fractal, mix, smooth, to_bytes
 
 SIZE = 384
 
@@ -35,7 +35,7 @@ _AXES = (
 )
 
 
-def _face(axes: tuple[tuple[int, int, int], ...], clouds: Picture) -> Picture:
+def _face(axes: tuple[tuple[int, int, int], ...], clouds: Image) -> Image:
     middle, right, down = (np.array(axis, np.float32) for axis in axes)
     place = (np.arange(SIZE, dtype=np.float32) + 0.5) / SIZE * 2.0 - 1.0
     ray = middle + place[None, :, None] * right + place[:, None, None] * down

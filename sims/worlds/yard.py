@@ -2,7 +2,7 @@
 
 Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres, from the middle. What
 things are made of is in `materials`, `facades` and `decals`; how they get into the model, in
-`builder`; the ground's picture, in `yard_ground`.
+`builder`; the ground's image, in `yard_ground`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from sims.worlds import decals, facades, materials, yard_ground
 from sims.worlds.builder import WHOLE, Builder
 from sims.worlds.model import Material
-from sims.worlds.patterns import Picture, fractal, shade, smooth
+from sims.worlds.patterns import Image, fractal, shade, smooth
 from sims.worlds.shapes import quad
 from sims.worlds.sky import add_sky
 from sims.worlds.yard_ground import CONTAINERS, CRATES, POSTS, TREES
@@ -48,7 +48,7 @@ def yard(seed: int = 0, bare: bool = False) -> Any:
     _trees(b)
     _walls(b, red)
     _houses(b)
-    ground = b.material("ground", lambda r: yard_ground.picture(r, SUN), yard_ground.DENSITY)
+    ground = b.material("ground", lambda r: yard_ground.image(r, SUN), yard_ground.DENSITY)
     half = yard_ground.HALF
     surface = quad(
         np.array([half, half, 0.0]),
@@ -140,18 +140,18 @@ def _trees(b: Builder) -> None:
                 (x + float(off[0]), y + float(off[1]), top))  # fmt: skip
 
 
-def _bark(random: np.random.Generator) -> Picture:
-    picture = materials.planks((192, 384), random, 96.0, width=0.07, palette=(
+def _bark(random: np.random.Generator) -> Image:
+    image = materials.planks((192, 384), random, 96.0, width=0.07, palette=(
         (0.40, 0.31, 0.23), (0.33, 0.26, 0.20), (0.46, 0.38, 0.29),
     ))  # fmt: skip
-    return np.ascontiguousarray(picture.transpose(1, 0, 2))
+    return np.ascontiguousarray(image.transpose(1, 0, 2))
 
 
-def _stone(random: np.random.Generator) -> Picture:
+def _stone(random: np.random.Generator) -> Image:
     return materials.brick((512, 768), random, 96.0, materials.GREY_STONE, (0.22, 0.46))
 
 
-def _crate_faces(random: np.random.Generator) -> Picture:
+def _crate_faces(random: np.random.Generator) -> Image:
     return decals.sheets([decals.crate_face(192, random, n) for n in range(9)], 3)
 
 
@@ -190,7 +190,7 @@ def _houses(b: Builder) -> None:
             left += width
 
 
-def _fronts(random: np.random.Generator, row: Sequence[tuple[float, int]], side: str) -> Picture:
+def _fronts(random: np.random.Generator, row: Sequence[tuple[float, int]], side: str) -> Image:
     """Return the fronts of a row of houses, side by side."""
     fronts = [
         facades.house(width, storeys, random, HOUSE_DENSITY, number + len(side))
@@ -201,7 +201,7 @@ def _fronts(random: np.random.Generator, row: Sequence[tuple[float, int]], side:
     return np.concatenate(padded, 1)
 
 
-def _containers(random: np.random.Generator) -> Picture:
+def _containers(random: np.random.Generator) -> Image:
     """Four containers' long side and end, one below the other, each with its name."""
     rows = []
     paints = ((0.20, 0.36, 0.50), (0.66, 0.30, 0.18), (0.30, 0.44, 0.34), (0.74, 0.58, 0.24))

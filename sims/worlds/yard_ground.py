@@ -1,4 +1,4 @@
-"""The ground of `yard`, in one picture: asphalt, slabs, lawn, paint, and the sun's shadows.
+"""The ground of `yard`, in one image: asphalt, slabs, lawn, paint, and the sun's shadows.
 
 Shadows are painted, not drawn: they cost nothing per frame. Where things stand is therefore said
 here (x north, y west, metres, as in `sims.worlds.yard`).
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sims.worlds import decals, materials
-from sims.worlds.patterns import Picture, fractal, mix, share, smooth
+from sims.worlds.patterns import Image, fractal, mix, share, smooth
 
 HALF = 17.6
 DENSITY = 60.0
@@ -38,7 +38,7 @@ POSTS = ((12.5, -5.0), (-1.5, 10.9), (-8.9, 3.4), (0.6, -9.9))
 Points = npt.NDArray[np.float64]
 
 
-def picture(random: np.random.Generator, sun: tuple[float, float, float]) -> Picture:
+def image(random: np.random.Generator, sun: tuple[float, float, float]) -> Image:
     """Return the ground, north up and west left, with shadows for light that goes along `sun`."""
     shape = (int(2 * HALF * DENSITY),) * 2
     ground = materials.asphalt(shape, random, DENSITY)
@@ -77,12 +77,12 @@ def pixels(points: Points) -> npt.NDArray[np.int32]:
     return np.stack([columns, rows], 1).astype(np.int32)
 
 
-def _coordinates(size: int) -> tuple[Picture, Picture]:
+def _coordinates(size: int) -> tuple[Image, Image]:
     line = HALF - (np.arange(size, dtype=np.float32) + 0.5) / DENSITY
     return np.broadcast_to(line[:, None], (size, size)), np.broadcast_to(line, (size, size))
 
 
-def _paint(ground: Picture, random: np.random.Generator) -> None:
+def _paint(ground: Image, random: np.random.Generator) -> None:
     """Parking bays in the south, a ball court's lines in the north, numbers."""
     size = ground.shape[0]
     worn = smooth(-1.2, 0.6, fractal((size, size), random, coarse=40))
@@ -103,7 +103,7 @@ def _paint(ground: Picture, random: np.random.Generator) -> None:
         decals.letters(ground, f"{number + 1}", box, colour, worn * 0.9)
 
 
-def _manholes(ground: Picture, random: np.random.Generator) -> Picture:
+def _manholes(ground: Image, random: np.random.Generator) -> Image:
     for x, y in random.uniform(-12.0, 12.0, (9, 2)):
         at = tuple(pixels(np.array([[x, y]]))[0].tolist())
         cv2.circle(ground, at, int(0.36 * DENSITY), (0.20, 0.20, 0.20), -1)
@@ -117,7 +117,7 @@ def _manholes(ground: Picture, random: np.random.Generator) -> Picture:
     return ground
 
 
-def _shadows(shape: tuple[int, int], sun: tuple[float, float, float]) -> Picture:
+def _shadows(shape: tuple[int, int], sun: tuple[float, float, float]) -> Image:
     """Return how dark it is (0..1): each thing's footprint, swept along the sun by its height."""
     mask = np.zeros(shape, np.float32)
     shift = np.array([sun[0], sun[1]]) / -sun[2]
@@ -150,7 +150,7 @@ def _shadows(shape: tuple[int, int], sun: tuple[float, float, float]) -> Picture
 
 
 def _arch_shadow(
-    mask: Picture,
+    mask: Image,
     place: tuple[float, float],
     turn: float,
     size: tuple[float, float, float],

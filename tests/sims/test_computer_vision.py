@@ -20,7 +20,7 @@ CAMERA = {"name": "c", "width": 8, "height": 6, "loss": 1.0}
 
 
 def watch(tmp_path: Path, *inputs: Any, duration: float = 2.0, **config: Any) -> NodeResult:
-    """Run a free camera that takes no pictures."""
+    """Run a free camera that takes no images."""
     world = tmp_path / "world.xml"
     world.write_text(WORLD)
     config = {"world": str(world), "cameras": [CAMERA], "camera_processes": 1} | config

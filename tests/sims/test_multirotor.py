@@ -113,7 +113,7 @@ def test_exposures_are_equidistant_and_true_at_their_own_stamps(
     rate: float, imu_rate: float, latency: str | float
 ) -> None:
     """Whatever the IMU's rate: nothing drifts, nothing comes twice; the truth is told at the very
-    stamp, and is the pose in the camera's; and before a picture comes all IMU samples up to it."""
+    stamp, and is the pose in the camera's; and before an image comes all IMU samples up to it."""
     camera = CAMERA | {"rate": rate, "latency": latency, "position": [0.2, 0.0, 0.0]}
     result = fly(takeoff(), cameras=[camera], camera_processes=1, imu_rate=imu_rate, duration=1.0)
     images, moves = result.of(Image), result.of(Odometry)

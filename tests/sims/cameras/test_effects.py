@@ -1,4 +1,4 @@
-"""What a camera's settings do to its pictures, and what they leave alone."""
+"""What a camera's settings do to its images, and what they leave alone."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_an_open_shutter_sees_the_mean_of_the_motion(
     yaw_rate: float,
     pixels: float,
 ) -> None:
-    """Sideways, turning, and hardly at all: the picture is the mean of those on the way."""
+    """Sideways, turning, and hardly at all: the image is the mean of those on the way."""
 
     def pose(seconds: float) -> npt.NDArray[np.float64]:
         x, y, z = (v * seconds for v in velocity)
@@ -154,7 +154,7 @@ def test_an_open_shutter_changes_nothing_but_colours(renderer: CameraRenderer) -
         np.testing.assert_array_equal(one, other)
 
 
-def test_grey_pictures_are_smeared_too(renderer: CameraRenderer) -> None:
+def test_grey_images_are_smeared_too(renderer: CameraRenderer) -> None:
     """As the colours are, though that camera gives no depth."""
     qvel = np.array([0.0, 10.0, 0.0, 0.0, 0.0, 0.0])
     frame = take(renderer, "open_grey", qvel=qvel)
@@ -188,7 +188,7 @@ def test_cameras_keep_their_own_light(renderer: CameraRenderer) -> None:
         )
 
 
-def test_out_of_focus_is_a_blurred_picture(renderer: CameraRenderer) -> None:
+def test_out_of_focus_is_a_blurred_image(renderer: CameraRenderer) -> None:
     sharp, soft = rgb(take(renderer, "plain")), rgb(take(renderer, "soft"))
     np.testing.assert_array_equal(soft, defocused(sharp, 1.5))
     assert (
@@ -200,7 +200,7 @@ def test_out_of_focus_is_a_blurred_picture(renderer: CameraRenderer) -> None:
 def test_a_heavy_scene_takes_real_time(
     renderer: CameraRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What drawing does not use of `render_time` is slept, and the picture is the same."""
+    """What drawing does not use of `render_time` is slept, and the image is the same."""
     slept: list[float] = []
     monkeypatch.setattr(time, "sleep", slept.append)
     heavy = rgb(take(renderer, "heavy"))

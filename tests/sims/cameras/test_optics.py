@@ -1,4 +1,4 @@
-"""Defocus and shutter as functions of pictures."""
+"""Defocus and shutter as functions of images."""
 
 from __future__ import annotations
 

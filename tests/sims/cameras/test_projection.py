@@ -1,4 +1,4 @@
-"""Where the announced geometry says a point falls, the picture shows it."""
+"""Where the announced geometry says a point falls, the image shows it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = npt.NDArray[np.float64]
 POSITION = (0.4, -0.3, -1.2)
 ORIENTATION = (0.9, 0.15, -0.2, 0.35)
 RADIUS = 28.0
-"""Of a ball in the picture, pixels."""
+"""Of a ball in the image, pixels."""
 CAMERAS = [
     CameraSpec(name="square", images=("segmentation", "depth")),
     CameraSpec(name="vga", images=("segmentation", "depth"), width=640, height=480, fov=70.0),

@@ -76,7 +76,7 @@ def test_same_bits_in_other_processes(renderer: CameraRenderer) -> None:
 
 
 def test_one_camera_is_drawn_the_same_alone_and_among_others(renderer: CameraRenderer) -> None:
-    """A camera's picture doesn't depend on which others were asked for, or in which order."""
+    """A camera's image doesn't depend on which others were asked for, or in which order."""
     together = renderer.render(7, QPOS, ("wide", "noisy", "all"))
     for name in NAMES:
         alone = renderer.render(7, QPOS, (name,))

@@ -1,4 +1,4 @@
-"""When pictures arrive, which are lost, and what else a simulator says of its cameras."""
+"""When images arrive, which are lost, and what else a simulator says of its cameras."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_delays_are_spread_evenly_over_the_jitter() -> None:
 
 
 def test_loss_and_jitter_do_not_depend_on_each_other() -> None:
-    """Of a camera that loses pictures, the others come when they would have come anyway."""
+    """Of a camera that loses images, the others come when they would have come anyway."""
     whole = msgspec.structs.replace(SPOILT, loss=0.0)
     prompt = msgspec.structs.replace(SPOILT, jitter=Latency(0))
     for stamp in range(0, 100 * PERIOD, PERIOD):
@@ -112,7 +112,7 @@ def test_loss_and_jitter_do_not_depend_on_each_other() -> None:
 
 @pytest.mark.slow
 def test_jitter_delays_and_keeps_the_order(world: str) -> None:
-    """Each picture comes at its own time, or with the one before it if that is later; and the
+    """Each image comes at its own time, or with the one before it if that is later; and the
     same whether one process renders quickly or two slowly."""
     result = watch(world, latency="40ms", jitter="90ms")
     came = arrivals(result)

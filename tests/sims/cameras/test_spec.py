@@ -69,7 +69,7 @@ def test_orientation_follows_the_body_axes(
     ahead: tuple[float, float, float],
     down: tuple[float, float, float],
 ) -> None:
-    """Pitch -90 looks down with the top of the picture ahead; yaw 90 looks right."""
+    """Pitch -90 looks down with the top of the image ahead; yaw 90 looks right."""
     _, optical = optical_in_body(CameraSpec(name="c", orientation=orientation))
     assert rotate(optical, (0.0, 0.0, 1.0)) == pytest.approx(ahead, abs=1e-12)
     assert rotate(optical, (0.0, 1.0, 0.0)) == pytest.approx(down, abs=1e-12)
@@ -84,8 +84,8 @@ def test_the_announcement_repeats_the_spec() -> None:
     assert said.orientation == optical_in_body(spec)[1]
 
 
-def test_the_model_makes_room_for_the_largest_picture() -> None:
-    """The off-screen buffer holds each camera's picture."""
+def test_the_model_makes_room_for_the_largest_image() -> None:
+    """The off-screen buffer holds each camera's image."""
     world = mujoco.MjSpec()
     specs = (CameraSpec(name="a", width=1280, height=64), CameraSpec(name="b", height=960))
     add_free_camera(world, "free", specs)

@@ -64,7 +64,7 @@ def test_the_attitude_points_the_thrust_along_the_acceleration_and_the_nose_alon
     """For any acceleration within the limits, by feed-forward at the place itself."""
     gains = Gains(velocity_xy_d=0.0)
     controller = PositionController(PARAMETERS, gains, Limits())
-    controller.to_place(STILL.position, acceleration=(north, east, down), yaw=yaw)
+    controller.to_position(STILL.position, acceleration=(north, east, down), yaw=yaw)
     target, _, _ = controller.update(STILL, 0.0025)
     force: Vector3 = (north, east, down - PARAMETERS.gravity)
     norm = sum(c * c for c in force) ** 0.5
@@ -76,17 +76,17 @@ def test_the_attitude_points_the_thrust_along_the_acceleration_and_the_nose_alon
 def test_integrators_learn_nothing_while_the_tilt_is_at_its_limit() -> None:
     """Ten seconds against a stop, and the vehicle is level as soon as it flies as told."""
     controller = PositionController(PARAMETERS, Gains(), Limits())
-    controller.at_velocity((2.5, 0.0, 0.0), yaw=0.0)
+    controller.to_velocity((2.5, 0.0, 0.0), yaw=0.0)
     for _ in range(4000):
         controller.update(STILL, 0.0025)
-    controller.at_velocity((0.0, 0.0, 0.0), yaw=0.0)
+    controller.to_velocity((0.0, 0.0, 0.0), yaw=0.0)
     assert controller.update(STILL, 0.0025)[0] == pytest.approx(rotations.IDENTITY, abs=1e-3)
 
 
 def test_integrators_learn_a_steady_wind() -> None:
     """A small error that stays is met with more and more tilt, up to the integral's bound."""
     controller = PositionController(PARAMETERS, Gains(), Limits())
-    controller.at_velocity((0.3, 0.0, 0.0), yaw=0.0)
+    controller.to_velocity((0.3, 0.0, 0.0), yaw=0.0)
     first = controller.update(STILL, 0.0025)[0]
     for _ in range(20_000):
         last = controller.update(STILL, 0.0025)[0]

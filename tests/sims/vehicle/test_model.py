@@ -57,7 +57,7 @@ def test_another_time_step_is_refused() -> None:
 
 
 def test_a_forward_camera_does_not_see_the_airframe() -> None:
-    """No visible geom meets the rays of a 100° picture taken 0.1 m ahead of the origin."""
+    """No visible geom meets the rays of a 100° image taken 0.1 m ahead of the origin."""
     spec = mujoco.MjSpec()
     attach_vehicle(spec, "drone", (0.0, 0.0, -1.0), 0.0)
     model = spec.compile()

@@ -170,7 +170,7 @@ def views(name: str, measure: Probe) -> Iterator[tuple[tuple[float, float, float
 
 @pytest.mark.slow
 def test_there_are_corners_everywhere(probe: tuple[str, Probe]) -> None:
-    """95 % of views have 200 good corners, in 12 of 16 parts of the picture."""
+    """95 % of views have 200 good corners, in 12 of 16 parts of the image."""
     name, measure = probe
     built = scene(name)
     renderer = CameraRenderer(built.packed, CAMERAS, built.prefix, seed=0)
