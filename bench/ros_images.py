@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 
-from nodes.ros_messages.images import ImageWriter, make_header
+from nodes.ros_messages.images import ImageWriter
 from nodes.ros_messages.typestore import TypeStore
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -100,7 +100,7 @@ def _by_the_bridge(encoding: str, data: npt.NDArray[Any]) -> Callable[[int], Any
 def _by_rosbags(encoding: str, data: npt.NDArray[Any]) -> Callable[[int], Any]:
     store, plain = TypeStore(), get_typestore(Stores.ROS2_JAZZY)
     message: Any = plain.types[IMAGE](
-        header=make_header(store, (0, 7), FRAME),
+        header=store.header((0, 7), FRAME),
         height=data.shape[0],
         width=data.shape[1],
         encoding=encoding,

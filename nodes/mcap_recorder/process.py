@@ -18,8 +18,8 @@ import msgspec
 from nodes.mcap.disk import RecordingError
 from nodes.mcap.mcap_file import McapWriter
 from nodes.mcap_recorder import pipe
+from nodes.mcap_recorder.event_writer import EventWriter
 from nodes.mcap_recorder.order import Answer, Order
-from nodes.mcap_recorder.topics import Topics
 from runtime.errors import MissingDependencyError, WireError
 
 LONGEST = 0.4
@@ -48,7 +48,7 @@ class Process:
         attachment = Path(order.attachment)
         if attachment.is_file():
             self._writer.attach(attachment.name, "application/toml", attachment.read_bytes())
-        self._topics = Topics(self._writer, config, self._complain)
+        self._events = EventWriter(self._writer, config, self._complain)
         self._said: set[str] = set()
         self._written = 0
         self._in_chunk = 0
@@ -75,7 +75,7 @@ class Process:
 
     def _write(self, piece: pipe.Piece) -> None:
         try:
-            self._topics.write(piece.time, piece.frame, piece.what == pipe.ANNOUNCEMENT)
+            self._events.write(piece.time, piece.frame, piece.what == pipe.ANNOUNCEMENT)
             self._written += 1
             self._in_chunk += 1
         except WireError as error:

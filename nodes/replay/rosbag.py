@@ -1,4 +1,4 @@
-"""Bags of ROS that others made: their messages as events, in our frames (`ros2_bridge.incoming`).
+"""Bags of ROS that others made: their messages as events, in our frames (`ros_messages.incoming`).
 
 Messages with a header keep its stamp, unless that is zero; the time of receipt is when they are
 said. Where the two
@@ -29,14 +29,14 @@ from events import (
     PoseEstimate,
 )
 from nodes.mcap import layout
-from nodes.mcap.arrays import decoded
 from nodes.replay.bag_topics import chosen
 from nodes.replay.folders import standing
 from nodes.replay.mounting import Mountings
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.replay.settings import Topic, Use
 from nodes.ros_messages.calibration import camera_announcement
-from nodes.ros_messages.incoming import READERS, Reading, estimate
+from nodes.ros_messages.depth import decode_compressed
+from nodes.ros_messages.incoming import READERS, MessageContext, estimate
 from nodes.ros_messages.stamps import Stamps
 from nodes.ros_messages.typestore import Bag
 from runtime.errors import VisnavError
@@ -127,27 +127,27 @@ class RosBag(Reader):
             raise ValueError(
                 f"expected no stamp before the first, found one {early:.3f} s before it"
             )
-        reading = Reading(
+        context = MessageContext(
             source=topic.source, now=_LATER, stamps=self._stamps, frame_id=topic.frame_id
         )
         if topic.use == "truth" or topic.use == "odometry":
-            return self._truth(topic, type_, message, reading)
+            return self._truth(topic, type_, message, context)
         if type_ == "sensor_msgs/msg/CompressedImage":
-            return _compressed(topic.use, message, reading)
-        event = READERS[type_, topic.use](message, reading)
+            return _compressed(topic.use, message, context)
+        event = READERS[type_, topic.use](message, context)
         assert event is not None
         return event
 
-    def _truth(self, topic: Topic, type_: str, message: Any, reading: Reading) -> Odometry:
+    def _truth(self, topic: Topic, type_: str, message: Any, context: MessageContext) -> Odometry:
         """Read a true pose; it is in ``map`` unless the settings say otherwise."""
-        reading = msgspec.structs.replace(reading, frame_id=topic.frame_id or "map")
+        context = msgspec.structs.replace(context, frame_id=topic.frame_id or "map")
         if type_ == "nav_msgs/msg/Odometry":
-            event = READERS[type_, "odometry"](message, reading)
+            event = READERS[type_, "odometry"](message, context)
             assert isinstance(event, Odometry)
             return msgspec.structs.replace(event, child_frame_id="base_link")
         if type_ == "geometry_msgs/msg/TransformStamped":
             message = _AsPose(message)
-        pose = estimate(message, reading)
+        pose = estimate(message, context)
         assert isinstance(pose, PoseEstimate)
         return Odometry(
             stamp=pose.stamp,
@@ -274,12 +274,12 @@ class _AsPose:
         self.orientation = message.transform.rotation
 
 
-def _compressed(use: Use, message: Any, reading: Reading) -> Event:
-    stamp, frame_id = reading.stamp(message.header), reading.frame(message.header, "")
-    pixels = decoded(message)
+def _compressed(use: Use, message: Any, context: MessageContext) -> Event:
+    stamp, frame_id = context.stamp(message.header), context.frame(message.header, "")
+    pixels = decode_compressed(message)
     if use == "depth":
-        return DepthImage(stamp=stamp, source=reading.source, frame_id=frame_id, data=pixels)
+        return DepthImage(stamp=stamp, source=context.source, frame_id=frame_id, data=pixels)
     encoding = "rgb8" if pixels.ndim == 3 else "mono8"
     return Image(
-        stamp=stamp, source=reading.source, frame_id=frame_id, encoding=encoding, data=pixels
+        stamp=stamp, source=context.source, frame_id=frame_id, encoding=encoding, data=pixels
     )

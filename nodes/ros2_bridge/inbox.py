@@ -1,4 +1,4 @@
-"""From the threads that read topics to the loop: bounded, with one wake-up for each burst.
+"""Passes messages from the threads that read topics to the loop: bounded, one wake-up a burst.
 
 What comes faster than is allowed is dropped where it is read, before its bytes are copied. The
 loop is given back between messages when they have held it for `BUDGET`.
@@ -24,9 +24,9 @@ class Inbox:
         loop: Where messages are read.
         deliver: Called there with the bytes of each; must not raise.
         depth: How many wait at most; the oldest is dropped.
-        rate: Messages a second at most; a burst of `depth` may come at once.
-        largest: Bytes of a message at most.
-        complain: Told, in the thread that reads, why a message is dropped.
+        max_rate: Messages a second at most; a burst of `depth` may come at once.
+        max_size: Bytes of a message at most.
+        complain: Called, in the thread that reads, with why a message is dropped.
         now: Real seconds.
     """
 
@@ -36,16 +36,16 @@ class Inbox:
         deliver: Callable[[bytes], object],
         *,
         depth: int,
-        rate: float,
-        largest: int,
+        max_rate: float,
+        max_size: int,
         complain: Callable[[str, str], None],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._loop = loop
         self._deliver = deliver
         self._depth = depth
-        self._rate = rate
-        self._largest = largest
+        self._max_rate = max_rate
+        self._max_size = max_size
         self._complain = complain
         self._now = now
         self._waiting: deque[bytes] = deque()
@@ -61,13 +61,13 @@ class Inbox:
             size: Bytes.
             read: Returns them.
         """
-        if size > self._largest:
+        if size > self._max_size:
             self._complain(
-                "message too large", f"expected {self._largest} bytes or less, found {size}"
+                "message too large", f"expected {self._max_size} bytes or less, found {size}"
             )
             return
         if not self._within_rate():
-            self._complain("too many messages", f"expected {self._rate:g} a second or less")
+            self._complain("too many messages", f"expected {self._max_rate:g} a second or less")
             return
         data = read()
         with self._lock:
@@ -83,10 +83,10 @@ class Inbox:
                 self._loop.call_soon_threadsafe(self._drain)
 
     def _within_rate(self) -> bool:
-        """Tell whether one more message fits; every second allows for `rate` more."""
+        """Tell whether one more message fits; every second allows for `max_rate` more."""
         with self._lock:
             now = self._now()
-            more = (now - self._asked) * self._rate
+            more = (now - self._asked) * self._max_rate
             self._allowed, self._asked = min(self._allowed + more, float(self._depth)), now
             if self._allowed < 1.0:
                 return False

@@ -1,27 +1,26 @@
-"""What the bridge hears: the bytes of a topic to an event, and all that may be wrong with them."""
+"""A topic that the bridge subscribes to: its messages to events, and all that may be wrong."""
 
 from __future__ import annotations
 
-import importlib
-
 from events import Event
 from nodes.ros2_bridge.complaints import Complaints
+from nodes.ros2_bridge.mappings import import_mapping
 from nodes.ros2_bridge.settings import Ros2BridgeConfig, Subscription
-from nodes.ros_messages.incoming import READERS, Reader, Reading
+from nodes.ros_messages.incoming import READERS, MessageContext, Reader
 from nodes.ros_messages.stamps import Stamps
 from nodes.ros_messages.topics import Qos, Topic, ros_name, topic_name
 from nodes.ros_messages.typestore import MessageError, TypeStore
 
 
-class Hearing:
-    """One subscription's way from bytes to an event.
+class IncomingTopic:
+    """Makes the events of one subscription.
 
     Args:
         subscription: As the file says.
         config: The bridge's settings.
         store: Of the types.
         node: The bridge's name, for the events' source.
-        complaints: Told of what is wrong.
+        complaints: Notes what is wrong.
 
     Raises:
         ValueError: The type is not known, or the mapping cannot be imported.
@@ -39,7 +38,7 @@ class Hearing:
         name = topic_name(config.namespace, subscription.topic)
         self.topic = topic(store, name, subscription.type, subscription.qos)
         self.source = subscription.source or f"{node}/{ros_name(subscription.topic)}"
-        self.heard = 0
+        self.received = 0
         self._store = store
         self._complaints = complaints
         self._read = _reader(subscription)
@@ -55,11 +54,11 @@ class Hearing:
         except MessageError as error:
             self.complain(f"not a {self.topic.type}", str(error))
             return None
-        reading = Reading(
+        context = MessageContext(
             source=self.source, now=now, stamps=stamps, frame_id=self.subscription.frame_id
         )
         try:
-            event = self._read(message, reading)
+            event = self._read(message, context)
         except (ValueError, TypeError, ArithmeticError) as error:
             self.complain("message refused", str(error))
             return None
@@ -71,7 +70,7 @@ class Hearing:
         if not isinstance(event, Event):
             self.complain("mapping failed", f"expected an event, found {type(event).__name__}")
             return None
-        self.heard += 1
+        self.received += 1
         return event
 
 
@@ -90,15 +89,4 @@ def topic(store: TypeStore, name: str, type_: str, qos: Qos) -> Topic:
 def _reader(subscription: Subscription) -> Reader:
     if subscription.use:
         return READERS[subscription.type, subscription.use]
-    module, _, name = subscription.mapping.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"{subscription.topic}: mapping: expected a function that can be imported, "
-            f"found {subscription.mapping!r}: {error}"
-        ) from None
-    if not callable(found):
-        raise ValueError(f"{subscription.topic}: mapping: expected a function, found {found!r}")
-    read: Reader = found
-    return read
+    return import_mapping(subscription.topic, subscription.mapping)

@@ -1,4 +1,4 @@
-"""Pictures and clouds as messages, with no more copies than one, and pictures back as events.
+"""Images and point clouds as messages, and images back as events. An image is copied once at most.
 
 Nearly all of such a message is its data, so the rest is serialised once by `typestore`, and then
 only stamp, length and data are written, into a buffer that is used again. The bytes are those
@@ -15,7 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from events import DepthImage, Image
+from nodes.ros_messages.stamps import Time
 from nodes.ros_messages.typestore import TypeStore
+from nodes.viewing.encoding import encode_image
+
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 
 _STAMP = struct.Struct("<iI")
 _STAMP_AT = 4
@@ -23,7 +27,10 @@ _STAMP_AT = 4
 _LENGTH = struct.Struct("<I")
 
 _NONE = np.zeros(0, np.uint8)
-_POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
+
+POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
+"""A point of a PointCloud2 as `CloudWriter` writes it."""
+
 _PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
 _TURNS = {
     "bgr8": cv2.COLOR_BGR2RGB,
@@ -49,16 +56,16 @@ class ImageWriter:
         self._shape: tuple[int, ...] | None = None
         self._buffer = bytearray()
 
-    def write(self, stamp: tuple[int, int], data: npt.NDArray[Any]) -> bytearray:
+    def write(self, time: Time, data: npt.NDArray[Any]) -> bytearray:
         """Return the message; it is overwritten by the next.
 
         Args:
-            stamp: Seconds and nanoseconds.
+            time: Seconds and nanoseconds.
             data: Pixels, shape (height, width) or (height, width, channels).
         """
         if data.shape != self._shape:
             self._begin(data)
-        _STAMP.pack_into(self._buffer, _STAMP_AT, *stamp)
+        _STAMP.pack_into(self._buffer, _STAMP_AT, *time)
         np.copyto(self._pixels, data)
         return self._buffer
 
@@ -66,7 +73,7 @@ class ImageWriter:
         message = self._store.message("sensor_msgs/msg/Image")
         head = self._store.serialize(
             message(
-                header=make_header(self._store, (0, 0), self.frame_id),
+                header=self._store.header((0, 0), self.frame_id),
                 height=data.shape[0],
                 width=data.shape[1],
                 encoding=self.encoding,
@@ -88,35 +95,33 @@ class CompressedWriter:
     Args:
         store: Of the types.
         frame_id: Optical frame.
-        how: Format of the picture.
+        format_: Of the encoded image.
         quality: Of a JPEG, 1 to 100.
     """
 
     def __init__(
-        self, store: TypeStore, frame_id: str, how: Literal["jpeg", "png"], quality: int
+        self, store: TypeStore, frame_id: str, format_: Literal["jpeg", "png"], quality: int
     ) -> None:
         self._store = store
         self._frame_id = frame_id
-        self._how = how
-        self._options = [cv2.IMWRITE_JPEG_QUALITY, quality] if how == "jpeg" else []
+        self._format = format_
+        self._quality = quality
 
-    def write(self, stamp: tuple[int, int], data: npt.NDArray[np.uint8]) -> bytearray:
+    def write(self, time: Time, data: npt.NDArray[np.uint8]) -> bytearray:
         """Return the message.
 
         Args:
-            stamp: Seconds and nanoseconds.
+            time: Seconds and nanoseconds.
             data: Pixels, shape (height, width, 3) in RGB, or (height, width).
         """
         colour = data.ndim == 3
-        pixels = cv2.cvtColor(data, cv2.COLOR_RGB2BGR) if colour else data
-        _, encoded = cv2.imencode(f".{self._how}", pixels, self._options)
-        format_ = f"{'rgb8' if colour else 'mono8'}; {self._how} compressed "
-        message = self._store.message("sensor_msgs/msg/CompressedImage")
+        format_ = f"{'rgb8' if colour else 'mono8'}; {self._format} compressed "
+        message = self._store.message(COMPRESSED)
         return self._store.serialize(
             message(
-                header=make_header(self._store, stamp, self._frame_id),
+                header=self._store.header(time, self._frame_id),
                 format=format_ + ("bgr8" if colour else "mono8"),
-                data=encoded.ravel(),
+                data=encode_image(data, self._format, self._quality),
             )
         )
 
@@ -139,14 +144,14 @@ class CloudWriter:
 
     def write(
         self,
-        stamp: tuple[int, int],
+        time: Time,
         points: npt.NDArray[np.float32],
         colors: npt.NDArray[np.uint8] | None = None,
     ) -> bytearray:
         """Return the message.
 
         Args:
-            stamp: Seconds and nanoseconds.
+            time: Seconds and nanoseconds.
             points: Metres in ROS's axes, shape (n, 3).
             colors: Red, green, blue, shape (n, 3), or (0, 3) for none: then all are white.
                 Not for ``xyz``.
@@ -157,37 +162,31 @@ class CloudWriter:
         names = enumerate(self._names)
         frame = self._store.serialize(
             message(
-                header=make_header(self._store, stamp, self._header),
+                header=self._store.header(time, self._header),
                 height=1,
                 width=count,
                 fields=[field(name=n, offset=4 * i, datatype=7, count=1) for i, n in names],
                 is_bigendian=False,
-                point_step=_POINT.itemsize,
-                row_step=_POINT.itemsize * count,
+                point_step=POINT.itemsize,
+                row_step=POINT.itemsize * count,
                 data=_NONE,
                 is_dense=bool(np.isfinite(points).all()),
             )
         )
         dense = frame.pop()  # follows the data
-        begin, size = len(frame), count * _POINT.itemsize
+        begin, size = len(frame), count * POINT.itemsize
         _LENGTH.pack_into(frame, begin - 4, size)
         frame += bytearray(size + 1)
         frame[-1] = dense
-        rows = np.frombuffer(frame, _POINT, count, begin)
+        rows = np.frombuffer(frame, POINT, count, begin)
         rows["xyz"] = points
         if colors is not None:
             rows["bgr"] = colors[:, ::-1] if len(colors) else 255
         return frame
 
 
-def make_header(store: TypeStore, stamp: tuple[int, int], frame_id: str) -> Any:
-    """Return a ``std_msgs/msg/Header``."""
-    time = store.message("builtin_interfaces/msg/Time")(sec=stamp[0], nanosec=stamp[1])
-    return store.message("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)
-
-
 def read_image(message: Any, source: str, stamp: int, frame_id: str) -> Image:
-    """Read a colour or grey picture.
+    """Read a colour or grey image.
 
     Raises:
         ValueError: The encoding is another, or sizes do not fit each other.
@@ -225,8 +224,20 @@ def read_depth(message: Any, source: str, stamp: int, frame_id: str) -> DepthIma
     return DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=metres)
 
 
+def decoded_pixels(code: npt.NDArray[np.uint8]) -> npt.NDArray[Any]:
+    """Return the pixels of an encoded image, in RGB if it has colours.
+
+    Raises:
+        ValueError: It is no image.
+    """
+    pixels = cv2.imdecode(code, cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ValueError("not an image")
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if pixels.ndim == 3 else pixels
+
+
 def _rows(message: Any, pixel: int) -> npt.NDArray[np.uint8]:
-    """Return a picture's bytes, shape (height, width * pixel), without what fills up its rows."""
+    """Return an image's bytes, shape (height, width * pixel), without what fills up its rows."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data: npt.NDArray[np.uint8] = message.data
     if height < 1 or width < 1 or step < width * pixel or len(data) != height * step:

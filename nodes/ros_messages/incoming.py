@@ -1,8 +1,8 @@
-"""ROS messages to events, in our frames. What is not sane is refused with a ValueError.
+"""ROS messages to events, in our frames. What makes no sense is refused with a ValueError.
 
 `READERS` has a function for each type of message and use; a mapping of the user's own is called
-alike. World ENU becomes NED, body FLU FRD; optical axes stay. See `frames`. Pictures are in
-`pictures`.
+alike. World ENU becomes NED, body FLU FRD; optical axes stay. See `frames`. Images are in
+`images`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from nodes.ros_messages.images import read_depth, read_image
 from nodes.ros_messages.stamps import Stamps
 
 
-class Reading(msgspec.Struct, frozen=True, kw_only=True):
-    """What a reader needs to know beside the message.
+class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
+    """What a reader needs beside the message.
 
     Attributes:
         source: Of the event.
@@ -59,32 +59,32 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
         return self.frame_id or header.frame_id or default
 
 
-Reader = Callable[[Any, Reading], Event | None]
+Reader = Callable[[Any, MessageContext], Event | None]
 
 
-def estimate(message: Any, reading: Reading) -> Event:
+def estimate(message: Any, context: MessageContext) -> Event:
     """Read a PoseStamped as an estimate."""
-    return _estimate(message.header, message.pose, (), reading)
+    return _estimate(message.header, message.pose, (), context)
 
 
-def estimate_with_covariance(message: Any, reading: Reading) -> Event:
+def estimate_with_covariance(message: Any, context: MessageContext) -> Event:
     """Read a PoseWithCovarianceStamped, or an Odometry, as an estimate."""
     covariance = message.pose.covariance
     if not np.isfinite(covariance).all():
         raise ValueError("covariance: expected finite numbers")
     given = covariance if covariance.any() else ()
     child = getattr(message, "child_frame_id", "") or "base_link"
-    return _estimate(message.header, message.pose.pose, given, reading, child)
+    return _estimate(message.header, message.pose.pose, given, context, child)
 
 
-def odometry(message: Any, reading: Reading) -> Event:
+def odometry(message: Any, context: MessageContext) -> Event:
     """Read an Odometry as a body's pose and twist."""
-    frame_id, child = reading.frame(message.header, "odom"), message.child_frame_id or "base_link"
+    frame_id, child = context.frame(message.header, "odom"), message.child_frame_id or "base_link"
     position, orientation = _pose(message.pose.pose, frame_id, child)
     twist, axes = message.twist.twist, axes_of(child)
     return Odometry(
-        stamp=reading.stamp(message.header),
-        source=reading.source,
+        stamp=context.stamp(message.header),
+        source=context.source,
         frame_id=frame_id,
         child_frame_id=child,
         position=position,
@@ -94,65 +94,65 @@ def odometry(message: Any, reading: Reading) -> Event:
     )
 
 
-def velocity(message: Any, reading: Reading) -> Event:
+def velocity(message: Any, context: MessageContext) -> Event:
     """Read a Twist as a velocity along the vehicle's heading."""
-    return _velocity(message, reading.now, reading.frame_id or "heading", reading)
+    return _velocity(message, context.now, context.frame_id or "heading", context)
 
 
-def stamped_velocity(message: Any, reading: Reading) -> Event:
+def stamped_velocity(message: Any, context: MessageContext) -> Event:
     """Read a TwistStamped as a velocity in ``map``, or else along the vehicle's heading."""
-    frame_id = "map" if reading.frame(message.header, "") == "map" else "heading"
-    return _velocity(message.twist, reading.stamp(message.header), frame_id, reading)
+    frame_id = "map" if context.frame(message.header, "") == "map" else "heading"
+    return _velocity(message.twist, context.stamp(message.header), frame_id, context)
 
 
-def position(message: Any, reading: Reading) -> Event:
+def position(message: Any, context: MessageContext) -> Event:
     """Read a PoseStamped as a place to be at, with its heading."""
-    place, orientation = _pose_in_map(message, reading)
+    place, orientation = _pose_in_map(message, context)
     return PositionSetpoint(
-        stamp=reading.stamp(message.header),
-        source=reading.source,
+        stamp=context.stamp(message.header),
+        source=context.source,
         position=place,
         yaw=yaw_of(orientation),
     )
 
 
-def pose(message: Any, reading: Reading) -> Event:
+def pose(message: Any, context: MessageContext) -> Event:
     """Read a PoseStamped as a place to be at in an attitude."""
-    place, orientation = _pose_in_map(message, reading)
+    place, orientation = _pose_in_map(message, context)
     return PoseSetpoint(
-        stamp=reading.stamp(message.header),
-        source=reading.source,
+        stamp=context.stamp(message.header),
+        source=context.source,
         position=place,
         orientation=orientation,
     )
 
 
-def imu(message: Any, reading: Reading) -> Event:
+def imu(message: Any, context: MessageContext) -> Event:
     """Read an Imu, without its orientation."""
-    frame_id = reading.frame(message.header, "base_link")
+    frame_id = context.frame(message.header, "base_link")
     axes = axes_of(frame_id)
     return Imu(
-        stamp=reading.stamp(message.header),
-        source=reading.source,
+        stamp=context.stamp(message.header),
+        source=context.source,
         frame_id=frame_id,
         angular_velocity=convert_vector(axes, _vector(message.angular_velocity)),
         linear_acceleration=convert_vector(axes, _vector(message.linear_acceleration)),
     )
 
 
-def image(message: Any, reading: Reading) -> Event:
-    """Read an Image as a colour or grey picture."""
+def image(message: Any, context: MessageContext) -> Event:
+    """Read an Image as a colour or grey image."""
     header = message.header
-    return read_image(message, reading.source, reading.stamp(header), reading.frame(header, ""))
+    return read_image(message, context.source, context.stamp(header), context.frame(header, ""))
 
 
-def depth(message: Any, reading: Reading) -> Event:
+def depth(message: Any, context: MessageContext) -> Event:
     """Read an Image as depth."""
     header = message.header
-    return read_depth(message, reading.source, reading.stamp(header), reading.frame(header, ""))
+    return read_depth(message, context.source, context.stamp(header), context.frame(header, ""))
 
 
-def nothing(message: Any, reading: Reading) -> None:
+def nothing(message: Any, context: MessageContext) -> None:
     """Make no event of a message."""
 
 
@@ -174,14 +174,14 @@ READERS: dict[tuple[str, str], Reader] = {
 
 
 def _estimate(
-    header: Any, pose: Any, covariance: Any, reading: Reading, child: str = "base_link"
+    header: Any, pose: Any, covariance: Any, context: MessageContext, child: str = "base_link"
 ) -> Event:
-    frame_id = reading.frame(header, "odom")
+    frame_id = context.frame(header, "odom")
     place, orientation = _pose(pose, frame_id, child)
     given = convert_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
     return PoseEstimate(
-        stamp=reading.stamp(header),
-        source=reading.source,
+        stamp=context.stamp(header),
+        source=context.source,
         frame_id=frame_id,
         child_frame_id=child,
         position=place,
@@ -190,19 +190,19 @@ def _estimate(
     )
 
 
-def _velocity(twist: Any, stamp: int, frame_id: str, reading: Reading) -> Event:
+def _velocity(twist: Any, stamp: int, frame_id: str, context: MessageContext) -> Event:
     turned = convert_vector("world" if frame_id == "map" else "body", _vector(twist.linear))
     return VelocitySetpoint(
         stamp=stamp,
-        source=reading.source,
+        source=context.source,
         frame_id=frame_id,
         velocity=turned,
         yaw_rate=-_vector(twist.angular)[2],
     )
 
 
-def _pose_in_map(message: Any, reading: Reading) -> tuple[Vector3, Quaternion]:
-    frame_id = reading.frame(message.header, "map")
+def _pose_in_map(message: Any, context: MessageContext) -> tuple[Vector3, Quaternion]:
+    frame_id = context.frame(message.header, "map")
     if frame_id != "map":
         raise ValueError(f'frame_id: expected "map", found {frame_id!r:.80}')
     return _pose(message.pose, "map", "base_link")

@@ -1,4 +1,4 @@
-"""Events to ROS messages that are small: as CDR, in ROS's frames. Pictures are in `pictures`."""
+"""Events to ROS messages that are small: as CDR, in ROS's frames. Images are in `images`."""
 
 from __future__ import annotations
 
@@ -24,11 +24,8 @@ from events import (
 )
 from events.frames import Axes, convert_covariance, convert_rotation, convert_vector
 from nodes.ros_messages.frame_names import FrameNames
-from nodes.ros_messages.images import make_header
+from nodes.ros_messages.stamps import Time
 from nodes.ros_messages.typestore import TypeStore
-
-Time = tuple[int, int]
-"""Seconds and nanoseconds."""
 
 _ZEROS_9, _ZEROS_36 = np.zeros(9), np.zeros(36)
 _UNKNOWN = np.array([-1.0, *[0.0] * 8])
@@ -154,7 +151,7 @@ class Messages:
         message = self._store.message("tf2_msgs/msg/TFMessage")(
             transforms=[
                 make["transform_stamped"](
-                    header=make_header(self._store, time, each.parent),
+                    header=self._store.header(time, each.parent),
                     child_frame_id=each.child,
                     transform=make["transform"](
                         translation=self._vector(each.translation),
@@ -224,7 +221,7 @@ class Messages:
         return self._store.serialize(self._store.message("std_msgs/msg/Float64")(data=event.value))
 
     def _header(self, time: Time, frame_id: str, source: str = "") -> Any:
-        return make_header(self._store, time, self._frames.name(frame_id, source))
+        return self._store.header(time, self._frames.name(frame_id, source))
 
     def _pose(self, parent: str, child: Axes, position: Vector3, orientation: Quaternion) -> Any:
         axes = self._frames.axes(parent)

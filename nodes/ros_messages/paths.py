@@ -1,7 +1,7 @@
-"""The way that a vehicle, or an estimate of it, has come: ``nav_msgs/msg/Path`` for RViz.
+"""The path of a vehicle, or of an estimate of it, as ``nav_msgs/msg/Path`` for RViz.
 
 A path is sent whole again and again, so its poses are kept as the bytes that they are sent as; the
-bytes are those that rosbags would make. Nothing here knows Zenoh.
+bytes are those that rosbags would make.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from events import Quaternion, Vector3
-from nodes.ros_messages.images import make_header
-from nodes.ros_messages.messages import Time
+from nodes.ros_messages.stamps import Time
 from nodes.ros_messages.typestore import TypeStore
 
 _COUNT = struct.Struct("<I")
@@ -24,8 +23,8 @@ _POSE = 56
 """Seven float64: position, and the quaternion's x, y, z, w."""
 
 
-class Path:
-    """Poses of one body in one frame.
+class PathMessage:
+    """The message of a path: poses of one body in one frame.
 
     Args:
         store: Of the types.
@@ -103,11 +102,9 @@ class Path:
             orientation=make("geometry_msgs/msg/Quaternion")(x=qx, y=qy, z=qz, w=qw),
         )
         stamp = int(row["sec"]), int(row["nanosec"])
-        header = make_header(self._store, stamp, self.frame)
+        header = self._store.header(stamp, self.frame)
         first = make("geometry_msgs/msg/PoseStamped")(header=header, pose=pose)
-        path = make("nav_msgs/msg/Path")(
-            header=make_header(self._store, time, self.frame), poses=[first]
-        )
+        path = make("nav_msgs/msg/Path")(header=self._store.header(time, self.frame), poses=[first])
         return self._store.serialize(path)
 
 

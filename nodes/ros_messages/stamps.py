@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import msgspec
 
-SECOND = 1_000_000_000
+from runtime.schedule import SECOND
 
 AHEAD = SECOND
-"""How far ahead of the run's clock a stamp from outside may be."""
+"""How far ahead of the run's clock a stamp from outside may be (ns)."""
+
+Time = tuple[int, int]
+"""The time in a message: seconds and nanoseconds."""
 
 
 class Stamps(msgspec.Struct, frozen=True):
-    """How the run's clock stands to the time in messages.
+    """Converts stamps of the run's clock to times in messages, and back.
 
     Attributes:
         offset: Nanoseconds to add on the way out.
@@ -19,12 +22,12 @@ class Stamps(msgspec.Struct, frozen=True):
 
     offset: int = 0
 
-    def out(self, stamp: int) -> tuple[int, int]:
+    def out(self, stamp: int) -> Time:
         """Return the seconds and nanoseconds of a stamp."""
         return divmod(stamp + self.offset, SECOND)
 
     def back(self, seconds: int, nanoseconds: int, now: int) -> int:
-        """Return a message's time on the run's clock.
+        """Return a message's time on the run's clock (ns).
 
         Args:
             seconds: Of the message; both 0 stand for now.

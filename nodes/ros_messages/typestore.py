@@ -108,6 +108,11 @@ class TypeStore:
         """Return the class of a type's messages."""
         return self._store.types[type_]
 
+    def header(self, time: tuple[int, int], frame_id: str) -> Any:
+        """Return a ``std_msgs/msg/Header`` with a time in seconds and nanoseconds."""
+        stamp = self.message("builtin_interfaces/msg/Time")(sec=time[0], nanosec=time[1])
+        return self.message("std_msgs/msg/Header")(stamp=stamp, frame_id=frame_id)
+
     def zero(self, type_: str) -> Any:
         """Return a message of zeros, empty texts and empty sequences.
 

@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 from events import Announcement, Event
 from nodes.dataset import DatasetWriter
 from nodes.mcap.mcap_file import McapWriter
+from nodes.mcap_recorder.event_writer import EventWriter
 from nodes.mcap_recorder.settings import McapRecorderConfig
-from nodes.mcap_recorder.topics import Topics
 from nodes.replay.formats import open_reader
 from nodes.replay.reader import Reader
 from nodes.replay.settings import ReplayConfig
@@ -39,7 +39,7 @@ def events() -> list[Event]:
 def recording(folder: Path, **settings: Any) -> Path:
     path = folder / "recording.mcap"
     writer = McapWriter(path)
-    topics = Topics(writer, McapRecorderConfig(**settings), lambda _: None)
+    topics = EventWriter(writer, McapRecorderConfig(**settings), lambda _: None)
     for event in events():
         topics.write(event.stamp, pack(event).frame(), isinstance(event, Announcement))
         if event.stamp:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, cast
 
 from events import Event
-from nodes.ros2_bridge.outgoing_topic import Writing
-from nodes.ros_messages.incoming import Reading
+from nodes.ros_messages.builder import MessageBuilder
+from nodes.ros_messages.incoming import MessageContext
 
 PERCENT = 100
 BATTERY = "sensor_msgs/msg/BatteryState"
@@ -18,44 +18,44 @@ class Battery(Event):
     percentage: float
 
 
-def battery(message: Any, reading: Reading) -> Event | None:
+def battery(message: Any, context: MessageContext) -> Event | None:
     if message.percentage < 0.0:
         return None
     return Battery(
-        stamp=reading.stamp(message.header), source=reading.source, percentage=message.percentage
+        stamp=context.stamp(message.header), source=context.source, percentage=message.percentage
     )
 
 
-def broken(message: Any, reading: Reading) -> Event | None:
+def broken(message: Any, context: MessageContext) -> Event | None:
     raise KeyError("no such thing")
 
 
-def no_event(message: Any, reading: Reading) -> Event | None:
+def no_event(message: Any, context: MessageContext) -> Event | None:
     return cast("Event", "not an event")
 
 
-def tell_battery(event: Battery, writing: Writing) -> Any:
+def make_battery(event: Battery, builder: MessageBuilder) -> Any:
     if event.percentage < 0.0:
         return None
-    header = writing.header(event.stamp, "base_link", event.source)
-    return writing.make(BATTERY, header=header, percentage=event.percentage, present=True)
+    header = builder.header(event.stamp, "base_link", event.source)
+    return builder.make(BATTERY, header=header, percentage=event.percentage, present=True)
 
 
-def tell_broken(event: Battery, writing: Writing) -> Any:
+def make_broken(event: Battery, builder: MessageBuilder) -> Any:
     raise KeyError("no such thing")
 
 
-def tell_another_type(event: Battery, writing: Writing) -> Any:
-    return writing.make("std_msgs/msg/Float64", data=event.percentage)
+def make_another_type(event: Battery, builder: MessageBuilder) -> Any:
+    return builder.make("std_msgs/msg/Float64", data=event.percentage)
 
 
-def tell_nonsense(event: Battery, writing: Writing) -> Any:
+def make_nonsense(event: Battery, builder: MessageBuilder) -> Any:
     return "not a message"
 
 
-def tell_a_text_for_a_number(event: Battery, writing: Writing) -> Any:
-    return writing.make(BATTERY, percentage="full")
+def make_a_text_for_a_number(event: Battery, builder: MessageBuilder) -> Any:
+    return builder.make(BATTERY, percentage="full")
 
 
-def tell_no_such_field(event: Battery, writing: Writing) -> Any:
-    return writing.make(BATTERY, charm=1.0)
+def make_no_such_field(event: Battery, builder: MessageBuilder) -> Any:
+    return builder.make(BATTERY, charm=1.0)

@@ -34,8 +34,8 @@ listen = ["tcp/127.0.0.1:{port}"]
 """
 
 SUBSCRIPTIONS = """
-compressed = "jpeg"
-compressed_depth = true
+compressed_images = "jpeg"
+compressed_depth = "inverse"
 
 [[nodes.publications]]
 topic = "battery"

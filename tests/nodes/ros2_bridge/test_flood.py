@@ -21,12 +21,12 @@ from tests.nodes.ros_messages import samples
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(150)]
 
 MORE = """
-largest = 1000
+max_message_size = 1000
 [[nodes.subscriptions]]
 topic = "/cmd_vel"
 type = "geometry_msgs/msg/Twist"
 as = "velocity"
-rate = {rate}
+max_rate = {rate}
 """
 
 
@@ -49,7 +49,7 @@ def test_what_was_sent_is_what_was_heard_and_what_was_dropped(rate: float, tmp_p
     assert sent[0] == sent[2] == 0
     assert min(sent[1], sent[3]) > 0
     (log,) = tmp_path.rglob("log.txt")
-    found = re.search(r"(\d+) heard, (\d+) refused or dropped", log.read_text())
+    found = re.search(r"(\d+) received, (\d+) refused or dropped", log.read_text())
     assert found is not None
     heard, refused = map(int, found.groups())
     assert heard + refused == sum(sent) + 1

@@ -85,13 +85,13 @@ def test_garbage_and_a_flood_are_counted_and_survived(tmp_path: Path) -> None:
 
 
 FLOODED = """
-largest = 1_000_000
+max_message_size = 1_000_000
 
 [[nodes.subscriptions]]
 topic = "/cmd_vel"
 type = "geometry_msgs/msg/Twist"
 as = "velocity"
-rate = 100
+max_rate = 100
 
 [[nodes.subscriptions]]
 topic = "/slam/pose"

@@ -33,8 +33,8 @@ class Box:
             asyncio.get_running_loop(),
             deliver,
             depth=depth,
-            rate=rate,
-            largest=100,
+            max_rate=rate,
+            max_size=100,
             complain=lambda kind, _: self.said.update([kind]),
             now=self.clock,
         )

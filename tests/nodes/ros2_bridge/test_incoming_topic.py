@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from events import Event
 from nodes.ros2_bridge.complaints import Complaints
-from nodes.ros2_bridge.incoming_topic import Hearing
+from nodes.ros2_bridge.incoming_topic import IncomingTopic
 from nodes.ros2_bridge.settings import Ros2BridgeConfig, Subscription
 from nodes.ros_messages.frame_names import FrameNames
-from nodes.ros_messages.images import ImageWriter, make_header
+from nodes.ros_messages.images import ImageWriter
 from nodes.ros_messages.incoming import READERS
 from nodes.ros_messages.messages import Messages
 from nodes.ros_messages.stamps import Stamps
@@ -28,16 +28,18 @@ NOW = 10_000_000_000
 
 
 class Ear:
-    """A hearing, and what it complained of."""
+    """A incoming, and what it complained of."""
 
     def __init__(self, type_: str, use: str = "", mapping: str = "") -> None:
         self.said: list[str] = []
         self.complaints = Complaints(self.said.append)
         table = Subscription(topic="/t", type=type_, use=use, mapping=mapping)
-        self.hearing = Hearing(table, Ros2BridgeConfig(), samples.store(), "ros2", self.complaints)
+        self.incoming = IncomingTopic(
+            table, Ros2BridgeConfig(), samples.store(), "ros2", self.complaints
+        )
 
     def hear(self, data: bytes) -> Event | None:
-        return self.hearing.event(data, NOW, Stamps())
+        return self.incoming.event(data, NOW, Stamps())
 
 
 def valid(type_: str) -> bytes:
@@ -46,7 +48,7 @@ def valid(type_: str) -> bytes:
     make: Any = store.message
     vector = make("geometry_msgs/msg/Vector3")(x=1.0, y=2.0, z=3.0)
     twist = make("geometry_msgs/msg/Twist")(linear=vector, angular=vector)
-    header = make_header(store, (3, 7), "map")
+    header = store.header((3, 7), "map")
     match type_.rpartition("/")[2]:
         case "Odometry":
             return bytes(messages.odometry((3, 7), samples.odometry()))
@@ -131,7 +133,7 @@ def test_a_sequence_that_lies_about_its_length_takes_no_memory() -> None:
 
 def battery(percentage: float) -> bytes:
     make: Any = samples.store().message
-    header = make_header(samples.store(), (3, 7), "f")
+    header = samples.store().header((3, 7), "f")
     nothing = np.zeros(0, np.float32)
     fields = [12.0, 20.0, 1.0, 1.0, 1.0, 1.0, percentage, 0, 0, 0, True, nothing, nothing, "", ""]
     return bytes(samples.store().serialize(make("sensor_msgs/msg/BatteryState")(header, *fields)))
@@ -156,7 +158,7 @@ def test_a_mapping_that_fails_is_left_out(name: str, found: str) -> None:
 
 @pytest.mark.parametrize("name", ["no.such:thing", f"{HERE}:nothing", f"{HERE}:HERE"])
 def test_a_mapping_that_is_not_there_is_named(name: str) -> None:
-    with pytest.raises(ValueError, match="/t: mapping: expected a function"):
+    with pytest.raises(ValueError, match=r"/t: mapping: expected (a function|something)"):
         Ear("sensor_msgs/msg/BatteryState", mapping=name)
 
 
@@ -165,7 +167,7 @@ def test_types_may_be_defined_by_files(tmp_path: Path) -> None:
     file.write_text("std_msgs/Header header\nfloat64 speed\n")
     store = TypeStore("jazzy", {"weather_msgs/msg/Wind": str(file)})
     make: Any = store.message("weather_msgs/msg/Wind")
-    data = store.serialize(make(header=make_header(store, (1, 2), "f"), speed=3.5))
+    data = store.serialize(make(header=store.header((1, 2), "f"), speed=3.5))
     message = store.deserialize(bytes(data), "weather_msgs/msg/Wind")
     assert message.speed == 3.5
     assert len(store.hash("weather_msgs/msg/Wind")) == 71

@@ -86,8 +86,8 @@ def test_only_what_is_asked_for_is_published_under_the_name_that_is_asked_for(
 ) -> None:
     config = listener.config | {
         "publish": ["images", "odometry"],
-        "raw": False,
-        "compressed": "jpeg",
+        "raw_images": False,
+        "compressed_images": "jpeg",
         "topics": {"drone/odom": "/truth"},
     }
     inputs = [*ANNOUNCED, samples.image(10_000_000), samples.odometry(20_000_000)]
@@ -104,12 +104,12 @@ def test_further_sensors_paths_and_mappings_of_the_users_own(listener: Listener)
         "topic": "battery",
         "type": "sensor_msgs/msg/BatteryState",
         "event": f"{mapping}:Battery",
-        "mapping": f"{mapping}:tell_battery",
+        "mapping": f"{mapping}:make_battery",
         "transient_local": True,
     }
-    publish = ["pressures", "magnetic_fields", "fixes", "lidars", "paths", "depth"]
+    publish = ["pressures", "magnetic_fields", "fixes", "lidar_scans", "paths", "depth_images"]
     config = listener.config | {"publications": [table], "publish": publish, "path_rate": 10.0}
-    config |= {"compressed_depth": True}
+    config |= {"compressed_depth": "inverse"}
     optical, points = "drone/camera_optical", np.eye(3, dtype=np.float32)
     depth, ms = np.full((48, 64), 2.5, np.float32), 1_000_000
     inputs = [
@@ -182,7 +182,7 @@ def test_a_camera_of_ros_is_waited_for_and_announced(
 
     common = {"source": "eye"}
     config = listener.config | {
-        "largest": 100_000,
+        "max_message_size": 100_000,
         "subscriptions": [
             {"topic": "/eye/camera_info", "type": type_, "as": "camera"} | common,
             {"topic": "/eye/image", "type": "sensor_msgs/msg/Image", "as": "image"} | common,
@@ -223,11 +223,11 @@ def test_pictures_are_read_in_order_beside_the_loop(
     np.testing.assert_array_equal(found[0].data, pixels[..., ::-1])
     assert len(threads) == 5
     assert threading.current_thread() not in threads
-    assert "5 heard, 1 refused or dropped" in caplog.text
+    assert "5 received, 1 refused or dropped" in caplog.text
 
 
 def test_a_camera_that_never_comes_ends_the_run() -> None:
-    table = {"topic": "c", "type": "sensor_msgs/msg/CameraInfo", "as": "camera", "wait": 0.05}
+    table = {"topic": "c", "type": "sensor_msgs/msg/CameraInfo", "as": "camera", "timeout": 0.05}
     config = {"connect": [], "subscriptions": [table]}
     with pytest.raises(FatalError, match=r"/c: expected a calibration within 0\.05 s, found none"):
         run_node(Ros2Bridge, config=config)
@@ -269,7 +269,7 @@ def test_what_cannot_work_ends_the_run_with_a_reason(config: dict[str, Any], mes
             {"subscriptions": [TWIST | {"frame_id": "odom"}]},
             'frame_id: expected "map" or "heading" for a velocity, found \'odom\'',
         ),
-        ({"subscriptions": [TWIST | {"wait": float("inf")}]}, r"subscriptions\[0\].wait"),
+        ({"subscriptions": [TWIST | {"timeout": float("inf")}]}, r"subscriptions\[0\].timeout"),
         ({"domain_id": 300}, "domain_id"),
         ({"publish": ["smell"]}, "publish"),
         ({"subscriptions": [{"topic": "a", "type": POSE, "as": "velocity"}]}, "found velocity"),

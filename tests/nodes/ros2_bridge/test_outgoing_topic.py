@@ -11,8 +11,9 @@ import pytest
 
 from events import Imu
 from nodes.ros2_bridge.complaints import Complaints
-from nodes.ros2_bridge.outgoing_topic import Telling, Writing
+from nodes.ros2_bridge.outgoing_topic import OutgoingTopic
 from nodes.ros2_bridge.settings import OwnPublication, Ros2BridgeConfig
+from nodes.ros_messages.builder import MessageBuilder
 from nodes.ros_messages.frame_names import FrameNames
 from tests.nodes.ros2_bridge.mappings import Battery
 from tests.nodes.ros_messages import samples
@@ -20,20 +21,20 @@ from tests.nodes.ros_messages import samples
 TYPE = "sensor_msgs/msg/BatteryState"
 HERE = "tests.nodes.ros2_bridge.mappings"
 GIVEN = OwnPublication(
-    topic="battery", type=TYPE, event=f"{HERE}:Battery", mapping=f"{HERE}:tell_battery"
+    topic="battery", type=TYPE, event=f"{HERE}:Battery", mapping=f"{HERE}:make_battery"
 )
 
 
-def writing() -> Writing:
-    return Writing(samples.store(), FrameNames(), lambda stamp: divmod(stamp, 10**9))
+def builder() -> MessageBuilder:
+    return MessageBuilder(samples.store(), FrameNames(), lambda stamp: divmod(stamp, 10**9))
 
 
-def made(**changes: Any) -> tuple[Telling, Counter[tuple[str, str]], list[str]]:
+def made(**changes: Any) -> tuple[OutgoingTopic, Counter[tuple[str, str]], list[str]]:
     lines: list[str] = []
     complaints = Complaints(lines.append)
     given = msgspec.structs.replace(GIVEN, **changes)
     config = Ros2BridgeConfig(namespace="/fleet")
-    return Telling(given, config, samples.store(), complaints), complaints.counts, lines
+    return OutgoingTopic(given, config, samples.store(), complaints), complaints.counts, lines
 
 
 def battery(percentage: float = 0.75, source: str = "drone/pack") -> Battery:
@@ -41,9 +42,9 @@ def battery(percentage: float = 0.75, source: str = "drone/pack") -> Battery:
 
 
 def test_an_event_becomes_a_message() -> None:
-    telling, wrong, _ = made()
-    assert telling.topic.name == "/fleet/battery"
-    data = telling.message(battery(), writing())
+    outgoing, wrong, _ = made()
+    assert outgoing.topic.name == "/fleet/battery"
+    data = outgoing.message(battery(), builder())
     assert data is not None
     message: Any = samples.store().deserialize(bytes(data), TYPE)
     assert message.percentage == 0.75
@@ -53,8 +54,8 @@ def test_an_event_becomes_a_message() -> None:
 
 
 def test_a_mapping_may_say_nothing() -> None:
-    telling, wrong, _ = made()
-    assert telling.message(battery(-1.0), writing()) is None
+    outgoing, wrong, _ = made()
+    assert outgoing.message(battery(-1.0), builder()) is None
     assert not wrong
 
 
@@ -63,26 +64,26 @@ def test_a_mapping_may_say_nothing() -> None:
     [("", True), ("drone", True), ("drone/pack", True), ("dron", False), ("drone/pack/1", False)],
 )
 def test_a_source_narrows_it(source: str, wanted: bool) -> None:
-    telling, _, _ = made(source=source)
-    assert telling.wants(battery()) is wanted
+    outgoing, _, _ = made(source=source)
+    assert outgoing.wants(battery()) is wanted
     zero = (0.0, 0.0, 0.0)
     imu = Imu(stamp=0, source="drone/pack", angular_velocity=zero, linear_acceleration=zero)
-    assert not telling.wants(imu)
+    assert not outgoing.wants(imu)
 
 
 @pytest.mark.parametrize(
     ("mapping", "what"),
     [
-        ("tell_broken", "KeyError"),
-        ("tell_another_type", "expected a sensor_msgs/msg/BatteryState, found std_msgs/msg/Float"),
-        ("tell_nonsense", "expected a sensor_msgs/msg/BatteryState, found str"),
-        ("tell_a_text_for_a_number", "mapping failed"),
-        ("tell_no_such_field", "has no field 'charm'"),
+        ("make_broken", "KeyError"),
+        ("make_another_type", "expected a sensor_msgs/msg/BatteryState, found std_msgs/msg/Float"),
+        ("make_nonsense", "expected a sensor_msgs/msg/BatteryState, found str"),
+        ("make_a_text_for_a_number", "mapping failed"),
+        ("make_no_such_field", "has no field 'charm'"),
     ],
 )
 def test_what_a_mapping_does_wrong_is_counted_and_told(mapping: str, what: str) -> None:
-    telling, wrong, lines = made(mapping=f"{HERE}:{mapping}")
-    assert telling.message(battery(), writing()) is None
+    outgoing, wrong, lines = made(mapping=f"{HERE}:{mapping}")
+    assert outgoing.message(battery(), builder()) is None
     assert wrong == {("/fleet/battery", "mapping failed"): 1}
     assert what in lines[0]
 
@@ -92,7 +93,7 @@ def test_what_a_mapping_does_wrong_is_counted_and_told(mapping: str, what: str) 
     [
         ({"type": "a/msg/B"}, "/fleet/battery: expected a known message type"),
         ({"event": f"{HERE}:Nothing"}, "battery: event: expected something that can be imported"),
-        ({"event": f"{HERE}:tell_battery"}, "battery: event: expected a type of event"),
+        ({"event": f"{HERE}:make_battery"}, "battery: event: expected a type of event"),
         ({"mapping": "no_such_module:f"}, "battery: mapping: expected something that can be impor"),
         ({"mapping": f"{HERE}:PERCENT"}, "battery: mapping: expected a function, found 100"),
     ],

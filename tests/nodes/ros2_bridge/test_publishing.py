@@ -98,8 +98,8 @@ def test_a_source_may_change_what_its_pictures_are(bridge: Bridge) -> None:
 def test_publications_of_one_topic_have_a_publisher_each(bridge: Bridge) -> None:
     """Or their messages would be numbered, and typed, as those of the other."""
     table = {"topic": "battery", "type": "sensor_msgs/msg/BatteryState", "event": f"{HERE}:Battery"}
-    tell = table | {"mapping": f"{HERE}:tell_battery"}
-    number = {"type": "std_msgs/msg/Float64", "mapping": f"{HERE}:tell_another_type"}
+    tell = table | {"mapping": f"{HERE}:make_battery"}
+    number = {"type": "std_msgs/msg/Float64", "mapping": f"{HERE}:make_another_type"}
     session = bridge(
         [Battery(stamp=1, source=source, percentage=0.5) for source in ("one", "two")],
         publications=[tell | {"source": "one"}, tell | {"source": "two"}, table | number],

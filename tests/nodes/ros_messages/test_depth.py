@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import struct
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from nodes.ros_messages.depth import CompressedDepthWriter
+from nodes.ros_messages.depth import HEAD, CompressedDepthWriter, decode_compressed
 from tests.nodes.ros_messages import samples
 
 
 def message(depth: np.ndarray, farthest: float = 10.0) -> Any:
-    data = CompressedDepthWriter(samples.store(), "eye", farthest, 100.0).write((3, 7), depth)
+    writer = CompressedDepthWriter(samples.store(), "eye", farthest=farthest)
+    data = writer.write((3, 7), depth)
     return samples.store().deserialize(bytes(data), "sensor_msgs/msg/CompressedImage")
 
 
@@ -51,3 +53,20 @@ def test_its_header_and_format_are_those_of_the_plugin() -> None:
     # q (q + 1) and 1 - a / z_max as float32, as its encoder has them for 100 and 10 m.
     assert bytes(found.data[:12]) == struct.pack("<iff", 0, 10_100.0, -1009.0)
     assert bytes(found.data[12:20]) == b"\x89PNG\r\n\x1a\n"
+
+
+def test_inverse_depth_is_read() -> None:
+    """As compressed_depth_image_transport makes it of 32FC1: q = 100, and 10 m at most."""
+    a = 100.0 * 101.0
+    b = 1.0 - a / 10.0
+    metres = np.array([[0.5, 2.0, 9.0]], np.float32)
+    steps = np.append(np.rint(a / metres + b), [[0.0]], axis=1).astype(np.uint16)
+    _, png = cv2.imencode(".png", steps)
+    data = np.frombuffer(HEAD.pack(0, a, b) + png.tobytes(), np.uint8)
+    message = SimpleNamespace(format="32FC1; compressedDepth png", data=data)
+    found = decode_compressed(message)
+    assert found[0, :3] == pytest.approx(metres[0], rel=5e-3)
+    assert np.isinf(found[0, 3])
+    for form, wrong in (("8UC1; compressedDepth", data), ("16UC1; compressedDepth", data[:12])):
+        with pytest.raises(ValueError, match="expected"):
+            decode_compressed(SimpleNamespace(format=form, data=wrong))

@@ -12,7 +12,6 @@ from nodes.ros_messages.images import (
     CloudWriter,
     CompressedWriter,
     ImageWriter,
-    make_header,
     read_depth,
     read_image,
 )
@@ -25,7 +24,7 @@ RANDOM = np.random.default_rng(0)
 def by_rosbags(encoding: str, data: np.ndarray, stamp: tuple[int, int], frame: str) -> bytes:
     store = samples.store()
     message = store.message(IMAGE)(
-        header=make_header(store, stamp, frame),
+        header=store.header(stamp, frame),
         height=data.shape[0],
         width=data.shape[1],
         encoding=encoding,

@@ -23,8 +23,7 @@ from events.rotations import normalize
 from nodes.ros2_bridge.settings import Subscription
 from nodes.ros_messages.calibration import camera_announcement
 from nodes.ros_messages.frame_names import FrameNames
-from nodes.ros_messages.images import make_header
-from nodes.ros_messages.incoming import READERS, Reading
+from nodes.ros_messages.incoming import READERS, MessageContext
 from nodes.ros_messages.messages import Messages
 from nodes.ros_messages.stamps import Stamps
 from tests.nodes.ros_messages import samples
@@ -56,7 +55,7 @@ def pose(
     qw, qx, qy, qz = wxyz
     return make(
         POSE,
-        header=make_header(samples.store(), stamp, frame_id),
+        header=samples.store().header(stamp, frame_id),
         pose=make(
             "geometry_msgs/msg/Pose",
             position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
@@ -65,9 +64,9 @@ def pose(
     )
 
 
-def read(message: Any, use: str, **reading: Any) -> Any:
-    given: dict[str, Any] = {"source": "s", "now": NOW} | reading
-    return READERS[message.__msgtype__, use](message, Reading(**given))
+def read(message: Any, use: str, **context: Any) -> Any:
+    given: dict[str, Any] = {"source": "s", "now": NOW} | context
+    return READERS[message.__msgtype__, use](message, MessageContext(**given))
 
 
 def test_a_pose_in_the_map_becomes_an_estimate_in_ned() -> None:
@@ -153,7 +152,7 @@ def test_a_stamped_twist_may_be_in_the_map() -> None:
         ("map", "map", (2.0, 1.0, -3.0)),
         ("base_link", "heading", (1.0, -2.0, -3.0)),
     ):
-        header = make_header(samples.store(), (3, 7), frame_id)
+        header = samples.store().header((3, 7), frame_id)
         event = read(make("geometry_msgs/msg/TwistStamped", header=header, twist=inner), "velocity")
         assert (event.frame_id, event.velocity, event.yaw_rate) == (frame, velocity, -0.5)
 
@@ -207,7 +206,7 @@ def test_optical_axes_stay_as_they_are(frame: str) -> None:
     assert event.angular_velocity == (twist.angular.x, twist.angular.y, twist.angular.z)
     measured = make(
         "sensor_msgs/msg/Imu",
-        header=make_header(samples.store(), (3, 7), frame),
+        header=samples.store().header((3, 7), frame),
         orientation=q,
         orientation_covariance=np.zeros(9),
         angular_velocity=vector(1.0, 2.0, 3.0),

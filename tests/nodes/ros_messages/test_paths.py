@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nodes.ros_messages.paths import Path
+from nodes.ros_messages.paths import PathMessage
 from tests.nodes.ros_messages import samples
 
 TYPE = "nav_msgs/msg/Path"
@@ -18,9 +18,11 @@ def read(data: bytearray) -> Any:
     return samples.store().deserialize(bytes(data), TYPE)
 
 
-def walked(count: int, *, frame: str = "map", step: float = 0.05, length: int = 1000) -> Path:
+def walked(
+    count: int, *, frame: str = "map", step: float = 0.05, length: int = 1000
+) -> PathMessage:
     """Return a path of so many steps of 10 cm along x, one each second."""
-    path = Path(samples.store(), frame, step, length)
+    path = PathMessage(samples.store(), frame, step, length)
     for n in range(count):
         if path.far((0.1 * n, 1.0, 2.0)):
             path.add((n, 5), (0.1 * n, 1.0, 2.0), TURN)
@@ -44,7 +46,10 @@ def test_a_path_has_the_bytes_that_rosbags_makes(frame: str, count: int) -> None
 
 def test_a_path_ends_where_the_body_is_and_says_no_place_twice() -> None:
     here = (0.3, 1.0, 2.0)
-    assert len(read(Path(samples.store(), "map", 0.05, 10).message((1, 0), here, TURN)).poses) == 1
+    assert (
+        len(read(PathMessage(samples.store(), "map", 0.05, 10).message((1, 0), here, TURN)).poses)
+        == 1
+    )
     path = walked(4)
     assert not path.far((0.34, 1.0, 2.0))
     assert len(read(path.message((4, 0), (0.34, 1.0, 2.0), TURN)).poses) == 5

@@ -1,7 +1,4 @@
-"""Which topics there will be, what they are called, and in which frames: from announcements.
-
-Pure: nothing here knows Zenoh or CDR.
-"""
+"""Which topics are published for what nodes announce: names, types and quality of service."""
 
 from __future__ import annotations
 
@@ -17,10 +14,10 @@ from events import (
     ImuAnnouncement,
     VehicleAnnouncement,
 )
-from nodes.ros2_bridge.settings import Kind, Ros2BridgeConfig
+from nodes.ros_messages.settings import PublishingConfig, TopicGroup
 from nodes.ros_messages.topics import Qos, ros_name, topic_name
 
-What = Literal[
+TopicKind = Literal[
     "image",
     "mono",
     "info",
@@ -46,44 +43,44 @@ What = Literal[
     "clock",
 ]
 
-NAMES: dict[What, tuple[str, str, Kind]] = {
+TOPICS: dict[TopicKind, tuple[str, str, TopicGroup]] = {
     "image": ("{}/image_raw", "sensor_msgs/msg/Image", "images"),
     "mono": ("{}/image_mono", "sensor_msgs/msg/Image", "images"),
     "info": ("{}/camera_info", "sensor_msgs/msg/CameraInfo", "images"),
     "compressed": ("{}/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "images"),
-    "depth": ("{}/depth/image_raw", "sensor_msgs/msg/Image", "depth"),
-    "depth_info": ("{}/depth/camera_info", "sensor_msgs/msg/CameraInfo", "depth"),
+    "depth": ("{}/depth/image_raw", "sensor_msgs/msg/Image", "depth_images"),
+    "depth_info": ("{}/depth/camera_info", "sensor_msgs/msg/CameraInfo", "depth_images"),
     "compressed_depth": (
         "{}/depth/image_raw/compressedDepth",
         "sensor_msgs/msg/CompressedImage",
-        "depth",
+        "depth_images",
     ),
-    "segmentation": ("{}/segmentation/image_raw", "sensor_msgs/msg/Image", "segmentation"),
-    "cloud": ("{}/points", "sensor_msgs/msg/PointCloud2", "clouds"),
+    "segmentation": ("{}/segmentation/image_raw", "sensor_msgs/msg/Image", "segmentation_images"),
+    "cloud": ("{}/points", "sensor_msgs/msg/PointCloud2", "point_clouds"),
     "imu": ("{}/imu", "sensor_msgs/msg/Imu", "imu"),
     "odometry": ("{}/odom", "nav_msgs/msg/Odometry", "odometry"),
-    "pose": ("{}/pose", "geometry_msgs/msg/PoseStamped", "poses"),
+    "pose": ("{}/pose", "geometry_msgs/msg/PoseStamped", "camera_poses"),
     "estimate": ("{}/pose", "geometry_msgs/msg/PoseStamped", "estimates"),
     "score": ("scores/{}", "std_msgs/msg/Float64", "scores"),
     "range": ("{}/range", "sensor_msgs/msg/Range", "ranges"),
     "pressure": ("{}/pressure", "sensor_msgs/msg/FluidPressure", "pressures"),
     "magnetic": ("{}/mag", "sensor_msgs/msg/MagneticField", "magnetic_fields"),
     "fix": ("{}/fix", "sensor_msgs/msg/NavSatFix", "fixes"),
-    "lidar": ("{}/lidar", "sensor_msgs/msg/PointCloud2", "lidars"),
+    "lidar": ("{}/lidar", "sensor_msgs/msg/PointCloud2", "lidar_scans"),
     "path": ("{}/path", "nav_msgs/msg/Path", "paths"),
-    "tf": ("/tf", "tf2_msgs/msg/TFMessage", "tf"),
-    "tf_static": ("/tf_static", "tf2_msgs/msg/TFMessage", "tf"),
+    "tf": ("/tf", "tf2_msgs/msg/TFMessage", "transforms"),
+    "tf_static": ("/tf_static", "tf2_msgs/msg/TFMessage", "transforms"),
     "clock": ("/clock", "rosgraph_msgs/msg/Clock", "clock"),
 }
 
-_QOS: dict[What, Qos] = {
+_QOS: dict[TopicKind, Qos] = {
     "tf": Qos(depth=100),
     "tf_static": Qos(depth=1, transient_local=True),
     "clock": Qos(depth=1, reliable=False),
     "path": Qos(depth=1),
 }
 
-_SENSORS: set[What] = {
+_SENSORS: set[TopicKind] = {
     "image", "mono", "info", "compressed", "depth", "depth_info", "compressed_depth",
     "segmentation", "lidar", "imu", "range", "pressure", "magnetic", "fix"
 }  # fmt: skip
@@ -94,72 +91,72 @@ class Publication(msgspec.Struct, frozen=True, kw_only=True):
     """A topic to publish.
 
     Attributes:
-        what: Kind of message.
+        kind: Kind of message.
         source: Of the events that become its messages.
         topic: Full name.
         type: Of its messages.
         qos: Quality of service.
     """
 
-    what: What
+    kind: TopicKind
     source: str
     topic: str
     type: str
     qos: Qos
 
 
-def publication(what: What, source: str, config: Ros2BridgeConfig) -> Publication | None:
-    """Return the topic for what a source says; `None` if it is not to be published."""
-    pattern, type_, kind = NAMES[what]
-    if kind not in config.publish or (what == "clock" and config.time == "wall"):
+def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Publication | None:
+    """Return the topic for the events of a source; `None` if it is not to be published."""
+    pattern, type_, group = TOPICS[kind]
+    if group not in config.publish or (kind == "clock" and config.time == "wall"):
         return None
     name = pattern.format(ros_name(source))
-    if what == "imu" and name.endswith("/imu/imu"):
+    if kind == "imu" and name.endswith("/imu/imu"):
         name = name.removesuffix("/imu")
     full = topic_name(config.namespace, name)
     given = config.topics.get(full, config.topics.get(name))
-    if what == "estimate" and config.covariance:
+    if kind == "estimate" and config.covariance:
         type_ = "geometry_msgs/msg/PoseWithCovarianceStamped"
     sensors = Qos(depth=5, reliable=config.sensor_qos == "reliable")
     return Publication(
-        what=what,
+        kind=kind,
         source=source,
         topic=full if given is None else topic_name(config.namespace, given),
         type=type_,
-        qos=sensors if what in _SENSORS else _QOS.get(what, Qos()),
+        qos=sensors if kind in _SENSORS else _QOS.get(kind, Qos()),
     )
 
 
-def announced(announcement: Announcement, config: Ros2BridgeConfig) -> Iterator[Publication]:
+def announced_topics(announcement: Announcement, config: PublishingConfig) -> Iterator[Publication]:
     """Yield the topics for what a node announced."""
-    whats: list[What] = []
+    kinds: list[TopicKind] = []
     match announcement:
         case CameraAnnouncement(images=images):
-            whats = [*camera_topics(images, config), "pose"]
+            kinds = [*camera_topics(images, config), "pose"]
         case ImuAnnouncement():
-            whats = ["imu"]
+            kinds = ["imu"]
         case VehicleAnnouncement():
-            whats = ["odometry", "path"]
+            kinds = ["odometry", "path"]
         case EstimatorAnnouncement():
-            whats = ["estimate", "path"]
-    for what in whats:
-        if found := publication(what, announcement.source, config):
+            kinds = ["estimate", "path"]
+    for kind in kinds:
+        if found := publication(kind, announcement.source, config):
             yield found
 
 
-def camera_topics(images: tuple[str, ...], config: Ros2BridgeConfig) -> Iterator[What]:
+def camera_topics(images: tuple[str, ...], config: PublishingConfig) -> Iterator[TopicKind]:
     """Yield the topics for the images that a camera gives."""
     if "rgb" in images or "grey" in images:
         yield "info"
-        if config.raw:
+        if config.raw_images:
             yield "image"
             if "rgb" in images and "grey" in images:
                 yield "mono"
-        if config.compressed:
+        if config.compressed_images:
             yield "compressed"
     if "depth" in images:
         yield "depth_info"
-        if config.raw or not config.compressed_depth:
+        if config.raw_depth:
             yield "depth"
         if config.compressed_depth:
             yield "compressed_depth"

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
 from events import Announcement, DepthImage, Event, Image
 from nodes.mcap import native
-from nodes.mcap.arrays import decoded
 from nodes.mcap.mcap_file import McapWriter
+from nodes.mcap_recorder.event_writer import EventWriter
 from nodes.mcap_recorder.settings import McapRecorderConfig
-from nodes.mcap_recorder.topics import Topics, in_millimetres
 from nodes.replay.recorded import Recorded
-from nodes.ros_messages.depth import DEPTH_HEAD
 from runtime.wire import pack
 from tests.nodes.mcap_recorder.samples import announcements, depth, image, odometry, said, same
 
@@ -29,7 +25,7 @@ def record(path: Path, events: list[Event], **settings: Any) -> list[str]:
     """Write events, each published 40 ms after its stamp; return complaints."""
     complaints: list[str] = []
     writer = McapWriter(path)
-    topics = Topics(writer, McapRecorderConfig(**settings), complaints.append)
+    topics = EventWriter(writer, McapRecorderConfig(**settings), complaints.append)
     for event in events:
         announced = isinstance(event, Announcement)
         time = 0 if announced else event.stamp + 40_000_000
@@ -130,29 +126,6 @@ def test_jpeg_and_millimetres_lose_what_they_must(tmp_path: Path) -> None:
     topics = messages(path)
     assert topics["/drone/front/image_raw/compressed"][0].format.startswith("rgb8; jpeg")
     assert topics["/drone/front/depth/image_raw/compressedDepth"][0].format.startswith("16UC1;")
-
-
-def test_inverse_depth_is_read() -> None:
-    """As compressed_depth_image_transport makes it of 32FC1: q = 100, and 10 m at most."""
-    a = 100.0 * 101.0
-    b = 1.0 - a / 10.0
-    metres = np.array([[0.5, 2.0, 9.0]], np.float32)
-    steps = np.append(np.rint(a / metres + b), [[0.0]], axis=1).astype(np.uint16)
-    _, png = cv2.imencode(".png", steps)
-    data = np.frombuffer(DEPTH_HEAD.pack(0, a, b) + png.tobytes(), np.uint8)
-    message = SimpleNamespace(format="32FC1; compressedDepth png", data=data)
-    found = decoded(message)
-    assert found[0, :3] == pytest.approx(metres[0], rel=5e-3)
-    assert np.isinf(found[0, 3])
-    for form, wrong in (("8UC1; compressedDepth", data), ("16UC1; compressedDepth", data[:12])):
-        with pytest.raises(ValueError, match="expected"):
-            decoded(SimpleNamespace(format=form, data=wrong))
-
-
-def test_millimetres_are_rounded_and_bounded() -> None:
-    """0 stands for none: too near, too far, or not known."""
-    metres = np.array([[0.0004, 0.0006, 65.535, 65.536, np.inf, np.nan]], np.float32)
-    assert in_millimetres(metres).tolist() == [[0, 1, 65535, 0, 0, 0]]
 
 
 def test_an_event_that_ros_cannot_have_is_recorded_nevertheless(tmp_path: Path) -> None:
