@@ -18,10 +18,10 @@ from collections.abc import Callable, Collection
 from runtime.tools.monitor.http import LONGEST_HEAD, HttpError, host_of, parse_head, response
 
 MOST = 64
-"""Viewers at a time, those included that have yet to say what they want."""
+"""Viewers at a time, those included that have yet to send their request."""
 
-_PATIENCE = 10.0
-"""Real seconds in which a viewer has to say it."""
+_HEAD_TIMEOUT = 10.0
+"""Real seconds in which a viewer has to send its request."""
 
 _PART = 1 << 16
 
@@ -32,14 +32,14 @@ def hidden_host() -> str:
 
 
 class Gate:
-    """Lets in viewers of the right origin, and passes on what they and the server say.
+    """Lets in viewers of the right origin, and passes bytes between them and the server.
 
     Args:
         host: Where to listen.
         port: The same; 0 for any that is free.
         inside: Host and port of the server.
         origins: Pages that may connect. Programs that are no browsers name none, and may.
-        refused: Told, in a thread, why somebody was not let in.
+        refused: Called, in a thread, with why somebody was not let in.
 
     Raises:
         OSError: It cannot listen there.
@@ -119,7 +119,7 @@ class Gate:
     def _serve(self, viewer: socket.socket) -> None:
         server = socket.socket()
         try:
-            viewer.settimeout(_PATIENCE)
+            viewer.settimeout(_HEAD_TIMEOUT)
             try:
                 head, rest = _read_head(viewer)
                 self.check(head.decode("latin-1"))

@@ -22,10 +22,10 @@ from events import (
     TrackingLost,
     Vector3,
 )
-from nodes.foxglove_server.scene import Colour, Trail
-from nodes.viewing.images import jpeg
-
-SECOND = 1_000_000_000
+from nodes.foxglove_server.scene import Trail
+from nodes.viewing.appearance import INLIER, OUTLIER, VEHICLE, Colour, describe
+from nodes.viewing.encoding import depth_in_steps, encode_image
+from runtime.schedule import SECOND
 
 _VECTOR = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyz"}}
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
@@ -45,8 +45,6 @@ SCORE_SCHEMA = {
     "type": "object",
     "properties": {"timestamp": _TIME, "value": {"type": "number"}, "unit": {"type": "string"}},
 }
-
-_INLIER, _OUTLIER = (0.3, 1.0, 0.4), (1.0, 0.3, 0.2)
 
 
 class Messages:
@@ -111,7 +109,7 @@ class Messages:
         return self._m.CompressedImage(
             timestamp=self._time(event.stamp),
             frame_id=event.frame_id,
-            data=jpeg(event.data, quality),
+            data=encode_image(event.data, "jpeg", quality).tobytes(),
             format="jpeg",
         )
 
@@ -121,9 +119,7 @@ class Messages:
 
     def depth(self, event: DepthImage) -> Any:
         """Return a RawImage in millimetres; 0 where there is no depth, or more than 65.5 m."""
-        steps = event.data * np.float32(1000.0)
-        steps = np.where((steps >= 0) & (steps <= 65535), steps, 0.0).round()
-        return self._raw(event, steps.astype("<u2"), "16UC1")
+        return self._raw(event, depth_in_steps(event.data, 1000.0).astype("<u2"), "16UC1")
 
     def cloud(self, event: PointCloud, frame_id: str) -> Any:
         """Return a PointCloud; `frame_id` is what its frame is called."""
@@ -156,7 +152,7 @@ class Messages:
                 fill_color=self._colour(colour),
                 thickness=4.0,
             )
-            for chosen, colour in ((event.inliers, _INLIER), (~event.inliers, _OUTLIER))
+            for chosen, colour in ((event.inliers, INLIER), (~event.inliers, OUTLIER))
         ]
         return self._m.ImageAnnotations(points=groups)
 
@@ -175,14 +171,11 @@ class Messages:
 
     def log(self, event: Event) -> Any:
         """Return a Log."""
-        text = type(event).__name__
-        if more := getattr(event, "reason", "") or getattr(event, "other", ""):
-            text += f" ({more})"
         levels = self._m.LogLevel
         return self._m.Log(
             timestamp=self._time(event.stamp),
             level=levels.Warning if isinstance(event, TrackingLost) else levels.Info,
-            message=text,
+            message=describe(event),
             name=event.source,
         )
 
@@ -202,17 +195,13 @@ class Messages:
 
     def vehicle(self, name: str, frame_id: str) -> Any:
         """Return a body with four rotors as a SceneEntity that goes where its frame goes."""
-        rotors = [(x, y, -0.03) for x in (-0.14, 0.14) for y in (-0.14, 0.14)]
-        parts = [((0.0, 0.0, 0.0), (0.2, 0.12, 0.07), (0.8, 0.8, 0.82))]
-        parts += [((0.09, 0.0, 0.0), (0.06, 0.06, 0.04), (0.9, 0.3, 0.27))]
-        parts += [(rotor, (0.18, 0.18, 0.012), (0.35, 0.37, 0.43)) for rotor in rotors]
         cubes = [
             self._m.CubePrimitive(
                 pose=self._pose(centre, (1.0, 0.0, 0.0, 0.0)),
                 size=self._vector(size),
                 color=self._colour(colour),
             )
-            for centre, size, colour in parts
+            for centre, size, colour in VEHICLE
         ]
         return self._m.SceneEntity(frame_id=frame_id, id=name, frame_locked=True, cubes=cubes)
 
@@ -243,7 +232,7 @@ class Messages:
 
     def _colour(self, colour: Colour) -> Any:
         r, g, b = colour
-        return self._m.Color(r=r, g=g, b=b, a=1.0)
+        return self._m.Color(r=r / 255, g=g / 255, b=b / 255, a=1.0)
 
     def _time(self, stamp: int) -> Any:
         return self._m.Timestamp(sec=stamp // SECOND, nsec=stamp % SECOND)

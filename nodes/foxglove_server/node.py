@@ -1,4 +1,4 @@
-"""The server as a node: what it hears, and where that is passed on."""
+"""The server as a node: which events it takes, and where they are passed on."""
 
 from __future__ import annotations
 
@@ -27,13 +27,12 @@ from events import (
 from nodes.foxglove_server.publishing import Publishing
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
-from nodes.viewing.images import Thinning
+from nodes.viewing.selection import ImageSelection
 from runtime import Node, Stream, Tick, every, on
 from runtime.errors import MissingDependencyError, VisnavError
 
 WAITING = 8
-"""Pictures of one kind that wait to be passed on; the oldest is dropped, and counted."""
-
+"""Images of one kind that wait to be passed on; the oldest is dropped, and counted."""
 
 _REFUSALS = 10
 """Different ones that are logged."""
@@ -48,15 +47,15 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         name = "foxglove"
         type = "nodes.foxglove_server:FoxgloveServer"
 
-    What is announced has its topics from the start; what is not, from its first event. Who begins
-    to look late gets calibrations, fixed transforms, clouds and the paths flown so far.
+    What is announced has its topics from the start; what is not, from its first event. A viewer
+    that connects late gets calibrations, fixed transforms, clouds and the paths flown so far.
     """
 
     def __init__(self) -> None:
         self._server: Server | None = None
         self._publishing: Publishing | None = None
-        self._thinning = Thinning(self.config.picture_rate)
-        self._lanes: dict[type[Event], Stream[Any]] = {
+        self._selection = ImageSelection(self.config.image_rate)
+        self._queues: dict[type[Event], Stream[Any]] = {
             kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
             for kind in (Image, DepthImage, TrackedFeatures, PointCloud)
         }
@@ -89,21 +88,21 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         self._small: dict[type[Event], Callable[[Any], None]] = {
             Odometry: publishing.odometry,
             PoseEstimate: publishing.estimate,
-            PoseStamped: publishing.placed,
+            PoseStamped: publishing.camera_pose,
             Imu: publishing.imu,
             Score: publishing.score,
-            PlannedPose: publishing.planned,
-            PositionSetpoint: publishing.planned,
+            PlannedPose: publishing.plan,
+            PositionSetpoint: publishing.plan,
         }
         self.log.info("open %s in Foxglove", server.address)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Declare the topics for what will be said."""
+        """Declare the topics of what is announced."""
         if self._publishing is not None:
             self._publishing.announced(announcement)
 
     async def run(self) -> None:
-        """Pass on pictures and clouds beside the loop, each kind in order."""
+        """Pass on images and point clouds beside the loop, each kind in order."""
         publishing = self._publishing
         assert publishing is not None
         large: dict[type[Event], Callable[[Any], None]] = {
@@ -113,37 +112,37 @@ class FoxgloveServer(Node[FoxgloveConfig]):
             PointCloud: publishing.cloud,
         }
         for kind, put in large.items():
-            self.start(self._lane(self._lanes[kind], put))
+            self.start(self._pass_on(self._queues[kind], put))
 
     async def on_shutdown(self) -> None:
         """Stop listening."""
         if self._server is not None:
             await self.offload(self._server.close)
-        if dropped := sum(lane.dropped for lane in self._lanes.values()):
-            self.log.warning("%d pictures dropped: they came faster than they could go", dropped)
+        if dropped := sum(queue.dropped for queue in self._queues.values()):
+            self.log.warning("%d images dropped: they came faster than they could go", dropped)
 
     @on(Image, DepthImage)
-    def pictured(self, event: Image | DepthImage) -> None:
-        """Have some pictures passed on."""
+    def images(self, event: Image | DepthImage) -> None:
+        """Pass on some images, beside the loop."""
         kind = Image if isinstance(event, Image) else DepthImage
         if kind is DepthImage and not self.config.depth:
             return
-        if self._thinning.picture(kind.__name__, event.source, event.frame_id, event.stamp):
-            self._lanes[kind].offer(event)
+        if self._selection.select(kind.__name__, event.source, event.frame_id, event.stamp):
+            self._queues[kind].offer(event)
 
     @on(TrackedFeatures)
-    def followed(self, event: TrackedFeatures) -> None:
-        """Have the features of those pictures passed on."""
-        if self._thinning.belongs(event.frame_id, event.stamp):
-            self._lanes[TrackedFeatures].offer(event)
+    def features(self, event: TrackedFeatures) -> None:
+        """Pass on the features of those images."""
+        if self._selection.selected(event.frame_id, event.stamp):
+            self._queues[TrackedFeatures].offer(event)
 
     @on(PointCloud)
-    def mapped(self, event: PointCloud) -> None:
-        """Have a cloud passed on."""
-        self._lanes[PointCloud].offer(event)
+    def point_clouds(self, event: PointCloud) -> None:
+        """Pass on a point cloud."""
+        self._queues[PointCloud].offer(event)
 
     @on(Odometry, PoseEstimate, PoseStamped, Imu, Score, PlannedPose, PositionSetpoint)
-    def said(self, event: Event) -> None:
+    def measurements(self, event: Event) -> None:
         """Pass on what is small, at once."""
         kind = type(event)
         put = self._small.get(kind) or next(
@@ -152,17 +151,17 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         put(event)
 
     @on(TrackingEvent, VehicleEvent)
-    def happened(self, event: Event) -> None:
-        """Tell it in words."""
+    def log_events(self, event: Event) -> None:
+        """Put an event into the viewers' log, in words."""
         if self._publishing is not None:
-            self._publishing.happened(event)
+            self._publishing.logged(event)
 
-    @every(hz="time_rate")
-    def tell_time(self, tick: Tick) -> None:  # noqa: ARG002
-        """Tell viewers the run's time."""
+    @every(hz="clock_rate")
+    def send_time(self, tick: Tick) -> None:  # noqa: ARG002
+        """Send the run's time to viewers."""
         if self._server is not None:
-            self._server.tell_time(self.clock.now())
+            self._server.send_time(self.clock.now())
 
-    async def _lane(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
+    async def _pass_on(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
         async for event in events:
             await self.offload(put, event)

@@ -1,15 +1,13 @@
 """Topics by source, and which message an event becomes.
 
-Pictures and clouds are put from threads beside the loop, one of each kind at a time; the rest takes
-some microseconds and is put at once. A frame ``world``, z up, is above ``map``, for viewers that
-have no other up.
+Images and point clouds are put from threads beside the loop, one of each kind at a time; the
+rest takes some microseconds and is put at once. A frame ``world``, z up, is above ``map``, for
+viewers that have no other up.
 """
 
 from __future__ import annotations
 
 from typing import Any
-
-import numpy as np
 
 from events import (
     Announcement,
@@ -32,12 +30,14 @@ from events import (
     Vector3,
     VehicleAnnouncement,
 )
-from events.poses import pose_matrix, pose_tuples
 from nodes.evaluation.live import RecentTruth
 from nodes.foxglove_server.messages import IMU_SCHEMA, SCORE_SCHEMA, Messages
-from nodes.foxglove_server.scene import ESTIMATES, PLAN, TRUTH, Colour, Trail
+from nodes.foxglove_server.scene import Trail
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
+from nodes.viewing.appearance import PLAN, TRUTH, Colour, estimate_colour
+from nodes.viewing.estimates import estimate_frame
+from nodes.viewing.selection import PlanSelection
 
 _MAP_IN_WORLD: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
 """North, east, down in east, north, up."""
@@ -56,7 +56,7 @@ class Publishing:
         self._config = config
         self._make = Messages(server.types)
         self._cameras: dict[str, CameraAnnouncement] = {}  # by source
-        self._frames: dict[str, str] = {}  # sources of pictures, by optical frame
+        self._frames: dict[str, str] = {}  # sources of images, by optical frame
         self._bodies: dict[str, str] = {}  # frames, by vehicle
         self._estimators: dict[str, str] = {}  # parent frames, by source
         self._renamed: dict[str, str] = {}  # the same by what the estimators call them
@@ -64,7 +64,7 @@ class Publishing:
         self._trails: dict[str, Trail] = {}
         self._drawn: list[Any] = []
         self._static: list[Any] = []
-        self._planned_by: type[Event] | None = None
+        self._plan = PlanSelection()
         for topic, kind in (
             ("/tf", "FrameTransforms"),
             ("/tf_static", "FrameTransforms"),
@@ -97,11 +97,11 @@ class Publishing:
         calibration = self._make.calibration(camera)
         server.declare(f"{topic}/camera_info", "CameraCalibration")
         server.latch(f"{topic}/camera_info", lambda: calibration, camera.stamp)
-        for kind in camera.images if self._config.picture_rate else ():
+        for kind in camera.images if self._config.image_rate else ():
             if kind == "grey" and "rgb" in camera.images:
-                server.declare(*self._picture(f"{camera.source}/grey"))
+                server.declare(*self._image_topic(f"{camera.source}/grey"))
             elif kind in ("rgb", "grey"):
-                server.declare(*self._picture(camera.source))
+                server.declare(*self._image_topic(camera.source))
             elif kind == "depth" and self._config.depth:
                 server.declare(f"{topic}/depth", "RawImage")
         if (parent := camera.parent_frame_id) != "map":
@@ -110,9 +110,9 @@ class Publishing:
     # Beside the loop.
 
     def image(self, event: Image) -> None:
-        """Put a picture."""
+        """Put an image."""
         self._frames.setdefault(event.frame_id, event.source)
-        topic, type_ = self._picture(event.source)
+        topic, type_ = self._image_topic(event.source)
         self._server.declare(topic, type_)
         if self._server.wanted(topic):
             quality = self._config.jpeg_quality
@@ -128,7 +128,7 @@ class Publishing:
             self._server.log(topic, self._make.depth(event), event.stamp)
 
     def features(self, event: TrackedFeatures) -> None:
-        """Put what an estimator followed in a picture."""
+        """Put the features that an estimator tracks in an image."""
         if (camera := self._frames.get(event.frame_id)) is None:
             return
         topic = f"{_topic(camera)}/features{_topic(event.source)}"
@@ -137,7 +137,7 @@ class Publishing:
             self._server.log(topic, self._make.features(event), event.stamp)
 
     def cloud(self, event: PointCloud) -> None:
-        """Put a cloud; the newest is for those, too, who look later."""
+        """Put a point cloud; viewers that connect later get the newest."""
         topic = f"{_topic(event.source)}/cloud"
         self._server.declare(topic, "PointCloud")
         message = self._make.cloud(event, self._renamed.get(event.frame_id, event.frame_id))
@@ -169,17 +169,15 @@ class Publishing:
         self._server.log(topic, self._make.pose(event, parent), stamp)
         body = f"{source}/{event.child_frame_id}"
         self._move(stamp, parent, body, event.position, event.orientation)
-        colour = ESTIMATES[list(self._estimators).index(source) % len(ESTIMATES)]
+        colour = estimate_colour(list(self._estimators).index(source))
         self._extend(f"estimate/{source}", parent, colour, stamp, event.position)
 
-    def planned(self, event: PlannedPose | PositionSetpoint) -> None:
-        """Draw where a vehicle is meant to be; set-points only if nobody tells the plan itself."""
-        if self._planned_by is not PlannedPose:
-            self._planned_by = type(event)
-        if isinstance(event, self._planned_by):
+    def plan(self, event: PlannedPose | PositionSetpoint) -> None:
+        """Draw where a vehicle is meant to be."""
+        if self._plan.select(event):
             self._extend("plan", "map", PLAN, event.stamp, event.position)
 
-    def placed(self, event: PoseStamped) -> None:
+    def camera_pose(self, event: PoseStamped) -> None:
         """Put where a free camera is."""
         camera = self._cameras.get(event.source)
         if camera is not None and camera.parent_frame_id == "map":
@@ -198,11 +196,11 @@ class Publishing:
         self._server.declare_json(topic, SCORE_SCHEMA)
         self._server.log(topic, self._make.score(event), event.stamp)
 
-    def happened(self, event: Event) -> None:
-        """Put an event that is worth a word."""
+    def logged(self, event: Event) -> None:
+        """Put an event into the log, in words."""
         self._server.log("/log", self._make.log(event), event.stamp)
 
-    # What they share.
+    # What these share.
 
     def _vehicle(self, source: str, frame_id: str) -> str:
         """Return a vehicle's frame: the first has its own, others have their name before it."""
@@ -215,15 +213,13 @@ class Publishing:
         return body
 
     def _parent_of(self, event: PoseEstimate) -> str:
-        """Return the frame that an estimator works in, laid on the truth if it is its own."""
+        """Return the frame that an estimator works in, aligned with the truth if it is its own."""
         if event.frame_id == "map":
             return "map"
         frame_id = f"{event.source}/{event.frame_id}"
         self._renamed.setdefault(event.frame_id, frame_id)
-        if (truth := self._truth.at(event.stamp)) is not None:
-            said = pose_matrix(event.position, event.orientation)
-            laid = pose_tuples(pose_matrix(*truth) @ np.linalg.inv(said))
-            self._fix(event.stamp, "map", frame_id, *laid)
+        if (frame := estimate_frame(event, self._truth)) is not None:
+            self._fix(event.stamp, "map", frame_id, *frame)
         return frame_id
 
     def _fix(self, stamp: int, parent: str, child: str, at: Vector3, turned: Quaternion) -> None:
@@ -248,7 +244,7 @@ class Publishing:
             self._server.log("/scene", self._make.scene(self._make.line(trail, *piece)), stamp)
 
     def _whole_scene(self) -> Any:
-        """Return all that is drawn, for those who begin to look; in any thread."""
+        """Return all that is drawn, for a viewer that connects; in any thread."""
         lines = [
             self._make.line(trail, name, piece)
             for trail in list(self._trails.values())
@@ -256,8 +252,8 @@ class Publishing:
         ]
         return self._make.scene(*list(self._drawn), *lines)
 
-    def _picture(self, source: str) -> tuple[str, str]:
-        """Return the topic of pictures, and its type.
+    def _image_topic(self, source: str) -> tuple[str, str]:
+        """Return the topic of images, and its type.
 
         A camera with both ``rgb`` and ``grey`` sends the grey ones as ``<source>/grey``.
         """

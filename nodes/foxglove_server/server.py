@@ -17,7 +17,7 @@ from runtime.errors import MissingDependencyError, VisnavError
 Make = Callable[[], Any]
 """Returns a message."""
 
-_PATIENCE = 2.0
+_CLOSING = 2.0
 """Real seconds that viewers have to go."""
 
 
@@ -27,7 +27,7 @@ class Server:
     Args:
         config: Where to listen.
         name: As viewers show it.
-        refused: Told, in a thread, why somebody was not let in.
+        refused: Called, in a thread, with why somebody was not let in.
 
     Raises:
         MissingDependencyError: foxglove is not installed.
@@ -103,8 +103,8 @@ class Server:
         if self.wanted(topic):
             self.log(topic, make(), stamp)
 
-    def tell_time(self, now: int) -> None:
-        """Tell the run's time (ns)."""
+    def send_time(self, now: int) -> None:
+        """Send the run's time (ns)."""
         self._server.broadcast_time(now)
 
     def close(self) -> None:
@@ -115,7 +115,7 @@ class Server:
         """
         stopping = threading.Thread(target=self._server.stop, name="foxglove stops", daemon=True)
         stopping.start()
-        stopping.join(_PATIENCE)
+        stopping.join(_CLOSING)
         self._gate.close()
 
     def _subscribed(self, topic: str) -> None:

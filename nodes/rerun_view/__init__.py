@@ -1,9 +1,9 @@
 """Rerun: a run in three dimensions, live or in a file (`pip install 'visnav-runtime[rerun]'`).
 
-Read in this order: `settings` (what the file says), `node` (what is heard, and how much of it),
-`entities` (where things stand in Rerun's tree), `pictures` and `paths` (what is done to them
-first), `recorder` (what becomes of each event; lives in a process of its own), `layout` (what the
-viewer shows at first), `sdk` (the only import of rerun, and its servers).
+Read in this order: `settings`, `node` (which events it takes, and how many), `recorder` (what
+becomes of each event; lives in a process of its own), `world` and `plots` (what it logs),
+`entities` (where things are in Rerun's tree), `entity_log`, `scene_points` (depth images as
+points), `layout` (what the viewer shows at first), `sdk` (the only import of rerun).
 """
 
 from nodes.rerun_view.node import RerunView

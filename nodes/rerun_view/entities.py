@@ -2,13 +2,13 @@
 
 map                        the world: x north, y east, z down
 map/<vehicle>              a vehicle's body, where it truly is
-map/<vehicle>/<camera>     one of its cameras (optical frame), with its pictures below
+map/<vehicle>/<camera>     one of its cameras (optical frame), with its images below
 map/cameras/<camera>       a free camera
 map/truth/<vehicle>        the path it has truly flown
 map/plan                   the path it was meant to fly
 map/estimates/<estimator>  the frame an estimator works in; its path and newest pose below
-pictures/<camera>          pictures of a camera that nobody announced
-map/clouds/<node>          clouds; map/seen/<camera>: points of depth images
+images/<camera>            images of a camera that nobody announced
+map/clouds/<node>          clouds; map/points/<camera>: points of depth images
 …/cloud/<node>             clouds in the frame of a body, a camera or an estimator
 imu, scores, log           plots and text
 """
@@ -51,9 +51,9 @@ def estimated_path(estimator: str) -> str:
     return f"{estimate(estimator)}/path"
 
 
-def seen(camera: str) -> str:
-    """Return where the points are that a camera saw."""
-    return path(WORLD, "seen", camera)
+def points(camera: str) -> str:
+    """Return where the points of a camera's depth images are."""
+    return path(WORLD, "points", camera)
 
 
 def cloud(source: str) -> str:
@@ -71,9 +71,9 @@ def imu(source: str, what: str) -> str:
     return path("imu", what, source)
 
 
-def pictures(source: str) -> str:
-    """Return where the pictures are of a camera of which nothing else is known."""
-    return path("pictures", source)
+def images(source: str) -> str:
+    """Return where the images are of a camera of which nothing else is known."""
+    return path("images", source)
 
 
 def camera(announced: CameraAnnouncement, vehicles: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""What the viewer shows at first: the world large, pictures beside it, plots below."""
+"""What the viewer shows at first: the world large, images beside it, plots below."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Eye = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Where the eye is and what it looks at, metres in ``map``."""
 
 _SHOWN = 2
-"""Cameras whose pictures have a place of their own; those of more share tabs."""
+"""Cameras whose images have a place of their own; those of more share tabs."""
 
 
 class Contents(msgspec.Struct):
@@ -39,7 +39,7 @@ def layout(rrb: Any, contents: Contents) -> Any:
         contents: What there is.
     """
     above = [_world(rrb, contents)]
-    if views := _pictures(rrb, contents):
+    if views := _images(rrb, contents):
         above.append(rrb.Vertical(*views))
     rows = [rrb.Horizontal(*above, column_shares=[2.4, 1.0][: len(above)])]
     if contents.plots:
@@ -65,7 +65,7 @@ def _world(rrb: Any, contents: Contents) -> Any:
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=(0, 0, -1)
         )
-    # Pictures of depth in the world would be clouds of their own, and features would float. But a
+    # Depth images in the world would be clouds of their own, and features would float. But a
     # camera that has nothing else is shown by its depth.
     hidden = [
         f"- /{camera}/{kind}/**"
@@ -84,7 +84,7 @@ def _world(rrb: Any, contents: Contents) -> Any:
     )
 
 
-def _pictures(rrb: Any, contents: Contents) -> list[Any]:
+def _images(rrb: Any, contents: Contents) -> list[Any]:
     cameras = [_camera(rrb, entity, kinds) for entity, kinds in contents.cameras.items() if kinds]
     if len(cameras) > _SHOWN:
         return [rrb.Tabs(*(rrb.Vertical(*views, name=name) for name, views in cameras))]

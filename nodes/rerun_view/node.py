@@ -1,4 +1,4 @@
-"""The view as a node: what it hears, how much of that it keeps, and when it passes it on."""
+"""The view as a node: which events it takes, how many of them, and when it passes them on."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from events import (
     TrackingEvent,
     VehicleEvent,
 )
+from nodes.rerun_view.entity_log import Numbered
 from nodes.rerun_view.recorder import Recorder
-from nodes.rerun_view.recording import Numbered
 from nodes.rerun_view.settings import RerunConfig
 from nodes.trajectory.growing import part_name
-from nodes.viewing.images import Thinning
+from nodes.viewing.selection import ImageSelection
 from runtime import Node, Stream, on
 
-_PICTURES, _ROWS = 256, 16384
-"""What waits to be passed on: pictures and clouds, and the rest. In lockstep time waits for the
+_LARGE, _SMALL = 256, 16384
+"""Events that wait to be passed on: images and clouds, and the rest. In lockstep time waits for the
 recorder, and nothing ever has to be dropped; in real time the oldest is, and counted."""
 
 _PACK = 2048
@@ -46,9 +46,9 @@ class RerunView(Node[RerunConfig]):
         name = "view"
         type = "nodes.rerun_view:RerunView"
 
-    The world, vehicles, cameras with their pictures, paths, estimates, clouds, errors and IMU have
-    their places in a layout that needs no arranging. First in the file, it also hears what others
-    say as they end, such as the cloud of a mapping.
+    The world, vehicles, cameras with their images, paths, estimates, clouds, errors and IMU have
+    their places in a layout that needs no arranging. First in the file, it also gets the events
+    that other nodes send as they end, such as the cloud of a mapping.
     """
 
     def __init__(self) -> None:
@@ -56,11 +56,9 @@ class RerunView(Node[RerunConfig]):
         self._heard = 0
         self._recorder: Any = None
         self._begun = False
-        self._thinning = Thinning(self.config.picture_rate)
-        self._pictures: Stream[Numbered[Event]] = Stream(
-            f"{self.name}.pictures", _PICTURES, "drop_oldest"
-        )
-        self._rows: Stream[Numbered[Event]] = Stream(f"{self.name}.rows", _ROWS, "drop_oldest")
+        self._selection = ImageSelection(self.config.image_rate)
+        self._large: Stream[Numbered[Event]] = Stream(f"{self.name}.large", _LARGE, "drop_oldest")
+        self._small: Stream[Numbered[Event]] = Stream(f"{self.name}.small", _SMALL, "drop_oldest")
 
     async def on_startup(self) -> None:
         """Start the process that logs."""
@@ -78,29 +76,29 @@ class RerunView(Node[RerunConfig]):
             self.log.info("open %s", page)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Note what there will be."""
+        """Note it for the recorder."""
         self._announcements.append(announcement)
 
     @on(Image, DepthImage, SegmentationImage)
-    def pictured(self, event: Image | DepthImage | SegmentationImage) -> None:
-        """Keep some pictures."""
+    def images(self, event: Image | DepthImage | SegmentationImage) -> None:
+        """Keep some images."""
         self._heard += 1
         kind = type(event).__name__
-        if self._thinning.picture(kind, event.source, event.frame_id, event.stamp):
-            self._pictures.offer((self._heard, event))
+        if self._selection.select(kind, event.source, event.frame_id, event.stamp):
+            self._large.offer((self._heard, event))
 
     @on(TrackedFeatures)
-    def followed(self, event: TrackedFeatures) -> None:
-        """Keep the features of those pictures."""
+    def features(self, event: TrackedFeatures) -> None:
+        """Keep the features of those images."""
         self._heard += 1
-        if self._thinning.belongs(event.frame_id, event.stamp):
-            self._pictures.offer((self._heard, event))
+        if self._selection.selected(event.frame_id, event.stamp):
+            self._large.offer((self._heard, event))
 
     @on(PointCloud)
-    def mapped(self, event: PointCloud) -> None:
+    def point_clouds(self, event: PointCloud) -> None:
         """Keep clouds."""
         self._heard += 1
-        self._pictures.offer((self._heard, event))
+        self._large.offer((self._heard, event))
 
     @on(
         Odometry,
@@ -113,20 +111,20 @@ class RerunView(Node[RerunConfig]):
         TrackingEvent,
         VehicleEvent,
     )
-    def said(self, event: Event) -> None:
+    def measurements(self, event: Event) -> None:
         """Keep what is small."""
         self._heard += 1
-        self._rows.offer((self._heard, event))
+        self._small.offer((self._heard, event))
 
     async def run(self) -> None:
-        """Pass on what has come, again and again.
+        """Pass on the events that have come, again and again.
 
         In lockstep the run goes on for one period while a batch is logged.
         """
         if self._recorder is None:
             return
         await self._begin()
-        period = 1.0 / self.config.rate
+        period = 1.0 / self.config.update_rate
         while True:
             batch = self._take()
             if batch:
@@ -143,7 +141,7 @@ class RerunView(Node[RerunConfig]):
             await self._recorder.call_for(0.0, Recorder.log, batch)
         if trouble := await self._recorder.call_for(0.0, Recorder.close):
             self.log.warning("the viewer has not got everything: %s", trouble)
-        dropped = self._pictures.dropped + self._rows.dropped
+        dropped = self._large.dropped + self._small.dropped
         dropped += await self._recorder.call_for(0.0, Recorder.left_out)
         if dropped:
             self.log.warning("%d of %d events dropped: the view was too slow", dropped, self._heard)
@@ -159,7 +157,7 @@ class RerunView(Node[RerunConfig]):
         """Return what waits, in the order in which it was heard."""
         batch = [
             stream.receive_nowait()
-            for stream in (self._pictures, self._rows)
+            for stream in (self._large, self._small)
             for _ in range(min(stream.statistics().buffered, _PACK))
         ]
         batch.sort(key=lambda each: each[0])

@@ -1,4 +1,4 @@
-"""Numbers over time, and what happened, in words."""
+"""Curves over time, and a log in words."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from events import Event, Imu, Score, TrackingLost
 from nodes.rerun_view import entities
-from nodes.rerun_view.recording import Colour, Numbered, Recording
+from nodes.rerun_view.entity_log import EntityLog, Numbered
+from nodes.viewing.appearance import Colour, describe
 
 _AXES = [(230, 80, 70), (90, 200, 90), (90, 140, 255)]
 """Colours of x, y, z."""
@@ -32,15 +33,15 @@ _TITLED = ("position_error", "rotation_error")
 
 
 class Plots:
-    """Writes curves and words.
+    """Writes curves and the log.
 
     Args:
-        recording: Where to.
+        log: Where to.
         colours: Of what is scored, by source.
     """
 
-    def __init__(self, recording: Recording, colours: Mapping[str, Colour]) -> None:
-        self._to = recording
+    def __init__(self, log: EntityLog, colours: Mapping[str, Colour]) -> None:
+        self._to = log
         self._colours = colours
         self._known: set[str] = set()
 
@@ -72,11 +73,9 @@ class Plots:
             values = np.array([event.value for _, event in found]) * factor
             self._to.columns(entity, found, self._to.rr.Scalars.columns(scalars=values))
 
-    def happened(self, event: Event) -> None:
-        """Put an event that is worth a word."""
-        text = f"{event.source}: {type(event).__name__}"
-        if more := getattr(event, "reason", "") or getattr(event, "other", ""):
-            text += f" ({more})"
+    def logged(self, event: Event) -> None:
+        """Put an event into the log, in words."""
+        text = f"{event.source}: {describe(event)}"
         lost = isinstance(event, TrackingLost)
         self._to.put(entities.LOG, self._to.rr.TextLog(text, level="WARN" if lost else "INFO"))
 

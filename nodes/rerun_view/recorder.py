@@ -37,9 +37,9 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
+from nodes.rerun_view.entity_log import EntityLog, Numbered
 from nodes.rerun_view.layout import Contents, Eye, layout
 from nodes.rerun_view.plots import PLOTS, Plots
-from nodes.rerun_view.recording import Numbered, Recording
 from nodes.rerun_view.sdk import Viewer, load
 from nodes.rerun_view.settings import RerunConfig
 from nodes.rerun_view.world import World
@@ -47,12 +47,12 @@ from nodes.rerun_view.world import World
 _GATHERED = 500
 """Events that are written into a file together."""
 
-_PATIENCE = 3.0
+_TIMEOUT = 3.0
 """Real seconds that a viewer has to take what was logged. If it takes longer, all that comes is
 left out until it has: the library would first fill hundreds of megabytes, and then stand still."""
 
-_GLANCE = 0.01
-"""Real seconds to see whether it has, by then."""
+_SECOND_TIMEOUT = 0.01
+"""Real seconds for the same, once it took longer."""
 
 
 class Recorder:
@@ -80,10 +80,9 @@ class Recorder:
             self._viewer = Viewer(config)
             self._stream.connect_grpc(self._viewer.data)
         self._stream.send_recording_name(name)
-        recording = Recording(library.log, self._stream)
-        self._recording = recording
-        self._world = World(recording, config)
-        self._plots = Plots(recording, self._world.colours)
+        self._entities = EntityLog(library.log, self._stream)
+        self._world = World(self._entities, config)
+        self._plots = Plots(self._entities, self._world.colours)
         self._plotted: set[str] = set()
         self._shown: tuple[int, ...] = ()
         self._closed = False
@@ -137,7 +136,7 @@ class Recorder:
                 if found is kind:
                     self._put_columns(kind, source, events)
         for number, event in batch:
-            self._recording.at(number, event.stamp)
+            self._entities.at(number, event.stamp)
             self._put(number, event)
         self._show()
 
@@ -172,7 +171,7 @@ class Recorder:
     def _taken(self) -> bool:
         """Tell whether a viewer has taken what was logged; wait for that, but only once."""
         try:
-            self._stream.flush(timeout_sec=_GLANCE if self._behind else _PATIENCE)
+            self._stream.flush(timeout_sec=_SECOND_TIMEOUT if self._behind else _TIMEOUT)
         except RuntimeError:
             self._behind = True
         else:
@@ -181,9 +180,9 @@ class Recorder:
 
     def _put_columns(self, kind: type[Event], source: str, events: list[Any]) -> None:
         if kind is Odometry:
-            self._world.moved(source, events)
+            self._world.odometry(source, events)
         elif kind is PoseEstimate:
-            self._world.estimated(source, events)
+            self._world.estimates(source, events)
         elif kind is Imu:
             self._plots.measurements(source, events)
             self._plotted.add("imu")
@@ -203,27 +202,27 @@ class Recorder:
             case TrackedFeatures():
                 world.features(event)
             case PoseStamped():
-                world.placed(event)
+                world.camera_pose(event)
             case PointCloud():
                 world.cloud(event)
             case PlannedPose() | PositionSetpoint():
-                world.planned(number, event)
+                world.plan(number, event)
             case TrackingEvent() | VehicleEvent():
-                self._plots.happened(event)
+                self._plots.logged(event)
 
     def _show(self, eye: Eye | None = None) -> None:
         """Send the layout if there is something new to show."""
-        pictures = self._world.pictures
+        images = self._world.images
         found = (
             len(self._world.trails),
             len(self._plotted),
-            *(len(kinds) for kinds in pictures.values()),
+            *(len(kinds) for kinds in images.values()),
         )
         if found == self._shown and eye is None:
             return
         self._shown = found
         plots = {t: what for t, what in PLOTS.items() if what.split("/")[1] in self._plotted}
-        contents = Contents(trails=self._world.trails, cameras=pictures, plots=plots, eye=eye)
+        contents = Contents(trails=self._world.trails, cameras=images, plots=plots, eye=eye)
         self._stream.send_blueprint(layout(self._rrb, contents))
 
     def _eye(self) -> Eye | None:

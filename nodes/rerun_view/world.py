@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from events import (
     CameraAnnouncement,
@@ -22,17 +21,27 @@ from events import (
     TrackedFeatures,
     Vector3,
 )
-from events.poses import pose_matrix, pose_tuples
 from nodes.evaluation.live import RecentTruth
 from nodes.rerun_view import entities
-from nodes.rerun_view.recording import Colour, Numbered, Recording
+from nodes.rerun_view.entity_log import EntityLog, Numbered
+from nodes.rerun_view.scene_points import ScenePoints
 from nodes.rerun_view.settings import RerunConfig
-from nodes.viewing.images import CENTIMETRES, Points, Surroundings, depth_png, jpeg
-from nodes.viewing.paths import Path
+from nodes.viewing.appearance import (
+    INLIER,
+    OUTLIER,
+    PLAN,
+    TRUTH,
+    VEHICLE,
+    Colour,
+    estimate_colour,
+)
+from nodes.viewing.encoding import depth_in_steps, encode_depth, encode_image
+from nodes.viewing.estimates import estimate_frame
+from nodes.viewing.paths import PathPieces
+from nodes.viewing.selection import PlanSelection
 
-_TRUTH, _PLAN = (80, 220, 120), (140, 140, 150)
-_INLIER, _OUTLIER = (90, 240, 120), (240, 80, 70)
-_ESTIMATES = [(255, 160, 20), (90, 170, 255), (230, 110, 230), (250, 230, 80), (120, 230, 230)]
+CENTIMETRES = 100.0
+"""Steps of a depth image per metre. Finer ones would show noise, which makes files large."""
 
 _THICK, _THIN = 0.02, 0.01
 """Metres: radii of paths."""
@@ -42,32 +51,32 @@ class World:
     """Writes what has a place.
 
     Args:
-        recording: Where to.
+        log: Where to.
         config: The node's settings.
     """
 
-    def __init__(self, recording: Recording, config: RerunConfig) -> None:
-        self._to = recording
-        self._rr = recording.rr
+    def __init__(self, log: EntityLog, config: RerunConfig) -> None:
+        self._to = log
+        self._rr = log.rr
         self._config = config
         self._truth: dict[str, RecentTruth] = {}
         self._cameras: dict[str, CameraAnnouncement] = {}  # by source
         self._frames: dict[str, str] = {}  # entities of cameras, by optical frame
         self._others: dict[str, str] = {}  # entities of bodies and of estimators' own, by frame
-        self._surroundings: dict[str, Surroundings] = {}  # by source
+        self._scene_points: dict[str, ScenePoints] = {}  # by source
         self._anchored: set[str] = set()
-        self._paths: dict[str, tuple[Path, Colour, float]] = {}
+        self._paths: dict[str, tuple[PathPieces, Colour, float]] = {}
         self._latest: dict[str, tuple[int, int]] = {}
-        self._planned_by: type | None = None
+        self._plan = PlanSelection()
         self.colours: dict[str, Colour] = {}
         """Of estimators, by source."""
-        self.pictures: dict[str, list[str]] = {}
-        """Kinds of pictures there are, by camera's entity."""
+        self.images: dict[str, list[str]] = {}
+        """Kinds of images there are, by camera's entity."""
         self.trails: list[str] = []
         """Entities of which all that was logged is to be shown."""
         self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
         """Where vehicles have been: lowest and highest coordinates, metres in ``map``."""
-        recording.static(entities.WORLD, self._rr.ViewCoordinates.FRD)
+        log.static(entities.WORLD, self._rr.ViewCoordinates.FRD)
 
     # What there is.
 
@@ -77,24 +86,23 @@ class World:
             return
         self._truth[source] = RecentTruth()
         entity = entities.body(source)
-        rotors = [(x, y, -0.03) for x in (-0.14, 0.14) for y in (-0.14, 0.14)]
         self._to.static(
             f"{entity}/shape",
             self._rr.Boxes3D(
-                centers=[(0, 0, 0), (0.09, 0, 0), *rotors],
-                half_sizes=[(0.1, 0.06, 0.035), (0.03, 0.03, 0.02), *[(0.09, 0.09, 0.006)] * 4],
-                colors=[(200, 200, 210), (230, 80, 70), *[(90, 95, 110)] * 4],
+                centers=[box.centre for box in VEHICLE],
+                sizes=[box.size for box in VEHICLE],
+                colors=[box.colour for box in VEHICLE],
                 fill_mode="solid",
             ),
         )
         self._to.static(entity, self._rr.TransformAxes3D(0.4))
-        self._path(entities.truth(source), _TRUTH, _THICK)
+        self._path(entities.truth(source), TRUTH, _THICK)
 
     def estimator(self, source: str) -> None:
         """Prepare an estimator's path, and give it a colour."""
         if source in self.colours:
             return
-        self.colours[source] = _ESTIMATES[len(self.colours) % len(_ESTIMATES)]
+        self.colours[source] = estimate_colour(len(self.colours))
         self._path(entities.estimated_path(source), self.colours[source], _THIN)
 
     def camera(self, announced: CameraAnnouncement) -> None:
@@ -103,24 +111,24 @@ class World:
         self._cameras[announced.source] = announced
         entity = self._frames[announced.frame_id] = entities.camera(announced, list(self._truth))
         kinds = [kind for kind in announced.images if config.depth or kind != "depth"]
-        self.pictures[entity] = kinds if config.picture_rate else []
+        self.images[entity] = kinds if config.image_rate else []
         if announced.parent_frame_id != "map":
             self._to.static(entity, self._transform(announced.position, announced.orientation))
         for kind in announced.images:
             self._pinhole(f"{entity}/{kind}", info, config.depth_stride if kind == "depth" else 1)
-        if "depth" in announced.images and config.points_rate and config.picture_rate:
-            self._surroundings[announced.source] = Surroundings(
+        if "depth" in announced.images and config.points_rate and config.image_rate:
+            self._scene_points[announced.source] = ScenePoints(
                 info,
                 config.points_rate,
                 config.points_stride,
-                config.points_reach,
-                config.points_above,
+                config.points_max_distance,
+                config.points_max_height,
             )
-            self.trails.append(entities.seen(announced.source))
+            self.trails.append(entities.points(announced.source))
 
     # What moves.
 
-    def moved(self, source: str, events: Sequence[Numbered[Odometry]]) -> None:
+    def odometry(self, source: str, events: Sequence[Numbered[Odometry]]) -> None:
         """Put true poses of one vehicle."""
         self.vehicle(source)
         self._others.setdefault(events[0][1].child_frame_id, entities.body(source))
@@ -133,10 +141,11 @@ class World:
         self.bounds[1] = np.maximum(self.bounds[1], positions.max(axis=0))
         self._poses(entities.body(source), events)
 
-    def estimated(self, source: str, events: Sequence[Numbered[PoseEstimate]]) -> None:
+    def estimates(self, source: str, events: Sequence[Numbered[PoseEstimate]]) -> None:
         """Put estimates of one estimator.
 
-        Those that are not in ``map`` begin at the true pose of their time, as evaluation lays them.
+        Those that are not in ``map`` begin at the true pose of their time, as evaluation aligns
+        them.
         """
         self.estimator(source)
         first = events[0][1]
@@ -144,55 +153,52 @@ class World:
             self._anchored.add(source)
             if first.frame_id != "map":
                 self._others.setdefault(first.frame_id, entities.estimate(source))
-            if first.frame_id != "map" and (truth := self._true_pose(first.stamp)) is not None:
-                laid = truth @ np.linalg.inv(pose_matrix(first.position, first.orientation))
-                self._to.static(entities.estimate(source), self._transform(*pose_tuples(laid)))
+                frames = (estimate_frame(first, truth) for truth in self._truth.values())
+                if (frame := next(filter(None, frames), None)) is not None:
+                    self._to.static(entities.estimate(source), self._transform(*frame))
             self._to.static(f"{entities.estimate(source)}/body", self._rr.TransformAxes3D(0.3))
         for number, event in events:
             self._extend(entities.estimated_path(source), number, event.stamp, event.position)
         self._poses(f"{entities.estimate(source)}/body", events)
 
-    def planned(self, number: int, event: PlannedPose | PositionSetpoint) -> None:
-        """Put where a vehicle is meant to be; set-points only if nobody tells the plan itself."""
-        if self._planned_by is not PlannedPose:
-            self._planned_by = type(event)
-        if isinstance(event, self._planned_by):
-            self._path(entities.PLAN, _PLAN, _THIN)
+    def plan(self, number: int, event: PlannedPose | PositionSetpoint) -> None:
+        """Put where a vehicle is meant to be."""
+        if self._plan.select(event):
+            self._path(entities.PLAN, PLAN, _THIN)
             self._extend(entities.PLAN, number, event.stamp, event.position)
 
-    def placed(self, event: PoseStamped) -> None:
+    def camera_pose(self, event: PoseStamped) -> None:
         """Put where a free camera is; that of a vehicle's camera serves its depth images."""
         camera = self._cameras.get(event.source)
         if camera is not None and camera.parent_frame_id == "map":
             pose = self._transform(event.position, event.orientation)
             self._to.put(self._frames[camera.frame_id], pose)
-        self._surround(event)
+        self._extend_scene(event)
 
-    # What is seen.
+    # Images, features and point clouds.
 
     def image(self, event: Image) -> None:
-        """Put a picture."""
-        quality = self._config.jpeg_quality
-        picture = (
-            self._rr.EncodedImage(contents=jpeg(event.data, quality), media_type="image/jpeg")
-            if quality
-            else self._rr.Image(event.data)
-        )
-        self._to.put(self._place(event, "grey" if event.data.ndim == 2 else "rgb"), picture)
-        self._surround(event)
+        """Put an image."""
+        image = self._rr.Image(event.data)
+        if quality := self._config.jpeg_quality:
+            code = encode_image(event.data, "jpeg", quality).tobytes()
+            image = self._rr.EncodedImage(contents=code, media_type="image/jpeg")
+        self._to.put(self._place(event, "grey" if event.data.ndim == 2 else "rgb"), image)
+        self._extend_scene(event)
 
     def depth(self, event: DepthImage) -> None:
         """Put a depth image."""
         if (config := self._config).depth:
-            picture = self._rr.EncodedDepthImage(
-                depth_png(event.data[:: config.depth_stride, :: config.depth_stride]),
+            pixels = event.data[:: config.depth_stride, :: config.depth_stride]
+            image = self._rr.EncodedDepthImage(
+                encode_depth(depth_in_steps(pixels, CENTIMETRES)),
                 media_type="image/png",
                 meter=CENTIMETRES,
                 colormap="turbo",
-                depth_range=(0.0, config.points_reach * CENTIMETRES),
+                depth_range=(0.0, config.points_max_distance * CENTIMETRES),
             )
-            self._to.put(self._place(event, "depth"), picture)
-        self._surround(event)
+            self._to.put(self._place(event, "depth"), image)
+        self._extend_scene(event)
 
     def segmentation(self, event: SegmentationImage) -> None:
         """Put which objects are seen; nothing is object 0."""
@@ -200,13 +206,13 @@ class World:
         self._to.put(self._place(event, "segmentation"), self._rr.SegmentationImage(classes))
 
     def features(self, event: TrackedFeatures) -> None:
-        """Put what an estimator followed in a picture."""
+        """Put the features that an estimator tracks in an image."""
         if (camera := self._frames.get(event.frame_id)) is not None:
-            colours = np.where(event.inliers[:, None], _INLIER, _OUTLIER).astype(np.uint8)
+            colours = np.where(event.inliers[:, None], INLIER, OUTLIER).astype(np.uint8)
             centres = event.points + 0.5  # Rerun's pixels have their centres at halves
             points = self._rr.Points2D(centres, colors=colours, radii=2.0)
             entity = entities.path("features", event.source)
-            kind = "rgb" if "rgb" in self.pictures[camera] else "grey"
+            kind = "rgb" if "rgb" in self.images[camera] else "grey"
             self._to.put(f"{camera}/{kind}/{entity}", points)
 
     def cloud(self, event: PointCloud) -> None:
@@ -225,20 +231,20 @@ class World:
                 self._strip(entity, *self._latest[entity], rest)
 
     def _place(self, event: Image | DepthImage | SegmentationImage, kind: str) -> str:
-        """Return where a picture belongs: to its camera, or by itself if nobody announced that."""
-        camera = self._frames.setdefault(event.frame_id, entities.pictures(event.source))
-        if kind not in (kinds := self.pictures.setdefault(camera, [])):
+        """Return where an image belongs: to its camera, or by itself if nobody announced that."""
+        camera = self._frames.setdefault(event.frame_id, entities.images(event.source))
+        if kind not in (kinds := self.images.setdefault(camera, [])):
             kinds.append(kind)
         return f"{camera}/{kind}"
 
-    def _surround(self, event: Image | DepthImage | PoseStamped) -> None:
-        if (found := self._surroundings.get(event.source)) is None:
-            return
-        if (seen := found.take(event)) is not None:
-            self._points(entities.seen(event.source), seen)
+    def _extend_scene(self, event: Image | DepthImage | PoseStamped) -> None:
+        found = self._scene_points.get(event.source)
+        if found is not None and (new := found.take(event)) is not None:
+            points = self._rr.Points3D(new.points, colors=new.colours, radii=0.02)
+            self._to.put(entities.points(event.source), points)
 
     def _pinhole(self, entity: str, info: CameraInfo, stride: int) -> None:
-        """Put how a picture of every n-th pixel was taken; Rerun's centres are at halves."""
+        """Put how an image of every n-th pixel was taken; Rerun's centres are at halves."""
         matrix = info.matrix()
         matrix[:2] /= stride
         matrix[:2, 2] += 0.5
@@ -252,14 +258,6 @@ class World:
                 color=(200, 200, 210),
             ),
         )
-
-    def _points(self, entity: str, seen: Points) -> None:
-        points = self._rr.Points3D(seen.points, colors=seen.colours, radii=0.02)
-        self._to.put(entity, points)
-
-    def _true_pose(self, stamp: int) -> npt.NDArray[np.float64] | None:
-        found = [pose for each in self._truth.values() if (pose := each.at(stamp)) is not None]
-        return pose_matrix(*found[0]) if found else None
 
     def _poses(
         self, entity: str, events: Sequence[Numbered[Odometry]] | Sequence[Numbered[PoseEstimate]]
@@ -278,7 +276,7 @@ class World:
 
     def _path(self, entity: str, colour: Colour, radius: float) -> None:
         if entity not in self._paths:
-            self._paths[entity] = Path(), colour, radius
+            self._paths[entity] = PathPieces(), colour, radius
             self.trails.append(entity)
 
     def _extend(self, entity: str, number: int, stamp: int, position: Vector3) -> None:

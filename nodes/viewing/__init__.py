@@ -1,1 +1,6 @@
-"""What the viewers share: which images are shown, how they are encoded, and paths in pieces."""
+"""What the viewers share, so that a run looks the same in all of them.
+
+`selection` chooses the images that are shown, `encoding` makes JPEG and PNG of them, `paths` cuts
+paths into pieces, `estimates` places estimates in the world, `appearance` has colours, shapes and
+the words for the log. The ROS 2 bridge and the recorder use the encodings, too.
+"""

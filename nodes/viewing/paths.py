@@ -1,4 +1,4 @@
-"""Flown paths as short pieces, so that each pose is passed on once. Pure Python."""
+"""Paths in short pieces, so that each pose is sent to a viewer once."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ GRAIN = 0.01
 """Metres: poses nearer than this to the last are left out."""
 
 
-class Path:
-    """One path, growing."""
+class PathPieces:
+    """Cuts one path, as it grows, into pieces."""
 
     def __init__(self) -> None:
         self._points: list[Vector3] = []
-        self._began = 0
+        self._first = 0
         self._last = 0
 
     def add(self, stamp: int, position: Vector3) -> list[Vector3] | None:
-        """Take in a pose (ns, metres); return a piece when there is one.
+        """Add a pose (ns, metres); return a piece when one is complete.
 
         Each piece begins where the one before ended, unless there was a gap between them.
         """
@@ -36,15 +36,15 @@ class Path:
         self._last = stamp
         if not self._points:
             self._points.append(position)
-            self._began = stamp
+            self._first = stamp
         elif dist(self._points[-1], position) >= GRAIN:
             self._points.append(position)
-            if stamp - self._began >= SPAN:
+            if stamp - self._first >= SPAN:
                 piece = self.rest()
                 self._points = [position]
-                self._began = stamp
+                self._first = stamp
         return piece
 
     def rest(self) -> list[Vector3] | None:
-        """Return what is no piece yet, if there is anything."""
+        """Return the points that are in no complete piece, if they make a line."""
         return list(self._points) if len(self._points) > 1 else None

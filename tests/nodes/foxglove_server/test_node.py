@@ -20,7 +20,7 @@ from nodes.foxglove_server.settings import FoxgloveConfig
 from runtime.errors import ConfigError, FatalError, MissingDependencyError
 from runtime.testing import run_node
 from tests.nodes.foxglove_server.client import Viewer, fields
-from tests.nodes.rerun_view.said import CAMERA, ESTIMATOR, MS, VEHICLE, image, imu, odometry
+from tests.nodes.viewing.samples import CAMERA, ESTIMATOR, MS, VEHICLE, image, imu, odometry
 
 ROOT = Path(__file__).parents[3]
 
@@ -30,7 +30,7 @@ def test_it_runs_where_nobody_looks(caplog: pytest.LogCaptureFixture) -> None:
     inputs += [e for i in range(20) for e in (odometry(i * MS), imu(i * MS), image(i * MS))]
     with caplog.at_level("INFO"):
         result = run_node(FoxgloveServer, inputs=inputs, config={"port": 0}, duration=0.1)
-    assert result.ticks["node.tell_time"].calls == 5
+    assert result.ticks["node.send_time"].calls == 5
     assert any("open ws://127.0.0.1:" in record.getMessage() for record in caplog.records)
 
 
@@ -43,7 +43,7 @@ def test_a_port_that_is_taken_ends_the_run_with_a_reason() -> None:
 
 @pytest.mark.parametrize(
     ("config", "message"),
-    [({"port": 70_000}, "port"), ({"picture_rate": -1}, "picture_rate"), ({"size": 1}, "size")],
+    [({"port": 70_000}, "port"), ({"image_rate": -1}, "image_rate"), ({"size": 1}, "size")],
 )
 def test_settings_that_are_wrong_say_where(config: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
@@ -59,7 +59,7 @@ def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.Mo
 def test_who_connects_and_says_nothing_does_not_hold_up_the_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("nodes.foxglove_server.server._PATIENCE", 0.1)
+    monkeypatch.setattr("nodes.foxglove_server.server._CLOSING", 0.1)
     server = Server(FoxgloveConfig(port=0), "test")
     port = int(server.address.rpartition(":")[2])
     with socket.create_connection(("127.0.0.1", port)):

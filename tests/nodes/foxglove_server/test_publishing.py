@@ -19,7 +19,7 @@ from nodes.foxglove_server.publishing import Publishing
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
 from tests.nodes.foxglove_server.client import Viewer, doubles, fields
-from tests.nodes.rerun_view.said import (
+from tests.nodes.viewing.samples import (
     CAMERA,
     ESTIMATOR,
     MS,
@@ -203,7 +203,7 @@ def test_features_clouds_words_and_numbers_come_too(server: Server, viewer: View
     say.features(features(STAMP))
     say.imu(imu(STAMP))
     say.score(score(STAMP))
-    say.happened(TrackingLost(stamp=STAMP, source="vo", reason="too dark"))
+    say.logged(TrackingLost(stamp=STAMP, source="vo", reason="too dark"))
     say.cloud(PointCloud(stamp=STAMP, source="mapping", points=points, colors=colours))
     groups = fields(viewer.next(topics[0]))[2]
     assert [doubles(fields(each)[3][0], 2) for each in groups] == [[1.0, 2.0], [3.0, 4.0]]
@@ -245,13 +245,13 @@ def test_where_nobody_looks_no_picture_is_made(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(server)
-    monkeypatch.setattr(messages, "jpeg", None)
+    monkeypatch.setattr(messages, "encode_image", None)
     stage.publishing.image(image(STAMP))
     stage.publishing.depth(depth(STAMP))
 
 
 def _asked(server: Server, viewer: Viewer) -> bool:
-    server.tell_time(STAMP)
+    server.send_time(STAMP)
     try:
         viewer.take(0.05)
     except TimeoutError:

@@ -21,7 +21,7 @@ from nodes.rerun_view.recorder import Recorder
 from nodes.rerun_view.settings import RerunConfig
 from runtime.errors import ConfigError, MissingDependencyError, VisnavError
 from runtime.testing import run_node
-from tests.nodes.rerun_view.said import (
+from tests.nodes.viewing.samples import (
     CAMERA,
     ESTIMATOR,
     MS,
@@ -51,7 +51,7 @@ def flight(seconds: float) -> list[Event]:
 @pytest.mark.slow
 def test_in_lockstep_all_is_recorded_and_as_many_pictures_as_asked_for(tmp_path: Path) -> None:
     inputs = [VEHICLE, CAMERA, ESTIMATOR, *flight(1.9)]
-    run_node(RerunView, inputs=inputs, config={"picture_rate": 4}, duration=1.9, out=tmp_path)
+    run_node(RerunView, inputs=inputs, config={"image_rate": 4}, duration=1.9, out=tmp_path)
     found = Recorded(tmp_path / "flight.rrd")
     poses = found.stamps("map/drone", "Transform3D:translation")
     assert poses == [i * 10 * MS for i in range(190)]
@@ -136,7 +136,7 @@ def test_a_viewer_that_goes_away_is_survived() -> None:
 @pytest.mark.slow
 def test_a_viewer_that_stands_still_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """What it does not take is left out and counted; once it goes on, so does the view."""
-    monkeypatch.setattr("nodes.rerun_view.recorder._PATIENCE", 0.3)
+    monkeypatch.setattr("nodes.rerun_view.recorder._TIMEOUT", 0.3)
     config = RerunConfig(mode="serve", port=free_port(), web_port=free_port(), jpeg_quality=0)
     noise = np.random.default_rng(0).integers(0, 255, (1000, 1000, 3), np.uint8)
     recorder = Recorder(config, "test", None)

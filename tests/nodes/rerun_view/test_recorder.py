@@ -12,7 +12,7 @@ import pytest
 from events import Event, PointCloud, PositionSetpoint, TrackingLost
 from nodes.rerun_view.recorder import Recorder
 from nodes.rerun_view.settings import RerunConfig
-from tests.nodes.rerun_view.said import (
+from tests.nodes.viewing.samples import (
     CAMERA,
     ESTIMATOR,
     MS,
@@ -126,7 +126,7 @@ def test_estimates_in_a_frame_of_their_own_begin_at_the_truth(tmp_path: Path) ->
 
 def test_pictures_and_features_are_below_their_camera(tmp_path: Path) -> None:
     events: list[Event] = [camera_pose(0), depth(0), image(0), features(0)]
-    found = record(tmp_path, events, points_above=9.0)
+    found = record(tmp_path, events, points_max_height=9.0)
     entity = "map/drone/camera"
     ((_, _, (blob,)),) = found.of(f"{entity}/rgb", "EncodedImage:blob")
     assert picture(blob, cv2.IMREAD_COLOR_RGB)[3, 4] == pytest.approx([200, 100, 50], abs=4)
@@ -134,15 +134,15 @@ def test_pictures_and_features_are_below_their_camera(tmp_path: Path) -> None:
     assert picture(blob, cv2.IMREAD_UNCHANGED).tolist() == [[200] * 4] * 3
     points = found.values(f"{entity}/rgb/features/vo", "Points2D:positions")
     assert points[0] == pytest.approx(np.array([[1.5, 2.5], [3.5, 4.5]]))
-    assert len(found.values("map/seen/drone/camera", "Points3D:positions")[0]) == 2
+    assert len(found.values("map/points/drone/camera", "Points3D:positions")[0]) == 2
 
 
 def test_pictures_that_nobody_announced_are_shown_by_themselves(tmp_path: Path) -> None:
     stray = msgspec.structs.replace(image(0), source="web/cam", frame_id="web_optical")
     points = msgspec.structs.replace(features(0), frame_id="web_optical")
     found = record(tmp_path, [stray, points])
-    assert len(found.of("pictures/web/cam/rgb", "EncodedImage:blob")) == 1
-    assert len(found.of("pictures/web/cam/rgb/features/vo", "Points2D:positions")) == 1
+    assert len(found.of("images/web/cam/rgb", "EncodedImage:blob")) == 1
+    assert len(found.of("images/web/cam/rgb/features/vo", "Points2D:positions")) == 1
 
 
 def test_quality_nought_leaves_pictures_as_they_are(tmp_path: Path) -> None:

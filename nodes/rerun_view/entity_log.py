@@ -1,4 +1,4 @@
-"""A recording with the run's two time lines, and what everything that writes into it shares."""
+"""A log of entities with the run's two time lines, for everything that writes into Rerun."""
 
 from __future__ import annotations
 
@@ -11,15 +11,12 @@ from events import Event
 
 E = TypeVar("E", bound=Event)
 
-Colour = tuple[int, int, int]
-"""Red, green, blue, 0 to 255."""
-
 Numbered = tuple[int, E]
 """How many events were heard before, and the event."""
 
 
-class Recording:
-    """Where entities are logged.
+class EntityLog:
+    """Logs entities.
 
     Args:
         rr: The library.

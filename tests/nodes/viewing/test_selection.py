@@ -1,0 +1,22 @@
+"""Which images and which plan are shown."""
+
+from __future__ import annotations
+
+from nodes.viewing.selection import ImageSelection
+
+
+def test_of_thirty_pictures_a_second_five_are_kept_and_of_one_exposure_all() -> None:
+    selection = ImageSelection(5.0)
+    stamps = [i * 1_000_000_000 // 30 for i in range(60)]
+    kept = {
+        kind: [s for s in stamps if selection.select(kind, "drone/camera", "optical", s)]
+        for kind in ("Image", "DepthImage")
+    }
+    assert len(kept["Image"]) == 10
+    assert kept["Image"] == kept["DepthImage"]
+    assert [s for s in stamps if selection.selected("optical", s)] == kept["Image"]
+    assert not selection.selected("another", stamps[0])
+
+
+def test_without_a_rate_there_are_no_pictures() -> None:
+    assert not ImageSelection(0.0).select("Image", "a", "a", 0)
