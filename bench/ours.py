@@ -139,9 +139,9 @@ def measure(case: Case, digest: bool = False) -> Samples:
         supervisor = Supervisor(config, clock, [Digest()] if digest else [])
         await supervisor.main()
         clock.close()
-        if supervisor.error is not None:
-            raise supervisor.error
-        return supervisor.ever[0]
+        if supervisor.state.error is not None:
+            raise supervisor.state.error
+        return supervisor.state.all_nodes[0]
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         samples: Samples = runner.run(main()).taken[case.warm_up :]

@@ -31,8 +31,8 @@ from runtime.real_clock import RealClock
 from runtime.sender import Sender, Tap
 from runtime.summary import Summary, summarise
 from runtime.supervisor import Supervisor
-from runtime.watchdogs.loop import Stall, Watchdog
-from runtime.watchdogs.progress import Standstill
+from runtime.watchdogs.loop import LoopWatchdog, Stall
+from runtime.watchdogs.progress import ProgressWatchdog
 
 if TYPE_CHECKING:
     from runtime.peers.peers import Peers
@@ -74,8 +74,8 @@ def execute(
         summary = event_loop.run_to_end(run.loop, run.main(), run.escaped)
         if out is not None:
             run.conclude(out, summary)
-    if run.supervisor.error is not None:
-        raise run.supervisor.error
+    if run.supervisor.state.error is not None:
+        raise run.supervisor.state.error
     return summary
 
 
@@ -140,12 +140,12 @@ class _Run:
         )
         # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
         level = logging.DEBUG if run.clock == "lockstep" else logging.WARNING
-        watchdog = Watchdog(loop, run.stall, functools.partial(_report_stall, level))
-        standstill = Standstill(supervisor, loop, run.progress_limit)
+        watchdog = LoopWatchdog(loop, run.stall, functools.partial(_report_stall, level))
+        progress = ProgressWatchdog(supervisor.state, loop, run.progress_limit)
         with (
             _signals_stop(supervisor, loop),
             _no_long_collections(),
-            standstill,
+            progress,
             self._watch(supervisor),
         ):
             watchdog.start()
@@ -154,22 +154,20 @@ class _Run:
             finally:
                 watchdog.stop()
             summary = summarise(
-                supervisor,
-                name=run.name,
-                sim_ns=clock.now(),
+                supervisor.state,
                 digest=self._digest,
                 stalls=watchdog.stalls,
                 longest_stalls=watchdog.longest,
             )
             if supervisor.peers is not None:
-                summary = await self._parted(supervisor.peers, summary)
+                summary = await self._whole_summary(supervisor.peers, summary)
         clock.close()
         return summary
 
-    async def _parted(self, peers: Peers, summary: Summary) -> Summary:
+    async def _whole_summary(self, peers: Peers, summary: Summary) -> Summary:
         """Put the summary together with those of the other processes, if they can be had."""
         try:
-            summary = await peers.ending.part(summary)
+            summary = await peers.shutdown.exchange_summaries(summary)
             await peers.close()
         except Exception as error:
             self.failed(wrap("the other processes", error))
@@ -183,24 +181,24 @@ class _Run:
 
     def failed(self, error: Exception) -> None:
         """Note an error; the first one counts."""
-        first = self.supervisor.error is None
+        first = self.supervisor.state.error is None
         if isinstance(error, NodeError):
             log_error(error, last=first)
         else:
             log.error("%s", error, extra={"told": first})
         if first:
-            self.supervisor.error = error
+            self.supervisor.state.error = error
 
     def conclude(self, out: Path, summary: Summary) -> None:
         """Write the summary, and call what nodes want called after it, whatever goes wrong."""
-        if summary.error is None and self.supervisor.error is not None:
-            error = with_place(self.supervisor.error)
+        if summary.error is None and self.supervisor.state.error is not None:
+            error = with_place(self.supervisor.state.error)
             summary = msgspec.structs.replace(summary, error=error)
         try:
             results.write_summary(out, summary)
         except VisnavError as error:
             self.failed(error)
-        for call in self.supervisor.after:
+        for call in self.supervisor.state.after_run:
             owner = getattr(call, "__self__", None)
             name = owner.name if isinstance(owner, Node) else getattr(call, "__module__", "runtime")
             try:
@@ -223,11 +221,11 @@ def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> It
     def stop(number: int, _: Any) -> None:
         for each in before:
             signal.signal(each, signal.SIG_DFL)
-        supervisor.asked = names[signal.Signals(number)]
-        loop.call_soon_threadsafe(supervisor.stop, supervisor.asked)
+        supervisor.state.stop_requested = names[signal.Signals(number)]
+        loop.call_soon_threadsafe(supervisor.stop, supervisor.state.stop_requested)
 
     def interrupt(*_: Any) -> None:  # whoever blocks the loop; see `runtime.watchdogs.progress`
-        error, supervisor.interruption = supervisor.interruption, None
+        error, supervisor.state.interruption = supervisor.state.interruption, None
         if error is not None:
             raise error
 

@@ -20,12 +20,21 @@ Sources = Mapping[str, Mapping[str, str]]
 Links = Mapping[str, Mapping[str, Link]]
 """Node to port to the link that stands before it."""
 
+Wrap = Callable[[str, Deliver], Deliver]
+"""Given a node and a handler of it, returns what is called instead."""
+
+
+def unwrapped(_: str, deliver: Deliver) -> Deliver:
+    """Return a handler as it is."""
+    return deliver
+
 
 def listeners(
     node: Node[Any],
     sources: Mapping[str, str],
     links: Mapping[str, Link],
     fault: Fault | None = None,
+    wrap: Wrap = unwrapped,
 ) -> list[Listener]:
     """Return a node's inputs, fields of bundles and handlers, in order."""
     found = []
@@ -34,7 +43,9 @@ def listeners(
         port: str, deliver: Deliver, events: Any, source: str | None, stream: Any = None
     ) -> None:
         if port in links:
-            deliver, stream = _linked(links[port], deliver, fault), None
+            deliver, stream = _linked(links[port], wrap(node.name, deliver), fault), None
+        elif stream is None:  # a stream's reader is wrapped already, with its task
+            deliver = wrap(node.name, deliver)
         found.append(Listener(node.name, deliver, events, source, stream))
 
     for name in node.declared.listening:
@@ -70,6 +81,7 @@ def connect(
     fault: Fault | None = None,
     last: Iterable[Listener] = (),
     elsewhere: Callable[[str], Iterable[Listener]] = nobody,
+    wrap: Wrap = unwrapped,
 ) -> list[Listener]:
     """Freeze every output's listeners, and return all that are here.
 
@@ -83,12 +95,13 @@ def connect(
         fault: Told of listeners that raise; without it, `send` raises what they do.
         last: Listeners after all nodes.
         elsewhere: Given ``node.port``, returns its listeners in other processes.
+        wrap: Puts something round the nodes' handlers.
     """
     heard = [
         listener
         for node in nodes
         for listener in listeners(
-            node, sources.get(node.name, {}), (links or {}).get(node.name, {}), fault
+            node, sources.get(node.name, {}), (links or {}).get(node.name, {}), fault, wrap
         )
     ]
     heard += last

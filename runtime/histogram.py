@@ -9,7 +9,7 @@ from __future__ import annotations
 _STEPS = 5  # bits of a value that are kept below its leading one
 
 
-class Lateness:
+class DurationHistogram:
     """Durations in nanoseconds, counted by size."""
 
     __slots__ = ("_counts", "_none", "maximum")

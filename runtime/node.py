@@ -86,7 +86,6 @@ class Host(Protocol):
 
     seed: int
     clock: Clock
-    executor: concurrent.futures.Executor
     out: Path | None
     checking: bool
 
@@ -101,8 +100,14 @@ class Host(Protocol):
     ) -> Worker[W]:
         """Make a worker that ends with the node."""
 
-    def stop(self, reason: str) -> None:
-        """End the run in order."""
+    def offload(
+        self, node: Node[Any], call: functools.partial[Any]
+    ) -> concurrent.futures.Future[Any]:
+        """Run a function of a node in a thread."""
+
+    @property
+    def stop(self) -> Callable[[str], None]:
+        """Ends the run in order, for a reason."""
 
     def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         """Put a verdict into the summary."""
@@ -247,7 +252,7 @@ class Node(Generic[C]):
         self._outside.add(call)
         for sender in senders(self).values():
             sender.watch()  # lest `call` sends something
-        work = self._host.executor.submit(call)
+        work = self._host.offload(self, call)
         work.add_done_callback(lambda _: self._outside.discard(call))
         return await self.clock.beside(work, round(latency * SECOND))
 

@@ -32,7 +32,7 @@ GRACE = 0.5
 Create = Callable[[Coroutine[Any, Any, Any], str], asyncio.Task[Any]]
 
 
-class Life:
+class NodeRunner:
     """What belongs to one node while it runs.
 
     Args:
@@ -40,7 +40,7 @@ class Life:
         create: Makes a task that the run owns.
 
     Attributes:
-        doing: The step that the run waits for, if it does: ``on_startup``, ``its tasks``…
+        phase: The step that the run waits for, if it does: ``on_startup``, ``its tasks``…
     """
 
     def __init__(self, spec: NodeSpec, create: Create) -> None:
@@ -53,17 +53,21 @@ class Life:
         self.started = False
         self.starts = 0
         self.failures = 0
-        self.begun = 0
+        self.running_since = 0
         """When it last began to run, on the run's clock (ns)."""
-        self.recovering = False
-        self.closing = False
-        self.ending = asyncio.Lock()
-        self.doing = ""
-        self.step: asyncio.Task[Any] | None = None
+        self.restarting = False
+        self.shutting_down = False
+        self.shutdown_lock = asyncio.Lock()
+        self.phase = ""
+        self.phase_task: asyncio.Task[Any] | None = None
         self._create = create
         self._succeeded = False
 
-    async def begin(self, host: Host, limit: float) -> None:
+    def awaited(self) -> list[asyncio.Task[Any]]:
+        """Return the tasks that the run waits for in this phase."""
+        return [self.phase_task] if self.phase_task is not None else list(self.tasks)
+
+    async def start_up(self, host: Host, limit: float) -> None:
         """Make the node and the links before its ports, and start it up.
 
         Args:
@@ -74,7 +78,7 @@ class Life:
             NodeError: Something went wrong in it.
         """
         spec = self.spec
-        self.closing = False
+        self.shutting_down = False
         try:
             self.node = make_node(spec.node, spec.name, spec.config, host, spec.inputs, self.starts)
             self.links = {
@@ -92,7 +96,7 @@ class Life:
             self.started = self._succeeded
             self.starts += self._succeeded
 
-    def announced(self) -> list[Announcement]:
+    def announcements(self) -> list[Announcement]:
         """Return what the node announces.
 
         Raises:
@@ -101,8 +105,8 @@ class Life:
         assert self.node is not None
         name = self.spec.name
         try:
-            said: Any = self.node.announce()
-            found: list[Any] = list(said) if isinstance(said, Iterable) else [said]
+            given: Any = self.node.announce()
+            found: list[Any] = list(given) if isinstance(given, Iterable) else [given]
             for each in found:
                 if not isinstance(each, Announcement):
                     raise NodeError(
@@ -115,7 +119,7 @@ class Life:
         except BaseException as error:
             raise wrap(name, error) from error
 
-    def hear(self, announcements: Iterable[Announcement]) -> None:
+    def receive_announcements(self, announcements: Iterable[Announcement]) -> None:
         """Let the node hear all announcements, and ask what it lacks then.
 
         Raises:
@@ -139,7 +143,7 @@ class Life:
         if lacks:
             raise RefusedError(name, "; ".join(lacks))
 
-    async def ready(self, limit: float) -> None:
+    async def get_ready(self, limit: float) -> None:
         """Let the node get ready with what it has heard.
 
         Args:
@@ -151,7 +155,7 @@ class Life:
         assert self.node is not None
         await self._within(limit, "on_ready", self.node.on_ready())
 
-    async def end(self, limit: float) -> list[NodeError]:
+    async def shut_down(self, limit: float) -> list[NodeError]:
         """End ticks, tasks, node and workers; whatever goes wrong, the other steps follow.
 
         Args:
@@ -161,7 +165,7 @@ class Life:
             What went wrong; it is logged.
         """
         node, wrong = self.node, []
-        self.closing = True
+        self.shutting_down = True
         for ticker in self.tickers:
             ticker.stopped = True
         self.tickers.clear()
@@ -196,7 +200,7 @@ class Life:
         task = self._create(_outcome(coro), self.spec.name)
         if inspect.iscoroutine(coro):  # which it may never begin, if it is cancelled at once
             task.add_done_callback(lambda _: coro.close())
-        self.doing, self.step = what, task
+        self.phase, self.phase_task = what, task
         try:
             late = await ended([task], limit)
             place = code_location.of_task(task)[1] if late else ""
@@ -204,7 +208,7 @@ class Life:
             if not task.done():
                 task.cancel()
                 await ended([task], GRACE)
-            self.doing, self.step = "", None
+            self.phase, self.phase_task = "", None
             self._succeeded = task.done() and not task.cancelled() and task.result() is None
         if late:
             raise self._too_late(what, limit, place)
@@ -229,9 +233,9 @@ class Life:
         self, seconds: float, what: str, tasks: list[asyncio.Task[Any]], limit: float = 0.0
     ) -> list[NodeError]:
         """Wait for tasks, leave behind those that do not end, and return what there is to say."""
-        self.doing = what if tasks else ""
+        self.phase = what if tasks else ""
         late = await ended(tasks, max(seconds, 0.0))
-        self.doing = ""
+        self.phase = ""
         wrong: list[NodeError] = [
             self._too_late(what, limit or seconds, code_location.of_task(task)[1])
             for task in late[:1]

@@ -1,4 +1,4 @@
-"""Changing a node's settings while it runs, so that everybody can know of it.
+"""Changing a node's settings while it runs, and telling every node that listens.
 
 What may change to what is decided in `runtime.config.parameters`.
 """
@@ -6,37 +6,36 @@ What may change to what is decided in `runtime.config.parameters`.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
 
 import msgspec
 
 from events import ParameterChanged
 from runtime.config.parameters import change
 from runtime.errors import ConfigError
+from runtime.run_state import RunState
 from runtime.sender import Listener, Sender, Tap
 from runtime.tasks import Fault
-
-if TYPE_CHECKING:
-    from runtime.supervisor import Supervisor
 
 log = logging.getLogger("visnav.runtime")
 
 
-class Changing:
-    """Changes settings of a run's nodes, and says so in an event.
+class ParameterServer:
+    """Changes settings of a run's nodes, and sends an event for each.
 
     Args:
-        supervisor: Of the run.
+        state: Of the run.
+        fault: Told which node raised what.
     """
 
-    def __init__(self, supervisor: Supervisor) -> None:
-        self._supervisor = supervisor
-        self.sender = Sender("run.parameters", ParameterChanged)
+    def __init__(self, state: RunState, fault: Callable[[str, BaseException], None]) -> None:
+        self._state = state
+        self._fault = fault
+        self._sender = Sender("run.parameters", ParameterChanged)
 
-    def connect(self, heard: Iterable[Listener], taps: Iterable[Tap], fault: Fault) -> None:
-        """Say who hears of changes: all that can, those of the changed node too."""
-        self.sender.connect(heard, taps, fault)
+    def connect(self, listeners: Iterable[Listener], taps: Iterable[Tap], fault: Fault) -> None:
+        """Connect those who hear of changes: all that can, those of the changed node too."""
+        self._sender.connect(listeners, taps, fault)
 
     def set(self, text: str) -> dict[str, str]:
         """Change a setting now, between two steps.
@@ -50,27 +49,27 @@ class Changing:
         Raises:
             ConfigError: It cannot be: the message says why, and all is as it was.
         """
-        lives = self._supervisor._lives
-        node, config, values = change(
-            {n: (life.node or life.spec).config for n, life in lives.items()}, text
+        runners = self._state.runners
+        name, config, values = change(
+            {n: (runner.node or runner.spec).config for n, runner in runners.items()}, text
         )
         if not values:
             return {}
-        life = lives[node]
-        if life.node is None or not life.started:
-            raise ConfigError(f"{text}: expected a node that runs, and {node} does not just now")
-        before = life.node.config
-        life.node.config = config
+        runner = runners[name]
+        if runner.node is None or not runner.started:
+            raise ConfigError(f"{text}: expected a node that runs, and {name} does not just now")
+        before = runner.node.config
+        runner.node.config = config
         try:
-            life.node.on_change(before)
+            runner.node.on_change(before)
         except ValueError as error:
-            life.node.config = before
-            raise ConfigError(f"{text}: {node} refuses: {error}") from None
+            runner.node.config = before
+            raise ConfigError(f"{text}: {name} refuses: {error}") from None
         except BaseException as error:
-            self._supervisor.fault(node, error)
-        life.spec = msgspec.structs.replace(life.spec, config=config)  # for when it restarts
+            self._fault(name, error)
+        runner.spec = msgspec.structs.replace(runner.spec, config=config)  # for when it restarts
         for key, value in values.items():
-            log.info("%s.%s is now %s", node, key, value)
-            now = self._supervisor.clock.now()
-            self.sender.send(ParameterChanged(stamp=now, source=node, key=key, value=value))
+            log.info("%s.%s is now %s", name, key, value)
+            now = self._state.clock.now()
+            self._sender.send(ParameterChanged(stamp=now, source=name, key=key, value=value))
         return values

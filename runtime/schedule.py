@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import msgspec
 
-from runtime.histogram import Lateness
+from runtime.histogram import DurationHistogram
 
 SECOND = 1_000_000_000
 
@@ -123,6 +123,7 @@ class Ticker:
     __slots__ = (
         "_call",
         "_fault",
+        "_function",
         "_hz",
         "_index",
         "_period",
@@ -145,14 +146,18 @@ class Ticker:
         self.name = name
         self.calls: int = before.calls if before else 0
         self.missed: int = before.missed if before else 0
-        self.late: Lateness = before.late if before else Lateness()
+        self.late: DurationHistogram = before.late if before else DurationHistogram()
         self.stopped = False
         self._hz = Fraction(hz).limit_denominator(1_000_000) or Fraction(hz)
         self._period = SECOND * self._hz.denominator  # times the numerator: an integer
-        self._call = call
+        self._function = self._call = call
         self._fault = fault
         self._start = 0
         self._index = 0
+
+    def wrap_call(self, wrap: Callable[[Callable[[Tick], Any]], Callable[[Tick], Any]]) -> None:
+        """Call from now on what `wrap` returns for the function, in place of what was before."""
+        self._call = wrap(self._function)
 
     def begin(self, start: int) -> None:
         """Have the first tick at `start` (ns)."""

@@ -277,7 +277,7 @@ class Stream(Generic[T]):
 
 
 class _ForeignTask:
-    """A reader in a task that is not stepped by `Steps`: it runs when the loop next turns."""
+    """A reader in a task that streams cannot resume: it runs when the loop next turns."""
 
     def __init__(
         self, stream: Stream[Any], wakeup: Callable[[Any], None], context: contextvars.Context

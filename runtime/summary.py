@@ -8,19 +8,17 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from runtime.digest import Digest, combined
 from runtime.json_values import plain
 from runtime.node import matchers, senders, streams
+from runtime.run_state import RunState
 from runtime.schedule import SECOND
 from runtime.watchdogs.loop import Stall
 from runtime.workers.costs import Costs
-
-if TYPE_CHECKING:
-    from runtime.supervisor import Supervisor
 
 
 class TickSummary(msgspec.Struct, frozen=True):
@@ -205,11 +203,11 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     workers: dict[str, WorkerSummary] = {}
 
 
-def count_events(supervisor: Supervisor) -> tuple[Counter[str], Counter[str]]:
+def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
     """Count what was sent so far, by type of event and by output."""
     by_type: Counter[str] = Counter()
     by_output: Counter[str] = Counter()
-    for node in supervisor.ever:
+    for node in state.all_nodes:
         for sender in senders(node).values():
             for event, count in sender.sent().items():
                 by_type[event.__name__] += count
@@ -217,10 +215,10 @@ def count_events(supervisor: Supervisor) -> tuple[Counter[str], Counter[str]]:
     return by_type, by_output
 
 
-def count_drops(supervisor: Supervisor) -> dict[str, StreamSummary]:
+def count_drops(state: RunState) -> dict[str, StreamSummary]:
     """Return how full each input got and what it dropped."""
     found: dict[str, StreamSummary] = {}
-    for node in supervisor.ever:
+    for node in state.all_nodes:
         missed = {port: matcher.missed for port, matcher in matchers(node).items()}
         for port, stream in streams(node).items():
             before = found.get(stream.name, StreamSummary(stream.bound, 0, 0))
@@ -234,7 +232,7 @@ def count_drops(supervisor: Supervisor) -> dict[str, StreamSummary]:
     return found
 
 
-def tick_summaries(supervisor: Supervisor) -> dict[str, TickSummary]:
+def tick_summaries(state: RunState) -> dict[str, TickSummary]:
     """Return how punctual each ticker was."""
     return {
         name: TickSummary(
@@ -245,50 +243,46 @@ def tick_summaries(supervisor: Supervisor) -> dict[str, TickSummary]:
             late_max_us=ticker.late.maximum / 1e3,
             missed=ticker.missed,
         )
-        for name, ticker in supervisor.tickers.items()
+        for name, ticker in state.tickers.items()
     }
 
 
 def summarise(
-    supervisor: Supervisor,
+    state: RunState,
     *,
-    name: str,
-    sim_ns: int,
     digest: Digest | None,
     stalls: Counter[str],
     longest_stalls: dict[str, Stall],
 ) -> Summary:
     """Put together what is known at the end of a run."""
-    by_type, by_output = count_events(supervisor)
-    by_input = count_drops(supervisor)
-    ended = supervisor.ended or time.monotonic()
+    by_type, by_output = count_events(state)
+    by_input = count_drops(state)
+    ended = state.stopped or time.monotonic()
     return Summary(
-        name=name,
-        clock=supervisor.clock.kind,
-        seed=supervisor.seed,
-        reason=supervisor.reason,
-        error=None if supervisor.error is None else str(supervisor.error),
-        sim_seconds=(sim_ns if supervisor.ended_at is None else supervisor.ended_at) / SECOND,
-        wall_seconds=round(ended - (supervisor.first_update or ended), 6),
+        name=state.config.run.name,
+        clock=state.clock.kind,
+        seed=state.config.run.seed,
+        reason=state.reason,
+        error=None if state.error is None else str(state.error),
+        sim_seconds=(state.clock.now() if state.stopped_at is None else state.stopped_at) / SECOND,
+        wall_seconds=round(ended - (state.first_update or ended), 6),
         digest=digest.hexdigest() if digest else None,
         digests=digest.outputs() if digest else {},
-        not_deterministic=sorted({n.name for n in supervisor.ever if not n.deterministic}),
-        verdict=_verdict(supervisor.verdicts),
+        not_deterministic=sorted({n.name for n in state.all_nodes if not n.deterministic}),
+        verdict=_verdict(state.conclusions),
         events=dict(sorted(by_type.items())),
         outputs=dict(by_output),
         drops={port: s.dropped for port, s in by_input.items()},
         streams=by_input,
-        links={
-            link.name: LinkSummary(link.lost, link.thinned) for link in supervisor.links.values()
-        },
-        ticks=tick_summaries(supervisor),
+        links={link.name: LinkSummary(link.lost, link.thinned) for link in state.links.values()},
+        ticks=tick_summaries(state),
         stalls=dict(stalls),
         longest_stalls=longest_stalls,
         announcements=[
-            {"type": type(a).__name__, **plain(a, a.source)} for a in supervisor.announcements
+            {"type": type(a).__name__, **plain(a, a.source)} for a in state.announcements
         ],
         environment=environment(),
-        workers={name: WorkerSummary.of(each) for name, each in supervisor.costs.items()},
+        workers={name: WorkerSummary.of(each) for name, each in state.costs.items()},
     )
 
 

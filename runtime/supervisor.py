@@ -14,54 +14,44 @@ Not here: loops, signals and files (`runtime.execute`).
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
-import functools
-import inspect
 import logging
 import time
-from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
-from itertools import chain, count
+from collections.abc import Collection, Coroutine, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from typing_extensions import TypeVar
 
 from events import Announcement, Event, Shutdown, WindowClosed
 from runtime import code_location, graph
 from runtime.clock import Clock
 from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
-from runtime.instruments import Probes
-from runtime.links import Link
-from runtime.node import Node
-from runtime.node_runner import Life, log_error, wrap
-from runtime.parameter_server import Changing
-from runtime.schedule import SECOND, Once, Tick, Ticker
+from runtime.instruments import Instruments
+from runtime.node_host import NodeHost
+from runtime.node_runner import NodeRunner, log_error, wrap
+from runtime.parameter_server import ParameterServer
+from runtime.run_state import RunState
+from runtime.schedule import SECOND, Once
 from runtime.sender import Deliver, Listener, Tap
-from runtime.streams import Stream
-from runtime.workers.costs import Costs
-from runtime.workers.worker import Worker
+from runtime.startup import Announced, Phase, start_up
 
 if TYPE_CHECKING:
     from runtime.peers.peers import Peers
 
-W = TypeVar("W")
-
 log = logging.getLogger("visnav.runtime")
 
 FIRST_BACKOFF = 0.5
-LONGEST_BACKOFF = 30.0
-"""Seconds of the clock before a restart: doubled from the first at each failure…"""
-HEALTHY = 60.0
-"""…until a node has run for so many without one."""
+"""Seconds of the clock before the first restart of a node; doubled at each failure."""
 
-LATER = 0.05
-"""Of a run's length, on the longer of the clock and real time, by which `shutdown_limit` grows:
-what a node has to finish grows with it."""
+LONGEST_BACKOFF = 30.0
+"""Seconds of the clock before a restart at most."""
+
+HEALTHY = 60.0
+"""Seconds of the clock after which a node that has not failed counts as one that never did."""
 
 
 class Supervisor:
-    """Runs the nodes of a configuration on the running loop; the `Host` of its nodes.
+    """Runs the nodes of a configuration on the running loop.
 
     Args:
         config: What to run.
@@ -69,9 +59,13 @@ class Supervisor:
         taps: See every event before its listeners do.
         out: Folder for what nodes write, or `None`.
         only: Nodes that run here, if others run in other processes.
-    """
 
-    checking = False
+    Attributes:
+        state: What is known of the run.
+        instruments: What looks at the run.
+        parameters: Changes settings of nodes.
+        peers: The other processes of the run, if there are any.
+    """
 
     def __init__(
         self,
@@ -81,65 +75,37 @@ class Supervisor:
         out: Path | None = None,
         only: Collection[str] = (),
     ) -> None:
-        self.out = out
-        self.seed = config.run.seed
-        self.clock = clock
-        self.executor: concurrent.futures.Executor = concurrent.futures.ThreadPoolExecutor(
-            max_workers=8, thread_name_prefix="offload"
-        )
-        self.announcements: list[Announcement] = []
-        self.first_update: float | None = None
-        """When the first update was, on `time.monotonic`."""
-        self.ended: float | None = None
-        """When the end of the run was asked for, on `time.monotonic`."""
-        self.ended_at: int | None = None
-        """The same on the run's clock (ns)."""
-        self.reason = ""
-        self.error: Exception | None = None
-        self.asked = ""
-        """Why somebody asked for the end of the run, whom the loop may not have heard yet."""
-        self.interruption: Exception | None = None
-        """What is to be raised in a node that blocks the loop."""
-        self.ever: list[Node[Any]] = []
-        """All nodes there have been, those restarted or dropped included."""
-        self.tickers: dict[str, Ticker] = {}
-        self.links: dict[str, Link] = {}
-        """All links of the nodes that there are, by ``node.port``."""
-        self.verdicts: dict[str, dict[str, Any]] = {}
-        """What nodes concluded, by what they judged."""
-        self.costs: dict[str, Costs] = {}
-        """What workers cost, by ``node.Factory``."""
-        self.after: list[Callable[[Path], Any]] = []
-        """What is to be called with the run's folder at the very end."""
-        self.probes = Probes(self)
-        self.changing = Changing(self)
-        self._config = config
-        self._taps = tuple(taps)
         here = [spec for spec in config.nodes if not only or spec.name in only]
-        self._lives = {spec.name: Life(spec, self._own) for spec in here}
+        runners = {spec.name: NodeRunner(spec, self._own) for spec in here}
+        several = len(runners) < len(config.nodes)
+        self.state = RunState(config, clock, runners, several_processes=several)
+        self.instruments = Instruments(runners, self._reconnect)
+        self.parameters = ParameterServer(self.state, self.fault)
+        self._host = NodeHost(
+            self.state, out, self.instruments, self.parameters, self._own, self.stop, self.fault
+        )
+        self._taps = tuple(taps)
         self.peers: Peers | None = None
-        """The other processes of the run, if there are any."""
-        if len(self._lives) < len(config.nodes):
+        if several:
             from runtime.peers.peers import Peers
 
             self.peers = Peers(config, only, clock, self)
-        self._running = False
         self._ended = asyncio.Event()
-        self._begin: asyncio.Task[None] | None = None
+        self._startup: asyncio.Task[None] | None = None
         self._tasks: dict[asyncio.Task[Any], None] = {}
-        self._recoveries: dict[asyncio.Task[Any], None] = {}
+        self._restarts: dict[asyncio.Task[Any], None] = {}
 
     async def main(self) -> None:
-        """Run until something ends the run; `reason` and `error` then say what did."""
-        self._begin = self._own(self._start_all(), "start")
+        """Run until something ends the run; the state's `reason` and `error` then say what did."""
+        self._startup = self._own(self._start_all(), "start")
         try:
             await self._ended.wait()
-            await asyncio.wait([self._begin])
+            await asyncio.wait([self._startup])
             await self._end_all()
         finally:  # there are none left but those that would not end, unless this was cancelled
             for task in self._tasks:
                 task.cancel()
-            self.executor.shutdown(wait=False, cancel_futures=True)
+            self._host.close()
 
     def _own(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
         """Make a task of the run."""
@@ -148,116 +114,54 @@ class Supervisor:
         task.add_done_callback(lambda _: self._tasks.pop(task, None))
         return task
 
-    # The host of the nodes.
+    # What others ask of a run.
 
-    def stop(self, reason: str, error: Exception | None = None, *, told: bool = False) -> None:
+    def stop(self, reason: str, error: Exception | None = None, *, from_peer: bool = False) -> None:
         """End the run in order; the first reason counts.
 
         Args:
             reason: For the summary.
             error: What went wrong, if anything did.
-            told: Whether another process says so, and need not be told.
+            from_peer: Whether another process says so, and need not be told.
         """
         if self._ended.is_set():
             return
-        reason = self.asked or reason
+        state = self.state
+        reason = state.stop_requested or reason
         if self.peers is not None:
-            self.peers.stopping(reason, error, told=told)
-        self.reason = reason
-        self.error = error
-        self.ended, self.ended_at = time.monotonic(), self.clock.now()
+            self.peers.stopping(reason, error, from_peer=from_peer)
+        state.reason = reason
+        state.error = error
+        state.stopped, state.stopped_at = time.monotonic(), state.clock.now()
         self._ended.set()
-        if self._begin is not None and not self._begin.done():
-            self._begin.cancel()
-
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
-        """Note a verdict for the summary."""
-        self.verdicts[subject] = {"passed": passed, **figures}
-
-    def after_run(self, call: Callable[[Path], Any]) -> None:
-        """Have a function called once the summary is written."""
-        self.after.append(call)
-
-    def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
-        """Run a coroutine as part of a node."""
-        self._start(node, coro)
-
-    def _start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        life = self._lives[node.name]
-        guarded = self._guard(node, coro)
-        guarded.__qualname__ = getattr(coro, "__qualname__", guarded.__qualname__)  # type: ignore[attr-defined]
-        task = self._own(guarded, node.name)
-        life.tasks[task] = None
-        self.probes.on_task(node.name, task)
-        task.add_done_callback(lambda _: life.tasks.pop(task, None))
-        if inspect.iscoroutine(coro):  # which is not begun if the task is cancelled before
-            task.add_done_callback(lambda _: coro.close())
-        return task
-
-    def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
-        """Call a function of a node at a rate, from the first update on."""
-        full_name = self._ticker_name(node.name, name)
-        if inspect.iscoroutinefunction(call):
-            call = self._in_background(node, call, full_name)
-        fault = functools.partial(self.fault, node.name)
-        ticker = Ticker(full_name, hz, call, fault, before=self.tickers.get(full_name))
-        self.tickers[full_name] = ticker
-        self._lives[node.name].tickers.append(ticker)
-        self.probes.on_ticker(ticker)
-        if self._running and self._lives[node.name].started:
-            self._add(ticker)
-        return ticker
-
-    async def worker(
-        self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
-    ) -> Worker[W]:
-        """Make a worker that ends with the node."""
-        loop = asyncio.get_running_loop()
-
-        def died(error: Exception) -> None:
-            loop.call_soon_threadsafe(self.fault, node.name, error)
-
-        name = f"{node.name}.{getattr(factory, '__name__', 'worker')}"
-        worker: Worker[W] = Worker(
-            name,
-            self.clock,
-            factory,
-            *args,
-            printed=lambda line: node.log.debug("%s printed: %s", name, line),
-            died=died,
-            costs=self.costs.setdefault(name, Costs()),
-            **options,
-        )
-        self._lives[node.name].workers.append(worker)  # which ends it, ready or not
-        await worker.ready()
-        self.probes.on_worker(worker)
-        return worker
+        if self._startup is not None and not self._startup.done():
+            self._startup.cancel()
 
     def escaped(self, error: BaseException) -> None:
         """Deal with an exception that came out of the loop: some task or callback let it."""
         name, place = code_location.of_error(error)
-        if name in self._lives:
+        if name in self.state.runners:
             self.fault(name, error)
             return
         wrapped = wrap("runtime", error)
         log_error(wrapped, last=not self._ended.is_set())
-        self.error = self.error or wrapped
+        self.state.note_error(wrapped)
         self.stop(f"failed at {place}", wrapped)
 
     def fault(self, name: str, error: BaseException) -> None:
         """Deal with an exception in a node as its `on_error` says."""
-        life = self._lives[name]
-        if life.recovering:
+        runner = self.state.runners[name]
+        if runner.restarting:
             return
         wrapped = wrap(name, error)
         fatal = (
             isinstance(code_location.leaf(error), FatalError)
-            or life.spec.on_error == "stop"
-            or not self._running
+            or runner.spec.on_error == "stop"
+            or not self.state.running
         )
         log_error(wrapped, last=fatal and not self._ended.is_set())
         if self._ended.is_set():
-            self.error = self.error or wrapped
+            self.state.note_error(wrapped)
         elif fatal:
             self.stop(f"{name} failed", wrapped)
         else:
@@ -270,38 +174,51 @@ class Supervisor:
             name: Of the node.
             anyway: Bring one up whatever that says: somebody asked for it.
         """
-        life = self._lives[name]
-        life.recovering = True
-        if self.clock.now() - life.begun > HEALTHY * SECOND:
-            life.failures = 0
-        task = self._own(self._recover(life, anyway), f"recover {name}")
-        self._recoveries[task] = None
-        task.add_done_callback(lambda task: self._recoveries.pop(task, None))
+        runner = self.state.runners[name]
+        runner.restarting = True
+        if self.state.clock.now() - runner.running_since > HEALTHY * SECOND:
+            runner.failures = 0
+        task = self._own(self._restart(runner, anyway), f"restart {name}")
+        self._restarts[task] = None
+        task.add_done_callback(lambda task: self._restarts.pop(task, None))
 
-    # Beginning.
+    def connect(self) -> None:
+        """Freeze who hears whom; anew whenever a node or another process comes or goes."""
+        runners = self.state.runners.values()
+        nodes = [runner.node for runner in runners if runner.node and runner.started]
+        taps = (*self._taps, *self.instruments.taps)
+        listeners = graph.connect(
+            nodes,
+            sources={node.name: node.sources for node in nodes},
+            links={runner.spec.name: runner.links for runner in runners},
+            taps=taps,
+            fault=self._listener_failed,
+            last=[Listener("run", self._hear_end, (Shutdown, WindowClosed))],
+            elsewhere=self.peers.listeners if self.peers is not None else graph.nobody,
+            wrap=self.instruments.listener,
+        )
+        if self.peers is not None:
+            self.peers.connect(listeners, self._listener_failed)
+        self.parameters.connect(listeners, taps, self._listener_failed)
+
+    def _reconnect(self) -> None:
+        if self.state.running:  # before, nodes must not be able to send
+            self.connect()
+
+    def _listener_failed(self, deliver: Deliver, error: BaseException) -> None:
+        owner: Any = deliver.__self__  # type: ignore[attr-defined]  # a node, or a stream of one
+        self.fault(owner.name.partition(".")[0], error)
+
+    def _hear_end(self, event: Event) -> None:
+        reason = getattr(event, "reason", "") or type(event).__name__
+        self.stop(f"{event.source}: {reason}")
+
+    # Starting.
 
     async def _start_all(self) -> None:
+        state = self.state
         try:
-            if self.peers is not None:
-                before = await self.peers.meet()
-                for life in self._lives.values():
-                    life.starts = before
-            for life in self._lives.values():
-                await self._start_up(life)
-                if self._ended.is_set():  # it stopped the run and did not wait for anything after
-                    return
-            said = {name: life.announced() for name, life in self._lives.items()}
-            mine = list(chain(*said.values()))
-            self.announcements += await self.peers.announce(said) if self.peers else mine
-            for life in self._lives.values():
-                life.hear(self.announcements)
-            for life in self._lives.values():
-                await life.ready(self._config.run.startup_limit)
-                if self._ended.is_set():
-                    return
-            if self.peers is not None:
-                self.connect()  # so that each knows what the others hear
-                await self.peers.begin()
+            announced = await self._start_nodes()
         except PeerError as error:
             log.error("%s", error, extra={"told": True})
             self.stop("the processes of the run did not come together", error)
@@ -313,187 +230,129 @@ class Supervisor:
             log_error(failed, last=True)
             self.stop("start-up failed", failed)
             return
-        for announcement in mine:
+        for announcement in announced:
             for tap in self._taps:
                 tap(None, announcement)
         self.connect()
-        self._running = True
-        self.first_update = time.monotonic()
+        state.running = True
+        state.first_update = time.monotonic()
         if self.peers is None:
-            self.clock.start()
-        if self._config.run.duration:
-            end = self.clock.now() + round(self._config.run.duration * 1e9)
-            self.clock.schedule.add(end, Once(lambda: self.stop("duration")))
-        for index, spec in enumerate(self._config.nodes):
-            if spec.name in self._lives:
-                self.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
-                self._begin_node(self._lives[spec.name])
+            state.clock.start()
+        if state.config.run.duration:
+            end = state.clock.now() + round(state.config.run.duration * SECOND)
+            state.clock.schedule.add(end, Once(lambda: self.stop("duration")))
+        for index, spec in enumerate(state.config.nodes):
+            if spec.name in state.runners:
+                state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
+                self._host.run_node(state.runners[spec.name])
         if self.peers is not None:
-            self.peers.begun()
+            self.peers.nodes_run()
 
-    async def _start_up(self, life: Life) -> None:
-        limit = self._config.run.startup_limit
+    async def _start_nodes(self) -> list[Announcement]:
+        """Bring the nodes here to where their first update is next; return their announcements."""
+        mine: list[Announcement] = []
+
+        async def start(runner: NodeRunner) -> None:
+            await self._start_node(runner)
+            self._check_wanted()
+
+        async def exchange(announced: Announced) -> list[Announcement]:
+            mine.extend(chain(*announced.values()))
+            self.state.announcements += await self.peers.announce(announced) if self.peers else mine
+            return self.state.announcements
+
+        async def ready(runner: NodeRunner) -> None:
+            await runner.get_ready(self.state.config.run.startup_limit)
+            self._check_wanted()
+
+        runners = self.state.runners.values()
+        if self.peers is not None:
+            before = await self.peers.meet()
+            for runner in runners:
+                runner.starts = before
+        await start_up(runners, start=start, exchange=exchange, ready=ready, failed=_give_up)
+        if self.peers is not None:
+            self.connect()  # so that each knows what the others hear
+            await self.peers.begin()
+        return mine
+
+    def _check_wanted(self) -> None:
+        """End the start-up if a node has stopped the run and did not wait for anything after."""
+        if self._ended.is_set():
+            raise asyncio.CancelledError
+
+    async def _start_node(self, runner: NodeRunner) -> None:
+        state = self.state
         try:
-            await life.begin(self, limit)
+            await runner.start_up(self._host, state.config.run.startup_limit)
         finally:
-            if life.node is not None and life.node not in self.ever:
-                self.ever.append(life.node)
-            self.links |= {link.name: link for link in life.links.values()}
+            if runner.node is not None and runner.node not in state.all_nodes:
+                state.all_nodes.append(runner.node)
+            state.links |= {link.name: link for link in runner.links.values()}
 
-    def connect(self) -> None:
-        """Freeze who hears whom; anew whenever a node or another process comes or goes."""
-        nodes = [life.node for life in self._lives.values() if life.node and life.started]
-        sources = {node.name: node.sources for node in nodes}
-        links = {life.spec.name: life.links for life in self._lives.values()}
-        end = Listener("run", self._hear_end, (Shutdown, WindowClosed))
-        elsewhere = self.peers.listeners if self.peers is not None else graph.nobody
-        heard = self.probes.looking(
-            graph.connect(
-                nodes, sources, links, self._taps, self._listener_failed, [end], elsewhere
-            )
-        )
-        if self.peers is not None:
-            self.peers.connect(heard, self._listener_failed)
-        self.changing.connect(heard, self._taps, self._listener_failed)
-        self.probes.on_connected(nodes, [self.changing.sender])
-
-    def _begin_node(self, life: Life) -> None:
-        node = life.node
-        assert node is not None
-        life.begun = self.clock.now()
-        for ticker in life.tickers:
-            self._add(ticker)
-        for method, ticks in node.declared.ticks.items():
-            hz = getattr(node.config, ticks.hz) if isinstance(ticks.hz, str) else ticks.hz
-            self.every(node, hz, getattr(node, method), method)
-        if type(node).run is not Node.run:
-            self._start(node, node.run()).add_done_callback(lambda _: self._has_run(node))
-
-    def _has_run(self, node: Node[Any]) -> None:
-        """Say so if a node has stopped reading its inputs: it looks alive, and is not."""
-        life, ports = self._lives[node.name], [*node.declared.inputs, *node.declared.bundles]
-        if ports and not (self._ended.is_set() or life.closing or life.recovering):
-            unread = ", ".join(ports)
-            log.warning("%s: run() has returned: nobody reads %s any more", node.name, unread)
-
-    def _add(self, ticker: Ticker) -> None:
-        ticker.begin(self.clock.now())
-        self.clock.schedule.add(ticker.due, ticker)
-
-    def _ticker_name(self, node: str, name: str) -> str:
-        """Return ``node.name``, with a number if the node has a ticker of this name already."""
-        taken = {ticker.name for ticker in self._lives[node].tickers if not ticker.stopped}
-        numbered = (f"{node}.{name}_{number}" for number in count(2))
-        return next(full for full in chain([f"{node}.{name}"], numbered) if full not in taken)
-
-    def _in_background(
-        self, node: Node[Any], call: Callable[[Tick], Any], name: str
-    ) -> Callable[[Tick], None]:
-        """Return a function that hands ticks to a coroutine, and skips those it is too busy for."""
-        ticks: Stream[Tick] = Stream(name, bound=1, overflow="drop_oldest")
-
-        async def serve() -> None:
-            async for tick in ticks:
-                await call(tick)
-
-        def hand_over(tick: Tick) -> None:
-            if ticks.waiter is None:
-                self.tickers[ticks.name].missed += 1
-            else:
-                ticks.offer(tick)
-
-        self.start(node, serve())
-        return hand_over
-
-    # Going wrong.
-
-    async def _guard(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
-        life = self._lives[node.name]
-        me = asyncio.current_task()
-        try:
-            await coro
-        except BaseException as error:
-            ours = life.closing or life.node is not node
-            if ours and isinstance(error, asyncio.CancelledError):
-                raise
-            if asyncio._get_running_loop() is None or asyncio.current_task() is not me:
-                raise  # a GeneratorExit: it is thrown away
-            if life.node is node:
-                self.fault(node.name, error)
-
-    def _listener_failed(self, deliver: Deliver, error: BaseException) -> None:
-        owner: Any = deliver.__self__  # type: ignore[attr-defined]  # a node, or a stream of one
-        self.fault(owner.name.partition(".")[0], error)
-
-    def _hear_end(self, event: Event) -> None:
-        reason = getattr(event, "reason", "") or type(event).__name__
-        self.stop(f"{event.source}: {reason}")
-
-    async def _recover(self, life: Life, anyway: bool) -> None:
-        name = life.spec.name
+    async def _restart(self, runner: NodeRunner, anyway: bool) -> None:
+        name = runner.spec.name
         # Shielded: the end of the run ends this task, but must not cut an on_shutdown short.
-        await asyncio.shield(self._own(self._retire(life), name))
-        if life.spec.on_error == "drop" and not anyway:
+        await asyncio.shield(self._own(self._shut_down(runner), name))
+        if runner.spec.on_error == "drop" and not anyway:
             log.warning("%s: left out from here on", name)
             return
         while not self._ended.is_set():
-            pause = min(FIRST_BACKOFF * 2 ** min(life.failures, 16), LONGEST_BACKOFF)
-            life.failures += 1
+            pause = min(FIRST_BACKOFF * 2 ** min(runner.failures, 16), LONGEST_BACKOFF)
+            runner.failures += 1
             log.warning("%s: restarts in %g s", name, pause)
-            await self.clock.sleep(pause)
+            await self.state.clock.sleep(pause)
             try:
-                await self._start_up(life)
-                life.hear(self.announcements)
-                await life.ready(self._config.run.startup_limit)
+                await self._start_node(runner)
+                runner.receive_announcements(self.state.announcements)
+                await runner.get_ready(self.state.config.run.startup_limit)
             except NodeError as error:
                 if isinstance(code_location.leaf(error.__cause__ or error), FatalError):
                     log_error(error, last=True)
                     self.stop(f"{name} failed", error)
                     return
                 log_error(error, last=False)
-                await asyncio.shield(self._own(self._retire(life), name))
+                await asyncio.shield(self._own(self._shut_down(runner), name))
                 continue
-            life.recovering = False
+            runner.restarting = False
             self.connect()
-            self._begin_node(life)
+            self._host.run_node(runner)
             return
 
     # Ending.
 
     async def _end_all(self) -> None:
-        for ticker in self.tickers.values():
+        for ticker in self.state.tickers.values():
             ticker.stopped = True
-        for task in self._recoveries:
+        for task in self._restarts:
             task.cancel()
-        if self._recoveries:
-            await asyncio.wait(self._recoveries)
-        if not self._running:  # what has started may still send farewells to what has, too
+        if self._restarts:
+            await asyncio.wait(self._restarts)
+        if not self.state.running:  # what has started may still send farewells to what has, too
             self.connect()
-        for name, life in reversed(self._lives.items()):
-            await self._turn_to_end(name)
-            await self._retire(life)
+        for name, runner in reversed(self.state.runners.items()):
+            await self._wait_to_end(name)
+            await self._shut_down(runner)
             if self.peers is not None:
-                self.peers.retired(name)
-        await self._turn_to_end("")
+                self.peers.node_ended(name)
+        await self._wait_to_end("")
 
-    async def _turn_to_end(self, name: str) -> None:
+    async def _wait_to_end(self, name: str) -> None:
         """Let the nodes after this one end first, in whichever process they are."""
         try:
             if self.peers is not None:
-                await self.peers.ending.turn(name)
+                await self.peers.shutdown.wait_to_end(name)
         except VisnavError as error:
             log.error("%s", error)
-            self.error = self.error or error
+            self.state.note_error(error)
 
-    async def _retire(self, life: Life) -> None:
+    async def _shut_down(self, runner: NodeRunner) -> None:
         """End one node, unless that is done: it hears nothing afterwards."""
-        async with life.ending:
-            for error in await life.end(self.shutdown_limit()):
-                self.error = self.error or error
+        async with runner.shutdown_lock:
+            for error in await runner.shut_down(self.state.shutdown_limit()):
+                self.state.note_error(error)
             self.connect()
 
-    def shutdown_limit(self) -> float:
-        """Return how many real seconds a node's end may take now."""
-        real = time.monotonic() - (self.first_update or time.monotonic())
-        length = max(real, self.clock.now() / SECOND)
-        return self._config.run.shutdown_limit + LATER * length
+
+def _give_up(_phase: Phase, _runner: NodeRunner, error: NodeError) -> None:
+    raise error

@@ -1,8 +1,8 @@
 """Resuming a waiting coroutine at once, inside the `send()` that it waits for.
 
 A stock task is woken through the loop's ready queue, which costs a future, a handle and a turn
-of the loop. `Steps` wraps a task's coroutine so that a stream can step it directly: the task
-itself stays parked on a future (the *gate*) all the while, and takes over again when the
+of the loop. `ResumableCoroutine` wraps a task's coroutine so that a stream can step it directly:
+the task itself stays parked on a future (the *gate*) all the while, and takes over again when the
 coroutine waits for anything but a stream, ends, or is cancelled. The task is asyncio's own, so
 `asyncio.timeout`, `TaskGroup`, `cancel`, `uncancel`, names and stacks are the stock ones; and the
 coroutine is stepped in the task's own context with the task as the current one, so it cannot
@@ -81,7 +81,7 @@ class _Task(asyncio.Task[Any]):
 class _Gate(asyncio.Future[None]):
     """What a task waits on while streams step its coroutine."""
 
-    steps: Steps
+    steps: ResumableCoroutine
 
     def cancel(self, msg: Any = None) -> bool:
         """Cancel the wait: from now on an event is kept, not given to the cancelled reader."""
@@ -89,7 +89,7 @@ class _Gate(asyncio.Future[None]):
         return super().cancel(msg)
 
 
-class Steps(Coroutine[Any, Any, Any]):
+class ResumableCoroutine(Coroutine[Any, Any, Any]):
     """A task's coroutine that can be stepped by streams as well as by the task."""
 
     __slots__ = (
@@ -124,6 +124,10 @@ class Steps(Coroutine[Any, Any, Any]):
         self._stream: Stream[Any] | None = None
         self._later: asyncio.Handle | None = None
         self._outcome: Any = _NOTHING  # of a step by a stream, for the task to deal with
+
+    def wrap_step(self, wrap: Callable[[Callable[[Any], Any]], Callable[[Any], Any]]) -> None:
+        """Step from now on by what `wrap` returns for the coroutine's own `send`."""
+        self._step = wrap(self._coro.send)
 
     # For streams.
 
@@ -215,8 +219,8 @@ class _WakeUp:
 
     __slots__ = ("waiter",)
 
-    def __init__(self, waiter: Steps) -> None:
-        self.waiter: Steps | None = waiter
+    def __init__(self, waiter: ResumableCoroutine) -> None:
+        self.waiter: ResumableCoroutine | None = waiter
 
 
 class FanOut:
@@ -258,7 +262,7 @@ class FanOut:
         try:
             for stream in self.streams:
                 steps = stream.waiter
-                if type(steps) is not Steps:
+                if type(steps) is not ResumableCoroutine:
                     try:
                         if steps is None:
                             stream.keep(event)
@@ -324,7 +328,7 @@ def _task_factory(
     """
     if context is None:
         context = contextvars.copy_context()
-        coro = Steps(coro, loop, context, nesting)
+        coro = ResumableCoroutine(coro, loop, context, nesting)
     parent: Any = _current_tasks.get(loop)
     counter = parent if isinstance(parent, _Task) else nesting
     counter.tasks += 1

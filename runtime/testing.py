@@ -126,13 +126,13 @@ def run_nodes(
         assert isinstance(loop, LockstepLoop)
         supervisor = Supervisor(settings, LockstepClock(loop), [collect], out)
         await supervisor.main()
-        if supervisor.error is not None:
-            raise supervisor.error
+        if supervisor.state.error is not None:
+            raise supervisor.state.error
         return NodeResult(
             sent,
-            supervisor.reason,
-            count_drops(supervisor),
-            tick_summaries(supervisor),
+            supervisor.state.reason,
+            count_drops(supervisor.state),
+            tick_summaries(supervisor.state),
             loop.now / 1e9,
         )
 

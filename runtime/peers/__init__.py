@@ -12,7 +12,7 @@
     turns      lockstep: one process at a time goes on, the one with the next thing due
     crossing   outputs here that are heard there, and the other way round
     greeting   how two processes that see each other come to a session
-    roster     who is there, who comes and who goes
+    membership     who is there, who comes and who goes
     member     one of them, and what is known of it
     ending     the end: in order, and nobody leaves before all know what each has to say
     peers      all of it together, for the supervisor

@@ -44,10 +44,10 @@ async def compare(
 
 def ask(member: Member) -> None:
     """Ask what time it is there."""
-    member.line.send(Ping(time.monotonic_ns()))
+    member.outbox.send(Ping(time.monotonic_ns()))
 
 
-class Pursuit:
+class PhaseLockedLoop:
     """How quickly to run to catch up with a clock: a phase-locked loop of the second order.
 
     It is critically damped and settles in half a minute. (As in RFC 5905, section 11.3.)
@@ -76,7 +76,7 @@ class Pursuit:
         return 1.0 + min(max(wanted, -LIMIT), LIMIT)
 
 
-class Following:
+class ClockFollower:
     """Keeps our clock with that of another process.
 
     Args:
@@ -87,7 +87,7 @@ class Following:
     def __init__(self, clock: RealClock, member: Member) -> None:
         self.member = member
         self._clock = clock
-        self._pursuit = Pursuit()
+        self._pursuit = PhaseLockedLoop()
         self._loop = asyncio.get_running_loop()
         self._asked = 0
         self._handle = self._loop.call_later(PERIOD, self._ask)

@@ -13,7 +13,8 @@ import contextlib
 import logging
 import secrets
 import threading
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import msgspec
 
@@ -22,9 +23,6 @@ from runtime.peers.authentication import NONCE, ForgedError, Sealing, hello_seal
 from runtime.peers.member import Member
 from runtime.peers.messages import Hello, decode, encode
 from runtime.peers.zenoh_session import Heard, Session
-
-if TYPE_CHECKING:
-    from runtime.peers.membership import Roster
 
 log = logging.getLogger("visnav.runtime")
 
@@ -50,7 +48,25 @@ class Contact:
         self.doubt = b""
 
 
-class Greeting:
+class Meeting(Protocol):
+    """What is told whom we meet, on the loop, and says who we are."""
+
+    hello: Hello
+
+    def soon(self, call: Callable[..., Any], *args: Any) -> None:
+        """Have something called on the loop."""
+
+    def met(self, member: Member) -> None:
+        """Take in that there is a session with a process."""
+
+    def went(self, member: Member, why: str = ...) -> None:
+        """Take in that a session has ended."""
+
+    def unsent(self, member: Member, error: VisnavError) -> None:
+        """Take in what could not be sent."""
+
+
+class Handshakes:
     """All processes that show themselves, and our sessions with them.
 
     Zenoh calls while it holds locks of its own: what asks it for something is left to the loop.
@@ -58,19 +74,19 @@ class Greeting:
     Args:
         key: Of the run.
         session: With Zenoh.
-        roster: Says who we are, and is told whom we meet.
+        membership: Says who we are, and is told whom we meet.
 
     Attributes:
         id: By which the others know us.
         refused: Messages that were left out, since nobody of the run wrote them.
     """
 
-    def __init__(self, key: bytes, session: Session, roster: Roster) -> None:
+    def __init__(self, key: bytes, session: Session, membership: Meeting) -> None:
         self.id = session.id
         self.refused = 0
         self._key = key
         self._session = session
-        self._roster = roster
+        self._membership = membership
         self._lock = threading.Lock()
         self._contacts: dict[str, Contact] = {}
         self._complained: set[str] = set()
@@ -85,7 +101,7 @@ class Greeting:
         """Say the last words, and leave."""
         self._enough.set()
         for member in self.members():
-            await asyncio.to_thread(member.line.close)
+            await asyncio.to_thread(member.outbox.close)
         await asyncio.to_thread(self._session.close)
 
     def member(self, sender: str) -> Member | None:
@@ -107,9 +123,9 @@ class Greeting:
         if contact is None:
             return
         if here:
-            self._roster.soon(self._greet_one, other, contact.nonce)
+            self._membership.soon(self._greet_one, other, contact.nonce)
         elif contact.member is not None:
-            self._roster.soon(self._roster.went, contact.member)
+            self._membership.soon(self._membership.went, contact.member)
 
     def hear(self, sender: str, sealed: bytes) -> None:
         """Take in a greeting; begin a session if it is a fresh one.
@@ -127,7 +143,7 @@ class Greeting:
             raise PeerError(f"expected a process that speaks as we do: {error}") from None
         if not isinstance(hello, Hello):
             raise ForgedError("expected a hello of a process without a session")
-        soon = self._roster.soon
+        soon = self._membership.soon
         with self._lock:
             contact = self._contact(sender)
             if contact is None:
@@ -142,14 +158,14 @@ class Greeting:
                     hello,
                     sealing,
                     lambda message, payload: self._session.put(sender, message, payload),
-                    lambda error: self._roster.unsent(member, error),
+                    lambda error: self._membership.unsent(member, error),
                 )
                 contact.nonce, contact.doubt = secrets.token_bytes(NONCE), b""
                 # Before anything that the loop seals for the session.
                 soon(self._greet_one, sender, sealing.nonce, sealing.seen, sealing.tag)
                 if before is not None:
-                    soon(self._roster.went, before, "their process had lost us")
-                soon(self._roster.met, member)
+                    soon(self._membership.went, before, "their process had lost us")
+                soon(self._membership.met, member)
             elif before is None:
                 soon(self._greet_one, sender, contact.nonce, hello.nonce)
             elif hello.session == before.sealing.tag:
@@ -175,7 +191,9 @@ class Greeting:
             if contact is None or member is None:
                 return
             contact.member = None
-        self._roster.soon(self._roster.went, member, f"their process is not understood: {error}")
+        self._membership.soon(
+            self._membership.went, member, f"their process is not understood: {error}"
+        )
 
     def greet_again(self) -> None:
         """Greet those who have not answered, and those who may be in another session than we."""
@@ -196,7 +214,7 @@ class Greeting:
             self.greet_again()
 
     def _greet_one(self, other: str, nonce: bytes, seen: bytes = b"", tag: bytes = b"") -> None:
-        hello = msgspec.structs.replace(self._roster.hello, nonce=nonce, seen=seen, session=tag)
+        hello = msgspec.structs.replace(self._membership.hello, nonce=nonce, seen=seen, session=tag)
         seal = hello_seal(self._key, self.id, other)
         with contextlib.suppress(PeerError):  # the session is closed
             self._session.put(other, seal.put_on(0, encode(hello)), b"")

@@ -17,8 +17,8 @@ import msgspec
 
 from runtime.peers.compatibility import name_of
 from runtime.peers.member import Member
-from runtime.peers.membership import Roster
-from runtime.peers.messages import Busy, Farewell, Parted
+from runtime.peers.membership import Membership
+from runtime.peers.messages import FinalSummary, StillWorking, SummaryReceived
 from runtime.summary import ProcessSummary, Summary, merged
 from runtime.time_limits import real_time_limit
 
@@ -34,11 +34,11 @@ PARTING = 5.0
 """Seconds that a process has, in the end, to tell what there was."""
 
 
-class Ending:
+class JointShutdown:
     """Our part in the end of a run.
 
     Args:
-        roster: Who is there.
+        membership: Who is there.
         went: Told that some are not waited for any more.
 
     Attributes:
@@ -47,14 +47,14 @@ class Ending:
         heard_at: When the last word of another process came, on `time.monotonic`.
     """
 
-    def __init__(self, roster: Roster, went: Callable[[], None]) -> None:
+    def __init__(self, membership: Membership, went: Callable[[], None]) -> None:
         self.retired: set[str] = set()
         self.at_work = False
         self.heard_at = 0.0
-        self._roster = roster
+        self._membership = membership
         self._went = went
         self._timer: threading.Timer | None = None
-        self._parted: dict[int, Member] = {}
+        self._with_summary: dict[int, Member] = {}
 
     def begin(self) -> None:
         """Look from now on, in real time, whether the end goes on."""
@@ -67,12 +67,12 @@ class Ending:
             self._timer.cancel()
             self._timer = None
 
-    async def turn(self, node: str) -> None:
+    async def wait_to_end(self, node: str) -> None:
         """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
-        nodes = self._roster.nodes
+        nodes = self._membership.nodes
         after = set(nodes[nodes.index(node) + 1 if node else 0 :])
-        await self._roster.until(
-            lambda: not any(after & {*m.nodes} - self.retired for m in self._roster.present()),
+        await self._membership.until(
+            lambda: not any(after & {*m.nodes} - self.retired for m in self._membership.present()),
             despite=True,
             whom=lambda m: bool(after & {*m.nodes} - self.retired),
         )
@@ -81,24 +81,24 @@ class Ending:
     def parted(self, member: Member, part: Summary) -> None:
         """Take in what another process has to say of the run."""
         member.parted = part
-        self._parted[member.number] = member
-        member.line.send(Farewell())
+        self._with_summary[member.number] = member
+        member.outbox.send(SummaryReceived())
 
-    async def part(self, mine: Summary) -> Summary:
+    async def exchange_summaries(self, mine: Summary) -> Summary:
         """Exchange what each process has to say of the run; return all of it together."""
-        roster = self._roster
-        roster.tell(Parted(msgspec.json.encode(mine)))
+        membership = self._membership
+        membership.tell(FinalSummary(msgspec.json.encode(mine)))
         try:
             async with real_time_limit(PARTING):
-                await roster.until(
-                    lambda: all(m.parted and m.has_ours for m in roster.present()), despite=True
+                await membership.until(
+                    lambda: all(m.parted and m.has_ours for m in membership.present()), despite=True
                 )
         except TimeoutError:
-            silent = [name_of(m.nodes) for m in roster.present() if m.parted is None]
+            silent = [name_of(m.nodes) for m in membership.present() if m.parted is None]
             log.warning("no summary of %s", "; ".join(silent))
-        parts = {roster.me: mine}
-        processes = {roster.me: ProcessSummary(list(roster.here), roster.hello.place)}
-        for member in [*self._parted.values(), *roster.present()]:
+        parts = {membership.me: mine}
+        processes = {membership.me: ProcessSummary(list(membership.here), membership.hello.place)}
+        for member in [*self._with_summary.values(), *membership.present()]:
             processes[member.number] = member.summary()
             if member.parted is not None:
                 parts[member.number] = member.parted
@@ -121,20 +121,20 @@ class Ending:
         if self._timer is None:
             return
         if self.at_work:
-            self._roster.tell(Busy())
+            self._membership.tell(StillWorking())
         elif time.monotonic() - self.heard_at > SILENCE:
             self._give_up()
         self._watch()
 
     def _give_up(self) -> None:
         """End without those who say nothing."""
-        roster = self._roster
-        if silent := [m for m in roster.present() if not m.has_ours]:
+        membership = self._membership
+        if silent := [m for m in membership.present() if not m.has_ours]:
             names = "; ".join(name_of(m.nodes) for m in silent)
             log.error("%s: expected a word within %g s; the run ends without it", names, SILENCE)
-            if roster.ended is not None:
-                roster.tell(roster.ended)
+            if membership.ended is not None:
+                membership.tell(membership.ended)
             for member in silent:
-                roster.forget(member)
+                membership.forget(member)
             self._went()
-            roster.notify()
+            membership.notify()

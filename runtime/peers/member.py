@@ -8,8 +8,16 @@ from events import Event
 from runtime.errors import VisnavError, WireError
 from runtime.peers.authentication import Sealing
 from runtime.peers.clock_offsets import Exchanges
-from runtime.peers.messages import Ack, Announced, Begin, Hello, OfTheRun, Said, Wanted
-from runtime.peers.outbox import Line, Put
+from runtime.peers.messages import (
+    Ack,
+    Announcements,
+    EventMessage,
+    FirstUpdate,
+    Hello,
+    OfTheRun,
+    Subscription,
+)
+from runtime.peers.outbox import Outbox, Put
 from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.summary import ProcessSummary, Summary
 from runtime.wire import unpack
@@ -65,20 +73,20 @@ class Member:
         self.held: list[tuple[OfTheRun, Event | None]] | None = None
         self.exchanges = Exchanges()
         self.drift_ppm: float | None = None
-        self.announced: Announced | None = None
+        self.announced: Announcements | None = None
         self.ready = False
-        self.begin: Begin | None = None
-        self.told: tuple[Wanted, ...] | None = None
+        self.begin: FirstUpdate | None = None
+        self.told: tuple[Subscription, ...] | None = None
         self._arrived = 0
         self.parted: Summary | None = None
         self.outgoing: Outgoing | None = None
         self.incoming: Incoming | None = None
         self.has_ours = False
-        self.line = Line(
+        self.outbox = Outbox(
             id_, lambda message, payload: put(sealing.seal(message, payload), payload), failed
         )
 
-    def event(self, said: Said, payload: bytes) -> Event:
+    def event(self, said: EventMessage, payload: bytes) -> Event:
         """Return the event that it said.
 
         Raises:
@@ -96,12 +104,12 @@ class Member:
         unread = 0 if self.incoming is None else self.incoming.unread
         if self._arrived >= ACK_EVERY or unread >= FREE_EVERY:
             freed = () if self.incoming is None else self.incoming.freed()
-            self.line.send(Ack(self._arrived, freed))
+            self.outbox.send(Ack(self._arrived, freed))
             self._arrived = 0
 
     def acknowledged(self, ack: Ack) -> None:
         """Take in what it has got, and what it reads no more."""
-        self.line.arrived(ack.arrived)
+        self.outbox.arrived(ack.arrived)
         if self.outgoing is not None:
             self.outgoing.freed(ack.freed)
 
@@ -124,6 +132,6 @@ class Member:
             clock_offset_ms=None if best is None else best.offset / 1e6,
             round_trip_ms=None if best is None else best.round_trip / 1e6,
             clock_drift_ppm=self.drift_ppm,
-            waited=self.line.peak,
-            replaced=self.line.replaced,
+            waited=self.outbox.peak,
+            replaced=self.outbox.replaced,
         )

@@ -14,7 +14,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -24,18 +24,18 @@ from runtime.errors import PeerError, VisnavError, WireError
 from runtime.peers.authentication import ForgedError, derive, is_hello
 from runtime.peers.clock_offsets import Exchange
 from runtime.peers.compatibility import check_fits, missing, name_of, say_missing, what_all_share
-from runtime.peers.handshake import Greeting
+from runtime.peers.handshake import Handshakes
 from runtime.peers.member import Member
 from runtime.peers.messages import (
     Ack,
+    EventMessage,
     Hello,
-    Mapped,
-    Memory,
+    MemoryMapped,
+    MemoryOffer,
     Message,
     OfTheRun,
     Ping,
     Pong,
-    Said,
     Stop,
     decode,
 )
@@ -44,16 +44,32 @@ from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.peers.zenoh_session import Session, certified
 from runtime.time_limits import real_time_limit
 
-if TYPE_CHECKING:
-    from runtime.peers.peers import Peers
-
 log = logging.getLogger("visnav.runtime")
 
 NAMED_EVERY = 5.0
 """Real seconds after which those who are waited for are named, again and again."""
 
 
-class Roster:
+class Reactions(Protocol):
+    """What is told, on the loop, what other processes do."""
+
+    def heard(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+        """Take in a message."""
+
+    def lost(self, member: Member) -> None:
+        """Deal with the loss of a process."""
+
+    def found_again(self, member: Member) -> None:
+        """Go on with a process that the network had parted from us."""
+
+    def unsent(self, member: Member, error: VisnavError) -> None:
+        """Say what could not be sent."""
+
+    def now(self, ago: int = 0) -> int:
+        """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
+
+
+class Membership:
     """The processes of a run.
 
     Args:
@@ -70,7 +86,7 @@ class Roster:
         ended: Once the run ends, what those are told who come anew.
     """
 
-    def __init__(self, config: Config, only: Iterable[str], peers: Peers) -> None:
+    def __init__(self, config: Config, only: Iterable[str], peers: Reactions) -> None:
         chosen = set(only)
         self.nodes = [spec.name for spec in config.nodes]
         self.here = tuple(name for name in self.nodes if name in chosen)
@@ -86,7 +102,7 @@ class Roster:
         self._network = config.network
         self._peers = peers
         self._loop = asyncio.get_running_loop()
-        self._greeting: Greeting | None = None
+        self._handshakes: Handshakes | None = None
         self.ended: Stop | None = None
         self._numbers: dict[tuple[str, ...], int] = {}
         self._numbered: dict[int, Member] = {}
@@ -106,8 +122,8 @@ class Roster:
         by_certificate = not network.secret and certified(network)
         secret = b"known by certificate" if by_certificate else secret_of(network.secret)
         session = await asyncio.to_thread(Session, self._run, network, secret)
-        self._greeting = Greeting(derive(secret, "run", self._run), session, self)
-        await asyncio.to_thread(self._greeting.begin, self._hear)
+        self._handshakes = Handshakes(derive(secret, "run", self._run), session, self)
+        await asyncio.to_thread(self._handshakes.begin, self._hear)
         if absent := self._missing():
             log.info("waiting for %s at %s", name_of(absent), network.meet)
         try:
@@ -147,13 +163,13 @@ class Roster:
     @property
     def id(self) -> str:
         """The id by which the others know this process."""
-        assert self._greeting is not None
-        return self._greeting.id
+        assert self._handshakes is not None
+        return self._handshakes.id
 
     def tell(self, message: Message) -> None:
         """Send a message to all other processes of the run that are there."""
         for member in self.present():
-            member.line.send(message)
+            member.outbox.send(message)
 
     def forget(self, member: Member) -> None:
         """Go on as if a process were gone."""
@@ -167,8 +183,8 @@ class Roster:
 
     async def close(self) -> None:
         """Say the last words, and leave."""
-        if self._greeting is not None:
-            await self._greeting.close()
+        if self._handshakes is not None:
+            await self._handshakes.close()
 
     # Waiting for what others say.
 
@@ -231,26 +247,26 @@ class Roster:
 
     def _hear(self, sender: str, sealed: bytes, payload: bytes) -> None:
         received = time.monotonic_ns()
-        greeting = self._greeting
-        assert greeting is not None
-        member = greeting.member(sender)
+        handshakes = self._handshakes
+        assert handshakes is not None
+        member = handshakes.member(sender)
         try:
             if member is None or is_hello(sealed):
-                greeting.hear(sender, sealed)
+                handshakes.hear(sender, sealed)
                 return
             data = member.sealing.open(sealed, payload)
             message = decode(data)
         except ForgedError as error:
-            greeting.refuse(sender, error)
+            handshakes.refuse(sender, error)
             return
         except PeerError as error:  # another version
             self.soon(self._misfit, error)
             return
         except WireError as error:
-            greeting.end(sender, error)
+            handshakes.end(sender, error)
             return
         event = None
-        if isinstance(message, Said):
+        if isinstance(message, EventMessage):
             try:
                 event = member.event(message, payload)
             except Exception as error:  # it is counted all the same: in lockstep, all are awaited
@@ -260,7 +276,7 @@ class Roster:
             return
         match message:
             case Ping():  # answered here: a detour by the loop would take time
-                member.line.send(Pong(message.sent, received, self._peers.now()))
+                member.outbox.send(Pong(message.sent, received, self._peers.now()))
             case Pong():
                 half = (received - message.sent) // 2
                 offset = message.here - message.sent - half
@@ -269,12 +285,12 @@ class Roster:
                 self.soon(self.notify)
             case Hello():
                 pass
-            case Memory():
+            case MemoryOffer():
                 member.incoming = Incoming.found(message) if self._network.shared else None
                 if member.incoming is not None:
-                    member.line.send(Mapped())
-            case Mapped():
-                member.line.memory = member.outgoing
+                    member.outbox.send(MemoryMapped())
+            case MemoryMapped():
+                member.outbox.memory = member.outgoing
             case _:
                 self.soon(self._take, member, message, event)
         member.acknowledge(len(data) + len(payload))
@@ -320,11 +336,11 @@ class Roster:
                 self._misfit(error)
             return
         if self.ended is not None:
-            member.line.send(self.ended)
+            member.outbox.send(self.ended)
             return
         if self._network.shared and member.outgoing is None:
             member.outgoing = Outgoing()
-            member.line.send(member.outgoing.offer())
+            member.outbox.send(member.outgoing.offer())
         if self._numbers:
             number = self._numbers.get(member.nodes, -1)
             if number in self._numbered:  # the one before has gone, but we do not know yet
@@ -347,17 +363,17 @@ class Roster:
         if member.over:
             return
         member.over = why
-        member.line.abandon()
+        member.outbox.abandon()
         if self._numbered.get(member.number) is member:
             del self._numbered[member.number]
             self._peers.lost(member)
-            for other in self._greeting.members() if self._greeting else ():
+            for other in self._handshakes.members() if self._handshakes else ():
                 if other.held is not None and other.nodes == member.nodes:
                     self.met(other)
         self.notify()
 
     def _fitting(self) -> list[Member]:
-        members = self._greeting.members() if self._greeting else []
+        members = self._handshakes.members() if self._handshakes else []
         return [m for m in members if not (m.unfit or m.over)]
 
     def _missing(self) -> list[str]:

@@ -51,13 +51,13 @@ class Hello(Message, frozen=True):
     lost: tuple[str, ...] = ()
 
 
-class Announced(Message, frozen=True):
+class Announcements(Message, frozen=True):
     """What each of my nodes announced, as frames of `runtime.wire`."""
 
     said: dict[str, tuple[bytes, ...]]
 
 
-class Wanted(msgspec.Struct, frozen=True):
+class Subscription(msgspec.Struct, frozen=True):
     """What one input or handler hears.
 
     Attributes:
@@ -71,10 +71,10 @@ class Wanted(msgspec.Struct, frozen=True):
     latest: bool
 
 
-class Hearing(Message, frozen=True):
+class Subscriptions(Message, frozen=True):
     """What my nodes hear."""
 
-    wanted: tuple[Wanted, ...]
+    wanted: tuple[Subscription, ...]
 
 
 class Ping(Message, frozen=True):
@@ -105,7 +105,7 @@ class Ready(Message, frozen=True):
     """My nodes can begin."""
 
 
-class Begin(Message, frozen=True):
+class FirstUpdate(Message, frozen=True):
     """The first update is (or was) then.
 
     Attributes:
@@ -117,7 +117,7 @@ class Begin(Message, frozen=True):
     now: int = 0
 
 
-class Memory(Message, frozen=True):
+class MemoryOffer(Message, frozen=True):
     """Memory into which I can put what is large for you, if you see it.
 
     Attributes:
@@ -131,11 +131,11 @@ class Memory(Message, frozen=True):
     key: bytes
 
 
-class Mapped(Message, frozen=True):
+class MemoryMapped(Message, frozen=True):
     """I see your memory."""
 
 
-class Said(Message, frozen=True):
+class EventMessage(Message, frozen=True):
     """An event of an output (``node.port``).
 
     Attributes:
@@ -165,31 +165,31 @@ class Stop(Message, frozen=True):
     apart: bool = False
 
 
-class Retired(Message, frozen=True):
+class NodeEnded(Message, frozen=True):
     """A node of mine has ended, and hears nothing any more."""
 
     node: str
     serial: int = AT_ONCE
 
 
-class Parted(Message, frozen=True):
+class FinalSummary(Message, frozen=True):
     """What there is to say of the run in my process: a part of the summary, as JSON."""
 
     part: bytes
 
 
-class Farewell(Message, frozen=True):
+class SummaryReceived(Message, frozen=True):
     """I have what you had to say of the run: leave when you like.
 
     That a process goes is told before its last messages may have arrived.
     """
 
 
-class Busy(Message, frozen=True):
+class StillWorking(Message, frozen=True):
     """I am still at work on the end of a node of mine."""
 
 
-class Turn(Message, frozen=True):
+class TimeToken(Message, frozen=True):
     """It is your turn in lockstep.
 
     Attributes:
@@ -222,18 +222,18 @@ class Ack(Message, frozen=True):
     freed: tuple[Count, ...] = ()
 
 
-class Call(Message, frozen=True):
+class TokenRequest(Message, frozen=True):
     """Give me a turn: something came from outside."""
 
 
-class Standing(Message, frozen=True):
+class StateReport(Message, frozen=True):
     """Where I stand, after a process went or came: what a new turn is made of.
 
     Attributes:
         processes: Ids of all that I know to be there.
         epoch: Of the last turn that I know of.
-        now: As in `Turn`.
-        orders: As in `Turn`.
+        now: As in `TimeToken`.
+        orders: As in `TimeToken`.
         key: What I have due next.
         sent: How many ordered messages I have sent to each process.
     """
@@ -246,24 +246,24 @@ class Standing(Message, frozen=True):
     sent: tuple[Count, ...]
 
 
-Ordered = Said | Stop | Retired
+Ordered = EventMessage | Stop | NodeEnded
 """In lockstep these are taken in at one's turn, in the order of their serial numbers; but at once
 if they have none."""
 
 OfTheRun = (
-    Announced
-    | Hearing
+    Announcements
+    | Subscriptions
     | Ready
-    | Begin
+    | FirstUpdate
     | Ordered
-    | Parted
-    | Farewell
-    | Busy
-    | Turn
-    | Call
-    | Standing
+    | FinalSummary
+    | SummaryReceived
+    | StillWorking
+    | TimeToken
+    | TokenRequest
+    | StateReport
 )
-AnyMessage = Hello | Ping | Pong | Ack | Memory | Mapped | OfTheRun
+AnyMessage = Hello | Ping | Pong | Ack | MemoryOffer | MemoryMapped | OfTheRun
 
 encode = msgspec.msgpack.Encoder().encode
 _decoder: msgspec.msgpack.Decoder[AnyMessage] = msgspec.msgpack.Decoder(AnyMessage)

@@ -36,7 +36,7 @@ UNDER_WAY = 32768
 """Bytes that may be under way for that: Zenoh's queue holds four times as many."""
 
 
-class Line:
+class Outbox:
     """Messages on their way to one process, in order.
 
     Args:

@@ -15,31 +15,31 @@ from runtime.clock import Clock
 from runtime.config.model import Config
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
 from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.peers.clock_sync import Following, compare
+from runtime.peers.clock_sync import ClockFollower, compare
 from runtime.peers.compatibility import name_of
-from runtime.peers.joint_shutdown import Ending
+from runtime.peers.joint_shutdown import JointShutdown
 from runtime.peers.member import Member
-from runtime.peers.membership import Roster
+from runtime.peers.membership import Membership
 from runtime.peers.messages import (
-    Announced,
-    Begin,
-    Busy,
-    Call,
-    Farewell,
-    Hearing,
+    Announcements,
+    EventMessage,
+    FinalSummary,
+    FirstUpdate,
     Message,
+    NodeEnded,
     OfTheRun,
     Ordered,
-    Parted,
     Ready,
-    Retired,
-    Said,
-    Standing,
+    StateReport,
+    StillWorking,
     Stop,
-    Turn,
+    Subscriptions,
+    SummaryReceived,
+    TimeToken,
+    TokenRequest,
 )
-from runtime.peers.remote_events import Crossing, hearing
-from runtime.peers.time_token import Turns
+from runtime.peers.remote_events import RemoteEvents, subscriptions
+from runtime.peers.time_token import TimeTokenHolder
 from runtime.real_clock import RealClock
 from runtime.sender import Listener
 from runtime.summary import Summary
@@ -55,8 +55,8 @@ LEAD = 50_000_000
 class Run(Protocol):
     """What the other processes can bring about here."""
 
-    def stop(self, reason: str, error: Exception | None = None, *, told: bool = False) -> None:
-        """End the run; `told` if another process says so."""
+    def stop(self, reason: str, error: Exception | None = None, *, from_peer: bool = False) -> None:
+        """End the run; `from_peer` if another process says so."""
 
     def connect(self) -> None:
         """Freeze anew who hears whom."""
@@ -72,26 +72,26 @@ class Peers:
         run: The run here.
 
     Attributes:
-        ending: Our part in the end of it.
+        shutdown: Our part in the end of it.
     """
 
     def __init__(self, config: Config, only: Iterable[str], clock: Clock, run: Run) -> None:
         self._config = config
         self._clock = clock
         self._run = run
-        self._roster = Roster(config, only, self)
-        self.ending = Ending(self._roster, self._gather)
-        self._crossing: Crossing | None = None
+        self._membership = Membership(config, only, self)
+        self.shutdown = JointShutdown(self._membership, self._gather)
+        self._remote: RemoteEvents | None = None
         self._loop: LockstepLoop | None = None
-        self._turns: Turns | None = None
-        self._announced = Announced({})
+        self._token: TimeTokenHolder | None = None
+        self._announced = Announcements({})
         self._early: list[tuple[Member, OfTheRun, Event | None]] = []
         self._ready = self._decided = self._begun = self._suspended = self._ends = False
         self._decider: Member | None = None
         self._lost_early: list[Member] = []
         self._apart: set[int] = set()
         self._retired_here: list[str] = []
-        self._following: Following | None = None
+        self._follower: ClockFollower | None = None
         self._followed = -1
 
     # Before the run.
@@ -105,24 +105,28 @@ class Peers:
         Raises:
             PeerError: They are not within the limit, or somebody runs another file or our nodes.
         """
-        roster = self._roster
-        before = await roster.meet()
-        self._crossing = Crossing(self._config.nodes, roster.owners(), roster.me, self._leave)
+        membership = self._membership
+        before = await membership.meet()
+        self._remote = RemoteEvents(
+            self._config.nodes, membership.owners(), membership.me, self._leave
+        )
         if isinstance(self._clock, LockstepClock):
             loop = asyncio.get_running_loop()
             assert isinstance(loop, LockstepLoop)
             self._loop = loop
-            self._turns = Turns(roster.me, roster.count, loop, self._send_to, self._do)
+            self._token = TimeTokenHolder(
+                membership.me, membership.count, loop, self._send_to, self._do
+            )
         return before
 
     async def announce(self, said: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Tell the others what the nodes here announce; return what all do, in file order."""
-        self._announced = Announced(
+        self._announced = Announcements(
             {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in said.items()}
         )
-        self._roster.tell(self._announced)
-        others = self._roster.present
-        await self._roster.until(
+        self._membership.tell(self._announced)
+        others = self._membership.present
+        await self._membership.until(
             lambda: all(m.announced is not None for m in others()),
             whom=lambda m: m.announced is None,
             limit=self._start_up_limit(),
@@ -135,7 +139,7 @@ class Peers:
                         everything[name] = [_announcement(frame) for frame in frames]
                     except WireError as error:
                         raise PeerError(f"{name}, at {member.place}: {error}") from None
-        return [a for name in self._roster.nodes for a in everything.get(name, ())]
+        return [a for name in self._membership.nodes for a in everything.get(name, ())]
 
     async def begin(self) -> None:
         """Agree on when the first update is, and wait for it.
@@ -144,23 +148,23 @@ class Peers:
         the run; one after it is dealt with as in the run, also by those who hear of it before they
         hear that the run has begun. Who comes back to a run that goes on joins it where it is.
         """
-        roster = self._roster
+        membership = self._membership
         reference = self._decider = self._reference()
-        if reference is not None and self._turns is None:
-            await compare(reference, roster.until)
+        if reference is not None and self._token is None:
+            await compare(reference, membership.until)
         self._ready = True
-        self._roster.tell(Ready())
+        self._membership.tell(Ready())
         if reference is None:
-            await roster.until(
-                lambda: all(m.ready for m in roster.present()),
+            await membership.until(
+                lambda: all(m.ready for m in membership.present()),
                 whom=lambda m: not m.ready,
                 limit=self._start_up_limit(),
             )
             self._decided = True
             origin = time.monotonic_ns() + LEAD
-            self._roster.tell(Begin(origin))
+            self._membership.tell(FirstUpdate(origin))
         else:
-            await roster.until(
+            await membership.until(
                 lambda: reference.begin is not None,
                 whom=lambda m: not m.ready or m is reference,
                 limit=self._start_up_limit(),
@@ -178,20 +182,20 @@ class Peers:
 
     def _start_up_limit(self) -> float:
         """Return the real seconds that all nodes of another process may take to start up."""
-        most = max((len(m.nodes) for m in self._roster.present()), default=1)
+        most = max((len(m.nodes) for m in self._membership.present()), default=1)
         return float(self._config.run.startup_limit) * (most + 1)
 
     def _follow(self, member: Member | None) -> None:
         if member is not None and isinstance(self._clock, RealClock):
             self._followed = member.number
-            self._following = Following(self._clock, member)
+            self._follower = ClockFollower(self._clock, member)
 
-    def begun(self) -> None:
+    def nodes_run(self) -> None:
         """Let what the others say arrive: the nodes here have begun."""
         self._begun = True
-        self._roster.settle()
+        self._membership.settle()
         if self._loop is not None:
-            self._loop.move(0, (len(self._roster.nodes) << 33, self._roster.me << 32))
+            self._loop.move(0, (len(self._membership.nodes) << 33, self._membership.me << 32))
             self._gather()
         early, self._early = self._early, []
         for item in early:
@@ -203,61 +207,61 @@ class Peers:
 
     def listeners(self, output: str) -> list[Listener]:
         """Return who hears an output in other processes."""
-        return self._crossing.listeners(output) if self._crossing else []
+        return self._remote.listeners(output) if self._remote else []
 
     def connect(self, listeners: list[Listener], fault: Fault) -> None:
         """Say who hears here what is said elsewhere, and tell the others."""
-        if self._crossing is None:
+        if self._remote is None:
             return
-        self._crossing.connect(listeners, fault)
-        wanted = hearing(each for each in listeners if each.node != "run")
-        for member in self._roster.present():
+        self._remote.connect(listeners, fault)
+        wanted = subscriptions(each for each in listeners if each.node != "run")
+        for member in self._membership.present():
             if member.told != wanted:
                 member.told = wanted
-                member.line.send(Hearing(wanted))
+                member.outbox.send(Subscriptions(wanted))
 
-    def stopping(self, reason: str, error: Exception | None, *, told: bool) -> None:
-        """Tell the others that the run ends, and why; also where one of them `told` us.
+    def stopping(self, reason: str, error: Exception | None, *, from_peer: bool) -> None:
+        """Tell the others that the run ends, and why; also where the word is `from_peer`.
 
         They may hear it from us first.
         """
         self._ends = True
         text = None if error is None else str(error)
         stop = Stop(reason, text, apart=not self._begun)
-        self._roster.ended = msgspec.structs.replace(stop, apart=True)
+        self._membership.ended = msgspec.structs.replace(stop, apart=True)
         if not self._begun:  # also those who said so: they need not wait for our turn
-            self._roster.tell(stop)
+            self._membership.tell(stop)
             early, self._early = self._early, []
             for member, message, _ in early:
-                if isinstance(message, Retired):
+                if isinstance(message, NodeEnded):
                     self._do(member.number, message, None)
         elif self._suspended:
-            self._roster.tell(stop)
+            self._membership.tell(stop)
             self._gather()
-        elif not told:
+        elif not from_peer:
             self._tell_in_order(stop)
-        self.ending.begin()
+        self.shutdown.begin()
 
-    def retired(self, node: str) -> None:
+    def node_ended(self, node: str) -> None:
         """Tell the others that a node here has ended."""
-        self.ending.at_work = False
+        self.shutdown.at_work = False
         self._retired_here.append(node)
-        self._tell_in_order(Retired(node))
+        self._tell_in_order(NodeEnded(node))
 
     # After the run.
 
     async def close(self) -> None:
         """Say the last words, and leave."""
         self._ends = True
-        self.ending.close()
-        if self._following is not None:
-            self._following.stop()
-        self._turns = None
+        self.shutdown.close()
+        if self._follower is not None:
+            self._follower.stop()
+        self._token = None
         if self._loop is not None:
             self._loop.gate = None
-        await self._roster.close()
+        await self._membership.close()
 
-    # What the roster tells.
+    # What the membership tells.
 
     def heard(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         """Take in a message of another process.
@@ -265,35 +269,37 @@ class Peers:
         Raises:
             WireError: It makes no sense.
         """
-        self.ending.heard_at = time.monotonic()
+        self.shutdown.heard_at = time.monotonic()
         match message:
-            case Said() if self._begun and self._turns is None:  # first, since there are many
+            case EventMessage() if (
+                self._begun and self._token is None
+            ):  # first, since there are many
                 self._do(member.number, message, event)
-            case Announced():
+            case Announcements():
                 if not message.said.keys() <= {*member.nodes}:
                     raise WireError("expected announcements of its own nodes")
                 member.announced = message
                 if self._begun:  # it was gone, and needs ours again
-                    member.line.send(self._announced)
-            case Parted():
+                    member.outbox.send(self._announced)
+            case FinalSummary():
                 try:
                     part = msgspec.json.decode(message.part, type=Summary)
                 except (msgspec.DecodeError, RecursionError) as error:
                     raise WireError(f"expected a part of the summary, found: {error}") from None
-                self.ending.parted(member, part)
-            case Farewell():
+                self.shutdown.parted(member, part)
+            case SummaryReceived():
                 member.has_ours = True
-            case Begin():
+            case FirstUpdate():
                 member.begin = message
             case Ready() if not member.ready:
                 member.ready = True
                 if self._begun:
                     self._welcome(member)
-            case Hearing() if self._crossing is not None:
-                self._crossing.wants(member.number, message.wanted)
+            case Subscriptions() if self._remote is not None:
+                self._remote.wants(member.number, message.wanted)
                 if self._begun:
                     self._run.connect()
-            case Busy() | Ready() | Hearing():
+            case StillWorking() | Ready() | Subscriptions():
                 pass
             case Stop() if not self._begun or message.serial < 0:
                 if message.apart:
@@ -301,18 +307,18 @@ class Peers:
                 elif self._suspended:  # it is no use to wait for anybody's return
                     self._gather()
                 self._do(member.number, message, None)
-            case Retired() if message.node not in member.nodes:
+            case NodeEnded() if message.node not in member.nodes:
                 raise WireError(f"expected one of its nodes, found {message.node!r}")
-            case Retired() if message.serial < 0 or (self._ends and not self._begun):
+            case NodeEnded() if message.serial < 0 or (self._ends and not self._begun):
                 self._do(member.number, message, None)
             case _ if not self._begun:
                 if not self._ends:
                     self._early.append((member, message, event))
-            case _ if self._turns is not None:
-                self._turns.take(member.number, message, event)
-            case Said() | Stop() | Retired():
+            case _ if self._token is not None:
+                self._token.take(member.number, message, event)
+            case EventMessage() | Stop() | NodeEnded():
                 self._do(member.number, message, event)
-            case Turn() | Call() | Standing() if not self._ends:
+            case TimeToken() | TokenRequest() | StateReport() if not self._ends:
                 raise WireError("expected the run to be in lockstep there, too")
 
     def lost(self, member: Member) -> None:
@@ -322,25 +328,27 @@ class Peers:
         ):
             self._lost_early.append(member)
             return
-        lost = set(member.nodes) - self.ending.retired
-        self.ending.retired |= lost
+        lost = set(member.nodes) - self.shutdown.retired
+        self.shutdown.retired |= lost
         name = name_of(member.nodes)
         gone = PeerError(f"{name}: {member.over} ({member.place})")
         if not (self._begun or self._ends):
-            self._roster.fail(gone)
+            self._membership.fail(gone)
             return
         if self._ends or not lost:
             if lost:
                 log.warning("%s: the run ends without it", gone)
-                if self._begun and self._turns is not None and self._roster.ended is not None:
+                if self._begun and self._token is not None and self._membership.ended is not None:
                     # Others may wait for its return, and not for their turn.
-                    self._roster.tell(msgspec.structs.replace(self._roster.ended, apart=False))
+                    self._membership.tell(
+                        msgspec.structs.replace(self._membership.ended, apart=False)
+                    )
             self._gather()
             return
-        if self._following is not None and self._following.member is member:
-            self._following.go_on_alone()
-        if self._crossing is not None:
-            self._crossing.wants(member.number, ())
+        if self._follower is not None and self._follower.member is member:
+            self._follower.go_on_alone()
+        if self._remote is not None:
+            self._remote.wants(member.number, ())
         rules = {spec.on_error for spec in self._config.nodes if spec.name in lost}
         if "stop" in rules:
             log.error("%s", gone, extra={"told": True})
@@ -348,13 +356,13 @@ class Peers:
             self._run.stop(f"{name} lost", gone)
         elif "restart" in rules:
             log.error("%s: waiting for its return", gone)
-            self._roster.settle(lost=member.nodes)
-            if self._turns is not None:
+            self._membership.settle(lost=member.nodes)
+            if self._token is not None:
                 self._suspended = True
-                self._turns.suspend()
+                self._token.suspend()
         else:
             log.error("%s: left out from here on", gone)
-            self._roster.settle(left_out=lost)
+            self._membership.settle(left_out=lost)
             self._gather()
         self._run.connect()
 
@@ -379,81 +387,81 @@ class Peers:
         """Do what another process says; in lockstep, at our turn."""
         try:
             match message:
-                case Said() if self._crossing is not None and event is not None:
-                    self._crossing.arrive(number, message.output, event)
+                case EventMessage() if self._remote is not None and event is not None:
+                    self._remote.arrive(number, message.output, event)
                 case Stop():
-                    member = self._roster.numbered(number)
+                    member = self._membership.numbered(number)
                     where = name_of(member.nodes) if member else "?"
                     failed = PeerError(f"at {where}: {message.error}") if message.error else None
-                    self._run.stop(message.reason, failed, told=True)
-                case Retired():
-                    self.ending.retired.add(message.node)
+                    self._run.stop(message.reason, failed, from_peer=True)
+                case NodeEnded():
+                    self.shutdown.retired.add(message.node)
         except WireError as error:
             log.warning("from process %d: %s", number, error)
-        self._roster.notify()
+        self._membership.notify()
 
     def _welcome(self, member: Member) -> None:
         """Let a process that was gone take part again."""
         log.warning("%s: back, at %s", name_of(member.nodes), member.place)
         now = self._clock.now()
         real = now / self._clock.speed if isinstance(self._clock, RealClock) else 0
-        member.line.send(Begin(time.monotonic_ns() - round(real), now))
+        member.outbox.send(FirstUpdate(time.monotonic_ns() - round(real), now))
         self._take_back(member)
 
     def _take_back(self, member: Member) -> None:
-        self.ending.retired -= {*member.nodes}
+        self.shutdown.retired -= {*member.nodes}
         self._apart.discard(member.number)
         self._gather(new=(member.number,))
         self._run.connect()
 
     def _gather(self, new: tuple[int, ...] = ()) -> None:
         """In lockstep, share the turns among those who are there."""
-        if self._turns is None or self._loop is None or not self._begun:
+        if self._token is None or self._loop is None or not self._begun:
             return
         self._suspended = False
-        present = [m for m in self._roster.present() if m.number not in self._apart]
-        self._loop.gate = self._turns if present else None
+        present = [m for m in self._membership.present() if m.number not in self._apart]
+        self._loop.gate = self._token if present else None
         if present:
-            numbers = [self._roster.me, *(m.number for m in present)]
-            self._turns.gather(numbers, [self._roster.id, *(m.id for m in present)], new)
+            numbers = [self._membership.me, *(m.number for m in present)]
+            self._token.gather(numbers, [self._membership.id, *(m.id for m in present)], new)
 
     def _go_on_without(self, member: Member) -> None:
         """Take a process out of the turns: it has not begun, or has given up."""
         self._apart.add(member.number)
         for node in self._retired_here:  # what was to be said at our turn is lost
-            member.line.send(Retired(node))
+            member.outbox.send(NodeEnded(node))
         self._gather()
 
     def _reference(self) -> Member | None:
         """Return the process whose clock counts, or `None` if it is this one."""
-        present = self._roster.present()
+        present = self._membership.present()
         running = [m for m in present if m.hello.running]
         first = min(running or present, key=lambda m: m.number, default=None)
-        return first if first and (running or first.number < self._roster.me) else None
+        return first if first and (running or first.number < self._membership.me) else None
 
     # Sending.
 
     def _tell_in_order(self, message: Ordered) -> None:
         """Send a message that others take in in its place among the events."""
-        for member in self._roster.present():
-            if self._turns is not None and self._begun and member.number not in self._apart:
-                self._turns.post(member.number, message)
+        for member in self._membership.present():
+            if self._token is not None and self._begun and member.number not in self._apart:
+                self._token.post(member.number, message)
             else:
-                member.line.send(message)
+                member.outbox.send(message)
 
     def _leave(self, process: int, output: str, event: Event, skip: bool) -> None:
         """Let an event leave for another process."""
-        if self._turns is not None:
-            self._turns.post(process, Said(output), event)
-        elif member := self._roster.numbered(process):
+        if self._token is not None:
+            self._token.post(process, EventMessage(output), event)
+        elif member := self._membership.numbered(process):
             try:
-                member.line.send(Said(output), event, output if skip else "")
+                member.outbox.send(EventMessage(output), event, output if skip else "")
             except ChannelFullError as error:
                 raise ChannelFullError(f"{output}: {error}") from None
 
     def _send_to(self, number: int, message: Message, event: Event | None) -> None:
-        if member := self._roster.numbered(number):
-            member.line.send(message, event)
+        if member := self._membership.numbered(number):
+            member.outbox.send(message, event)
 
 
 def _announcement(frame: bytes) -> Announcement:

@@ -8,7 +8,7 @@ from typing import Any
 from events import Event
 from runtime.config.model import NodeSpec
 from runtime.errors import WireError
-from runtime.peers.messages import Wanted
+from runtime.peers.messages import Subscription
 from runtime.sender import Listener, Sender
 from runtime.tasks import Fault
 from runtime.wire import event_type, kind_of
@@ -18,7 +18,7 @@ Leave = Callable[[int, str, Event, bool], None]
 take its place on the way."""
 
 
-class Crossing:
+class RemoteEvents:
     """What crosses between this process and the others.
 
     Args:
@@ -32,7 +32,7 @@ class Crossing:
         self, specs: Iterable[NodeSpec], owners: dict[str, int], me: int, leave: Leave
     ) -> None:
         self._leave = leave
-        self._wanted: dict[int, tuple[Wanted, ...]] = {}
+        self._wanted: dict[int, tuple[Subscription, ...]] = {}
         self._arrivals: dict[str, tuple[int, Sender[Any]]] = {}
         for spec in specs:
             if owners[spec.name] != me:
@@ -40,7 +40,7 @@ class Crossing:
                     name = f"{spec.name}.{port}"
                     self._arrivals[name] = (owners[spec.name], Sender(name, output.event))
 
-    def wants(self, process: int, wanted: tuple[Wanted, ...]) -> None:
+    def wants(self, process: int, wanted: tuple[Subscription, ...]) -> None:
         """Note what a process hears; nothing, if it is gone.
 
         Raises:
@@ -57,7 +57,7 @@ class Crossing:
         They come before those in this process, so that a handler here ends no delivery there.
         """
         return [
-            Far(process, output, wanted, self._leave)
+            RemoteListener(process, output, wanted, self._leave)
             for process, wanted in sorted(self._wanted.items())
         ]
 
@@ -83,12 +83,14 @@ class Crossing:
         sender.send(event)
 
 
-class Far(Listener):
+class RemoteListener(Listener):
     """All inputs and handlers of another process, as one listener of an output here."""
 
     __slots__ = ("_heard", "_leave", "_may_skip", "_output", "_process", "name")
 
-    def __init__(self, process: int, output: str, wanted: tuple[Wanted, ...], leave: Leave) -> None:
+    def __init__(
+        self, process: int, output: str, wanted: tuple[Subscription, ...], leave: Leave
+    ) -> None:
         super().__init__("", self.offer, ())
         self.name = output  # whose fault it is if it cannot leave
         self._process = process
@@ -122,10 +124,10 @@ class Far(Listener):
         self._leave(self._process, self._output, event, skip)
 
 
-def hearing(listeners: Iterable[Listener]) -> tuple[Wanted, ...]:
+def subscriptions(listeners: Iterable[Listener]) -> tuple[Subscription, ...]:
     """Return what these listeners hear, for other processes."""
     found = {
-        Wanted(
+        Subscription(
             kinds=tuple(kind_of(event) for event in listener.events),
             source=listener.source,
             latest=listener.stream is not None

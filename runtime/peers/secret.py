@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 from runtime.errors import CommandError, PeerError
-from runtime.tools.monitor.address import folder
+from runtime.user_folder import user_folder
 
 SHORTEST = 16
 """Characters of a secret at least."""
@@ -49,7 +49,7 @@ def secret_of(setting: str) -> bytes:
 
 def _of_this_user() -> str:
     try:
-        path = folder() / "network.key"
+        path = user_folder() / "network.key"
         if not path.exists():
             _make(path)
         return _read(path)

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from runtime.errors import WireError
-from runtime.peers.messages import Memory
+from runtime.peers.messages import MemoryOffer
 from runtime.wire import Packed
 from runtime.workers.shared_memory import Arena, Window, anonymous_file
 
@@ -50,9 +50,11 @@ class Outgoing:
         self._freed: collections.deque[int] = collections.deque()
         self._taken: set[int] = set()
 
-    def offer(self) -> Memory:
+    def offer(self) -> MemoryOffer:
         """Return what the other process needs to find it."""
-        return Memory(machine=machine(), path=f"/proc/{os.getpid()}/fd/{self._fd}", key=self._key)
+        return MemoryOffer(
+            machine=machine(), path=f"/proc/{os.getpid()}/fd/{self._fd}", key=self._key
+        )
 
     def put(self, packed: Packed) -> tuple[int, int] | None:
         """Put a frame there, and return its place and size; `None` if there is no room."""
@@ -83,7 +85,7 @@ class Incoming:
         weakref.finalize(self, self._window.close)
 
     @classmethod
-    def found(cls, offer: Memory) -> Incoming | None:
+    def found(cls, offer: MemoryOffer) -> Incoming | None:
         """Return the memory that is offered, or `None` if it is not to be had here."""
         here = offer.machine and offer.machine == machine()
         if not (here and re.fullmatch(r"/proc/\d+/fd/\d+", offer.path)):

@@ -18,7 +18,15 @@ import msgspec
 
 from events import Event
 from runtime.errors import WireError
-from runtime.peers.messages import NEVER, Call, Key, Message, Ordered, Standing, Turn
+from runtime.peers.messages import (
+    NEVER,
+    Key,
+    Message,
+    Ordered,
+    StateReport,
+    TimeToken,
+    TokenRequest,
+)
 
 Send = Callable[[int, Message, Event | None], None]
 Deliver = Callable[[int, Ordered, Event | None], None]
@@ -38,7 +46,7 @@ class Timeline(Protocol):
         """Go to a time, and go on with these numbers."""
 
 
-class Turns:
+class TimeTokenHolder:
     """One process's part in whose turn it is.
 
     Args:
@@ -62,7 +70,7 @@ class Turns:
         self._calls: set[int] = set()
         self._epoch = 0
         self._oldest = 1
-        self._next: Turn | None = None
+        self._next: TimeToken | None = None
         self._outbox: list[tuple[int, Ordered, Event | None]] = []
         self._inbox: list[tuple[int, Ordered, Event | None]] = []
         self._sent = [[0] * count for _ in range(count)]
@@ -72,8 +80,8 @@ class Turns:
         self._others: Key = NEVER
         self._alive: frozenset[int] = frozenset()
         self._ids: tuple[str, ...] = ()
-        self._standings: dict[int, Standing] = {}
-        self._to_stand = False
+        self._reports: dict[int, StateReport] = {}
+        self._report_due = False
 
     # Who is there.
 
@@ -87,11 +95,11 @@ class Turns:
         """
         self._alive = frozenset(alive)
         self._ids = tuple(sorted(ids))
-        self._standings = {n: s for n, s in self._standings.items() if n in self._alive}
+        self._reports = {n: s for n, s in self._reports.items() if n in self._alive}
         self.holding = False
         self._next = None
         self._oldest = self._epoch + 1
-        self._to_stand = True
+        self._report_due = True
         for each in new:
             self._received[each] = 0
             self._sent[self._me][each] = 0
@@ -102,20 +110,20 @@ class Turns:
         """Let time stand until processes are gathered again."""
         self.holding = False
         self._next = None
-        self._to_stand = False
+        self._report_due = False
         self._oldest = self._epoch + 1
 
     # What the loop asks, whenever nothing is ready.
 
     def may_go(self, key: Key) -> bool:
         """Tell whether time may go on to what is due here next."""
-        if self._to_stand:
-            self._stand(key)
+        if self._report_due:
+            self._report_state(key)
         if not self.holding:
             if (self._outbox or key < self._told) and not self._called and self._epoch:
                 self._called = True
                 for other in self._alive - {self._me}:
-                    self._send(other, Call(), None)
+                    self._send(other, TokenRequest(), None)
             return False
         if not (self._outbox or self._unread or self._calls):
             if key == NEVER == self._others:  # what comes now comes from outside
@@ -135,7 +143,10 @@ class Turns:
     # What comes from others.
 
     def take(
-        self, other: int, message: Turn | Call | Standing | Ordered, event: Event | None
+        self,
+        other: int,
+        message: TimeToken | TokenRequest | StateReport | Ordered,
+        event: Event | None,
     ) -> None:
         """Take in a message of another process.
 
@@ -143,17 +154,17 @@ class Turns:
             WireError: It is of another number of processes.
         """
         match message:
-            case Turn():
+            case TimeToken():
                 if not message.fits(len(self._keys)):
                     raise WireError(f"expected a turn of {len(self._keys)} processes")
                 if message.epoch >= self._oldest:
                     self._next = message
-            case Call():
+            case TokenRequest():
                 self._calls.add(other)  # of all of us, since only one has the turn
-            case Standing():
+            case StateReport():
                 if len(message.sent) != len(self._keys):
                     raise WireError(f"expected a standing of {len(self._keys)} processes")
-                self._standings[other] = message
+                self._reports[other] = message
                 self._resume()
             case _:
                 self._received[other] += 1
@@ -201,7 +212,7 @@ class Turns:
         self.holding = False
         self._send(
             to,
-            Turn(
+            TimeToken(
                 epoch=self._epoch,
                 now=self._timeline.now,
                 orders=self._timeline.orders(),
@@ -214,11 +225,11 @@ class Turns:
 
     # After somebody went or came.
 
-    def _stand(self, key: Key) -> None:
+    def _report_state(self, key: Key) -> None:
         """Say where we stand to whoever makes the next turn."""
-        self._to_stand = False
+        self._report_due = False
         self._told = key
-        standing = Standing(
+        standing = StateReport(
             processes=self._ids,
             epoch=self._epoch,
             now=self._timeline.now,
@@ -228,23 +239,23 @@ class Turns:
         )
         maker = min(self._alive)
         if maker == self._me:
-            self._standings[self._me] = standing
+            self._reports[self._me] = standing
             self._resume()
         else:
             self._send(maker, standing, None)
 
     def _resume(self) -> None:
         """Make a turn, if it is ours to make and all have said where they stand."""
-        found = [self._standings.get(n) for n in sorted(self._alive)]
+        found = [self._reports.get(n) for n in sorted(self._alive)]
         if min(self._alive, default=-1) != self._me or any(
             s is None or s.processes != self._ids for s in found
         ):
             return
-        standings = {n: self._standings.pop(n) for n in self._alive}
+        standings = {n: self._reports.pop(n) for n in self._alive}
         keys, sent = [NEVER] * len(self._keys), [[0] * len(self._keys) for _ in self._keys]
         for n, standing in standings.items():
             keys[n], sent[n] = standing.key, list(standing.sent)
-        self._next = Turn(
+        self._next = TimeToken(
             epoch=max(s.epoch for s in standings.values()) + 1,
             now=max(s.now for s in standings.values()),
             orders=(

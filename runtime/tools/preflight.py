@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
+import functools
 import logging
 import posixpath
 from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType
 from typing import Any, NoReturn
@@ -31,10 +32,11 @@ from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
 from runtime.execute import make_clock, make_loop
 from runtime.graph import heard_types, unconnected
 from runtime.node import Node
-from runtime.node_runner import Life
+from runtime.node_runner import NodeRunner
 from runtime.paths import written
 from runtime.schedule import Tick, Ticker
 from runtime.sender import Listener
+from runtime.startup import Announced, Phase, start_up
 
 RUN_FILES = ("config.toml", "log.txt", "summary.json")
 """What the run itself writes into its folder."""
@@ -75,19 +77,13 @@ def of_file(config: Config, only: Collection[str] = ()) -> Findings:
 def of_nodes(config: Config) -> Findings:
     """Bring all nodes up to where their first update would be, and take them down again."""
     errors: list[str] = []
-    announced: dict[str, list[Announcement]] = {}
     loop = make_loop(config.run)
     with asyncio.Runner(loop_factory=lambda: loop) as runner, _warnings() as warnings:
-        runner.run(_rehearse(config, errors, announced, warnings))
+        runner.run(_rehearse(config, errors, warnings))
     return Findings(errors, warnings)
 
 
-async def _rehearse(
-    config: Config,
-    errors: list[str],
-    announced: dict[str, list[Announcement]],
-    warnings: list[str],
-) -> None:
+async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> None:
     loop = asyncio.get_running_loop()
     tasks.install(loop)
     clock = make_clock(config.run, loop)
@@ -99,39 +95,45 @@ async def _rehearse(
         created.add(task)
         return task
 
-    lives = [Life(spec, create) for spec in config.nodes]
+    runners = [NodeRunner(spec, create) for spec in config.nodes]
     cut_short: set[str] = set()
     uncertain = False
+
+    async def start(runner: NodeRunner) -> None:
+        await runner.start_up(host, config.run.startup_limit)
+
+    async def exchange(announced: Announced) -> list[Announcement]:
+        everything = [each for of_node in announced.values() for each in of_node]
+        errors.extend(_announced_twice(announced))
+        warnings.extend(_unknown_sources(config.nodes, everything))
+        return everything
+
+    def failed(phase: Phase, runner: NodeRunner, error: NodeError) -> None:
+        nonlocal uncertain
+        if phase == "on_startup":
+            cut_short.add(runner.spec.name)
+            if isinstance(error.__cause__, UncheckableError):
+                uncertain = True
+            elif not isinstance(error.__cause__, _NoWorkerError):
+                errors.append(str(error))
+        elif phase == "announce":
+            if runner.spec.name not in cut_short:
+                errors.append(str(error))
+        else:
+            (warnings if uncertain else errors).append(str(error))
+
     try:
-        for life in lives:
-            try:
-                await life.begin(host, config.run.startup_limit)
-            except NodeError as error:
-                cut_short.add(life.spec.name)
-                if isinstance(error.__cause__, UncheckableError):
-                    uncertain = True
-                elif not isinstance(error.__cause__, _NoWorkerError):
-                    errors.append(str(error))
-        if errors:  # what others then miss is of no interest
-            return
-        for life in lives:
-            try:
-                announced[life.spec.name] = life.announced()
-            except NodeError as error:
-                if life.spec.name not in cut_short:
-                    errors.append(str(error))
-        everything = [each for said in announced.values() for each in said]
-        errors += _said_twice(announced)
-        warnings += _unknown_sources(config.nodes, everything)
-        for life in lives:
-            try:
-                life.hear(everything)
-            except NodeError as error:
-                (warnings if uncertain else errors).append(str(error))
+        await start_up(
+            runners,
+            start=start,
+            exchange=exchange,
+            failed=failed,
+            give_up=lambda: bool(errors),  # what others then miss is of no interest
+        )
     finally:
         before = len(warnings)
-        for life in reversed(lives):
-            await life.end(config.run.shutdown_limit)
+        for runner in reversed(runners):
+            await runner.shut_down(config.run.shutdown_limit)
         del warnings[before:]  # that nothing came is no news
         host.executor.shutdown(wait=False, cancel_futures=True)
         clock.close()
@@ -162,9 +164,16 @@ class _DryHost:
     def __init__(self, seed: int, clock: Clock) -> None:
         self.seed = seed
         self.clock = clock
-        self.executor: concurrent.futures.Executor = concurrent.futures.ThreadPoolExecutor(
+        self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
         )
+
+    def offload(
+        self,
+        node: Node[Any],  # noqa: ARG002
+        call: functools.partial[Any],
+    ) -> concurrent.futures.Future[Any]:
+        return self.executor.submit(call)
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:  # noqa: ARG002
         coro.close()
@@ -185,7 +194,7 @@ class _DryHost:
         pass
 
 
-@contextmanager
+@contextlib.contextmanager
 def _warnings() -> Iterator[list[str]]:
     """Collect what nodes warn of, instead of printing it."""
     found: list[str] = []
@@ -241,11 +250,11 @@ def _unread(cls: type[Node[Any]]) -> list[str]:
     return [port for port in (*cls.declared.inputs, *cls.declared.bundles) if port not in mentioned]
 
 
-def _said_twice(announced: Mapping[str, Iterable[Announcement]]) -> Iterator[str]:
+def _announced_twice(announced: Mapping[str, Iterable[Announcement]]) -> Iterator[str]:
     """Say what two nodes announce, or one twice."""
     first: dict[tuple[type[Announcement], str], str] = {}
-    for node, said in announced.items():
-        for each in said:
+    for node, announcements in announced.items():
+        for each in announcements:
             key = type(each), each.source
             if key in first:
                 yield (

@@ -46,7 +46,7 @@ class Stall(msgspec.Struct, frozen=True):
     seconds: float
 
 
-class Watchdog:
+class LoopWatchdog:
     """Watches the loop of the thread that makes it.
 
     Args:

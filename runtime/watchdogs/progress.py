@@ -17,15 +17,13 @@ import threading
 import time
 from collections import Counter
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from runtime import code_location
 from runtime.errors import NodeTimeoutError
 from runtime.lockstep import LockstepLoop
+from runtime.run_state import RunState
 from runtime.watchdogs.loop import idle
-
-if TYPE_CHECKING:
-    from runtime.supervisor import Supervisor
 
 log = logging.getLogger("visnav.runtime")
 
@@ -36,19 +34,17 @@ _LOOK = 0.01
 _MOST_NAMED = 3
 
 
-class Standstill:
+class ProgressWatchdog:
     """Watches a run of the thread that makes it; a context as long as the run.
 
     Args:
-        supervisor: Of the run.
+        state: Of the run.
         loop: Its loop.
         limit: Real seconds without progress after which there is something to say; 0 for never.
     """
 
-    def __init__(
-        self, supervisor: Supervisor, loop: asyncio.AbstractEventLoop, limit: float
-    ) -> None:
-        self._supervisor = supervisor
+    def __init__(self, state: RunState, loop: asyncio.AbstractEventLoop, limit: float) -> None:
+        self._state = state
         self._loop = loop
         self._limit = limit
         self._thread_id = threading.get_ident()
@@ -82,18 +78,22 @@ class Standstill:
                 since = now
                 continue
             if time.monotonic() >= since + due:
-                log.warning("%s", self._told(answer, seen, time.monotonic() - since))
+                log.warning("%s", self._message(answer, seen, time.monotonic() - since))
                 due *= 2
-            if self._main and answer is None and time.monotonic() - interrupted > self._patience():
+            if (
+                self._main
+                and answer is None
+                and time.monotonic() - interrupted > self._blocking_limit()
+            ):
                 interrupted = time.monotonic()
                 self._interrupt()
 
     def _mark(self) -> tuple[Any, ...]:
         """Return what is the same for as long as nothing goes on; in any thread."""
-        run = self._supervisor
+        run = self._state
         now = self._loop.now if isinstance(self._loop, LockstepLoop) else 0
-        doing = tuple((life.starts, life.doing) for life in list(run._lives.values()))
-        return now, run.first_update, run.ended, run.asked, doing
+        phases = tuple((runner.starts, runner.phase) for runner in list(run.runners.values()))
+        return now, run.first_update, run.stopped, run.stop_requested, phases
 
     def _ask(self, until: float, seen: Counter[tuple[str, str]]) -> str | None:
         """Let the loop explain, and note where it is meanwhile; `None` if it does not answer."""
@@ -129,18 +129,18 @@ class Standstill:
 
     def _explain(self) -> str:
         """Say who is waited for; ``""`` if all is well, ``"busy"`` if nobody is; on the loop."""
-        run, loop = self._supervisor, self._loop
-        waiting = [life for life in run._lives.values() if life.doing]
+        run, loop = self._state, self._loop
+        waiting = [runner for runner in run.runners.values() if runner.phase]
         if waiting:
             return "; ".join(
-                f"{life.spec.name}: {life.doing}{_at([life.step] if life.step else life.tasks)}"
-                for life in waiting[:_MOST_NAMED]
+                f"{runner.spec.name}: {runner.phase}{_at(runner.awaited())}"
+                for runner in waiting[:_MOST_NAMED]
             )
-        if run.first_update is None or run.ended is not None:
-            return "the other processes of the run" if run.peers is not None else ""
+        if run.first_update is None or run.stopped is not None:
+            return "the other processes of the run" if run.several_processes else ""
         return _explain_time(loop, run) if isinstance(loop, LockstepLoop) else ""
 
-    def _told(self, answer: str | None, seen: Counter[tuple[str, str]], seconds: float) -> str:
+    def _message(self, answer: str | None, seen: Counter[tuple[str, str]], seconds: float) -> str:
         places_seen = [place for place, _ in seen.most_common()] or [("runtime", "?")]
         node, line = places_seen[0]
         if answer is None:
@@ -155,12 +155,12 @@ class Standstill:
             )
         return f"for {seconds:.1f} s the run has waited for {answer}"
 
-    def _patience(self) -> float:
+    def _blocking_limit(self) -> float:
         """Return how long a node may block the loop: as long as the step may take that it is in."""
-        run = self._supervisor
-        if run.ended is not None or run.asked:
+        run = self._state
+        if run.stopped is not None or run.stop_requested:
             return run.shutdown_limit()
-        return run._config.run.startup_limit if run.first_update is None else float("inf")
+        return run.config.run.startup_limit if run.first_update is None else float("inf")
 
     def _interrupt(self) -> None:
         """Raise an error in whatever blocks the loop, by a signal."""
@@ -169,11 +169,11 @@ class Standstill:
             return
         error = NodeTimeoutError(node, "expected it to give back the loop, found it blocking it")
         error.place = line
-        self._supervisor.interruption = error
+        self._state.interruption = error
         signal.pthread_kill(self._thread_id, signal.SIGUSR2)
 
 
-def _explain_time(loop: LockstepLoop, run: Supervisor) -> str:
+def _explain_time(loop: LockstepLoop, run: RunState) -> str:
     """Say what simulated time waits for."""
     if loop.gate is not None:
         paused = getattr(loop.gate, "paused", False)
@@ -189,9 +189,9 @@ def _explain_time(loop: LockstepLoop, run: Supervisor) -> str:
     return "slow work beside the loop"
 
 
-def _all(run: Supervisor) -> str:
+def _all(run: RunState) -> str:
     """Return where all nodes wait, as far as there is room."""
-    found = [(life.spec.name, task) for life in run._lives.values() for task in life.tasks]
+    found = [(runner.spec.name, task) for runner in run.runners.values() for task in runner.tasks]
     listed = ", ".join(f"{name}{_at([task])}" for name, task in found[:_MOST_NAMED])
     more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
     return f" ({listed}{more})" if listed else ""

@@ -9,7 +9,7 @@ import re
 import threading
 from pathlib import Path
 
-from runtime.histogram import Lateness
+from runtime.histogram import DurationHistogram
 
 
 class Costs:
@@ -28,8 +28,8 @@ class Costs:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.calls = 0
-        self.wall = Lateness()
-        self.cpu = Lateness()
+        self.wall = DurationHistogram()
+        self.cpu = DurationHistogram()
         self.peak = 0
         self.processes = 0
         self.latency: float | None = None

@@ -37,6 +37,9 @@ W = TypeVar("W")
 R = TypeVar("R")
 P = ParamSpec("P")
 
+Called = Callable[[str, str, concurrent.futures.Future[Any]], None]
+"""Told which process is asked to run which method, and the answer to come."""
+
 _GRACE = 2.0
 """Seconds a process gets to end by itself once its connection is closed."""
 
@@ -95,6 +98,8 @@ class Worker(Generic[W]):
         self.costs = costs or Costs()
         self.costs.latency = latency
         self.costs.processes = processes
+        self.called: Called | None = None
+        """Told of every call, if anybody wants to know."""
         self._clock = clock
         self._latency = latency
         self._processes: list[_Process] = []
@@ -158,6 +163,8 @@ class Worker(Generic[W]):
             self.costs.latency = None
         process = min(self._processes, key=_Process.outstanding)
         work = process.request((method.__name__, args, kwargs))
+        if self.called is not None:
+            self.called(process.name, method.__name__, work)
         result: R = await self._clock.beside(work, round(latency * SECOND))
         return result
 
@@ -205,7 +212,7 @@ class _Process:
         died: Callable[[WorkerError], None],
         costs: Costs,
     ) -> None:
-        self._name = name
+        self.name = name
         self._timeout = timeout
         self._printed = printed
         self._died = died
@@ -348,7 +355,7 @@ class _Process:
     def _story(self, what: str) -> str:
         self._output.join(_GRACE)
         tail = "; its last output:\n" + "\n".join(self._tail) if self._tail else "; it said nothing"
-        return f"worker {self._name}: {what}{tail}"
+        return f"worker {self.name}: {what}{tail}"
 
     def _read_output(self) -> None:
         """Read what the process prints until it ends, even if others could still write there."""

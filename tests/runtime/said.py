@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import functools
 from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -48,7 +49,6 @@ class NoHost:
         with_loop = LockstepLoop()
         self.clock: Clock = LockstepClock(with_loop)
         with_loop.close()
-        self.executor: concurrent.futures.Executor = concurrent.futures.ThreadPoolExecutor()
         self.out: Path | None = None
         self.checking = False
 
@@ -61,6 +61,11 @@ class NoHost:
     async def worker(
         self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
     ) -> Worker[W]:
+        raise NotImplementedError
+
+    def offload(
+        self, node: Node[Any], call: functools.partial[Any]
+    ) -> concurrent.futures.Future[Any]:
         raise NotImplementedError
 
     def stop(self, reason: str) -> None:

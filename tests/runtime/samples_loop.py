@@ -133,14 +133,14 @@ async def until_sent(supervisor: Supervisor, name: str, more: int) -> None:
     """Wait until a node has sent some more events, however slow the machine is."""
 
     def count() -> int:
-        node = supervisor._lives[name].node
+        node = supervisor.state.runners[name].node
         return (
             0 if node is None else sum(sender.sent().total() for sender in senders(node).values())
         )
 
     begin = count()
     while count() < begin + more:
-        await supervisor.clock.sleep(0.01)
+        await supervisor.state.clock.sleep(0.01)
 
 
 Body = Callable[[Supervisor], Coroutine[Any, Any, None]]
@@ -149,7 +149,7 @@ Body = Callable[[Supervisor], Coroutine[Any, Any, None]]
 async def after_start(supervisor: Supervisor, body: Body) -> None:
     """Await a body once the nodes have started; they take a few turns of the loop each."""
     for _ in range(100):
-        if supervisor.first_update is not None:
+        if supervisor.state.first_update is not None:
             break
         await asyncio.sleep(0)
     await body(supervisor)
@@ -181,12 +181,12 @@ def look(
             await supervisor.main()
         if beside:
             await beside
-        supervisor.clock.close()
+        supervisor.state.clock.close()
         done.append(supervisor)
 
     done: list[Supervisor] = []
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
         runner.run(main())
-    if done[0].error is not None:
-        raise done[0].error
+    if done[0].state.error is not None:
+        raise done[0].state.error
     return Looked(done[0], sent, digest.hexdigest())

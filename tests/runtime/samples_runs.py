@@ -20,8 +20,8 @@ class Outcome:
 
     def __init__(self, supervisor: Supervisor, sent: list[Event], seconds: float) -> None:
         self.supervisor = supervisor
-        self.reason = supervisor.reason
-        self.error = supervisor.error
+        self.reason = supervisor.state.reason
+        self.error = supervisor.state.error
         self.sent = sent
         self.seconds = seconds
 

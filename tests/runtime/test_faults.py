@@ -173,7 +173,7 @@ def test_a_node_knows_how_often_it_was_up_before(place: str) -> None:
 
 def test_statistics_carry_on_over_a_restart() -> None:
     treated = treat("tick", "restart")
-    ticks = treated.supervisor.tickers["p.tick"]
+    ticks = treated.supervisor.state.tickers["p.tick"]
     assert 11 + 35 <= ticks.calls <= 11 + 36
 
 
@@ -279,7 +279,7 @@ def test_two_thousand_restarts_overflow_nothing() -> None:
 
     outcome = supervise([spec(Weak, "w", on_error="restart")], duration=2000 * 30.0)
     assert outcome.error is None
-    assert outcome.supervisor._lives["w"].starts > 1900
+    assert outcome.supervisor.state.runners["w"].starts > 1900
 
 
 def test_failures_are_forgotten_after_a_healthy_period() -> None:
@@ -297,4 +297,4 @@ def test_failures_are_forgotten_after_a_healthy_period() -> None:
 
 def test_the_limit_of_a_node_s_end_grows_with_the_run() -> None:
     outcome = supervise([spec(Speaker, "s")], duration=6000.0, shutdown_limit=10)
-    assert outcome.supervisor.shutdown_limit() >= 10 + 0.05 * 6000
+    assert outcome.supervisor.state.shutdown_limit() >= 10 + 0.05 * 6000

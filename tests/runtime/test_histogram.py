@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.histogram import Lateness
+from runtime.histogram import DurationHistogram
 
 durations = st.lists(st.integers(0, 10**12) | st.integers(0, 200), min_size=1, max_size=200)
 
 
-def counted(values: list[int]) -> Lateness:
-    lateness = Lateness()
+def counted(values: list[int]) -> DurationHistogram:
+    lateness = DurationHistogram()
     for value in values:
         lateness.add(value)
     return lateness
@@ -54,7 +54,7 @@ def test_early_counts_as_on_time() -> None:
 
 @pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
 def test_nothing_counted_is_not_late(q: float) -> None:
-    assert Lateness().quantile(q) == 0
+    assert DurationHistogram().quantile(q) == 0
 
 
 def test_small_durations_are_exact() -> None:

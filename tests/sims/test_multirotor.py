@@ -293,7 +293,10 @@ def test_it_runs_in_real_time() -> None:
     """At 400 Hz, whatever else the machine does: late ticks are counted, not lost."""
     outcome = supervise([spec(Multirotor, "drone", {"world": world})], clock="real", duration=1.0)
     assert outcome.error is None
-    ticker, end = outcome.supervisor.tickers["drone.control"], outcome.supervisor.clock.now()
+    ticker, end = (
+        outcome.supervisor.state.tickers["drone.control"],
+        outcome.supervisor.state.clock.now(),
+    )
     assert 395 <= ticker.calls + ticker.missed <= 400 * end / SECOND + 1
     stamps = [e.stamp for e in outcome.sent if isinstance(e, Odometry)]
     assert stamps == sorted(set(stamps))

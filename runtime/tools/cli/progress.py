@@ -58,13 +58,13 @@ def _print(run: RunConfig, supervisor: Supervisor, console: Console, end: thread
 
 
 def _state(run: RunConfig, supervisor: Supervisor) -> tuple[float, str]:
-    if supervisor.first_update is None:
+    if supervisor.state.first_update is None:
         return 0.0, "starting"
-    seconds = supervisor.clock.now() / SECOND
-    speed = seconds / max(time.monotonic() - supervisor.first_update, 1e-9)
+    seconds = supervisor.state.clock.now() / SECOND
+    speed = seconds / max(time.monotonic() - supervisor.state.first_update, 1e-9)
     limit = f" of {run.duration:g}" if run.duration else ""
     try:
-        frames = count_events(supervisor)[0]["Image"]
+        frames = count_events(supervisor.state)[0]["Image"]
     except RuntimeError:  # a table of counts grew while this thread read it
         frames = 0
     return seconds, f"{seconds:5.1f}{limit} s  {speed:.1f} × real time  {frames} frames"

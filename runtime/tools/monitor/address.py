@@ -6,35 +6,13 @@ import contextlib
 import os
 import re
 import socket
-import stat
-import tempfile
 from pathlib import Path
 
 from runtime.errors import CommandError, suggest
+from runtime.user_folder import user_folder
 
 _LONGEST = 100
 """Bytes of a Unix socket's path at most (108 on Linux, 104 elsewhere)."""
-
-
-def folder() -> Path:
-    """Return the folder of the sockets, made if missing.
-
-    Raises:
-        CommandError: It cannot be made, or others than its user may get at it.
-    """
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    path = Path(base) / "visnav" if base else Path(tempfile.gettempdir()) / f"visnav-{os.getuid()}"
-    try:
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = path.lstat()
-    except OSError as error:
-        raise CommandError(f"{path}: expected a folder for sockets: {error.strerror}") from None
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise CommandError(
-            f"{path}: expected a folder that only its user may enter, found mode "
-            f"{stat.S_IMODE(found.st_mode):o} of user {found.st_uid}"
-        )
-    return path
 
 
 def socket_of(run: str) -> Path:
@@ -43,7 +21,7 @@ def socket_of(run: str) -> Path:
     Raises:
         CommandError: The folder is no good.
     """
-    place, end = folder(), f"-{os.getpid()}.sock"
+    place, end = user_folder(), f"-{os.getpid()}.sock"
     for other in place.glob("*.sock"):  # what killed runs have left goes at the next occasion
         _answers(other)
     name = re.sub(r"[^\w.-]", "_", run)
@@ -54,7 +32,7 @@ def socket_of(run: str) -> Path:
 
 def runs() -> dict[str, Path]:
     """Return the runs that listen now, by name; of two of one name the process is named, too."""
-    listening = [path for path in sorted(folder().glob("*.sock")) if _answers(path)]
+    listening = [path for path in sorted(user_folder().glob("*.sock")) if _answers(path)]
     names = [path.stem.rpartition("-")[0] for path in listening]
     return {
         path.stem if names.count(name) > 1 else name: path

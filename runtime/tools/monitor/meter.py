@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import Future
 from typing import Any
 
 from events import Event
 from runtime.clock import Clock
-from runtime.instruments import Call
-from runtime.sender import Sender, Tap
+from runtime.instruments import Call, Instrument
+from runtime.sender import Sender
 from runtime.tools.monitor.window import Amount
 
 
@@ -32,8 +31,8 @@ class Sum:
         return amount
 
 
-class Meter:
-    """A probe that adds up.
+class Meter(Instrument):
+    """An instrument that adds up.
 
     Args:
         clock: The run's clock.
@@ -49,9 +48,9 @@ class Meter:
         self._clock = clock
         self._inner = [0]
         """Nanoseconds that the steps within the one that runs have taken."""
-        self.tap: Tap = self._tap
+        self.event_sent = self._tap
 
-    def around(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
+    def wrap_call(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
         """Return a function that calls `call` and adds up how long it takes."""
         inner, time_ns = self._inner, time.perf_counter_ns
         steps = self.nodes.setdefault(node, Sum())
@@ -72,9 +71,6 @@ class Meter:
                     steps.longest = own
 
         return metering
-
-    def asked(self, process: str, method: str, answer: Future[Any]) -> None:
-        """Know of calls of workers already: they can be counted at any time."""
 
     def _tap(self, sender: Sender[Any] | None, event: Event) -> None:
         name = "run.announced" if sender is None else sender.name

@@ -13,7 +13,7 @@ from runtime.config.model import Config
 from runtime.config.parameters import settings
 from runtime.errors import CommandError, suggest
 from runtime.node import NodeConfig, senders, streams
-from runtime.node_runner import Life
+from runtime.node_runner import NodeRunner
 from runtime.schedule import SECOND
 from runtime.summary import count_drops
 from runtime.supervisor import Supervisor
@@ -45,9 +45,10 @@ class Observer:
 
     def __init__(self, supervisor: Supervisor, config: Config, records: LastRecords) -> None:
         self._supervisor = supervisor
+        self._state = supervisor.state
         self._config = config
         self._records = records
-        self._keeper = Timekeeper(supervisor.clock, over=lambda: bool(supervisor.reason))
+        self._keeper = Timekeeper(self._state.clock, over=lambda: bool(self._state.reason))
         self._meter: Meter | None = None
         self._window = Window(self._sample())
         self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}
@@ -57,14 +58,14 @@ class Observer:
     def begin(self) -> None:
         """Begin to measure: somebody looks."""
         if self._meter is None:
-            self._meter = Meter(self._supervisor.clock)
-            self._supervisor.probes.attach(self._meter)
+            self._meter = Meter(self._state.clock)
+            self._supervisor.instruments.attach(self._meter)
             self._window = Window(self._sample())
 
     def end(self) -> None:
         """Measure no more: nobody looks."""
         if self._meter is not None:
-            self._supervisor.probes.detach(self._meter)
+            self._supervisor.instruments.detach(self._meter)
             self._meter = None
             self._window = Window(self._sample())
 
@@ -72,7 +73,7 @@ class Observer:
 
     def take(self) -> Snapshot:
         """Return what there is to see now, and of the last second or so."""
-        supervisor = self._supervisor
+        state = self._state
         self._number += 1
         sample = self._sample()
         self._window.add(sample)
@@ -81,9 +82,9 @@ class Observer:
             run=self._config.run.name,
             pid=os.getpid(),
             number=self._number,
-            ended=supervisor.reason,
+            ended=state.reason,
             clock=ClockState(
-                kind=supervisor.clock.kind,
+                kind=state.clock.kind,
                 now=now / SECOND,
                 duration=float(self._config.run.duration),
                 speed=self._window.run / self._window.real,
@@ -91,7 +92,7 @@ class Observer:
                 paused=self._keeper.paused,
                 fixed=self._keeper.fixed(),
             ),
-            nodes=[self._node(life) for life in supervisor._lives.values()],
+            nodes=[self._node(runner) for runner in state.runners.values()],
             outputs=self._outputs(sample),
             inputs=[
                 InputState(
@@ -105,7 +106,7 @@ class Observer:
             ],
             links=[
                 LinkState(name=link.name, lost=link.lost, thinned=link.thinned)
-                for link in supervisor.links.values()
+                for link in state.links.values()
             ],
             ticks=[
                 TickState(
@@ -116,7 +117,7 @@ class Observer:
                     late_p99_us=ticker.late.quantile(0.99) / 1e3,
                     late_max_us=ticker.late.maximum / 1e3,
                 )
-                for name, ticker in supervisor.tickers.items()
+                for name, ticker in state.tickers.items()
             ],
             log=self._records.lines(),
         )
@@ -124,54 +125,54 @@ class Observer:
     def _sample(self) -> Sample:
         """Return what has been added up since the last time."""
         sent: Counter[str] = Counter()
-        for node in self._supervisor.ever:
+        for node in self._state.all_nodes:
             for sender in senders(node).values():
                 sent[sender.name] += sender.sent().total()
         meter = self._meter
         return Sample(
             time.perf_counter(),
-            self._supervisor.clock.now(),
+            self._state.clock.now(),
             sent,
             {} if meter is None else {name: sum_.take() for name, sum_ in meter.nodes.items()},
             {} if meter is None else {name: sum_.take() for name, sum_ in meter.outputs.items()},
         )
 
-    def _node(self, life: Life) -> NodeState:
-        steps, real = self._window.node(life.spec.name), self._window.real
+    def _node(self, runner: NodeRunner) -> NodeState:
+        steps, real = self._window.node(runner.spec.name), self._window.real
         return NodeState(
-            name=life.spec.name,
-            type=life.spec.type_name,
-            condition=self._condition(life),
-            failures=life.failures,
+            name=runner.spec.name,
+            type=runner.spec.type_name,
+            condition=self._condition(runner),
+            failures=runner.failures,
             share=steps.total / 1e9 / real,
             steps=steps.times / real,
             longest_ms=steps.longest / 1e6,
-            calls=sum(worker.outstanding() for worker in life.workers),
-            settings=self._shown(life),
+            calls=sum(worker.outstanding() for worker in runner.workers),
+            settings=self._shown(runner),
         )
 
-    def _shown(self, life: Life) -> dict[str, str]:
-        config = life.node.config if life.node else life.spec.config
-        known = self._settings.get(life.spec.name)
+    def _shown(self, runner: NodeRunner) -> dict[str, str]:
+        config = runner.node.config if runner.node else runner.spec.config
+        known = self._settings.get(runner.spec.name)
         if known is None or known[0] is not config:
-            known = self._settings[life.spec.name] = config, settings(config)
+            known = self._settings[runner.spec.name] = config, settings(config)
         return known[1]
 
-    def _condition(self, life: Life) -> NodeCondition:
-        if life.recovering:
-            return "left out" if life.spec.on_error == "drop" else "restarting"
-        if self._supervisor.reason and not life.started:
+    def _condition(self, runner: NodeRunner) -> NodeCondition:
+        if runner.restarting:
+            return "left out" if runner.spec.on_error == "drop" else "restarting"
+        if self._state.reason and not runner.started:
             return "over"
-        if life.node is None:
+        if runner.node is None:
             return "waiting"
-        if not life.started:
+        if not runner.started:
             return "starting"
-        return "running" if self._supervisor._running else "ready"
+        return "running" if self._state.running else "ready"
 
     def _outputs(self, sample: Sample) -> list[OutputState]:
         events = {
             sender.name: sender.event.__name__
-            for node in self._supervisor.ever
+            for node in self._state.all_nodes
             for sender in senders(node).values()
         }
         last = self._meter.outputs if self._meter is not None else {}
@@ -192,12 +193,12 @@ class Observer:
         return found
 
     def _inputs(self) -> list[tuple[Any, Any]]:
-        drops = count_drops(self._supervisor)
+        drops = count_drops(self._state)
         return [
             (stream, drops[stream.name])
-            for life in self._supervisor._lives.values()
-            if life.node is not None
-            for stream in streams(life.node).values()
+            for runner in self._state.runners.values()
+            if runner.node is not None
+            for stream in streams(runner.node).values()
         ]
 
     # Doing.
@@ -231,14 +232,16 @@ class Observer:
             case Restart(node=node):
                 return self._restart(node)
             case Set(text=text):
-                values = self._supervisor.changing.set(text)
+                values = self._supervisor.parameters.set(text)
                 return ", ".join(f"{key} = {value}" for key, value in values.items()) or "as it was"
 
     def _restart(self, name: str) -> str:
-        lives = self._supervisor._lives
-        if name not in lives:
-            raise CommandError(f"expected the name of a node, found {name!r}{suggest(name, lives)}")
-        condition = self._condition(lives[name])
+        runners = self._state.runners
+        if name not in runners:
+            raise CommandError(
+                f"expected the name of a node, found {name!r}{suggest(name, runners)}"
+            )
+        condition = self._condition(runners[name])
         if condition not in {"running", "left out"}:
             raise CommandError(f"expected a node that runs, and {name} is {condition}")
         self._supervisor.restart(name, anyway=True)

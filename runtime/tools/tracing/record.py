@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
-import functools
 import logging
-import sys
 import threading
 import time
 from collections import deque
@@ -17,8 +15,7 @@ from typing import Any
 from events import Event
 from runtime.clock import Clock
 from runtime.errors import ConfigError
-from runtime.instruments import Call
-from runtime.node import Node
+from runtime.instruments import Call, Instrument
 from runtime.real_clock import RealClock
 from runtime.sender import Sender, Tap
 from runtime.supervisor import Supervisor
@@ -27,12 +24,9 @@ from runtime.tools.tracing.write import write_trace
 
 log = logging.getLogger("visnav.runtime")
 
-OUTSIDE = "runtime"
-"""Who offloaded what no node did."""
 
-
-class Recorder:
-    """A probe that notes what it sees, for a `Spool`.
+class Recorder(Instrument):
+    """An instrument that notes what it sees, for a `Spool`.
 
     Each note is a tuple that begins with its kind::
 
@@ -60,9 +54,9 @@ class Recorder:
         self._cause = [0]
         self.beside: deque[tuple[Any, ...]] = spool.beside
         """Notes of other threads, which must not touch the loop's list."""
-        self.tap: Tap = self._make_tap()
+        self.event_sent: Tap = self._make_tap()
 
-    def around(self, node: str, what: str, call: Call) -> Call:
+    def wrap_call(self, node: str, what: str, call: Call) -> Call:
         """Return a function that calls `call` and notes when it began and ended."""
         notes, add, current, now = self._notes, self._notes.append, self._cause, self._now
         time_ns, flush, identity = time.perf_counter_ns, self._flush, id
@@ -106,7 +100,23 @@ class Recorder:
 
         return tap
 
-    def asked(self, process: str, method: str, answer: concurrent.futures.Future[Any]) -> None:
+    def wrap_offload(self, node: str, call: Callable[[], Any], name: str) -> Callable[[], Any]:
+        """Return a function that calls `call` and notes when a thread runs it."""
+        submitted, note = time.perf_counter_ns(), self.beside.append
+
+        def noting() -> Any:
+            begin = time.perf_counter_ns()
+            try:
+                return call()
+            finally:
+                thread = threading.current_thread().name
+                note(("thread", thread, node, name, submitted, begin, time.perf_counter_ns()))
+
+        return noting
+
+    def worker_called(
+        self, process: str, method: str, answer: concurrent.futures.Future[Any]
+    ) -> None:
         """Note a worker's call once it is answered."""
         asked = time.perf_counter_ns()
         answer.add_done_callback(
@@ -123,43 +133,6 @@ class Recorder:
     def _flush(self) -> None:
         self._spool.put(self._notes.copy())
         self._notes.clear()
-
-
-class NotingExecutor(concurrent.futures.Executor):
-    """Notes who offloads what, and when a thread does it.
-
-    Args:
-        inner: Does the work.
-        note: Takes a note from any thread.
-    """
-
-    def __init__(
-        self, inner: concurrent.futures.Executor, note: Callable[[tuple[Any, ...]], None]
-    ) -> None:
-        self._inner = inner
-        self._note = note
-
-    def submit(
-        self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
-    ) -> concurrent.futures.Future[Any]:
-        """Have a function called in a thread."""
-        submitted, node = time.perf_counter_ns(), _asker()
-        inner = fn.func if isinstance(fn, functools.partial) else fn
-        name = getattr(inner, "__qualname__", type(inner).__name__)
-
-        def noting() -> Any:
-            begin = time.perf_counter_ns()
-            try:
-                return fn(*args, **kwargs)
-            finally:
-                thread = threading.current_thread().name
-                self._note(("thread", thread, node, name, submitted, begin, time.perf_counter_ns()))
-
-        return self._inner.submit(noting)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the threads."""
-        self._inner.shutdown(wait, cancel_futures=cancel_futures)
 
 
 @contextlib.contextmanager
@@ -182,9 +155,8 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
         raise ConfigError(
             f"{path}: expected a place for a trace, found: {error.strerror}"
         ) from None
-    recorder = Recorder(supervisor.clock, spool)
-    supervisor.probes.attach(recorder)
-    supervisor.executor = NotingExecutor(supervisor.executor, recorder.beside.append)
+    recorder = Recorder(supervisor.state.clock, spool)
+    supervisor.instruments.attach(recorder)
     try:
         yield
     finally:
@@ -196,15 +168,9 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
 
 
 def _write(spool: Spool, path: Path, supervisor: Supervisor, name: str) -> None:
-    order = [node.name for node in supervisor.ever]
+    order = [node.name for node in supervisor.state.all_nodes]
     try:
-        write_trace(spool, path, name=name, clock=supervisor.clock.kind, nodes=order)
+        write_trace(spool, path, name=name, clock=supervisor.state.clock.kind, nodes=order)
     except OSError as error:  # a full disk: the run's other results must not go with the trace
         log.error("%s: the trace could not be written: %s", path, error)
         path.unlink(missing_ok=True)
-
-
-def _asker() -> str:
-    """Return the node whose `offload` called `submit`, which called this."""
-    caller = sys._getframe(2).f_locals.get("self")
-    return caller.name if isinstance(caller, Node) else OUTSIDE

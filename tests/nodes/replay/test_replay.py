@@ -135,7 +135,7 @@ class Setting(Pausing):
 
     def set(self, text: str) -> None:
         host: Any = self._host
-        host.changing.set(f"{self.drone.name}.{text}")
+        host.parameters.set(f"{self.drone.name}.{text}")
 
 
 class Going(Setting):
@@ -166,8 +166,8 @@ class Overshooting(Seeking):
 
 
 def _replay_of(witness: Node[Any]) -> Replay:
-    nodes: Any = witness._host
-    return next(node for node in nodes.ever if isinstance(node, Replay))
+    host: Any = witness._host
+    return next(node for node in host.state.all_nodes if isinstance(node, Replay))
 
 
 def test_a_pause_makes_all_that_follows_later(path: Path) -> None:

@@ -95,9 +95,9 @@ def test_what_can_change_is_listed_with_its_values() -> None:
 def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> None:
     async def body(supervisor: Supervisor) -> None:
         await until_sent(supervisor, "pilot", 1)
-        assert supervisor.changing.set("pilot.gain=3") == {"gain": "3.0"}
+        assert supervisor.parameters.set("pilot.gain=3") == {"gain": "3.0"}
         with pytest.raises(ConfigError, match="pilot refuses: expected a gain that brings no"):
-            supervisor.changing.set("pilot.gain=13")
+            supervisor.parameters.set("pilot.gain=13")
         if clock == "real":
             await until_sent(supervisor, "pilot", 1)
             supervisor.stop("seen enough")
@@ -114,7 +114,7 @@ def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> Non
     gains = [e.velocity[0] for e in looked.sent if isinstance(e, VelocitySetpoint)]
     assert sorted(gains) == gains
     assert set(gains) == {1.0, 3.0}
-    listener = looked.supervisor.ever[3]
+    listener = looked.supervisor.state.all_nodes[3]
     assert isinstance(listener, Listener)
     assert listener.heard == ["pilot.gain=3.0"]
     if clock == "lockstep":
@@ -123,12 +123,12 @@ def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> Non
 
 def test_a_node_that_restarts_keeps_what_was_changed() -> None:
     async def body(supervisor: Supervisor) -> None:
-        await supervisor.clock.sleep(0.2)
-        supervisor.changing.set("pilot.gain=3")
+        await supervisor.state.clock.sleep(0.2)
+        supervisor.parameters.set("pilot.gain=3")
         supervisor.restart("pilot", anyway=True)
 
     looked = look([spec(Pilot, "pilot")], body)
-    first, second = looked.supervisor.ever
+    first, second = looked.supervisor.state.all_nodes
     assert first is not second
     assert isinstance(second, Pilot)
     assert second.config.gain == 3.0
@@ -137,19 +137,19 @@ def test_a_node_that_restarts_keeps_what_was_changed() -> None:
 def test_a_node_that_has_not_started_cannot_change() -> None:
     class First(Node):
         async def on_startup(self) -> None:
-            supervisor: Any = self._host
+            host: Any = self._host
             with pytest.raises(ConfigError, match="pilot does not just now"):
-                supervisor.changing.set("pilot.gain=3")
+                host.parameters.set("pilot.gain=3")
 
     look([spec(First, "first"), spec(Pilot, "pilot")], duration=0.1)
 
 
 def test_a_node_that_does_not_run_cannot_change() -> None:
     async def body(supervisor: Supervisor) -> None:
-        await supervisor.clock.sleep(0.2)
+        await supervisor.state.clock.sleep(0.2)
         supervisor.restart("pilot", anyway=True)
-        await supervisor.clock.sleep(0.2)
+        await supervisor.state.clock.sleep(0.2)
         with pytest.raises(ConfigError, match="expected a node that runs"):
-            supervisor.changing.set("pilot.gain=3")
+            supervisor.parameters.set("pilot.gain=3")
 
     look([spec(Pilot, "pilot")], body)

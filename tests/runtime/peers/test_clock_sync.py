@@ -14,7 +14,7 @@ import pytest
 
 from runtime.lockstep import LockstepLoop
 from runtime.peers.clock_offsets import KEPT, Exchange, Exchanges
-from runtime.peers.clock_sync import LIMIT, Following, Pursuit
+from runtime.peers.clock_sync import LIMIT, ClockFollower, PhaseLockedLoop
 from runtime.peers.member import Member
 from runtime.real_clock import RealClock
 from runtime.schedule import SECOND
@@ -36,11 +36,11 @@ class Alarm:
         pass
 
 
-class Far:
+class RemoteListener:
     """Another process, whose answers take a while that varies; stands in for a member."""
 
     def __init__(self, clock: RealClock, ours: Callable[[], int], theirs: Callable[[], int]):
-        self.line = self
+        self.outbox = self
         self.exchanges = Exchanges()
         self.drift_ppm: float | None = None
         self._clock, self._ours, self._theirs = clock, ours, theirs
@@ -71,8 +71,8 @@ def followed(
     async def main() -> tuple[list[float], float]:
         clock = RealClock(loop)
         clock.start_at(ours() + round(behind * SECOND))
-        far = Far(clock, ours, theirs)
-        following = Following(clock, cast("Member", far))
+        far = RemoteListener(clock, ours, theirs)
+        following = ClockFollower(clock, cast("Member", far))
         late, before = [], 0
         for second in range(1, 10 * seconds + 1):
             await asyncio.sleep(0.1)
@@ -128,7 +128,7 @@ def test_a_clock_that_is_steered_goes_on_from_where_it_was(monkeypatch: pytest.M
 
 
 def test_alone_it_runs_as_quickly_as_the_other_did() -> None:
-    pursuit = Pursuit()
+    pursuit = PhaseLockedLoop()
     for _ in range(200):
         pursuit.factor(1e-4, 1.0)
     assert 0 < pursuit.drift < LIMIT

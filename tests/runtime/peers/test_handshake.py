@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from runtime.config.model import Config
 from runtime.errors import VisnavError
 from runtime.peers.authentication import derive
-from runtime.peers.handshake import Greeting
-from runtime.peers.membership import Roster
+from runtime.peers.handshake import Handshakes
+from runtime.peers.membership import Membership
 from runtime.peers.peers import Peers
 from tests.runtime.peers.samples import settings
 
@@ -39,15 +39,15 @@ class Pair:
 
     def __init__(self) -> None:
         self.ends = {
-            name: Roster(CONFIG, [name], cast("Peers", Nobody())) for name in ("asker", "one")
+            name: Membership(CONFIG, [name], cast("Peers", Nobody())) for name in ("asker", "one")
         }
-        self.greetings: dict[str, Greeting] = {}
+        self.greetings: dict[str, Handshakes] = {}
         self.under_way: dict[str, deque[bytes]] = {name: deque() for name in self.ends}
         self.said: list[tuple[str, bytes]] = []
         for name, roster in self.ends.items():
             roster.soon = lambda call, *args: call(*args)  # type: ignore[method-assign]
-            greeting = Greeting(KEY, End(self, name), roster)  # type: ignore[arg-type]
-            self.greetings[name] = roster._greeting = greeting
+            greeting = Handshakes(KEY, End(self, name), roster)  # type: ignore[arg-type]
+            self.greetings[name] = roster._handshakes = greeting
 
     def other(self, name: str) -> str:
         return "one" if name == "asker" else "asker"

@@ -19,7 +19,7 @@ import msgspec
 import pytest
 
 from runtime.errors import VisnavError
-from runtime.peers.messages import AnyMessage, Begin, Message
+from runtime.peers.messages import AnyMessage, FirstUpdate, Message
 from runtime.peers.peers import Peers
 from runtime.summary import Summary
 from tests.runtime.peers.samples import Process, free_port, settings
@@ -70,7 +70,7 @@ def test_an_end_between_readiness_and_the_first_update_ends_both(
     begin = Peers.begin
 
     async def begin_and_end(peers: Peers) -> None:
-        if peers._roster.here == (who,):
+        if peers._membership.here == (who,):
             peers._run.stop("enough", ValueError("of this"))
         await begin(peers)
 
@@ -89,7 +89,7 @@ def test_one_that_never_hears_that_the_run_has_begun_ends_all(
     heard = Peers.heard
 
     def deaf(peers: Peers, member: object, message: AnyMessage, event: None) -> None:
-        if isinstance(message, Begin) and peers._roster.here == ("one",):
+        if isinstance(message, FirstUpdate) and peers._membership.here == ("one",):
             peers._run.stop("Ctrl-C")
         else:
             heard(peers, member, message, event)  # type: ignore[arg-type]
@@ -115,7 +115,7 @@ def test_the_end_goes_on_without_one_that_says_nothing(monkeypatch: pytest.Monke
     monkeypatch.setattr("runtime.peers.joint_shutdown.SILENCE", 1.0)
 
     def mute(peers: Peers, message: Message) -> None:
-        if peers._roster.here != ("one",):
+        if peers._membership.here != ("one",):
             tell(peers, message)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Peers, "_tell_in_order", mute)

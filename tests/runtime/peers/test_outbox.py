@@ -9,8 +9,8 @@ import pytest
 
 from events import Image
 from runtime.errors import VisnavError
-from runtime.peers.messages import Message, Ready, Said, decode
-from runtime.peers.outbox import Line
+from runtime.peers.messages import EventMessage, Message, Ready, decode
+from runtime.peers.outbox import Outbox
 from runtime.peers.shared_memory import Outgoing
 from tests.runtime.peers.test_shared_memory import picture
 
@@ -18,9 +18,9 @@ LARGE = 1000
 """Side of a picture that a line's thread writes."""
 
 
-def line_of(put: Any) -> tuple[Line, list[VisnavError]]:
+def line_of(put: Any) -> tuple[Outbox, list[VisnavError]]:
     wrong: list[VisnavError] = []
-    return Line("x", put, wrong.append), wrong
+    return Outbox("x", put, wrong.append), wrong
 
 
 def test_it_goes_on_though_a_library_fails() -> None:
@@ -34,10 +34,10 @@ def test_it_goes_on_though_a_library_fails() -> None:
 
     line, wrong = line_of(put)
     large: Image = picture(1, side=LARGE)
-    line.send(Said("a.b"), large)
-    line.send(Said("c.d"), large)
+    line.send(EventMessage("a.b"), large)
+    line.send(EventMessage("c.d"), large)
     line.close()
-    assert said[1:] == [Said("c.d")]
+    assert said[1:] == [EventMessage("c.d")]
     assert "RuntimeError: of the library's own" in str(wrong[0])
 
 
@@ -53,10 +53,10 @@ def test_what_cannot_be_put_into_memory_is_counted_all_the_same(
     monkeypatch.setattr(Outgoing, "put", full)
     line, wrong = line_of(lambda head, payload: said.append((decode(head), payload)))
     line.memory = Outgoing()
-    line.send(Said("a.b", 7), picture(1, side=LARGE))
+    line.send(EventMessage("a.b", 7), picture(1, side=LARGE))
     line.send(Ready())
     line.close()
-    assert said == [(Said("a.b", 7), b""), (Ready(), b"")]
+    assert said == [(EventMessage("a.b", 7), b""), (Ready(), b"")]
     assert "no space left" in str(wrong[0])
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from runtime.errors import PeerError
 from runtime.execute import execute
-from runtime.peers.messages import Message, Parted
-from runtime.peers.outbox import Line
+from runtime.peers.messages import FinalSummary, Message
+from runtime.peers.outbox import Outbox
 from tests.runtime.peers.samples import Process, apart, settings
 
 THREE: tuple[tuple[str, str, dict[str, Any]], ...] = (
@@ -60,16 +60,16 @@ def test_nobody_leaves_before_all_have_heard_what_it_had_to_say(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Zenoh may tell that a process has gone before it delivers that one's last words."""
-    send, late = Line.send, list[threading.Timer]()
+    send, late = Outbox.send, list[threading.Timer]()
 
-    def send_late(line: Line, message: Message, *args: Any) -> None:
-        if isinstance(message, Parted) and not late:
+    def send_late(line: Outbox, message: Message, *args: Any) -> None:
+        if isinstance(message, FinalSummary) and not late:
             late.append(threading.Timer(0.2, send, (line, message)))
             late[0].start()
         else:
             send(line, message, *args)
 
-    monkeypatch.setattr(Line, "send", send_late)
+    monkeypatch.setattr(Outbox, "send", send_late)
     one, other = apart(settings(*THREE, duration=0.1), "asker", "one,other")
     assert late
     assert one.outputs == other.outputs

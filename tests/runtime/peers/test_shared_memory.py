@@ -14,8 +14,8 @@ import pytest
 from events import Image
 from runtime.errors import WireError
 from runtime.peers import shared_memory
-from runtime.peers.messages import Mapped, Said, decode
-from runtime.peers.outbox import SMALL, Line
+from runtime.peers.messages import EventMessage, MemoryMapped, decode
+from runtime.peers.outbox import SMALL, Outbox
 from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.wire import Packed, pack, unpack
 from runtime.workers.shared_memory import anonymous_file
@@ -127,9 +127,9 @@ def test_nobody_can_shrink_the_file() -> None:
     os.close(fd)
 
 
-def lined(outgoing: Outgoing | None) -> tuple[Line, list[tuple[Any, bytes]]]:
+def lined(outgoing: Outgoing | None) -> tuple[Outbox, list[tuple[Any, bytes]]]:
     said: list[tuple[Any, bytes]] = []
-    line = Line("x", lambda head, payload: said.append((decode(head), payload)), said.append)  # type: ignore[arg-type]
+    line = Outbox("x", lambda head, payload: said.append((decode(head), payload)), said.append)  # type: ignore[arg-type]
     line.memory = outgoing
     return line, said
 
@@ -137,16 +137,16 @@ def lined(outgoing: Outgoing | None) -> tuple[Line, list[tuple[Any, bytes]]]:
 def test_a_line_puts_a_picture_there_at_once_and_a_larger_one_in_its_thread() -> None:
     outgoing, incoming = both()
     line, said = lined(outgoing)
-    line.send(Said("a.b"), picture(1))
+    line.send(EventMessage("a.b"), picture(1))
     ((first, payload),) = said  # already
     assert payload == b""
     got = unpack(incoming.frame(*first.place))
-    line.send(Said("a.b"), picture(2, side=1000))
-    line.send(Mapped())
+    line.send(EventMessage("a.b"), picture(2, side=1000))
+    line.send(MemoryMapped())
     line.close()
     second = unpack(incoming.frame(*said[1][0].place))
     assert [got.stamp, second.stamp] == [1, 2]
-    assert isinstance(said[2][0], Mapped)
+    assert isinstance(said[2][0], MemoryMapped)
 
 
 def test_a_line_without_room_there_sends_the_frame_itself(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,9 +154,9 @@ def test_a_line_without_room_there_sends_the_frame_itself(monkeypatch: pytest.Mo
     line, said = lined(Outgoing())
     packed = pack(picture(1))
     assert packed.size > SMALL
-    line.send(Said("a.b"), picture(1))
+    line.send(EventMessage("a.b"), picture(1))
     line.close()
-    assert said == [(Said("a.b"), packed.frame())]
+    assert said == [(EventMessage("a.b"), packed.frame())]
 
 
 @pytest.mark.parametrize("shared", [True, False])

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from events import Event
-from runtime.peers.messages import NEVER, Key, Ordered, Said
-from runtime.peers.time_token import Turns
+from runtime.peers.messages import NEVER, EventMessage, Key, Ordered
+from runtime.peers.time_token import TimeTokenHolder
 
 Plan = list[tuple[int, int, int]]
 """For each node: it begins at a time, comes again after a period, and says something to a node."""
@@ -52,10 +52,12 @@ class Nodes:
         self.count = max(owners) + 1
         self.timelines = [Timeline() for _ in range(self.count)]
         self.net: dict[tuple[int, int], deque[tuple[Any, Event | None]]] = {}
-        self.turns: list[Turns] = []
+        self.turns: list[TimeTokenHolder] = []
         for me in range(self.count):
             self.turns.append(
-                Turns(me, self.count, self.timelines[me], self.sender(me), self.receiver(me))
+                TimeTokenHolder(
+                    me, self.count, self.timelines[me], self.sender(me), self.receiver(me)
+                )
             )
         for node, (begin, _, _) in enumerate(plan):
             timeline = self.timelines[owners[node]]
@@ -72,7 +74,7 @@ class Nodes:
 
     def receiver(self, me: int) -> Any:
         def deliver(_: int, message: Ordered, __: Event | None) -> None:
-            assert isinstance(message, Said)
+            assert isinstance(message, EventMessage)
             self.hear(me, int(message.output))
 
         return deliver
@@ -89,7 +91,7 @@ class Nodes:
         if self.owners[hearer] == me:
             self.hear(me, hearer)
         else:
-            self.turns[me].post(self.owners[hearer], Said(str(hearer)))
+            self.turns[me].post(self.owners[hearer], EventMessage(str(hearer)))
         timeline.add(due + period, node)
 
     def hear(self, me: int, node: int) -> None:

@@ -22,7 +22,7 @@ from runtime.lockstep import LockstepLoop
 from runtime.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.units import Duration
-from runtime.watchdogs.loop import Stall, Watchdog
+from runtime.watchdogs.loop import LoopWatchdog, Stall
 
 pytestmark = pytest.mark.timeout(20)
 LOOPS: dict[str, Callable[[], asyncio.AbstractEventLoop]] = {
@@ -68,16 +68,16 @@ class Patient(Node):
         await self.offload(time.sleep, 0.15)
 
 
-def watch(*nodes: type[Node[Any]], clock: str, duration: float = 0.25) -> Watchdog:
+def watch(*nodes: type[Node[Any]], clock: str, duration: float = 0.25) -> LoopWatchdog:
     """Run nodes under a watchdog with a limit of 40 ms."""
     run: Any = {"clock": clock, "duration": Duration(duration), "speed": 1.0}
     config = Config(run=RunConfig(**run), nodes=tuple(spec(n, n.__name__) for n in nodes))
     loop = make_loop(config.run)
-    dogs: list[Watchdog] = []
+    dogs: list[LoopWatchdog] = []
 
     async def main() -> None:
         tasks.install(loop)
-        dogs.append(Watchdog(loop, 0.04, reports.append))
+        dogs.append(LoopWatchdog(loop, 0.04, reports.append))
         kept = make_clock(config.run, loop)
         dogs[0].start()
         await Supervisor(config, kept).main()
@@ -134,7 +134,7 @@ class CountingLoop:
 def test_only_a_busy_loop_is_woken(name: str, busy: bool) -> None:
     async def main() -> int:
         counting: Any = CountingLoop(asyncio.get_running_loop())
-        dog = Watchdog(counting, 0.02, lambda _: None)
+        dog = LoopWatchdog(counting, 0.02, lambda _: None)
         dog.start()
         end = time.monotonic() + 0.2
         while busy and time.monotonic() < end:
@@ -151,7 +151,7 @@ def test_only_a_busy_loop_is_woken(name: str, busy: bool) -> None:
 
 def test_a_closed_loop_ends_the_watch() -> None:
     loop = asyncio.new_event_loop()
-    dog = Watchdog(loop, 0.02, lambda _: None)
+    dog = LoopWatchdog(loop, 0.02, lambda _: None)
     loop.close()
     dog.start()
     dog._thread.join(1.0)
@@ -160,7 +160,7 @@ def test_a_closed_loop_ends_the_watch() -> None:
 
 def test_a_long_limit_does_not_hold_up_the_end() -> None:
     """A watchdog with a limit of an hour stops within a moment of being told to."""
-    dog = Watchdog(asyncio.new_event_loop(), 3600.0, lambda _: None)
+    dog = LoopWatchdog(asyncio.new_event_loop(), 3600.0, lambda _: None)
     try:
         dog.start()
         stopping = threading.Thread(target=dog.stop)
@@ -174,7 +174,7 @@ def test_a_long_limit_does_not_hold_up_the_end() -> None:
 def test_a_limit_of_none_watches_nothing() -> None:
     """With a limit of 0 there is no thread, and stopping is no mistake."""
     loop = asyncio.new_event_loop()
-    dog = Watchdog(loop, 0.0, lambda _: None)
+    dog = LoopWatchdog(loop, 0.0, lambda _: None)
     before = threading.active_count()
     dog.start()
     assert threading.active_count() == before

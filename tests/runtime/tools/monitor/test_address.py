@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from runtime.errors import VisnavError
-from runtime.tools.monitor.address import find, folder, runs, socket_of
+from runtime.tools.monitor.address import find, runs, socket_of
+from runtime.user_folder import user_folder
 
 
 @pytest.fixture
@@ -24,11 +25,11 @@ def listening(sockets: Path) -> Iterator[socket.socket]:
 
 
 def test_the_folder_is_its_users_alone(sockets: Path) -> None:
-    assert folder() == sockets
+    assert user_folder() == sockets
     assert sockets.stat().st_mode & 0o777 == 0o700
     sockets.chmod(0o755)
     with pytest.raises(VisnavError, match="only its user may enter, found mode 755"):
-        folder()
+        user_folder()
 
 
 def test_a_folder_that_cannot_be_is_a_clear_error(

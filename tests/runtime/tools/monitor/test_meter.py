@@ -27,8 +27,8 @@ def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) 
             work(5)
             raise RuntimeError
 
-        inner = found.around("b", "hear", work)
-        failing = found.around("c", "hear", fail)
+        inner = found.wrap_call("b", "hear", work)
+        failing = found.wrap_call("c", "hear", fail)
 
         def outer(_: Any) -> None:
             work(10)
@@ -38,8 +38,8 @@ def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) 
                 failing(None)
             work(20)
 
-        found.around("a", "tick", outer)(None)
-        found.around("a", "tick", work)(7)
+        found.wrap_call("a", "tick", outer)(None)
+        found.wrap_call("a", "tick", work)(7)
     finally:
         loop.close()
     assert found.nodes["a"].take() == Amount(2, 37, 30)

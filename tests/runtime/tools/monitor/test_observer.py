@@ -49,7 +49,7 @@ def test_a_snapshot_tells_what_there_was_lately() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         observer.begin()
         for _ in range(2):
-            await supervisor.clock.sleep(0.35)
+            await supervisor.state.clock.sleep(0.35)
             taken.append(observer.take())
 
     observe(script)
@@ -74,13 +74,13 @@ def test_a_snapshot_tells_what_there_was_lately() -> None:
 
 def test_nobody_is_measured_before_the_beginning_and_after_the_end() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
-        await supervisor.clock.sleep(0.2)
+        await supervisor.state.clock.sleep(0.2)
         before = observer.take()
         observer.begin()
         observer.begin()
-        await supervisor.clock.sleep(0.2)
+        await supervisor.state.clock.sleep(0.2)
         observer.end()
-        await supervisor.clock.sleep(0.2)
+        await supervisor.state.clock.sleep(0.2)
         after = observer.take()
         for snapshot in (before, after):
             assert node(snapshot, "drone").steps == 0
@@ -92,27 +92,27 @@ def test_nobody_is_measured_before_the_beginning_and_after_the_end() -> None:
 
 def test_looking_changes_nothing_of_what_is_said() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
-        await supervisor.clock.sleep(0.25)
+        await supervisor.state.clock.sleep(0.25)
         observer.begin()
         observer.take()
 
     async def nothing(supervisor: Supervisor, observer: Observer) -> None:
-        await supervisor.clock.sleep(0.25)
+        await supervisor.state.clock.sleep(0.25)
 
     assert observe(script).digest == observe(nothing).digest
 
 
 def test_a_node_is_restarted_once_at_a_time() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
-        await supervisor.clock.sleep(0.1)
+        await supervisor.state.clock.sleep(0.1)
         assert observer.do(Restart(node="vo")) == "vo restarts"
-        await supervisor.clock.sleep(0.1)
+        await supervisor.state.clock.sleep(0.1)
         assert node(observer.take(), "vo").condition == "restarting"
         with pytest.raises(VisnavError, match="expected a node that runs, and vo is restarting"):
             observer.do(Restart(node="vo"))
         with pytest.raises(VisnavError, match="found 'v0'"):
             observer.do(Restart(node="v0"))
-        await supervisor.clock.sleep(0.5)
+        await supervisor.state.clock.sleep(0.5)
         found = node(observer.take(), "vo")
         assert (found.condition, found.failures) == ("running", 1)
 
@@ -121,13 +121,13 @@ def test_a_node_is_restarted_once_at_a_time() -> None:
 
 def test_commands_end_the_run_and_change_settings() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
-        await supervisor.clock.sleep(0.1)
+        await supervisor.state.clock.sleep(0.1)
         assert observer.do(Set(text="pilot.gain=2")) == "gain = 2.0"
         assert observer.do(Set(text="pilot.gain=2")) == "as it was"
         assert observer.do(Stop()) == "ends"
         assert observer.take().ended == "stopped by hand"
 
-    assert observe(script).supervisor.reason == "stopped by hand"
+    assert observe(script).supervisor.state.reason == "stopped by hand"
     assert told(Step(seconds=0.5)) == "step 0.5"
 
 
@@ -143,13 +143,15 @@ def test_a_run_ends_in_order_though_time_stands() -> None:
         config = Config(
             run=RunConfig(name="sample", shutdown_limit=Duration(1)), nodes=tuple(NODES)
         )
-        supervisor._config = config
+        supervisor.state.config = config
         observer = Observer(supervisor, config, LastRecords())
-        await supervisor.clock.sleep(0.1)
+        await supervisor.state.clock.sleep(0.1)
         observer.do(Pause())
         observer.do(Stop())
 
-    assert look([*NODES[:2], spec(Slow, "pilot")], body).supervisor.reason == "stopped by hand"
+    assert (
+        look([*NODES[:2], spec(Slow, "pilot")], body).supervisor.state.reason == "stopped by hand"
+    )
     assert Slow.landed
 
 

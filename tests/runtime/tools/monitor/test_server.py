@@ -81,8 +81,8 @@ def test_snapshots_come_and_commands_are_answered(clock: str) -> None:
         assert paced.done == (clock == "lockstep")
 
     looked = served(outside, clock)
-    assert looked.supervisor.reason == "seen enough"
-    assert looked.supervisor.probes._probes == ()
+    assert looked.supervisor.state.reason == "seen enough"
+    assert looked.supervisor.instruments.attached == ()
 
 
 def test_a_command_needs_no_more_than_a_line(sockets: Path) -> None:
@@ -109,7 +109,7 @@ def test_nonsense_is_answered_and_does_no_harm() -> None:
                     assert b"expected a command" in connection.makefile("rb").readline()
         assert ask(find(None), Set(text="pilot.gain=2")) == "gain = 2.0"
 
-    assert served(outside).supervisor.reason == "seen enough"
+    assert served(outside).supervisor.state.reason == "seen enough"
 
 
 def test_who_looks_sees_the_end() -> None:
@@ -159,7 +159,7 @@ def test_a_monitor_that_fails_leaves_the_run_alone(monkeypatch: pytest.MonkeyPat
             connection.sendall(b'{"type":"watch"}\n')
             assert ask(find(None), Set(text="pilot.gain=2")) == "gain = 2.0"
 
-    assert served(outside).supervisor.reason == "seen enough"
+    assert served(outside).supervisor.state.reason == "seen enough"
 
 
 def test_those_who_read_nothing_do_not_hold_up_the_end(
@@ -187,7 +187,7 @@ def test_those_who_read_nothing_do_not_hold_up_the_end(
         assert enough.wait(10)
 
     try:
-        assert served(outside).supervisor.reason == "seen enough"
+        assert served(outside).supervisor.state.reason == "seen enough"
         assert list(sockets.iterdir()) == []  # its thread has come to its end
     finally:
         for each in watching:
@@ -281,7 +281,7 @@ def test_an_error_of_the_monitors_own_is_an_answer(monkeypatch: pytest.MonkeyPat
         with pytest.raises(VisnavError, match="could not do it, and its log says why"):
             ask(find(None), Stop())
 
-    assert served(outside).supervisor.reason == "seen enough"
+    assert served(outside).supervisor.state.reason == "seen enough"
 
 
 async def test_a_late_answer_and_the_end_disturb_nobody(monkeypatch: pytest.MonkeyPatch) -> None:

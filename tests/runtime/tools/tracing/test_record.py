@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.schedule import Tick
 from runtime.sender import Sender
-from runtime.tools.tracing.record import OUTSIDE, NotingExecutor, Recorder
+from runtime.tools.tracing.record import Recorder
 from runtime.tools.tracing.spool import CHUNK, Spool
 from tests.runtime.samples import Ping
 
@@ -34,15 +35,15 @@ def test_what_is_sent_after_an_inner_step_is_the_outer_ones(tmp_path: Path) -> N
     given, reply = Ping(stamp=1, source="x"), Ping(stamp=2, source="a")
 
     def do(recorder: Recorder) -> None:
-        inner = recorder.around("b", "hear", lambda _: None)
+        inner = recorder.wrap_call("b", "hear", lambda _: None)
 
         def outer(_: Any) -> None:
-            recorder.tap(sender, reply)
+            recorder.event_sent(sender, reply)
             inner(reply)
-            recorder.tap(sender, reply)
+            recorder.event_sent(sender, reply)
 
-        recorder.around("a", "hear", outer)(given)
-        recorder.tap(None, reply)
+        recorder.wrap_call("a", "hear", outer)(given)
+        recorder.event_sent(None, reply)
 
     first, within, second, around, outside = notes(tmp_path, do)
     assert first[-1] == second[-1] == around[-1] == id(given)
@@ -55,7 +56,9 @@ def test_what_is_no_event_is_no_cause(tmp_path: Path) -> None:
     tick = Tick(stamp=1, index=0, late=0, missed=0)  # it may lie where an event lay
 
     def do(recorder: Recorder) -> None:
-        recorder.around("a", "tick", lambda _: recorder.tap(None, Ping(stamp=1, source="a")))(tick)
+        recorder.wrap_call(
+            "a", "tick", lambda _: recorder.event_sent(None, Ping(stamp=1, source="a"))
+        )(tick)
 
     event, step = notes(tmp_path, do)
     assert (event[-1], step[-1]) == (0, 0)
@@ -64,7 +67,7 @@ def test_what_is_no_event_is_no_cause(tmp_path: Path) -> None:
 def test_the_order_is_kept_however_many_there_are(tmp_path: Path) -> None:
     def do(recorder: Recorder) -> None:
         for n in range(3 * CHUNK):
-            recorder.around("a", str(n), lambda _: None)(None)
+            recorder.wrap_call("a", str(n), lambda _: None)(None)
 
     assert [note[2] for note in notes(tmp_path, do)] == [str(n) for n in range(3 * CHUNK)]
 
@@ -72,11 +75,13 @@ def test_the_order_is_kept_however_many_there_are(tmp_path: Path) -> None:
 def test_threads_are_noted_with_what_they_did(tmp_path: Path) -> None:
     def do(recorder: Recorder) -> None:
         with ThreadPoolExecutor(1, thread_name_prefix="beside") as inner:
-            executor = NotingExecutor(inner, recorder.beside.append)
-            assert executor.submit(divmod, 7, 2).result() == (3, 1)
-            assert isinstance(executor.submit(divmod, 7, 0).exception(), ZeroDivisionError)
+            for divisor, result in ((2, (3, 1)), (0, None)):
+                call = recorder.wrap_offload("a", functools.partial(divmod, 7, divisor), "divmod")
+                answer = inner.submit(call)
+                assert isinstance(answer.exception(), ZeroDivisionError) == (divisor == 0)
+                assert result is None or answer.result() == result
 
     for note in notes(tmp_path, do):
-        assert note[:4] == ["thread", "beside_0", OUTSIDE, "divmod"]
+        assert note[:4] == ["thread", "beside_0", "a", "divmod"]
         submitted, begin, end = note[4:]
         assert submitted <= begin <= end

@@ -145,7 +145,7 @@ def test_a_full_disk_costs_the_trace_and_not_the_run(
     else:
         monkeypatch.setattr(write._Writer, "_step", full)
     looked = look(NODES, watch=lambda s: tracing(s, tmp_path / "t.json", "loop"))
-    assert looked.supervisor.reason == "duration"
+    assert looked.supervisor.state.reason == "duration"
     assert list(tmp_path.iterdir()) == []
     assert "No space left on device" in caplog.text
 
