@@ -88,7 +88,12 @@ class MultirotorConfig(SimulatorConfig):
 
 
 class Multirotor(Simulator[MultirotorConfig]):
-    """A quadrotor with cameras, an IMU and ground truth, in a MuJoCo world."""
+    """A quadrotor with cameras, an IMU and ground truth, in a MuJoCo world.
+
+    It obeys commands (`Arm`, `Takeoff`, `Hover`, `Land`, `Disarm`), and follows set-points of
+    position, velocity, attitude or body rates while it flies. Ground truth is sent as `odometry`
+    and `camera_poses`, without noise.
+    """
 
     imu = Output(Imu)
     vehicle_events = Output(VehicleEvent)

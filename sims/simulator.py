@@ -31,10 +31,9 @@ class SimulatorConfig(NodeConfig):
     """Settings of every simulator.
 
     Attributes:
-        world: Name of a built-in world (``hall``, ``yard``), or path of an MJCF file. The axes of
-            an MJCF file are x north, y west, z up, as MuJoCo's bodies have theirs forward, left and
-            up; those of all settings and events are x north, y east, z down (NED). So a geom with
-            ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
+        world: Name of a built-in world (``hall``, ``yard``), or path of an MJCF file. In an MJCF
+            file x is north, y is west and z is up; in all settings and events x is north, y is
+            east and z is down (NED). So a geom with ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
         cameras: The cameras that are carried.
         camera_processes: Number of processes that render.
         render_threads: Threads of the software renderer in each of them.

@@ -9,7 +9,7 @@ clock = "lockstep"
 name = "drone"
 type = "sims.multirotor:Multirotor"     # module:Class
 on_error = "stop"                       # optional, like `inputs`
-inputs = { setpoints = "tour" }         # narrow a port to a source
+inputs = { setpoints = "pilot" }        # narrow a port to a source
 links = { setpoints = { delay = "80ms" } }  # make the way there worse than perfect
 rate = 30                               # all other keys: the node's own settings
 """

@@ -27,7 +27,7 @@ from tests.nodes.monocular_odometry.world import (
 Place = tuple[float, ...]
 """As `pose` takes it."""
 FRAME = 33_000_000
-NO_MAP = TrackingResult(np.eye(4), lost=True)
+NO_MAP = TrackingResult(np.eye(4))
 """Stands for images before there is a map."""
 DARK = np.zeros((INFO.height, INFO.width), np.uint8)
 RIGHT: list[Place] = [(0.05 * i,) for i in range(24)]
@@ -73,6 +73,7 @@ MOTIONS: dict[str, list[Place]] = {
 @pytest.mark.parametrize("path", MOTIONS.values(), ids=MOTIONS)
 def test_a_motion_has_its_direction_and_its_turn(path: list[Place]) -> None:
     *_, last = follow(MonocularOdometry(INFO), pictures(path))
+    assert last is not NO_MAP
     assert not last.lost
     true = pose(*path[-1])
     assert angle(last.pose[:3, 3], true[:3, 3]) < 0.6
