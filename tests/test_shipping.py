@@ -121,14 +121,10 @@ def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
     assert "monocular" in done(visnav, "example")
     done(visnav, "example", "brightness")
     done(visnav, "check", "brightness.toml")
-    shorter = (
-        "--set",
-        "run.duration=3s",
-        "--set",
-        "camera.width=128",
-        "--set",
-        "camera.height=128",
-    )
+    shorter = [
+        *("--set", "run.duration=3s", "--set", "run.shutdown_limit=60s"),
+        *("--set", "camera.width=128", "--set", "camera.height=128"),
+    ]
     judged = subprocess.run(
         [str(visnav), "demo", "--quiet", "--out", "tour", *shorter],
         cwd=tmp_path / "work",

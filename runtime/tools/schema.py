@@ -135,7 +135,7 @@ class _Maker:
                 text = f"{text} It can be changed in a run.".strip()
             if field.required:
                 required.append(field.encode_name)
-            elif field.default is not msgspec.NODEFAULT and field.default is not None:
+            elif _may_stand(field.default):
                 default = msgspec.to_builtins(field.default, enc_hook=plain)
                 found = _beside(found, "default", default)
             properties[field.encode_name] = _beside(found, "description", text) if text else found
@@ -193,3 +193,8 @@ def _bounds(info: Any, of: Literal["", "Items", "Length"] = "") -> Schema:
         for name, value in found.items()
         if value is not None
     }
+
+
+def _may_stand(default: Any) -> bool:
+    """Tell whether a default is one that a file may have; a table's are those of its settings."""
+    return default not in (None, msgspec.NODEFAULT) and not isinstance(default, msgspec.Struct)

@@ -53,6 +53,16 @@ def test_a_node_of_ones_own_scores_each_image(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_an_estimator_of_ones_own_is_judged_beside_ours(tmp_path: Path) -> None:
+    """`own_estimator` passes its thresholds; so does the reference, which is better."""
+    summary = run("own_estimator", tmp_path, "report.figures=[]")
+    figures = summary["verdict"]["estimators"]
+    assert figures["reference"]["ate_percent"] < figures["own"]["ate_percent"] < 2.0
+    assert figures["own"]["coverage_percent"] == 100.0
+
+
+@pytest.mark.slow
 def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
     """`two_cameras` gives 15 coloured pairs and 70 grey pictures a second."""
     summary = run("two_cameras", tmp_path, "run.duration=2s")

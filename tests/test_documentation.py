@@ -1,0 +1,150 @@
+"""The documentation is true: its snippets run, its files are valid, its commands exist."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+import jsonschema
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SCHEMA = json.loads((ROOT / "docs/reference/config.schema.json").read_text(encoding="utf-8"))
+PAGES = sorted([*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
+PAGES = [page for page in PAGES if page.is_file()]
+ABOUT_FILES = {"pyproject.toml"}
+"""Titles of blocks in TOML that are no configuration."""
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    page: Path
+    language: str
+    title: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.title or self.text.split(chr(10))[0][:40]}"
+
+
+def blocks(*languages: str) -> list[Block]:
+    """Return the fenced blocks of all pages in these languages, with included files put in."""
+    found = []
+    for page in PAGES:
+        for match in re.finditer(
+            r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$',
+            page.read_text(encoding="utf-8"),
+            re.MULTILINE | re.DOTALL,
+        ):
+            language, title, text = match.groups()
+            text = re.sub(r'^--8<-- "(.*)"$', lambda m: included(m[1]), text, flags=re.MULTILINE)
+            if language in languages:
+                found.append(Block(page, language, title or "", text))
+    return found
+
+
+def included(path: str) -> str:
+    return (ROOT / path).read_text(encoding="utf-8")
+
+
+def commands() -> list[str]:
+    """Return what the pages tell to type, without the name of the program."""
+    lines = [line for block in blocks("sh") for line in block.text.splitlines()]
+    starts = r"^(?:visnav|python -m runtime) (.*?)(?: +#.*)?$"
+    return [match[1] for line in lines if (match := re.match(starts, line))]
+
+
+def test_there_is_something_to_check() -> None:
+    """The patterns above find what a reader sees."""
+    assert len(PAGES) >= 20
+    assert len(blocks("python")) >= 6
+    assert len(blocks("toml")) >= 8
+    assert len(commands()) >= 15
+
+
+def test_every_block_says_its_language() -> None:
+    known = {"python", "toml", "sh", "text", "json5", "xml"}
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        opened = re.findall(r"^```(.*)$", text, re.MULTILINE)[::2]
+        assert {line.partition(" ")[0] for line in opened} <= known, page
+
+
+@pytest.mark.parametrize("block", blocks("python"), ids=str)
+def test_python_runs(block: Block, tmp_path: Path) -> None:
+    """As a module of its own: an assertion in it is one of ours."""
+    (tmp_path / "snippet.py").write_text(block.text, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(tmp_path / "snippet.py")],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": ""},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("block", blocks("toml"), ids=str)
+def test_toml_keeps_to_the_schema(block: Block) -> None:
+    """Whole files and single tables; a part of a node's table is only read."""
+    table = tomllib.loads(block.text)
+    if block.title in ABOUT_FILES or not isinstance(table.get("nodes", []), list):
+        return
+    if set(table) <= {"run", "network", "nodes"}:
+        whole = {"nodes": [{"name": "any", "type": "any:Any"}], **table}
+        jsonschema.validate(whole, SCHEMA)
+
+
+@pytest.mark.parametrize("words", sorted(set(commands())))
+def test_commands_name_what_there_is(words: str) -> None:
+    """The command exists, so do its files and options, and the settings that it changes."""
+    from runtime.config.reading import load
+    from runtime.tools.cli.run import chosen
+    from tests.runtime.tools.samples_cli import command_here
+
+    name, *arguments = shlex.split(words)
+    help_ = command_here(name, "--help", folder=ROOT)
+    assert help_.returncode == 0, help_.stderr
+    for option in (each for each in arguments if each.startswith("--")):
+        assert option in help_.stdout, option
+    files = [each for each in arguments if each.endswith(".toml")]
+    pairs = list(itertools.pairwise(arguments))
+    changes = [value for option, value in pairs if option == "--set"]
+    changes += [value.split(",")[0] for option, value in pairs if option == "--vary"]
+    if name == "demo":
+        files = ["config.toml"]
+    for file in files:
+        settings = load(ROOT / file, changes)
+        if "--only" in arguments:
+            chosen(settings, arguments[arguments.index("--only") + 1])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_site_builds_and_needs_no_network(tmp_path: Path) -> None:
+    """Strictly: every link leads somewhere; and no page loads anything from another server."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) >= 25
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(r"<(?:script|img|iframe)[^>]+src=\"([^\"]+)", text)
+        loaded += re.findall(r"<link[^>]+rel=\"(?:stylesheet|preconnect|icon)\"[^>]*>", text)
+        assert [each for each in loaded if "http" in each.split("?")[0]] == [], page
+    nodes = (tmp_path / "reference" / "nodes.html").read_text(encoding="utf-8")
+    assert "VisualOdometry" in nodes
+    assert "How many are tracked at most" not in nodes, "examples are no nodes of the project"

@@ -1,0 +1,238 @@
+"""The pages of the documentation that are made from the code, as a hook of MkDocs.
+
+Commands, nodes and the tables of a file are read from their typed declarations, the picture of
+the architecture from the imports, each time the site is built: so they cannot drift.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+import typer
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+
+from runtime.config.model import NetworkConfig, RunConfig
+from runtime.links import LinkConfig
+from runtime.node import Node
+from runtime.tools.cli import app
+from runtime.tools.describe import SettingDescription, describe, describe_settings
+from runtime.tools.plugins import find_nodes
+
+ROOT = Path(__file__).parents[1]
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are made here."""
+    for path, content in {
+        "reference/commands.md": commands_page(),
+        "reference/configuration.md": configuration_page(),
+        "reference/nodes.md": nodes_page(find_nodes(_refuse)),
+        "explanation/architecture.svg": architecture(imports_between_rooms()),
+    }.items():
+        files.append(File.generated(config, path, content=content))
+    return files
+
+
+def _refuse(warning: str) -> None:
+    """Stop the build: the reference would lack a node."""
+    raise PluginError(warning)
+
+
+# Commands
+
+
+def commands_page() -> str:
+    """Return the page of all commands, with their arguments and options."""
+    lines = [
+        "# Commands",
+        "",
+        "`visnav COMMAND` and `python -m runtime COMMAND` are the same. Exit codes: 0, the command "
+        "ended in order; 1, a run missed a threshold; 2, an error, which is one line on standard "
+        "error that says what was expected, what was found and where.",
+    ]
+    group: Any = typer.main.get_command(app)
+    context = typer.Context(group, info_name="visnav")
+    for name in group.list_commands(context):
+        _, command, _ = group.resolve_command(context, [name])
+        lines += ["", f"## {name}", "", _prose(command.help or ""), ""]
+        rows = [
+            (_option(parameter), getattr(parameter, "help", None) or "", _default(parameter))
+            for parameter in command.params
+            if parameter.name != "help"
+        ]
+        lines += _table(("argument or option", "meaning", "default"), rows)
+    return "\n".join(lines) + "\n"
+
+
+def _option(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        return f"`{(parameter.name or '').upper()}`"
+    return ", ".join(f"`{option}`" for option in (*parameter.opts, *parameter.secondary_opts))
+
+
+def _default(parameter: Any) -> str:
+    if parameter.required:
+        return "required"
+    value = parameter.default
+    plain = value is not None and value is not False and not callable(value)
+    return f"`{getattr(value, 'value', value)}`" if plain and "UNSET" not in repr(value) else ""
+
+
+# The file and its nodes
+
+
+def configuration_page() -> str:
+    """Return the page of what a file may hold besides the settings of nodes."""
+    text = (ROOT / "tools" / "configuration.md").read_text(encoding="utf-8")
+    for key, cls in {"run": RunConfig, "network": NetworkConfig, "link": LinkConfig}.items():
+        text = text.replace(f"{{{{ {key} }}}}", "\n".join(_settings(describe_settings(cls))))
+    return text
+
+
+def nodes_page(nodes: dict[str, type[Node[Any]]]) -> str:
+    """Return the page of all nodes: what each is for, its ports and its settings."""
+    lines = [
+        "# Nodes",
+        "",
+        "Every node that comes with the project, with its ports and settings. `visnav nodes NAME` "
+        "prints the same, also for nodes of your own (`visnav nodes my_module:MyNode`). What all "
+        "nodes have in common (`name`, `type`, `on_error`, `inputs`, `links`) is in "
+        "[Configuration](configuration.md).",
+    ]
+    for name, cls in nodes.items():
+        node = describe(cls, name)
+        lines += ["", f"## {cls.__name__}", "", "```toml", f'type = "{name}"', "```", ""]
+        lines += [_prose(node.doc), ""]
+        lines += _table(
+            ("port", "kind", "events", "meaning"),
+            [
+                (
+                    f"`{port.name}`",
+                    f"{port.kind}, {port.delivery}" if port.delivery else port.kind,
+                    ", ".join(f"`{event}`" for event in port.events),
+                    _prose(port.doc),
+                )
+                for port in (*node.inputs, *node.outputs)
+            ],
+        )
+        rates = [(f"`{tick.name}`", tick.rate, _prose(tick.doc)) for tick in node.ticks]
+        lines += ["", *_table(("called", "at", "what it does"), rates)]
+        lines += ["", *_settings(node.settings)]
+    return "\n".join(lines) + "\n"
+
+
+def _settings(settings: tuple[SettingDescription, ...], table: str = "") -> list[str]:
+    """Return a table of settings; those of a table or of a list of tables follow below."""
+    rows = []
+    for each in settings:
+        default = "required" if each.required else each.default and f"`{each.default}`"
+        change = " It can be changed in a run." if each.changeable else ""
+        type_ = f"{each.type}, {each.constraint}" if each.constraint else each.type
+        rows.append((f"`{table}{each.name}`", type_, default, _prose(each.doc) + change))
+    lines = _table(("setting", "type", "default", "meaning"), rows)
+    for each in settings:
+        if each.settings:
+            lines += ["", *_settings(each.settings, f"{table}{each.name}.")]
+    return lines
+
+
+# The architecture
+
+LAYERS = (("bench",), ("sims", "nodes"), ("runtime.tools",), ("runtime",), ("events",))
+"""Rooms from top to bottom: each may import what lies below it."""
+
+ABOUT = {
+    "bench": "benchmarks and their peers",
+    "sims": "simulators",
+    "nodes": "estimators, evaluation, recorder, viewers, bridge",
+    "runtime.tools": "command line, monitor, sweep, trace",
+    "runtime": "the core: node, channels, clocks, workers, run",
+    "events": "frozen typed data",
+}
+
+
+def imports_between_rooms() -> set[tuple[str, str]]:
+    """Return which room imports which, as read from every source file."""
+    found = set()
+    for path in sorted(each for room in ABOUT for each in (ROOT / room).rglob("*.py")):
+        if path.name == "__main__.py":  # it starts the command line
+            continue
+        room = _room(".".join(path.relative_to(ROOT).with_suffix("").parts))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and not node.level:
+                modules = [f"{node.module}.{alias.name}" for alias in node.names]
+            found |= {(room, _room(module)) for module in modules}
+    return {(one, other) for one, other in found if one != other and one and other}
+
+
+def _room(module: str) -> str:
+    return next((r for r in ABOUT if r.count(".") and f"{module}.".startswith(f"{r}.")), None) or (
+        module.partition(".")[0] if module.partition(".")[0] in ABOUT else ""
+    )
+
+
+def architecture(imports: set[tuple[str, str]]) -> str:
+    """Return the rooms and their imports as SVG, without arrows that others imply.
+
+    Raises:
+        PluginError: A room imports one that does not lie below it.
+    """
+    depth = {room: row for row, layer in enumerate(LAYERS) for room in layer}
+    for one, other in sorted(imports):
+        if depth[one] >= depth[other]:
+            raise PluginError(f"{one} imports {other}, which does not lie below it")
+    shown = {
+        (one, other)
+        for one, other in imports
+        if not any((one, way) in imports and (way, other) in imports for way in ABOUT)
+    }
+    width, height, across, down = 300, 50, 340, 95
+    place = {}
+    for row, layer in enumerate(LAYERS):
+        for column, room in enumerate(layer):
+            x = 340 + (column - (len(layer) - 1) / 2) * across
+            place[room] = (x, 40 + row * down)
+    parts = [
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 680 450" '
+        'font-family="sans-serif" text-anchor="middle">',
+        '<defs><marker id="tip" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="8" '
+        'markerHeight="8" orient="auto"><path d="M0 0 8 4 0 8z" fill="#607d8b"/></marker></defs>',
+    ]
+    for one, other in sorted(shown):
+        (x0, y0), (x1, y1) = place[one], place[other]
+        parts.append(
+            f'<line x1="{x0:.0f}" y1="{y0 + height / 2:.0f}" x2="{x1 + (x0 - x1) / 8:.0f}" '
+            f'y2="{y1 - height / 2 - 2:.0f}" stroke="#607d8b" stroke-width="1.5" '
+            'marker-end="url(#tip)"/>'
+        )
+    for room, (x, y) in place.items():
+        parts.append(
+            f'<rect x="{x - width / 2:.0f}" y="{y - height / 2:.0f}" width="{width}" '
+            f'height="{height}" rx="6" fill="#eceff1" stroke="#607d8b"/>'
+            f'<text x="{x:.0f}" y="{y - 4:.0f}" font-size="15" font-weight="bold">{room}</text>'
+            f'<text x="{x:.0f}" y="{y + 15:.0f}" font-size="10">{ABOUT[room]}</text>'
+        )
+    return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+# Markdown
+
+
+def _prose(text: str) -> str:
+    """Return a docstring as Markdown: what stands before its sections, with single backticks."""
+    text = re.split(r"^(?:Args|Attributes|Raises|Returns):$", text, flags=re.MULTILINE)[0]
+    text = re.sub(r"^::$|:(?=:$)", "", text, flags=re.MULTILINE)  # what follows is indented
+    return re.sub(r"``([^`]+)``", r"`\1`", text).strip()
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    if not rows:
+        return []
+    cells = [" | ".join(" ".join(c.split()).replace("|", "\\|") for c in row) for row in rows]
+    return [f"| {' | '.join(head)} |", "|---" * len(head) + "|", *(f"| {row} |" for row in cells)]
