@@ -1,4 +1,4 @@
-"""Worlds to fly in: where the walls are and what they look like. Vehicles and cameras are not here.
+"""Worlds to fly in: geometry, materials and lights, without vehicles and cameras.
 
 A built-in world costs physics little (primitives, all in the world body) and is made to be seen:
 textures are drawn from a seed, and nothing repeats for long.

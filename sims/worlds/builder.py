@@ -19,7 +19,7 @@ WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 
 
 class Builder(Model):
-    """A model and the things that worlds are built of."""
+    """A model, with methods for the solids that worlds are built of."""
 
     def box(
         self,
@@ -36,13 +36,13 @@ class Builder(Model):
         """Add a box.
 
         Args:
-            name: Its name.
-            material: Of all its faces.
+            name: Name of the box.
+            material: Material of all its faces.
             size: Lengths along its x, y, z, metres.
             place: The middle of its **base**, metres (of the box itself if it is tilted).
             turn: About z, degrees.
             tilt: About its y, degrees; positive lowers its +x end.
-            windows: Which part of the material goes on which face; the others are cut.
+            windows: Part of the material for some faces; for the others one is cut at random.
             hidden: Faces that nobody can see; None: the bottom, if it lies on the ground.
         """
         chosen = windows or {}
@@ -113,15 +113,15 @@ class Builder(Model):
         place: Vector,
         facing: float,
     ) -> None:
-        """Hang up an image (seen, not felt).
+        """Hang up an image (drawn, without collisions).
 
         Args:
-            name: Its name.
-            material: What it shows a part of.
-            window: Which part.
+            name: Name of the image.
+            material: Material of which it shows a part.
+            window: That part.
             size: Width and height, metres.
             place: Its middle.
-            facing: Where it looks: degrees from north to the west.
+            facing: Direction in which it faces: degrees from north to the west.
         """
         width, height = size
         surface = quad(
@@ -147,7 +147,7 @@ class Builder(Model):
 
         Args:
             name: Its name; the legs are ``<name>/left``, ``/right``, the ring ``<name>/ring``.
-            material: Of all of it.
+            material: Material of the whole arch.
             opening: Clear width, and height of the legs, metres.
             leg: Width of a leg and of the ring, metres.
             depth: Thickness along x, metres.

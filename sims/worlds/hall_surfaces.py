@@ -1,7 +1,7 @@
 """The images of `hall`: floor with its shadows, walls, ceiling, pillars, crates, posters.
 
-Shadows are painted on the floor, not drawn: they cost nothing per frame. Where things stand is
-therefore said here (x north, y west, metres, as in `sims.worlds.hall`).
+Shadows are painted on the floor, not drawn: they cost nothing per frame. The positions of
+objects are therefore given here (x north, y west, metres, as in `sims.worlds.hall`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Finding a world by its name or by its path, and saying clearly why there is none."""
+"""Loading a world by its name or by the path of a file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WORLDS: dict[str, Callable[[int, bool], Any]] = {"hall": hall, "yard": yard}
 
 
 class WorldError(VisnavError, ValueError):
-    """The world that was asked for isn't there, or isn't one."""
+    """There is no such world, or the file is not one."""
 
 
 def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> mujoco.MjSpec:
@@ -30,7 +30,7 @@ def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
     Args:
         name_or_path: A name in `WORLDS`, or the path of an MJCF file (what ends in ``.xml``,
             contains a slash, or is a `Path`).
-        seed: Of a built-in world's looks; its geometry is the same for every seed, but for
+        seed: Seed of a built-in world's textures; its geometry is the same for every seed, but for
             what lies on shelves. A file has none.
         bare: Leave out a built-in world's images, and what has a random place in it: the rest
             is there in a tenth of the time.

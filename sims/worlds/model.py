@@ -25,9 +25,9 @@ class Material(NamedTuple):
     """A texture in the model.
 
     Attributes:
-        name: The material's.
-        width: How much it covers, metres.
-        height: As above.
+        name: Name of the material.
+        width: Width that it covers, metres.
+        height: Height that it covers, metres.
         module: Pieces that are cut out of it start at a multiple of this, metres down: a course
             of bricks.
     """
@@ -42,8 +42,8 @@ class Model:
     """Collects a world.
 
     Args:
-        name: The model's.
-        seed: Everything random follows from it.
+        name: Name of the model.
+        seed: Seed of everything random.
         bare: Leave out the images, which take seconds to draw, and what has a random place.
     """
 
@@ -69,11 +69,11 @@ class Model:
         """Add a material drawn at `density` pixels per metre.
 
         Args:
-            name: Its name and its texture's.
+            name: Name of the material and of its texture.
             draw: Returns its image, shape (h, w, 3), given a source of random numbers.
             density: Pixels per metre.
             module: See `Material`.
-            glow: How much it shines by itself, 0..1.
+            glow: Light that it emits, 0..1.
         """
         image = np.zeros((64, 64, 3), np.float32) if self.bare else draw(self.random)
         height, width = image.shape[:2]
@@ -115,7 +115,7 @@ class Model:
         turn: float = 0.0,
         tilt: float = 0.0,
     ) -> None:
-        """Add a surface that is seen and not felt."""
+        """Add a surface that is drawn, without collisions."""
         self.spec.add_mesh(
             name=name,
             uservert=surface.points.ravel(),
@@ -146,7 +146,7 @@ class Model:
         tilt: float = 0.0,
         roll: float = 0.0,
     ) -> None:
-        """Add a primitive that is felt and not seen; `size` is MuJoCo's (half lengths)."""
+        """Add a primitive for collisions, not drawn; `size` is MuJoCo's (half lengths)."""
         quat = np.empty(4)
         mujoco.mju_mulQuat(
             quat,
@@ -176,8 +176,8 @@ class Model:
         """Add a light.
 
         Args:
-            name: Its name.
-            place: Where it hangs, metres.
+            name: Name of the light.
+            place: Its position, metres.
             colour: Strength in red, green, blue.
             towards: Its direction.
             sun: Parallel rays from very far away.

@@ -26,7 +26,7 @@ class Cells:
     Attributes:
         index: int32 number of the cell that each pixel belongs to, shape (h, w).
         edge: Distance to the cell's edge, pixels, shape (h, w).
-        count: How many cells there are.
+        count: Number of cells.
     """
 
     index: npt.NDArray[np.int32]
@@ -47,7 +47,7 @@ def fractal(
 
     Args:
         shape: Height and width.
-        random: Where it comes from.
+        random: Source of random numbers.
         coarse: Size of the largest blobs, pixels.
         fine: Size of the smallest; below 2 it would alias.
         stretch: Blobs are this much longer down and across: wood grain, drips.
@@ -79,11 +79,11 @@ def cells(
 
     Args:
         shape: Height and width.
-        random: For shifts and widths.
+        random: Source of random numbers for shifts and widths.
         high: Height of a row.
         wide: Mean width of a cell.
-        stagger: How far each other row is shifted, in cells; 1.0 shifts every row at random.
-        uneven: How much the widths differ, in mean widths (less than 0.5).
+        stagger: Shift of every other row, in cells; 1.0 shifts every row at random.
+        uneven: Variation of the widths, in mean widths (less than 0.5).
     """
     height, width = shape
     row_of = (np.arange(height) / high).astype(np.int32)

@@ -185,8 +185,8 @@ def arch(
         inner: Radius of the opening, metres.
         outer: Radius of the outer edge, metres.
         depth: Thickness along x, metres.
-        angles: How many pieces the ring is cut into.
-        per_metre: What a metre is in texture coordinates, across and down.
+        angles: Number of pieces into which the ring is cut.
+        per_metre: Texture coordinates of a metre, across and down.
     """
     turn = np.linspace(np.pi, 0.0, angles + 1)
     rims = {radius: np.stack([np.cos(turn), np.sin(turn)], 1) * radius for radius in (inner, outer)}

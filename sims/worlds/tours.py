@@ -7,7 +7,7 @@ import math
 from events.base import Vector3
 
 CLEARANCE = 0.8
-"""How far (metres) the straight lines between a tour's points keep from every solid, at least."""
+"""Least distance (metres) of the straight lines between a tour's points from every solid."""
 
 TOURS: dict[str, tuple[Vector3, ...]] = {
     # Round the hall, through the brick arch and the timber portal.
@@ -49,8 +49,8 @@ TOURS: dict[str, tuple[Vector3, ...]] = {
         (2.5, -2.2, -1.7),
     ),
 }
-"""Each world's tour: places in NED (metres), flown in order and from the last to the first again.
-They stand about 50 to 60 m long."""
+"""Each world's tour: waypoints in NED (metres), in order; from the last it goes back to the first.
+Each is about 50 to 60 m long."""
 
 
 def tour_length(name: str) -> float:
