@@ -1,4 +1,4 @@
-"""Bringing an estimate and the truth together: in time, in frame, in scale."""
+"""Bringing an estimate and the truth together: in frame and in scale."""
 
 from __future__ import annotations
 
@@ -35,37 +35,12 @@ class Alignment(msgspec.Struct, frozen=True, eq=False):
     scale: float
 
 
-def associate(
-    truth: Trajectory, estimate: Trajectory, *, exact: bool = False
-) -> tuple[Trajectory, Trajectory]:
-    """Return the truth at the estimate's stamps, and the estimate where there is a truth.
-
-    Args:
-        truth: True poses, as densely as there are.
-        estimate: Estimated poses.
-        exact: Take only stamps that both have; else the truth is interpolated, and only
-            estimates before its start or after its end are left out.
-
-    Raises:
-        ValueError: They have no time in common.
-    """
-    known = np.isin(estimate.stamps, truth.stamps) if exact else truth.covers(estimate.stamps)
-    if not known.any():
-        what = "stamps in common" if exact else "estimates within the truth's time"
-        raise ValueError(
-            f"expected {what}, found the truth from {truth.stamps[0]} to {truth.stamps[-1]} ns "
-            f"and the estimate from {estimate.stamps[0]} to {estimate.stamps[-1]} ns"
-        )
-    kept = estimate.take(known)
-    return truth.at(kept.stamps), kept
-
-
 def align(estimate: Trajectory, truth: Trajectory, how: How) -> Alignment:
     """Move an estimate into the truth's frame.
 
     Args:
         estimate: Estimated poses.
-        truth: True poses at the same stamps; see `associate`.
+        truth: True poses at the same stamps; see `nodes.trajectory.associate`.
         how: See `How`.
 
     Raises:

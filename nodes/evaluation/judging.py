@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.evaluation.alignment import How, align, associate, transform
+from nodes.evaluation.alignment import How, align, transform
 from nodes.evaluation.coverage import SECOND, Interval, Stamps, choose_frames, cover, seconds
 from nodes.evaluation.metrics import (
     absolute_error,
@@ -22,7 +22,7 @@ from nodes.evaluation.metrics import (
     rotation_errors,
 )
 from nodes.evaluation.record import EstimatorRecord
-from nodes.trajectory import Trajectory
+from nodes.trajectory import Trajectory, associate
 
 Floats = npt.NDArray[np.float64]
 

@@ -26,10 +26,10 @@ from events import (
 from events.rotations import from_yaw
 from nodes.evaluation.album import Album
 from nodes.evaluation.judging import Judgement, Thresholds, beside_the_plan, judge
-from nodes.evaluation.live import LiveErrors, RecentTruth
+from nodes.evaluation.live import LiveErrors
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import FRAMES, file_name, write_results
-from nodes.trajectory import PoseRows, Trajectory
+from nodes.trajectory import PoseRows, RecentPoses, Trajectory
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.growing import GrowingFile
 from runtime import Duration, Node, NodeConfig, Output, on
@@ -76,7 +76,7 @@ class Evaluation(Node[EvaluationConfig]):
     async def on_startup(self) -> None:
         """Open the files of trajectories: they grow as the run goes on."""
         self._truth = PoseRows()
-        self._recent = RecentTruth()
+        self._recent = RecentPoses()
         self._plan = PoseRows()
         self._setpoints = PoseRows()
         self._records: dict[str, EstimatorRecord] = {}

@@ -1,4 +1,4 @@
-"""What a flight leaves to look at: the true trajectory, a plot of it, and a sheet of images.
+"""The node that writes down a flight, and draws it when it is over.
 
 After a restart the trajectory goes on in the same file; plot and sheet get a number (``flight-2``)
 and show what came after it.
@@ -12,10 +12,11 @@ from typing import Annotated
 import cv2
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from events import Collision, Image, Odometry
 from nodes.flight_log.drawing import Thumbnail, draw_contact_sheet, draw_flight
+from nodes.trajectory import PoseRows
+from nodes.trajectory.formats import tum_row
 from nodes.trajectory.growing import GrowingFile, part_name
 from runtime import Duration, Node, NodeConfig, on
 from runtime.paths import OutputPath
@@ -50,6 +51,7 @@ class FlightLog(Node[FlightLogConfig]):
 
     async def on_startup(self) -> None:
         """Open the trajectory: it grows as the vehicle flies."""
+        self._poses = PoseRows()
         self._thumbnails: list[Thumbnail] = []
         self._collisions: list[Collision] = []
         self._interval = round(self.config.interval * 1e9)
@@ -62,12 +64,9 @@ class FlightLog(Node[FlightLogConfig]):
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
         """Note where the vehicle is."""
-        (x, y, z), (qw, qx, qy, qz) = event.position, event.orientation
         if self._file is not None:
-            # TUM's format (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): xyzw.
-            seconds, rest = divmod(event.stamp, 1_000_000_000)
-            pose = f"{x:.9f} {y:.9f} {z:.9f} {qx:.9f} {qy:.9f} {qz:.9f} {qw:.9f}"
-            self._file.add(f"{seconds}.{rest:09d} {pose}\n")
+            self._file.add(tum_row(event.stamp, event.position, event.orientation))
+            self._poses.add(event.stamp, event.position, event.orientation)
 
     @on(Image)
     def images(self, event: Image) -> None:
@@ -96,27 +95,12 @@ class FlightLog(Node[FlightLogConfig]):
             return
         self._file.close()
         plot = self.out / part_name(self, self.config.plot)
-        await self.offload(self._draw, self.out / self.config.trajectory, self._file.begin, plot)
+        if len(self._poses):
+            await self.offload(self._draw, plot)
         if self._thumbnails:
             sheet = self.out / part_name(self, self.config.sheet)
             await self.offload(draw_contact_sheet, self._thumbnails, sheet)
 
-    def _draw(self, trajectory: Path, begin: int, plot: Path) -> None:
-        rows = _flown(trajectory, begin)
-        if len(rows):
-            places = [(c.position[0], c.position[1]) for c in self._collisions]
-            draw_flight(rows, places, plot)
-
-
-def _flown(path: Path, begin: int) -> npt.NDArray[np.float64]:
-    """Return the rows from a byte on, with velocities by differences, as `draw_flight` has it."""
-    with path.open(encoding="ascii") as file:
-        file.seek(begin)
-        lines = [line for line in file if not line.startswith("#")]
-    if not lines:
-        return np.empty((0, 7))
-    poses = np.loadtxt(lines, usecols=range(4), ndmin=2)
-    steps = np.diff(poses, axis=0, append=poses[-1:])
-    steps[-1] = steps[-2] if len(steps) > 1 else 0.0
-    seconds = np.where(steps[:, :1] > 0.0, steps[:, :1], np.inf)  # none where time stands still
-    return np.hstack([poses[:, :1] * 1e9, poses[:, 1:], steps[:, 1:] / seconds])
+    def _draw(self, plot: Path) -> None:
+        places = [(c.position[0], c.position[1]) for c in self._collisions]
+        draw_flight(self._poses.trajectory(), places, plot)

@@ -30,11 +30,11 @@ from events import (
     Vector3,
     VehicleAnnouncement,
 )
-from nodes.evaluation.live import RecentTruth
 from nodes.foxglove_server.messages import IMU_SCHEMA, SCORE_SCHEMA, Messages
 from nodes.foxglove_server.scene import Trail
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
+from nodes.trajectory import RecentPoses
 from nodes.viewing.appearance import PLAN, TRUTH, Colour, estimate_colour
 from nodes.viewing.estimates import estimate_frame
 from nodes.viewing.selection import PlanSelection
@@ -60,7 +60,7 @@ class Publishing:
         self._bodies: dict[str, str] = {}  # frames, by vehicle
         self._estimators: dict[str, str] = {}  # parent frames, by source
         self._renamed: dict[str, str] = {}  # the same by what the estimators call them
-        self._truth = RecentTruth()
+        self._truth = RecentPoses()
         self._trails: dict[str, Trail] = {}
         self._drawn: list[Any] = []
         self._static: list[Any] = []

@@ -9,15 +9,14 @@ Pure: a node feeds it from its handlers. The frames themselves are defined in `e
 
 from __future__ import annotations
 
-import bisect
 import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from events import Odometry, PoseStamped, TransformStamped
 from events.poses import Pose, pose_matrix
+from nodes.trajectory import RecentPoses
 
 Floats = npt.NDArray[np.float64]
 
@@ -142,7 +141,7 @@ class TransformTree:
         if child not in self._edges:
             raise UnknownFrameError(f"expected a frame with a parent, found {child!r}")
         edge = self._edges[child]
-        return None if edge.static else (edge.stamps[0], edge.stamps[-1])
+        return None if edge.static else edge.poses.span()
 
     def _line(self, frame: str) -> list[str]:
         """Return a frame and its ancestors."""
@@ -168,7 +167,7 @@ class TransformTree:
             ancestors = self._line(parent) if parent in self._frames else [parent]
             if child in ancestors:
                 raise ValueError(f"{where}: expected a tree, but {child} is above {parent}")
-            edge = self._edges[child] = _Edge(parent, child, static)
+            edge = self._edges[child] = _Edge(parent, child, static, self._history)
             self._frames |= {parent: None, child: None}
         elif edge.parent != parent:
             raise ValueError(
@@ -177,55 +176,27 @@ class TransformTree:
         elif edge.static != static:
             kinds = ("moving", "static")
             raise ValueError(f"{where}: expected a {kinds[edge.static]} transform as before")
-        edge.add(stamp, pose, self._history)
+        edge.poses.add(stamp, *pose)
 
 
 class _Edge:
     """What is known of one frame in its parent."""
 
-    __slots__ = ("child", "parent", "poses", "stamps", "static")
+    __slots__ = ("child", "parent", "poses", "static")
 
-    def __init__(self, parent: str, child: str, static: bool) -> None:
+    def __init__(self, parent: str, child: str, static: bool, history: int | None) -> None:
         self.parent = parent
         self.child = child
         self.static = static
-        self.stamps: list[int] = []
-        self.poses: list[Pose] = []
-
-    def add(self, stamp: int, pose: Pose, history: int | None) -> None:
-        """Put a pose in its place; one of the same stamp gives way."""
-        stamps, poses = self.stamps, self.poses
-        if self.static:
-            stamps[:], poses[:] = [stamp], [pose]
-            return
-        place = bisect.bisect_left(stamps, stamp)
-        if place < len(stamps) and stamps[place] == stamp:
-            poses[place] = pose
-        else:
-            stamps.insert(place, stamp)
-            poses.insert(place, pose)
-        if history is not None:
-            old = bisect.bisect_left(stamps, stamps[-1] - history)
-            del stamps[:old], poses[:old]
+        self.poses = RecentPoses(0 if static else history)
 
     def at(self, stamp: int) -> Floats:
         """Return the child's pose in the parent, shape (4, 4)."""
-        stamps = self.stamps
-        if self.static:
-            return pose_matrix(*self.poses[0])
-        after = bisect.bisect_left(stamps, stamp)
-        if after < len(stamps) and stamps[after] == stamp:
-            return pose_matrix(*self.poses[after])
-        if after in (0, len(stamps)):
+        first, last = self.poses.span() or (0, 0)
+        pose = self.poses.at(last if self.static else stamp)
+        if pose is None:
             raise UnknownTimeError(
-                f"{self.parent} → {self.child}: expected a stamp from {stamps[0] / 1e9:.9f} s to "
-                f"{stamps[-1] / 1e9:.9f} s, found {stamp / 1e9:.9f} s"
+                f"{self.parent} → {self.child}: expected a stamp from {first / 1e9:.9f} s to "
+                f"{last / 1e9:.9f} s, found {stamp / 1e9:.9f} s"
             )
-        (p, q), (r, s) = self.poses[after - 1 : after + 1]
-        share = (stamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
-        first, last = Rotation.from_quat([q, s], scalar_first=True)
-        turn = Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
-        matrix = np.eye(4)
-        matrix[:3, :3] = (first * turn).as_matrix()
-        matrix[:3, 3] = (1.0 - share) * np.array(p) + share * np.array(r)
-        return matrix
+        return pose_matrix(*pose)

@@ -37,6 +37,7 @@ from nodes.replay.folders import (
 )
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.replay.settings import Pinhole
+from nodes.trajectory.formats import read_tum
 from nodes.trajectory.table import read_rows
 
 FARTHEST = 20_000_000
@@ -211,12 +212,14 @@ class TumRgbd(Reader):
         path = self._folder / "groundtruth.txt"
         if not path.is_file():
             return []
-        found = []
-        for row in read_rows(path, None, (8,), "timestamp tx ty tz qx qy qz qw"):
-            x, y, z, qx, qy, qz, qw = row.numbers(1, 8)
-            pose = flip_yz((x, y, z)), rotation_to_ned((qw, qx, qy, qz))
-            found.append((row.seconds(), *pose))
-        return sorted(found)
+        truth = read_tum(path, in_order=False)
+        rows = zip(
+            truth.stamps.tolist(),
+            truth.positions.tolist(),
+            truth.orientations.tolist(),
+            strict=True,
+        )
+        return [(stamp, flip_yz(place), rotation_to_ned(turn)) for stamp, place, turn in rows]
 
 
 def _rate(rows: _Rows) -> float:

@@ -152,7 +152,8 @@ class _Reader:
         try:
             return read(path)
         except (OSError, ValueError, msgspec.MsgspecError) as error:
-            self.missing.append(f"{name} cannot be read: {error}")
+            text = str(error).replace(f"{path}: ", "").replace(f"{path}:", "line ")
+            self.missing.append(f"{name} cannot be read: {text}")
             return None
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from nodes.evaluation.alignment import align, associate
+from nodes.evaluation.alignment import align
 from nodes.evaluation.coverage import Interval, cover
 from nodes.evaluation.judging import Errors
 from nodes.evaluation.metrics import position_errors, rotation_errors
-from nodes.trajectory import Trajectory
+from nodes.trajectory import Trajectory, associate
+from nodes.trajectory.formats import read_tum
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -29,24 +30,12 @@ def read_poses(path: Path) -> Trajectory:
     """Read a TUM file that may end in the middle of a line, as that of a killed run does.
 
     Raises:
-        OSError: It cannot be read.
-        ValueError: It holds something else.
+        ValueError: It cannot be read or holds something else.
     """
-    text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    lines = [line for line in whole.splitlines() if line and line[0] != "#"]
-    if not lines:
-        raise ValueError("expected rows of timestamp tx ty tz qx qy qz qw, found none")
-    rows = np.loadtxt(lines, ndmin=2)
-    if rows.shape[1] != 8:
-        raise ValueError(f"expected 8 numbers a row, found {rows.shape[1]}")
-    if (far := np.abs(rows[:, 1:4]).max()) > _FARTHEST:
+    poses = read_tum(path, whole=False, in_order=False)
+    if (far := np.abs(poses.positions).max()) > _FARTHEST:
         raise ValueError(f"expected positions within {_FARTHEST:g} m, found {far:g} m")
-    # Whole seconds apart, as those of a calendar leave a float no nanoseconds.
-    halves = [line.split(None, 1)[0].partition(".") for line in lines]
-    stamps = np.array([int(s) * SECOND + int(f"{f:0<9}"[:9]) for s, _, f in halves], np.int64)
-    _, kept = np.unique(stamps, return_index=True)  # in order; of equal stamps the first
-    return Trajectory(stamps[kept], rows[kept, 1:4], rows[kept][:, [7, 4, 5, 6]])
+    return poses
 
 
 def lay_on(truth: Trajectory, said: Trajectory) -> tuple[Trajectory, Errors]:

@@ -32,6 +32,8 @@ COLORS = (
 "Color universal design", 2008)."""
 TRUTH = "#3a3a3a"
 PLAN = "#111111"
+LINE = COLORS[0]
+"""Of what belongs to no estimator."""
 
 WIDTH = 10.0
 """Inches of a picture across the page."""
@@ -130,6 +132,31 @@ def sheet(
     rows = -(-len(names) // legend_columns(names))
     size = (width, height + 0.2 * max(rows - 1, 0))
     return Figure(figsize=size, layout="constrained" if constrained else None)
+
+
+def bounds(points: Floats, least: float | Sequence[float]) -> tuple[Floats, Floats]:
+    """Return the corners of what is drawn, with a margin; no side is all too thin.
+
+    Args:
+        points: Metres, shape (n, k); rows may be NaN.
+        least: What share of the longest side each side has at least; one for all, or k.
+    """
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    middle, extent = (low + high) / 2, high - low
+    longest = max(float(extent.max()), 0.5)
+    half = np.maximum(extent, longest * np.asarray(least)) / 2 + 0.05 * longest
+    return middle - half, middle + half
+
+
+def mark_ends(
+    axis: Any, start: tuple[float, float] | None, end: tuple[float, float], color: str
+) -> None:
+    """Mark where a line starts, by a ring, and where it ends, by a square that fits inside it."""
+    style: dict[str, Any] = {"color": color, "ls": "", "zorder": 4}
+    if start is not None:
+        axis.plot(*start, "o", label="start", ms=12, mfc="none", mew=2.0, **style)
+    named = "end" if start is not None else None
+    axis.plot(*end, "s", label=named, ms=5, mec="white", **style)
 
 
 def label(name: str) -> str:

@@ -12,7 +12,18 @@ import numpy.typing as npt
 from nodes.evaluation.coverage import Interval
 from nodes.report.contents import Run
 from nodes.report.poses import Floats, broken
-from nodes.report.style import PLAN, TRUTH, WIDTH, Plot, label, legend_columns, sheet, thin
+from nodes.report.style import (
+    PLAN,
+    TRUTH,
+    WIDTH,
+    Plot,
+    bounds,
+    label,
+    legend_columns,
+    mark_ends,
+    sheet,
+    thin,
+)
 from nodes.trajectory import Trajectory
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 0.7, 0.2, 0.5, 0.5
@@ -134,12 +145,8 @@ def _bounds(lines: list[_Line]) -> tuple[Floats, Floats]:
         low, high = first.min(axis=0), first.max(axis=0)
         beyond = max(float((high - low).max()), 0.5)
         points = np.clip(points, low - beyond, high + beyond)
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    middle, extent = (low + high) / 2, high - low
-    widest = max(float(extent.max()), 0.5)
-    # A vehicle that hovers, or one that goes straight ahead, still has a picture of some shape.
-    half = np.maximum(extent / 2, widest * np.array([0.2, 0.2, 0.06])) + 0.05 * widest
-    return middle - half, middle + half
+    # A vehicle that hovers, or one that goes straight ahead, still has a figure of some shape.
+    return bounds(points, (0.4, 0.4, 0.12))
 
 
 def _layout(
@@ -184,9 +191,8 @@ def _layout(
 def _ends(above: Any, beside: Any, line: _Line, *, main: bool) -> None:
     """Mark where a line ends, and where the main one starts."""
     known = line.points[~np.isnan(line.points[:, 0])]
-    marks = [(0, "o", "start"), (-1, "s", "end")] if main else [(-1, "s", None)]
-    for row, marker, name in marks if len(known) else []:
-        east, north, up = known[row]
-        style = {"color": line.style["color"], "ms": 8 if main else 5, "mec": "white", "ls": ""}
-        above.plot(east, north, marker, label=name, zorder=4, **style)
-        beside.plot(east, up, marker, zorder=4, **style)
+    if len(known):
+        (first, last), color = known[[0, -1]].tolist(), line.style["color"]
+        for axis, row in ((above, 1), (beside, 2)):
+            start = (first[0], first[row]) if main else None
+            mark_ends(axis, start, (last[0], last[row]), color)

@@ -21,11 +21,11 @@ from events import (
     TrackedFeatures,
     Vector3,
 )
-from nodes.evaluation.live import RecentTruth
 from nodes.rerun_view import entities
 from nodes.rerun_view.entity_log import EntityLog, Numbered
 from nodes.rerun_view.scene_points import ScenePoints
 from nodes.rerun_view.settings import RerunConfig
+from nodes.trajectory import RecentPoses
 from nodes.viewing.appearance import (
     INLIER,
     OUTLIER,
@@ -59,7 +59,7 @@ class World:
         self._to = log
         self._rr = log.rr
         self._config = config
-        self._truth: dict[str, RecentTruth] = {}
+        self._truth: dict[str, RecentPoses] = {}
         self._cameras: dict[str, CameraAnnouncement] = {}  # by source
         self._frames: dict[str, str] = {}  # entities of cameras, by optical frame
         self._others: dict[str, str] = {}  # entities of bodies and of estimators' own, by frame
@@ -84,7 +84,7 @@ class World:
         """Prepare a vehicle: a body with four rotors, and its axes."""
         if source in self._truth:
             return
-        self._truth[source] = RecentTruth()
+        self._truth[source] = RecentPoses()
         entity = entities.body(source)
         self._to.static(
             f"{entity}/shape",

@@ -1,5 +1,6 @@
 """Trajectories: poses in time, the files they come in, and exports for other tools."""
 
-from nodes.trajectory.trajectory import PoseRows, Trajectory
+from nodes.trajectory.recent import RecentPoses
+from nodes.trajectory.trajectory import PoseRows, Trajectory, associate
 
-__all__ = ["PoseRows", "Trajectory"]
+__all__ = ["PoseRows", "RecentPoses", "Trajectory", "associate"]

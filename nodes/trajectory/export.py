@@ -21,7 +21,7 @@ from events.frames import OPTICAL_TO_FRD
 from events.poses import pose_matrix
 from nodes.trajectory.formats import read_tum, write_euroc, write_kitti, write_tum
 from nodes.trajectory.table import EPOCH, epoch_of
-from nodes.trajectory.trajectory import Trajectory
+from nodes.trajectory.trajectory import Trajectory, associate
 
 FORMATS = ("tum", "euroc", "kitti")
 
@@ -71,7 +71,7 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
         )
     # Before anything is written: a run that has no such pair leaves no half of an export.
     pairs = {
-        name: together(truth, estimate, f"{run / 'trajectories' / name}.tum")
+        name: associate(truth, estimate, name=f"{run / 'trajectories' / name}.tum")
         for name, estimate in (estimates.items() if form == "kitti" else ())
     }
     folder = out or run / "export"
@@ -167,21 +167,3 @@ def load(run: Path) -> tuple[Trajectory, dict[str, Trajectory]]:
         if path.stem not in {TRUTH, PLAN}
     }
     return truth, estimates
-
-
-def together(
-    truth: Trajectory, estimate: Trajectory, name: str = "estimate"
-) -> tuple[Trajectory, Trajectory]:
-    """Return the truth at the estimate's stamps, and the estimate where there is a truth.
-
-    Raises:
-        ValueError: They have no time in common.
-    """
-    known = truth.covers(estimate.stamps)
-    if not known.any():
-        raise ValueError(
-            f"{name}: expected estimates between {truth.stamps[0]} and {truth.stamps[-1]} ns, "
-            f"found them between {estimate.stamps[0]} and {estimate.stamps[-1]} ns"
-        )
-    kept = estimate.take(known)
-    return truth.at(kept.stamps), kept

@@ -33,14 +33,24 @@ EUROC_HEADER = (
 """First line of EuRoC's files."""
 
 
-def read_tum(path: Path) -> Trajectory:
+def read_tum(path: Path, *, whole: bool = True, in_order: bool = True) -> Trajectory:
     """Read a TUM file; stamps keep every nanosecond that is written.
+
+    Args:
+        path: The file.
+        whole: Whether its last line counts though nothing ends it. That of a run that was killed
+            may be cut off.
+        in_order: Whether stamps have to rise. If not, the rows are sorted, and of several with one
+            stamp the first counts.
 
     Raises:
         ValueError: It cannot be read or holds something else; the message names the line.
     """
-    rows = read_rows(path, None, (8,), "timestamp tx ty tz qx qy qz qw")
+    rows = read_rows(path, None, (8,), "timestamp tx ty tz qx qy qz qw", whole=whole)
     poses = [(row, row.seconds(), row.numbers(1, 8)) for row in rows]
+    if not in_order:
+        poses = list({pose[1]: pose for pose in reversed(poses)}.values())
+        poses.sort(key=lambda pose: pose[1])
     return _trajectory([(row, stamp, [*v[:3], v[6], *v[3:6]]) for row, stamp, v in poses])
 
 
@@ -89,14 +99,7 @@ def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
     Raises:
         OSError: It cannot be written.
     """
-    velocities: list[Vector3] = [(0.0, 0.0, 0.0)] * len(trajectory)
-    if len(trajectory) > 1:
-        # As np.gradient, whose seconds since the start cannot tell stamps of nanoseconds apart.
-        steps = np.diff(trajectory.stamps)[:, None] / 1e9
-        each = np.diff(trajectory.positions, axis=0) / steps
-        inner = (each[:-1] * steps[1:] + each[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
-        slopes: Floats = np.concatenate([each[:1], inner, each[-1:]])
-        velocities = [(x, y, z) for x, y, z in slopes.tolist()]
+    velocities = [(x, y, z) for x, y, z in trajectory.velocities().tolist()]
     rows = (
         euroc_row(*pose, velocity)
         for pose, velocity in zip(_poses(trajectory), velocities, strict=True)

@@ -115,7 +115,7 @@ class Row:
 
 
 def read_rows(
-    path: Path, separator: str | None, columns: tuple[int, ...], meaning: str
+    path: Path, separator: str | None, columns: tuple[int, ...], meaning: str, *, whole: bool = True
 ) -> Iterator[Row]:
     """Yield the rows of a file.
 
@@ -124,6 +124,7 @@ def read_rows(
         separator: Between fields; None for blanks.
         columns: How many fields a row may have.
         meaning: What they are, for messages.
+        whole: Whether a last line without its end counts.
 
     Raises:
         ValueError: The file cannot be read, has no rows, or a row of another length.
@@ -134,6 +135,8 @@ def read_rows(
         raise ValueError(
             f"{path}: expected a text file of rows {meaning}, found: {error}"
         ) from None
+    if not whole:
+        text = text[: text.rfind("\n") + 1]
     empty = True
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.partition("#")[0].strip()

@@ -117,6 +117,19 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         steps = np.linalg.norm(np.diff(self.positions, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
+    def velocities(self) -> Floats:
+        """Return velocities by differences of the positions, m/s in the parent frame, shape (n, 3).
+
+        Zeros if there is but one pose.
+        """
+        if len(self) < 2:
+            return np.zeros((len(self), 3))
+        # As np.gradient, whose seconds since the start cannot tell stamps of nanoseconds apart.
+        steps = np.diff(self.stamps)[:, None] / 1e9
+        each = np.diff(self.positions, axis=0) / steps
+        inner = (each[:-1] * steps[1:] + each[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
+        return np.concatenate([each[:1], inner, each[-1:]])
+
     def rotations(self) -> Any:
         """Return the orientations as a `scipy.spatial.transform.Rotation` of n rotations."""
         return Rotation.from_quat(self.orientations, scalar_first=True)
@@ -252,6 +265,33 @@ class PoseRows:
             found = np.frombuffer(file.read(self._written * _ROW.itemsize), _ROW)
         self._file, self._written = None, 0
         return found
+
+
+def associate(
+    truth: Trajectory, estimate: Trajectory, *, exact: bool = False, name: str = ""
+) -> tuple[Trajectory, Trajectory]:
+    """Return the truth at the estimate's stamps, and the estimate where there is a truth.
+
+    Args:
+        truth: True poses, as densely as there are.
+        estimate: Estimated poses.
+        exact: Take only stamps that both have; else the truth is interpolated, and only
+            estimates before its start or after its end are left out.
+        name: What the message of an error begins with, such as the estimate's file.
+
+    Raises:
+        ValueError: They have no time in common.
+    """
+    known = np.isin(estimate.stamps, truth.stamps) if exact else truth.covers(estimate.stamps)
+    if not known.any():
+        what = "stamps in common" if exact else "estimates within the truth's time"
+        raise ValueError(
+            f"{name}{name and ': '}expected {what}, found the truth from {truth.stamps[0]} to "
+            f"{truth.stamps[-1]} ns and the estimate from {estimate.stamps[0]} to "
+            f"{estimate.stamps[-1]} ns"
+        )
+    kept = estimate.take(known)
+    return truth.at(kept.stamps), kept
 
 
 def quaternions(rotations: Floats) -> Floats:

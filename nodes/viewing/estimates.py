@@ -6,11 +6,11 @@ import numpy as np
 
 from events import PoseEstimate, Quaternion, Vector3
 from events.poses import pose_matrix, pose_tuples
-from nodes.evaluation.live import RecentTruth
+from nodes.trajectory import RecentPoses
 
 
 def estimate_frame(
-    event: PoseEstimate, truth: RecentTruth | None
+    event: PoseEstimate, truth: RecentPoses | None
 ) -> tuple[Vector3, Quaternion] | None:
     """Return the pose of an estimate's frame in ``map``, from its first estimate.
 

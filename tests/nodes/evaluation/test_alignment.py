@@ -8,9 +8,9 @@ import pytest
 from evo.core.geometry import umeyama_alignment
 from hypothesis import given, settings
 
-from nodes.evaluation.alignment import How, align, associate, umeyama
+from nodes.evaluation.alignment import How, align, umeyama
 from nodes.evaluation.metrics import absolute_error
-from nodes.trajectory import Trajectory
+from nodes.trajectory import Trajectory, associate
 from tests.nodes.trajectory.samples import angle, as_evo, moved, noisy, walk
 
 SEEDS = st.integers(0, 2**32 - 1)

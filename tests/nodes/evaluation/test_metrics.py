@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
 from events.rotations import angle_between
-from nodes.evaluation.alignment import align, associate
+from nodes.evaluation.alignment import align
 from nodes.evaluation.metrics import (
     absolute_error,
     drift_percent,
@@ -25,7 +25,7 @@ from nodes.evaluation.metrics import (
     relative_error,
     rotation_errors,
 )
-from nodes.trajectory import Trajectory
+from nodes.trajectory import Trajectory, associate
 from nodes.trajectory.formats import read_tum
 from tests.nodes.trajectory.samples import as_evo, moved, noisy, walk
 

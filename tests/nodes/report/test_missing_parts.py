@@ -89,7 +89,7 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
         "evaluation/verdict.json cannot be read",
         "evaluation/vo.csv cannot be read: expected rows of errors",
         "evaluation/vo.ticks.csv cannot be read",
-        "trajectories/plan.tum cannot be read: expected 8 numbers",
+        "trajectories/plan.tum cannot be read: line 1: expected 8 fields",
         "clouds/vo.ply cannot be read: expected a PLY file",
         "clouds/empty.ply cannot be drawn: it has no points",
         "frames/vo_000.jpg cannot be read: expected a JPEG",
