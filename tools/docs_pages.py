@@ -143,8 +143,11 @@ def _settings(settings: tuple[SettingDescription, ...], table: str = "") -> list
 
 # The architecture
 
-LAYERS = (("bench",), ("sims", "nodes"), ("runtime.tools",), ("runtime",), ("events",))
-"""Rooms from top to bottom: each may import what lies below it."""
+PLACES = {
+    "bench": (0, 0), "sims": (-1, 1), "nodes": (1, 1), "runtime.tools": (1, 2), "runtime": (0, 3),
+    "events": (0, 4),
+}  # fmt: skip
+"""Column and row of each room: it may import what lies below it."""
 
 ABOUT = {
     "bench": "benchmarks and their peers",
@@ -183,21 +186,16 @@ def architecture(imports: set[tuple[str, str]]) -> str:
     Raises:
         PluginError: A room imports one that does not lie below it.
     """
-    depth = {room: row for row, layer in enumerate(LAYERS) for room in layer}
     for one, other in sorted(imports):
-        if depth[one] >= depth[other]:
+        if PLACES[one][1] >= PLACES[other][1]:
             raise PluginError(f"{one} imports {other}, which does not lie below it")
     shown = {
         (one, other)
         for one, other in imports
         if not any((one, way) in imports and (way, other) in imports for way in ABOUT)
     }
-    width, height, across, down = 300, 50, 340, 95
-    place = {}
-    for row, layer in enumerate(LAYERS):
-        for column, room in enumerate(layer):
-            x = 340 + (column - (len(layer) - 1) / 2) * across
-            place[room] = (x, 40 + row * down)
+    width, height = 300, 50
+    place = {room: (340 + 170 * column, 40 + 95 * row) for room, (column, row) in PLACES.items()}
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 680 450" '
         'font-family="sans-serif" text-anchor="middle">',
@@ -228,7 +226,9 @@ def _prose(text: str) -> str:
     """Return a docstring as Markdown: what stands before its sections, with single backticks."""
     text = re.split(r"^(?:Args|Attributes|Raises|Returns):$", text, flags=re.MULTILINE)[0]
     text = re.sub(r"^::$|:(?=:$)", "", text, flags=re.MULTILINE)  # what follows is indented
-    return re.sub(r"``([^`]+)``", r"`\1`", text).strip()
+    text = re.sub(r"``([^`]+)``", r"`\1`", text).strip()
+    # An angle bracket outside code would be read as HTML.
+    return re.sub(r"(`[^`]*`|^ {4}.*$)|<", lambda m: m[1] or "&lt;", text, flags=re.MULTILINE)
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Foxglove: a live view over a WebSocket (`pip install 'visnav-runtime[foxglove]'`).
+"""Foxglove: a live view over a WebSocket (the extra `foxglove`).
 
 Read in this order: `settings` (what the file says), `node` (what is heard, and where it is passed
 on), `publishing` (topics, and what becomes of each event), `scene` (paths and vehicles to draw),

@@ -13,6 +13,7 @@ from typing import Any
 from nodes.foxglove_server.gate import Gate, hidden_host
 from nodes.foxglove_server.settings import FoxgloveConfig
 from runtime.errors import MissingDependencyError, VisnavError
+from runtime.extras import install_command
 
 Make = Callable[[], Any]
 """Returns a message."""
@@ -44,7 +45,7 @@ class Server:
             import foxglove.websocket
         except ImportError as error:
             raise MissingDependencyError(
-                f"the server needs foxglove ({error}): pip install 'visnav-runtime[foxglove]'"
+                f"the server needs foxglove ({error}): {install_command('foxglove')}"
             ) from error
         self.types: Any = foxglove.messages
         self._channel, self._typed = foxglove.Channel, foxglove.channels

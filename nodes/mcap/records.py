@@ -16,6 +16,7 @@ from typing import IO, Any
 from nodes.mcap import layout
 from nodes.mcap.disk import RecordingError
 from runtime.errors import MissingDependencyError
+from runtime.extras import install_command
 
 try:
     from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
@@ -106,7 +107,7 @@ def check() -> None:
     """
     if _MISSING is not None:
         raise MissingDependencyError(
-            "recordings need mcap: pip install 'visnav-runtime[record]'"
+            f"recordings need mcap: {install_command('record')}"
         ) from _MISSING
 
 

@@ -24,12 +24,13 @@ from nodes.orb_slam3.cloud import Cloud
 from nodes.orb_slam3.settings import Settings
 from nodes.orb_slam3.vocabulary_file import check_vocabulary
 from runtime.errors import MissingDependencyError
+from runtime.extras import install_command
 
 Floats = npt.NDArray[np.float64]
 Points = npt.NDArray[np.float32]
 
 INSTALL = (
-    "pip install 'visnav-runtime[orbslam3]', and on Debian and Ubuntu "
+    f"{install_command('orbslam3')}, and on Debian and Ubuntu "
     "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6"
 )
 

@@ -1,4 +1,4 @@
-"""Rerun: a run in three dimensions, live or in a file (`pip install 'visnav-runtime[rerun]'`).
+"""Rerun: a run in three dimensions, live or in a file (the extra `rerun`).
 
 Read in this order: `settings`, `node` (which events it takes, and how many), `recorder` (what
 becomes of each event; lives in a process of its own), `world` and `plots` (what it logs),

@@ -23,6 +23,7 @@ import msgspec
 
 from nodes.rerun_view.settings import RerunConfig
 from runtime.errors import MissingDependencyError, VisnavError
+from runtime.extras import install_command
 
 _PATIENCE = 15.0
 """Real seconds until a server must listen."""
@@ -57,7 +58,7 @@ def load() -> Library:
         import rerun.blueprint
     except ImportError as error:
         raise MissingDependencyError(
-            f"the view needs rerun ({error}): pip install 'visnav-runtime[rerun]'"
+            f"the view needs rerun ({error}): {install_command('rerun')}"
         ) from error
     return Library(rerun, rerun.blueprint)
 
@@ -158,9 +159,7 @@ def program() -> str:
     """Return the path of the program that comes with the library."""
     found = importlib.util.find_spec("rerun_cli")
     if found is None or not found.submodule_search_locations:
-        raise MissingDependencyError(
-            "the view needs Rerun's program: pip install 'visnav-runtime[rerun]'"
-        )
+        raise MissingDependencyError(f"the view needs Rerun's program: {install_command('rerun')}")
     return str(Path(found.submodule_search_locations[0]) / "rerun")
 
 

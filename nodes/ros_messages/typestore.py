@@ -14,6 +14,7 @@ import numpy as np
 
 from nodes.ros_messages.topics import NO_HASH, dds_type
 from runtime.errors import MissingDependencyError, suggest
+from runtime.extras import install_command
 
 Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 
@@ -55,7 +56,7 @@ class TypeStore:
             _hash_as_ros_2_does()
         except ImportError as error:
             raise MissingDependencyError(
-                "the ROS 2 bridge needs rosbags: pip install 'visnav-runtime[ros2]'"
+                f"the ROS 2 bridge needs rosbags: {install_command('ros2')}"
             ) from error
         self._error = SerdeError
         self._store = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
@@ -175,7 +176,7 @@ class Bag:
             _hash_as_ros_2_does()
         except ImportError as error:
             raise MissingDependencyError(
-                "bags need rosbags: pip install 'visnav-runtime[record]'"
+                f"bags need rosbags: {install_command('record')}"
             ) from error
         self._path = path
         try:

@@ -13,6 +13,7 @@ import msgspec
 from rich.text import Text
 
 from runtime.errors import MissingDependencyError, VisnavError
+from runtime.extras import install_command
 from runtime.tools.monitor.command import (
     QUICKEST,
     SLOWEST,
@@ -37,7 +38,7 @@ try:
     from textual.widgets import DataTable, Footer, Input, RichLog, Static
 except ImportError:
     raise MissingDependencyError(
-        "the monitor's screen needs textual: pip install 'visnav-runtime[monitor]'"
+        f"the monitor's screen needs textual: {install_command('monitor')}"
     ) from None
 
 CONFIRM = 3.0

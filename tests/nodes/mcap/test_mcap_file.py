@@ -235,5 +235,5 @@ def test_without_mcap_the_error_says_what_to_install(
     """For writing as for reading."""
     monkeypatch.setattr(records, "_MISSING", ImportError("mcap"))
     for ask in (McapWriter, contents, recover_file):
-        with pytest.raises(MissingDependencyError, match=r"visnav-runtime\[record\]"):
+        with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[record\]'"):
             ask(tmp_path / "a.mcap")

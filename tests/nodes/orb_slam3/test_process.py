@@ -196,7 +196,7 @@ def test_a_missing_library_is_an_error_that_says_what_to_install(
     vocabulary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyorbslam3", None)
-    with pytest.raises(MissingDependencyError, match=r"visnav-runtime\[orbslam3\].*libegl1"):
+    with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[orbslam3\]'.*libegl1"):
         OrbSlam3Process(make_settings("rgbd", CAMERA), vocabulary)
 
 

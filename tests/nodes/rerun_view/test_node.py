@@ -86,7 +86,7 @@ def test_settings_that_are_wrong_say_where(config: dict[str, Any], message: str)
 
 def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'visnav-runtime\[rerun\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[rerun\]'"):
         sdk.load()
 
 

@@ -283,5 +283,5 @@ def test_settings_that_are_wrong_say_where(config: dict[str, Any], message: str)
 
 def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'visnav-runtime\[ros2\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[ros2\]'"):
         TypeStore()

@@ -1,0 +1,32 @@
+"""The optional libraries, which are extras of the package, and how they are installed."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from pathlib import Path
+
+_PROJECT = Path(__file__).parents[1] / "pyproject.toml"
+"""Of a checkout; an installed wheel has none."""
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs what an extra needs, for the message of an error.
+
+    In a checkout that is the extra itself. A wheel's extra cannot be asked for by the name of the
+    package, which is in no index: there, the libraries themselves are named.
+
+    Args:
+        extra: As in ``pyproject.toml``: ``ros2``, ``record``…
+    """
+    if _PROJECT.is_file():
+        return f"pip install -e '.[{extra}]'"
+    try:
+        required = importlib.metadata.requires("visnav-runtime") or []
+    except importlib.metadata.PackageNotFoundError:
+        required = []
+    wanted = [
+        requirement.partition(";")[0].strip()
+        for requirement in required
+        if f"extra == '{extra}'" in requirement.replace('"', "'")
+    ]
+    return f"pip install {' '.join(repr(each) for each in wanted or [f'visnav-runtime[{extra}]'])}"
