@@ -28,7 +28,7 @@ class Waiting(NamedTuple):
 
     Attributes:
         time: When it was published (ns).
-        event: What was said.
+        event: The event.
         size: Bytes that it is reckoned at.
     """
 
@@ -42,7 +42,7 @@ class Backlog:
 
     Args:
         limit: Bytes that may wait.
-        when_full: What happens beyond: ``wait`` keeps everything, and tells it by `is_full`;
+        when_full: What happens beyond: ``wait`` keeps everything, and `is_full` shows it;
             ``drop_images`` drops what is large, and the oldest only if there is nothing but small
             events; ``drop_oldest`` makes room, whatever it costs.
     """
@@ -106,7 +106,7 @@ class Backlog:
     # In other threads.
 
     def take(self) -> Waiting | None:
-        """Return the oldest; `None` if nothing waits. Say `done` when it is written."""
+        """Return the oldest; `None` if nothing waits. Call `done` when it is written."""
         try:
             return self._queue.popleft()
         except IndexError:
@@ -118,14 +118,14 @@ class Backlog:
         if not self._room.is_set() and self.bytes <= self.limit // 2:
             self._room.set()
 
-    def wait_for_room(self, patience: float | None = None) -> bool:
+    def wait_for_room(self, timeout: float | None = None) -> bool:
         """Wait until half of the room is free, or `release` is called; tell whether that came.
 
         Args:
-            patience: Real seconds to wait at most.
+            timeout: Real seconds to wait at most.
         """
         self._room.clear()
-        return self.bytes <= self.limit // 2 or self._room.wait(patience)
+        return self.bytes <= self.limit // 2 or self._room.wait(timeout)
 
     def release(self) -> None:
         """Let go of whoever waits: nothing will be written any more."""

@@ -61,10 +61,10 @@ class EventWriter:
         self._store = TypeStore(config.distribution)
         published = PublishingConfig(
             publish=tuple(group for group in ALL_GROUPS if group not in _LEFT_OUT),
-            raw_images=config.images == "raw",
-            compressed_images="" if config.images == "raw" else config.images,
-            raw_depth=config.depth == "raw",
-            compressed_depth="" if config.depth == "raw" else "millimetres",
+            raw_images=config.image_format == "raw",
+            compressed_images="" if config.image_format == "raw" else config.image_format,
+            raw_depth=config.depth_format == "raw",
+            compressed_depth="" if config.depth_format == "raw" else "millimetres",
             jpeg_quality=config.jpeg_quality,
         )
         self._ros = Publishing(self, self._store, published, Stamps().out)

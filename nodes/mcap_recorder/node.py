@@ -1,4 +1,4 @@
-"""Records a run: everything that is said, as MCAP, beside the loop."""
+"""Records a run: all its events, as MCAP, beside the loop."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from pathlib import Path
 from events import Announcement, Event
 from nodes.mcap.disk import RecordingError
 from nodes.mcap_recorder.backlog import Backlog
-from nodes.mcap_recorder.order import Order
-from nodes.mcap_recorder.recording import STANDSTILL, Recording, spare_cores
+from nodes.mcap_recorder.requests import WriteRequest
 from nodes.mcap_recorder.settings import McapRecorderConfig
+from nodes.mcap_recorder.writer_process import STANDSTILL, WriterProcess, spare_cores
 from nodes.trajectory.growing import part_name
 from runtime import Input, Node
 
 _WAITING = 1 << 16
-"""Events that may come while simulated time waits: more than are ever said at one moment."""
+"""Events that may come while simulated time waits: more than are ever sent at one moment."""
 
 _LOOK = 0.5
 """Real seconds between two looks at a process that simulated time waits for."""
 
-_PATIENCE = 8.0
+_END_TIMEOUT = 8.0
 """Real seconds that the run's end may take; `run.shutdown_limit` is 10 unless changed."""
 
 
@@ -35,14 +35,14 @@ class McapRecorder(Node[McapRecorderConfig]):
         name = "recorder"
         type = "nodes.mcap_recorder:McapRecorder"
 
-    Put it first in the file: it then hears events before those that they cause, and those that
-    another node handles. The order in the recording is the order in which it heard.
+    Put it first in the file: it then gets events before those that they cause, and those that
+    another node handles. They are recorded in the order in which it gets them.
     """
 
     events = Input(Event, bound=_WAITING, overflow="drop_oldest")
 
     def __init__(self) -> None:
-        self._recording: Recording | None = None
+        self._process: WriterProcess | None = None
         self._backlog = Backlog(self.config.memory, self.config.when_full)
         self._failed: asyncio.Future[RecordingError] | None = None
         self._ended_run = False
@@ -69,21 +69,21 @@ class McapRecorder(Node[McapRecorderConfig]):
         loop = asyncio.get_running_loop()
         self._failed = loop.create_future()
         try:
-            self._recording = await self.offload(self._open, loop)
+            self._process = await self.offload(self._open, loop)
         except RecordingError as error:
             self.log.fatal("%s", error)
-        assert self._recording is not None
-        self._recording.start()
+        assert self._process is not None
+        self._process.start()
         self.after_run(self._finish)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Record what will be provided."""
-        if self._recording is not None:
+        """Record it."""
+        if self._process is not None:
             self._backlog.put(0, announcement)
 
     async def run(self) -> None:
-        """Hand all that is said to the thread that writes."""
-        if self._recording is None:
+        """Hand all events to the thread that passes them to the writing process."""
+        if self._process is None:
             return
         self.start(self._watch())
         clock, backlog, put = self.clock, self._backlog, self._backlog.put
@@ -96,25 +96,25 @@ class McapRecorder(Node[McapRecorderConfig]):
                 await self._wait()
 
     async def on_shutdown(self) -> None:
-        """Write what still waits, and the index; what takes longer is done after the run.
+        """Write what still waits, and the index; if that takes long, it goes on after the run.
 
         Raises:
             FatalError: The disk is full, or the like.
         """
-        recording, backlog = self._recording, self._backlog
-        if recording is None:
+        process, backlog = self._process, self._backlog
+        if process is None:
             return
         while self.events.statistics().buffered:
             backlog.put(self.clock.now(), self.events.receive_nowait())
         self._unfinished = self.clock.now()
-        if not await self.offload(recording.close, self._unfinished, _PATIENCE):
+        if not await self.offload(process.close, self._unfinished, _END_TIMEOUT):
             waits = backlog.bytes / 1e6
             self.log.warning("%.1f MB are yet to be written: that goes on after the run", waits)
             return
         self._unfinished = None
-        self._tell(recording)
-        if recording.error is not None and not self._ended_run:
-            self.log.fatal("%s", recording.error)
+        self._log_result(process)
+        if process.error is not None and not self._ended_run:
+            self.log.fatal("%s", process.error)
 
     def _finish(self, _: Path) -> None:
         """Give a slow disk the time that it needs, when the run is over and nobody waits for it.
@@ -122,23 +122,23 @@ class McapRecorder(Node[McapRecorderConfig]):
         Raises:
             RecordingError: The disk is full, or the like.
         """
-        recording = self._recording
-        if recording is None or self._unfinished is None:
+        process = self._process
+        if process is None or self._unfinished is None:
             return
-        recording.close(self._unfinished)
-        if recording.error is not None:
-            raise recording.error
+        process.close(self._unfinished)
+        if process.error is not None:
+            raise process.error
 
-    def _tell(self, recording: Recording) -> None:
-        """Log, and count, what came of it."""
-        backlog, result = self._backlog, recording.result
-        lost = backlog.dropped + recording.unwritten
+    def _log_result(self, process: WriterProcess) -> None:
+        """Log how much was written, and count what was not."""
+        backlog, result = self._backlog, process.result
+        lost = backlog.dropped + process.unwritten
         self.events.dropped += lost
         if result.what != "gone":  # it would have said how many there are
             waits = f"{self._waits} times for the disk, {self._waited:.1f} s in all"
             self.log.info(
                 "%s: %d events, %.1f MB; at most %.1f MB waited%s",
-                recording.path,
+                process.path,
                 result.written,
                 result.size / 1e6,
                 backlog.peak / 1e6,
@@ -151,7 +151,7 @@ class McapRecorder(Node[McapRecorderConfig]):
                 ", nor is what its process had yet to write" if result.what == "gone" else "",
             )
 
-    def _open(self, loop: asyncio.AbstractEventLoop) -> Recording:
+    def _open(self, loop: asyncio.AbstractEventLoop) -> WriterProcess:
         assert self.out is not None
 
         def complain(what: str) -> None:
@@ -162,14 +162,14 @@ class McapRecorder(Node[McapRecorderConfig]):
             with contextlib.suppress(RuntimeError):  # the run is over, and `_finish` tells
                 loop.call_soon_threadsafe(self._fail, error)
 
-        order = Order(
+        request = WriteRequest(
             path=str(self.out / part_name(self, self.config.file)),
             config=self.config,
             attachment=str(self.out / "config.toml"),
             niceness=5,
             cores=spare_cores() if self.clock.kind == "real" else (),
         )
-        return Recording(order, self._backlog, failed, complain)
+        return WriterProcess(request, self._backlog, failed, complain)
 
     def _fail(self, error: RecordingError) -> None:
         if self._failed is not None and not self._failed.done():
@@ -195,11 +195,11 @@ class McapRecorder(Node[McapRecorderConfig]):
                 self._backlog.bytes / 1e6,
             )
         began = time.monotonic()
-        assert self._recording is not None
-        self._recording.still_for()  # from now on
+        assert self._process is not None
+        self._process.still_for()  # from now on
         while not await self.offload(self._backlog.wait_for_room, _LOOK):
-            if self._recording.still_for() >= STANDSTILL:
-                self.log.fatal("%s", self._recording.standstill())
+            if self._process.still_for() >= STANDSTILL:
+                self.log.fatal("%s", self._process.standstill())
         self._waits += 1
         self._waited += time.monotonic() - began
 

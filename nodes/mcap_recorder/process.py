@@ -1,8 +1,8 @@
 """The process that records: reads events from its standard input, and writes the file.
 
-Started by `recording` as ``python -m nodes.mcap_recorder.process``. A process of its own, because
-encoding holds Python's lock, and would keep the run's loop from it for milliseconds; and because
-it outlives a run that is killed, and closes the file in order.
+Started by `writer_process` as ``python -m nodes.mcap_recorder.process``. It is a process of its
+own because encoding holds Python's lock, and would keep the run's loop from it for milliseconds;
+and because it outlives a run that is killed, and closes the file in order.
 """
 
 from __future__ import annotations
@@ -19,43 +19,43 @@ from nodes.mcap.disk import RecordingError
 from nodes.mcap.mcap_file import McapWriter
 from nodes.mcap_recorder import pipe
 from nodes.mcap_recorder.event_writer import EventWriter
-from nodes.mcap_recorder.order import Answer, Order
+from nodes.mcap_recorder.requests import Reply, WriteRequest
 from runtime.errors import MissingDependencyError, WireError
 
 LONGEST = 0.4
 """Seconds, real and of the run's clock, after which a chunk ends."""
 
 
-class Process:
+class FileWriter:
     """Writes one file.
 
     Args:
-        order: What to do.
+        request: What to do.
 
     Raises:
         RecordingError: The file cannot be made.
         MissingDependencyError: A library is not installed.
     """
 
-    def __init__(self, order: Order) -> None:
-        config = order.config
+    def __init__(self, request: WriteRequest) -> None:
+        config = request.config
         self._writer = McapWriter(
-            Path(order.path),
+            Path(request.path),
             compression=config.compression,
             chunk_size=config.chunk_size,
             fsync=config.fsync,
         )
-        attachment = Path(order.attachment)
+        attachment = Path(request.attachment)
         if attachment.is_file():
             self._writer.attach(attachment.name, "application/toml", attachment.read_bytes())
         self._events = EventWriter(self._writer, config, self._complain)
-        self._said: set[str] = set()
+        self._complaints: set[str] = set()
         self._written = 0
         self._in_chunk = 0
         self._chunk_began: tuple[float, int] | None = None
         """Real seconds, and the run's nanoseconds."""
 
-    def run(self, file: int) -> Answer:
+    def run(self, file: int) -> Reply:
         """Write what comes from a file descriptor, and close the file."""
         last = 0
         try:
@@ -70,8 +70,8 @@ class Process:
         except RecordingError as error:
             self._written -= self._in_chunk
             self._writer.abandon()
-            return self._answer("error", str(error))
-        return self._answer("done")
+            return self._reply("error", str(error))
+        return self._reply("done")
 
     def _write(self, piece: pipe.Piece) -> None:
         try:
@@ -100,17 +100,17 @@ class Process:
         self._in_chunk = 0
 
     def _complain(self, what: str) -> None:
-        if what not in self._said:
-            self._said.add(what)
-            say(Answer("complaint", what))
+        if what not in self._complaints:
+            self._complaints.add(what)
+            send(Reply("complaint", what))
 
-    def _answer(self, what: str, text: str = "") -> Answer:
-        return Answer(what, text, self._written, self._writer.size)
+    def _reply(self, what: str, text: str = "") -> Reply:
+        return Reply(what, text, self._written, self._writer.size)
 
 
-def say(answer: Answer) -> None:
-    """Say something to the run, if it is still there."""
-    line = msgspec.json.encode(answer) + b"\n"
+def send(reply: Reply) -> None:
+    """Send a reply to the run, if it is still there."""
+    line = msgspec.json.encode(reply) + b"\n"
     try:
         while line:
             line = line[os.write(sys.stdout.fileno(), line) :]
@@ -118,24 +118,24 @@ def say(answer: Answer) -> None:
         pass
 
 
-def main(order: str) -> None:
-    """Do what is asked, and tell what came of it."""
+def main(request: str) -> None:
+    """Do what is requested, and reply what came of it."""
     for each in (signal.SIGINT, signal.SIGHUP):  # the terminal is the run's business
         signal.signal(each, signal.SIG_IGN)
-    wanted = msgspec.json.decode(order, type=Order)
+    wanted = msgspec.json.decode(request, type=WriteRequest)
     os.nice(wanted.niceness)
     if wanted.cores:
         os.sched_setaffinity(0, wanted.cores)
     try:
-        process = Process(wanted)
+        writer = FileWriter(wanted)
     except RecordingError as error:
-        say(Answer("error", str(error)))
+        send(Reply("error", str(error)))
         return
     except MissingDependencyError as error:
-        say(Answer("missing", str(error)))
+        send(Reply("missing", str(error)))
         return
-    say(Answer("ready"))
-    say(process.run(sys.stdin.fileno()))
+    send(Reply("ready"))
+    send(writer.run(sys.stdin.fileno()))
 
 
 if __name__ == "__main__":

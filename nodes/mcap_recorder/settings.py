@@ -1,4 +1,4 @@
-"""What the file says of a recording."""
+"""The recorder's settings in a run's file."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ class McapRecorderConfig(NodeConfig):
     """Settings of a recording.
 
     Attributes:
-        file: Its name in the run's folder. One that was there is replaced.
-        images: How pictures are kept: ``raw``, ``png`` (smaller, and no loss), or
+        file: Its name in the run's folder. An older one is replaced.
+        image_format: How images are kept: ``raw``, ``png`` (smaller, and no loss), or
             ``jpeg`` (small; a replay gives what is left).
-        depth: How depth is kept: ``raw``, or ``png``: whole millimetres, up to 65 m.
+        depth_format: How depth images are kept: ``raw``, or ``png``: whole millimetres, up to 65 m.
         jpeg_quality: 1 to 100.
         compression: Of the file's chunks: ``zstd``, ``lz4`` (quicker, larger) or ``none``.
         chunk_size: Bytes of a chunk before compression. A chunk also ends 0.4 s after its
             first event, real or on the run's clock.
         memory: Bytes of events that may wait to be written.
         when_full: What happens if more would wait. ``wait``: simulated time waits for the disk;
-            real time cannot, and does as ``drop_images``: pictures and clouds are left out until
+            real time cannot, and does as ``drop_images``: images and clouds are left out until
             there is room. A process that shows no sign of life for 10 s while it is waited for
             ends the run. ``drop_oldest``: what has waited longest is left out. What is left out
             is counted among the run's drops, and logged. What the disk has not taken when the run
@@ -41,8 +41,8 @@ class McapRecorderConfig(NodeConfig):
     """
 
     file: Annotated[OutputPath, msgspec.Meta(pattern=r"^[^/]+\.mcap$")] = "recording.mcap"
-    images: Literal["raw", "png", "jpeg"] = "raw"
-    depth: Literal["raw", "png"] = "raw"
+    image_format: Literal["raw", "png", "jpeg"] = "raw"
+    depth_format: Literal["raw", "png"] = "raw"
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
     compression: Compression = "zstd"
     chunk_size: ChunkBytes = 4 << 20

@@ -113,7 +113,7 @@ def test_jpeg_and_millimetres_lose_what_they_must(tmp_path: Path) -> None:
     column = np.arange(0, 250, 2).astype(np.uint8)[:, None, None]
     smooth = np.broadcast_to(column, (125, 40, 3)).copy()
     picture = Image(stamp=1, source="drone/front", frame_id="f", data=smooth)
-    record(path, [*announcements(), picture, depth(2)], images="jpeg", depth="png")
+    record(path, [*announcements(), picture, depth(2)], image_format="jpeg", depth_format="png")
     *_, found, far = replayed(path)
     assert isinstance(found, Image)
     assert found.frame_id == "f"

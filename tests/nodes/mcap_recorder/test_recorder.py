@@ -18,9 +18,9 @@ from nodes.mcap.disk import RecordingError
 from nodes.mcap.mcap_file import McapWriter, contents, read
 from nodes.mcap_recorder import McapRecorder, McapRecorderConfig, pipe
 from nodes.mcap_recorder.backlog import Backlog
-from nodes.mcap_recorder.order import Order
-from nodes.mcap_recorder.process import Process
-from nodes.mcap_recorder.recording import Recording
+from nodes.mcap_recorder.process import FileWriter
+from nodes.mcap_recorder.requests import WriteRequest
+from nodes.mcap_recorder.writer_process import WriterProcess
 from nodes.replay.recorded import Recorded
 from runtime import Tick, every
 from runtime.errors import FatalError, NodeError
@@ -62,7 +62,7 @@ def test_a_run_is_recorded_to_its_end(tmp_path: Path) -> None:
 def test_simulated_time_waits_for_a_slow_disk(tmp_path: Path) -> None:
     """With next to no memory nothing is lost: pictures come no faster than they are written."""
     events: list[Event] = [big(n * 10_000_000) for n in range(12)]
-    result = record(events, tmp_path, memory=1 << 19, images="png")
+    result = record(events, tmp_path, memory=1 << 19, image_format="png")
     assert result.drops["recorder.events"].dropped == 0
     assert result.seconds == 3.0
     found = Recorded(tmp_path / "recording.mcap").events(0, None, lambda _, __: True)
@@ -82,13 +82,13 @@ def test_a_disk_that_is_full_at_the_very_end_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Though the run itself is over when the last chunk is written."""
-    start = Recording.start
+    start = WriterProcess.start
 
-    def limited(recording: Recording) -> None:
-        resource.prlimit(recording._child.pid, resource.RLIMIT_FSIZE, (500, 500))
-        start(recording)
+    def limited(process: WriterProcess) -> None:
+        resource.prlimit(process._child.pid, resource.RLIMIT_FSIZE, (500, 500))
+        start(process)
 
-    monkeypatch.setattr(Recording, "start", limited)
+    monkeypatch.setattr(WriterProcess, "start", limited)
     with pytest.raises(NodeError, match=r"recording\.mcap cannot be written: File too large"):
         record([*announcements(), *said(0)], tmp_path, chunk_size=1 << 28)
 
@@ -99,11 +99,11 @@ def test_a_disk_that_is_slow_at_the_end_has_its_time_after_the_run(
 ) -> None:
     """What the run's end has no time for is written nevertheless."""
 
-    def close(_: Recording, end: int, patience: float) -> bool:
-        assert 0 < patience < 10
+    def close(_: WriterProcess, end: int, timeout: float) -> bool:
+        assert 0 < timeout < 10
         return False
 
-    monkeypatch.setattr(Recording, "close", close)
+    monkeypatch.setattr(WriterProcess, "close", close)
     asked = list[tuple[McapRecorder, Callable[[Path], Any]]]()
     monkeypatch.setattr(McapRecorder, "after_run", lambda *of: asked.append(of))
     record([imu(0)], tmp_path)
@@ -121,11 +121,11 @@ def test_what_a_failed_chunk_had_is_not_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nor what comes after it: the process stops reading."""
-    order = Order(
+    request = WriteRequest(
         path=str(tmp_path / "a.mcap"), config=McapRecorderConfig(), attachment="", niceness=0,
         cores=(),
     )  # fmt: skip
-    process = Process(order)
+    process = FileWriter(request)
 
     def fail(_: McapWriter) -> None:
         raise RecordingError("full")
@@ -135,9 +135,9 @@ def test_what_a_failed_chunk_had_is_not_counted(
     for stamp in (0, SECOND, 2 * SECOND):
         pipe.write_all(here, pipe.pieces(stamp, pack(imu(stamp)), pipe.EVENT))
     os.close(here)
-    answer = process.run(there)
+    reply = process.run(there)
     os.close(there)
-    assert (answer.what, answer.text, answer.written) == ("error", "full", 0)
+    assert (reply.what, reply.text, reply.written) == ("error", "full", 0)
 
 
 @pytest.mark.slow
@@ -177,22 +177,22 @@ def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> 
     """The run hears of it, and simulated time does not wait for what will not come."""
     path, failures = tmp_path / "a.mcap", list[RecordingError]()
     config = McapRecorderConfig(chunk_size=1 << 16)
-    order = Order(path=str(path), config=config, attachment="", niceness=0, cores=())
+    request = WriteRequest(path=str(path), config=config, attachment="", niceness=0, cores=())
     backlog = Backlog(1 << 18, "wait")
-    recording = Recording(order, backlog, failures.append, lambda _: None)
-    recording.start()
+    process = WriterProcess(request, backlog, failures.append, lambda _: None)
+    process.start()
     backlog.put(1, big(1))
     while path.stat().st_size < 200_000:
         time.sleep(0.01)  # for another process
-    os.kill(recording._child.pid, signal.SIGKILL)
-    recording._child.wait()
+    os.kill(process._child.pid, signal.SIGKILL)
+    process._child.wait()
     for stamp in range(2, 9):
         backlog.put(stamp, big(stamp))
     backlog.wait_for_room()
-    assert recording.close(9)
-    assert recording.unwritten <= 7  # what it had written is not among them
+    assert process.close(9)
+    assert process.unwritten <= 7  # what it had written is not among them
     assert "the process that writes it ended with -9" in str(failures)
-    assert recording.unwritten >= 6
+    assert process.unwritten >= 6
     trouble: list[str] = []
     assert {each.time for each in read(path, damaged=trouble.append)} == {1}
     assert trouble == ["the end is missing: the file was not closed"]
@@ -202,20 +202,22 @@ def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> 
 def test_a_run_that_is_killed_leaves_a_whole_file(tmp_path: Path) -> None:
     """To the process that writes, that is the end of its input; it closes the file."""
     path = tmp_path / "a.mcap"
-    order = Order(path=str(path), config=McapRecorderConfig(), attachment="", niceness=0, cores=())
+    request = WriteRequest(
+        path=str(path), config=McapRecorderConfig(), attachment="", niceness=0, cores=()
+    )
     backlog = Backlog(1 << 18, "wait")
-    recording = Recording(order, backlog, lambda _: None, lambda _: None)
-    recording.start()
+    process = WriterProcess(request, backlog, lambda _: None, lambda _: None)
+    process.start()
     for event in said(5):
         backlog.put(5, event)
     while backlog.bytes:
         time.sleep(0.01)  # for the thread that hands over
-    assert recording._child.stdin is not None
-    recording._child.stdin.close()  # as the end of this process would
-    recording._child.wait()
+    assert process._child.stdin is not None
+    process._child.stdin.close()  # as the end of this process would
+    process._child.wait()
     assert contents(path).complete
     assert len([r for r in read(path) if "kind" in r.metadata]) == len(said(5))
-    recording.close(5)
+    process.close(5)
 
 
 @pytest.mark.slow
@@ -224,13 +226,13 @@ def test_a_recorder_that_is_stopped_ends_the_run_and_loses_nothing(
 ) -> None:
     """The run names it instead of waiting without end; then it is told to go on."""
     monkeypatch.setattr("nodes.mcap_recorder.node.STANDSTILL", 1.0)
-    start = Recording.start
+    start = WriterProcess.start
 
-    def stopped(recording: Recording) -> None:
-        start(recording)
-        os.kill(recording._child.pid, signal.SIGSTOP)
+    def stopped(process: WriterProcess) -> None:
+        start(process)
+        os.kill(process._child.pid, signal.SIGSTOP)
 
-    monkeypatch.setattr(Recording, "start", stopped)
+    monkeypatch.setattr(WriterProcess, "start", stopped)
     events: list[Event] = [big(20_000_000 * k) for k in range(1, 30)]
     begin = time.monotonic()
     with pytest.raises(NodeError, match=r"recorder: .*recording\.mcap: the process that writes it"):
@@ -247,26 +249,26 @@ def test_a_process_that_cannot_be_woken_is_ended_and_what_it_had_written_is_kept
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Such as one in a frozen group: closing takes no longer than the limit."""
-    monkeypatch.setattr("nodes.mcap_recorder.recording.STANDSTILL", 0.3)
+    monkeypatch.setattr("nodes.mcap_recorder.writer_process.STANDSTILL", 0.3)
     path, failures = tmp_path / "a.mcap", list[RecordingError]()
     config = McapRecorderConfig(chunk_size=1 << 16)
-    order = Order(path=str(path), config=config, attachment="", niceness=0, cores=())
-    recording = Recording(order, Backlog(1 << 30, "wait"), failures.append, lambda _: None)
-    recording.start()
-    recording.backlog.put(1, big(1))
+    request = WriteRequest(path=str(path), config=config, attachment="", niceness=0, cores=())
+    process = WriterProcess(request, Backlog(1 << 30, "wait"), failures.append, lambda _: None)
+    process.start()
+    process.backlog.put(1, big(1))
     while path.stat().st_size < 200_000:
         time.sleep(0.01)  # for another process
-    os.kill(recording._child.pid, signal.SIGSTOP)
-    send = recording._child.send_signal
+    os.kill(process._child.pid, signal.SIGSTOP)
+    send = process._child.send_signal
     deaf = {signal.SIGCONT}
-    monkeypatch.setattr(recording._child, "send_signal", lambda s: s in deaf or send(s))
+    monkeypatch.setattr(process._child, "send_signal", lambda s: s in deaf or send(s))
     for stamp in range(2, 20):
-        recording.backlog.put(stamp, big(stamp))
-    assert not recording.close(20, 0.05)
-    assert recording.close(20)
+        process.backlog.put(stamp, big(stamp))
+    assert not process.close(20, 0.05)
+    assert process.close(20)
     (error,) = failures
-    assert error is recording.error
-    assert str(recording._child.pid) in str(error)
+    assert error is process.error
+    assert str(process._child.pid) in str(error)
     assert "has taken nothing for 0.3 s; what it had taken is kept" in str(error)
     trouble: list[str] = []
     assert {each.time for each in read(path, damaged=trouble.append)} == {1}

@@ -79,7 +79,7 @@ def mcap_bag(folder: Path) -> Path:
 
 
 def compressed_bag(folder: Path) -> Path:
-    return bag(folder, images="png", depth="png")
+    return bag(folder, image_format="png", depth_format="png")
 
 
 def dataset(folder: Path, layout: str) -> Path:

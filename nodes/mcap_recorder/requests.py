@@ -1,4 +1,4 @@
-"""What a run and the process that records for it say to each other, beside the events."""
+"""What a run and the process that writes for it send each other, beside the events."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import msgspec
 from nodes.mcap_recorder.settings import McapRecorderConfig
 
 
-class Order(msgspec.Struct, frozen=True):
-    """What to do.
+class WriteRequest(msgspec.Struct, frozen=True):
+    """A file to write, and how.
 
     Attributes:
         path: The file to write.
@@ -27,12 +27,12 @@ class Order(msgspec.Struct, frozen=True):
     cores: tuple[int, ...]
 
 
-class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A line of what the process says.
+class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A line that the process sends.
 
     Attributes:
         what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``;
-            ``gone`` stands for a process that ended without a word.
+            ``gone`` stands for a process that ended without a reply.
         text: For messages.
         written: Events in the file.
         size: Bytes of the file.
@@ -44,7 +44,7 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
     size: int = 0
 
 
-def command(order: Order) -> list[str]:
+def command(request: WriteRequest) -> list[str]:
     """Return the command that starts such a process."""
-    text = msgspec.json.encode(order).decode()
+    text = msgspec.json.encode(request).decode()
     return [sys.executable, "-m", "nodes.mcap_recorder.process", text]

@@ -1,6 +1,6 @@
-"""A file that is being written: a thread hands what waits to a process, and hears how that does.
+"""The process that writes, as the run sees it: a thread feeds it, and another reads its replies.
 
-The loop puts events into the backlog, and asks nothing here that waits.
+The loop puts events into the backlog, and calls nothing here that waits.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from events import Announcement
 from nodes.mcap.disk import RecordingError
 from nodes.mcap_recorder import pipe
 from nodes.mcap_recorder.backlog import Backlog, Waiting
-from nodes.mcap_recorder.order import Answer, Order, command
+from nodes.mcap_recorder.requests import Reply, WriteRequest, command
 from runtime.errors import MissingDependencyError, WireError
 from runtime.wire import pack
 
@@ -48,11 +48,11 @@ _PIPE = 1 << 20
 """Bytes that the pipe holds: Linux allows no more without privileges."""
 
 
-class Recording:
+class WriterProcess:
     """Hands a backlog to a process that writes it.
 
     Args:
-        order: To the process.
+        request: The file to write, and how.
         backlog: Where events come from.
         failed: Called in a thread, once, with what ended the writing.
         complain: Called in a thread with what could not be recorded.
@@ -64,28 +64,28 @@ class Recording:
 
     def __init__(
         self,
-        order: Order,
+        request: WriteRequest,
         backlog: Backlog,
         failed: Callable[[RecordingError], None],
         complain: Callable[[str], None],
     ) -> None:
-        self.path = order.path
+        self.path = request.path
         self.backlog = backlog
         self.error: RecordingError | None = None
-        self.result = Answer("")
-        """What the process said at its end."""
+        self.result = Reply("")
+        """The last reply of the process."""
         self.unwritten = 0
         """Events that are not in the file."""
         self._handed = 0
         self._seen: tuple[object, ...] = ()
         self._seen_at = time.monotonic()
-        self._cores = order.cores
+        self._cores = request.cores
         self._failed = failed
         self._complain = complain
         self._closing = threading.Event()
         self._end = 0
         self._child = subprocess.Popen(  # noqa: S603  # our own module
-            command(order),
+            command(request),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             process_group=0,  # so that a terminal's Ctrl-C does not reach it
@@ -93,27 +93,27 @@ class Recording:
         )
         assert self._child.stdin is not None
         assert self._child.stdout is not None
-        self._answers = self._child.stdout
+        self._replies = self._child.stdout
         self._file = self._child.stdin.fileno()
         with contextlib.suppress(OSError, AttributeError):  # elsewhere it is smaller
             fcntl.fcntl(self._file, fcntl.F_SETPIPE_SZ, _PIPE)
-        first = self._answer()
+        first = self._reply()
         if first.what != "ready":
             self._child.stdin.close()
-            self._answers.close()
+            self._replies.close()
             self._child.wait()
             if first.what == "missing":
                 raise MissingDependencyError(first.text)
             raise RecordingError(first.text)
-        self._feeder = threading.Thread(target=self._feed, name="recording", daemon=True)
-        self._listener = threading.Thread(target=self._listen, name="recording", daemon=True)
+        self._feeder = threading.Thread(target=self._feed, name="recorder", daemon=True)
+        self._listener = threading.Thread(target=self._listen, name="recorder", daemon=True)
 
     def start(self) -> None:
         """Begin."""
         self._listener.start()
         self._feeder.start()
 
-    def close(self, end: int, patience: float | None = None) -> bool:
+    def close(self, end: int, timeout: float | None = None) -> bool:
         """Have what still waits written, and tell whether the file is closed. Not on a loop.
 
         A process that somebody stopped is told to go on, and one that shows no sign of life for
@@ -121,14 +121,14 @@ class Recording:
 
         Args:
             end: Time of the run's clock (ns) at which it ends.
-            patience: Real seconds to wait at most, after which it may be called again; if `None`,
+            timeout: Real seconds to wait at most, after which it may be called again; if `None`,
                 as long as the disk takes.
         """
         self._end = end
         self._closing.set()
         with contextlib.suppress(OSError):
             self._child.send_signal(signal.SIGCONT)
-        until = math.inf if patience is None else time.monotonic() + patience
+        until = math.inf if timeout is None else time.monotonic() + timeout
         for thread in (self._feeder, self._listener):
             while thread.is_alive():
                 if (rest := until - time.monotonic()) <= 0.0:
@@ -137,7 +137,7 @@ class Recording:
                 self._end_if_still()
         try:
             self._child.wait(STANDSTILL)
-        except subprocess.TimeoutExpired:  # it has said all there is to say
+        except subprocess.TimeoutExpired:  # it has sent its last reply
             self._child.kill()
             self._child.wait()
         if self.result.what in {"done", "error"}:  # one that was killed did not count
@@ -243,26 +243,26 @@ class Recording:
 
     def _listen(self) -> None:
         while True:
-            answer = self._answer()
-            if answer.what == "complaint":
-                self._complain(answer.text)
+            reply = self._reply()
+            if reply.what == "complaint":
+                self._complain(reply.text)
                 continue
             break
-        self._answers.close()
-        self.result = answer
-        if answer.what != "done":
-            self.error = self.error or RecordingError(answer.text)
+        self._replies.close()
+        self.result = reply
+        if reply.what != "done":
+            self.error = self.error or RecordingError(reply.text)
             self._failed(self.error)
 
-    def _answer(self) -> Answer:
-        line = self._answers.readline()
+    def _reply(self) -> Reply:
+        line = self._replies.readline()
         try:
-            return msgspec.json.decode(line, type=Answer)
+            return msgspec.json.decode(line, type=Reply)
         except msgspec.DecodeError:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._child.wait(1.0)
             code = self._child.returncode
-            return Answer("gone", f"{self.path}: the process that writes it ended with {code}")
+            return Reply("gone", f"{self.path}: the process that writes it ended with {code}")
 
 
 def spare_cores() -> tuple[int, ...]:
