@@ -69,11 +69,11 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         """
         if self.checking:
             return
-        loop, told = asyncio.get_running_loop(), set[str]()
+        loop, logged = asyncio.get_running_loop(), set[str]()
 
         def refused(why: str) -> None:
-            if why not in told and len(told) < _REFUSALS:
-                told.add(why)
+            if why not in logged and len(logged) < _REFUSALS:
+                logged.add(why)
                 with contextlib.suppress(RuntimeError):  # the run is over
                     loop.call_soon_threadsafe(self.log.warning, "somebody was refused: %s", why)
 

@@ -78,7 +78,7 @@ class Publishing:
     # Before the first event.
 
     def announced(self, announcement: Announcement) -> None:
-        """Declare the topics for what will be said."""
+        """Declare the topics of what is announced."""
         topic = _topic(announcement.source)
         match announcement:
             case VehicleAnnouncement():

@@ -111,7 +111,7 @@ class Server:
     def close(self) -> None:
         """End the server; may take a moment.
 
-        The library waits without end for whoever has connected and never said a word, such as a
+        The library waits without end for whoever has connected and never sent a request, such as a
         browser that connects in advance: we do not.
         """
         stopping = threading.Thread(target=self._server.stop, name="foxglove stops", daemon=True)
@@ -127,14 +127,14 @@ class Server:
 
 
 class _Listener:
-    """Hears, in the server's threads, who subscribes to what."""
+    """Gets subscriptions, in the server's threads."""
 
     def __init__(self, subscribed: Callable[[str], None]) -> None:
         self._subscribed = subscribed
 
     def on_subscribe(self, _: Any, channel: Any) -> None:
-        """Hear of a subscription."""
+        """Send the topic's newest message to a viewer that has subscribed."""
         self._subscribed(channel.topic)
 
     def on_unsubscribe(self, _: Any, channel: Any) -> None:
-        """Hear of the end of one."""
+        """Do nothing: the library counts."""

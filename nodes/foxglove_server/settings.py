@@ -15,7 +15,7 @@ class FoxgloveConfig(NodeConfig):
     Attributes:
         host: Where it listens. Whoever reaches it can see the run, except pages of other origins;
             hence this machine only, unless the file says otherwise.
-        port: The same; 0: any that is free (the log tells it).
+        port: The same; 0: any that is free (the log has it).
         origins: Pages that may connect, as browsers name them: Foxglove's own, in a browser and
             as a program. What is no browser needs none.
         image_rate: Images a second of each camera, on the run's clock; of a set (colours,

@@ -160,7 +160,7 @@ def has_summary(file: IO[bytes]) -> bool:
 
 
 def _why(file: IO[bytes], at: int, size: int) -> str:
-    """Tell a file that ends too early from one that is damaged in the middle."""
+    """Distinguish a file that ends too early from one that is damaged in the middle."""
     file.seek(-len(MAGIC), os.SEEK_END)
     if file.read() != MAGIC:
         return NOT_CLOSED

@@ -23,7 +23,7 @@ from nodes.mcap.disk import WholeWrites, open_anew, unwritable
 Compression = Literal["zstd", "lz4", "none"]
 
 LIBRARY = "visnav-runtime"
-"""Which wrote a file, as its header tells."""
+"""The library that a file's header names as its writer."""
 
 
 class Record(NamedTuple):
@@ -34,7 +34,7 @@ class Record(NamedTuple):
         type: Name of its schema.
         metadata: Of its channel.
         time: When it was published, nanoseconds.
-        sequence: Its number among those of its channel, from 0; a gap tells of a lost one.
+        sequence: Its number among those of its channel, from 0; a gap means that one was lost.
         data: Its bytes.
     """
 
@@ -207,7 +207,7 @@ def read(
         path: The file; torn ones are read as far as they go.
         start: Messages before this time (ns) are left out.
         end: So are those at this time and after.
-        damaged: Told of parts that cannot be read, which are passed over.
+        damaged: Called for parts that cannot be read, which are passed over.
 
     Raises:
         RecordingError: It is no MCAP file.

@@ -65,7 +65,7 @@ def writer(
         file: To write into.
         compression: Of chunks: ``zstd``, ``lz4`` or ``none``.
         chunk_size: Bytes of a chunk.
-        profile: What the file is for, as its header tells.
+        profile: What the file is for, for its header.
         library: Which wrote it.
 
     Raises:
@@ -154,7 +154,7 @@ def records(
         path: The file.
         start: Messages before this time (ns) may be left out.
         end: So may those at this time and after.
-        damaged: Told of parts that cannot be read, which are passed over.
+        damaged: Called for parts that cannot be read, which are passed over.
         everything: Yield metadata and attachments, too.
 
     Raises:

@@ -134,7 +134,7 @@ class McapRecorder(Node[McapRecorderConfig]):
         backlog, result = self._backlog, process.result
         lost = backlog.dropped + process.unwritten
         self.events.dropped += lost
-        if result.what != "gone":  # it would have said how many there are
+        if result.what != "gone":  # it did not report how many there are
             waits = f"{self._waits} times for the disk, {self._waited:.1f} s in all"
             self.log.info(
                 "%s: %d events, %.1f MB; at most %.1f MB waited%s",
@@ -159,7 +159,7 @@ class McapRecorder(Node[McapRecorderConfig]):
                 loop.call_soon_threadsafe(self.log.warning, "%s", what)
 
         def failed(error: RecordingError) -> None:
-            with contextlib.suppress(RuntimeError):  # the run is over, and `_finish` tells
+            with contextlib.suppress(RuntimeError):  # the run is over, and `_finish` raises it
                 loop.call_soon_threadsafe(self._fail, error)
 
         request = WriteRequest(
@@ -186,7 +186,7 @@ class McapRecorder(Node[McapRecorderConfig]):
         """Have simulated time wait until there is room.
 
         Raises:
-            FatalError: The process that writes stands still.
+            FatalError: The process that writes shows no sign of life.
         """
         if not self._waits:
             self.log.info(

@@ -116,7 +116,7 @@ class WriterProcess:
     def close(self, end: int, timeout: float | None = None) -> bool:
         """Have what still waits written, and tell whether the file is closed. Not on a loop.
 
-        A process that somebody stopped is told to go on, and one that shows no sign of life for
+        A process that somebody stopped is continued, and one that shows no sign of life for
         `STANDSTILL` seconds is ended; `error` then says so.
 
         Args:
@@ -158,7 +158,7 @@ class WriterProcess:
         return now - self._seen_at
 
     def standstill(self) -> RecordingError:
-        """Return the error that says who stands still."""
+        """Return the error for a process that shows no sign of life."""
         return RecordingError(
             f"{self.path}: the process that writes it ({self._child.pid}) has taken nothing for "
             f"{STANDSTILL:g} s; what it had taken is kept"

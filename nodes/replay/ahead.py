@@ -1,4 +1,4 @@
-"""Reads ahead of the loop in a thread, so that it never decodes a picture; bounded by bytes."""
+"""Reads ahead of the loop in a thread, so that it never decodes an image; bounded by bytes."""
 
 from __future__ import annotations
 

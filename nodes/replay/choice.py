@@ -1,4 +1,4 @@
-"""Which events of a recording are sent again: by type, and by who said them."""
+"""Which events of a recording are sent again: by type, and by source."""
 
 from __future__ import annotations
 

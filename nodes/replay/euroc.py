@@ -33,7 +33,7 @@ from nodes.replay.folders import (
     in_order,
     read_depth,
     read_image,
-    standing,
+    vehicle_at,
     while_seen,
 )
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
@@ -92,7 +92,7 @@ class Euroc(Reader):
         super().__init__()
         self._folder = folder
         self._vehicle = vehicle
-        self._pictures: dict[str, list[tuple[int, Path]]] = {}
+        self._images: dict[str, list[tuple[int, Path]]] = {}
         self._depths: dict[str, tuple[list[tuple[int, Path]], float]] = {}
         self._announcements: list[Announcement] = []
         try:
@@ -107,25 +107,25 @@ class Euroc(Reader):
         except ValueError as error:
             raise ReplayError(str(error)) from None
         stamps = [row[0] for row in self._imu]
-        stamps += [stamp for rows in self._pictures.values() for stamp, _ in rows]
+        stamps += [stamp for rows in self._images.values() for stamp, _ in rows]
         if not stamps:
             raise ReplayError(f"{folder}: expected the data of cameras or an IMU, found none")
         self._truth = while_seen(self._truth, min(stamps), max(stamps))
         firsts = [min(stamps), *(row[0] for row in self._truth[:1])]
         self._origin = min(firsts + noted_epoch(folder / "body.yaml"))
         if self._truth:
-            pictures = [rows[0][0] for rows in self._pictures.values() if rows]
-            first = min(pictures, default=self._truth[0][0])
+            images = [rows[0][0] for rows in self._images.values() if rows]
+            first = min(images, default=self._truth[0][0])
             row = next((row for row in self._truth if row[0] >= first), self._truth[0])
             moved = self._moved(*row)
-            self._announcements.insert(0, standing(vehicle, moved.position, moved.orientation))
+            self._announcements.insert(0, vehicle_at(vehicle, moved.position, moved.orientation))
 
     def announcements(self) -> Sequence[Announcement]:
         """Return the vehicle where it begins, its cameras and its IMU."""
         return self._announcements
 
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
-        """Yield IMU, truth and pictures, all at their own stamps."""
+        """Yield IMU, truth and images, all at their own stamps."""
 
         def inside(stamp: int) -> bool:
             time = stamp - self._origin
@@ -141,7 +141,7 @@ class Euroc(Reader):
                 streams.append(
                     self._seen_depths(source, (row for row in rows if inside(row[0])), factor)
                 )
-        for source, rows in self._pictures.items():
+        for source, rows in self._images.items():
             if wants(Image, source):
                 streams.append(self._seen(source, (row for row in rows if inside(row[0]))))
         return in_order(streams)
@@ -190,7 +190,7 @@ class Euroc(Reader):
                 f"{sensor.path}: distortion_model: expected radial-tangential, found {model!r}"
             )
         position, orientation = pose_tuples(np.reshape(sensor.list("data", 16), (4, 4)))
-        self._pictures[source] = rows = self._index(folder)
+        self._images[source] = rows = self._index(folder)
         images = ["grey"]
         if rows and read_image(rows[0][1], 0, source, "").encoding == "rgb8":
             images = ["rgb"]
@@ -251,10 +251,10 @@ def noted_epoch(path: Path) -> list[int]:
     Raises:
         ReplayError: It is no number.
     """
-    said = read_sensor(path).texts.get("epoch_ns") if path.is_file() else None
-    if said is not None and not (said.isdecimal() and len(said) <= 19):
-        raise ReplayError(f"{path}: epoch_ns: expected whole nanoseconds, found {said!r:.80}")
-    return [] if said is None else [int(said)]
+    text = read_sensor(path).texts.get("epoch_ns") if path.is_file() else None
+    if text is not None and not (text.isdecimal() and len(text) <= 19):
+        raise ReplayError(f"{path}: epoch_ns: expected whole nanoseconds, found {text!r:.80}")
+    return [] if text is None else [int(text)]
 
 
 def read_sensor(path: Path) -> Sensor:

@@ -1,4 +1,4 @@
-"""What data sets in folders have in common: a world with z up, pictures in files, rows to merge."""
+"""What data sets in folders have in common: a world with z up, images in files, rows to merge."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def while_seen(truth: list[R], first: int, last: int) -> list[R]:
     return truth[max(begin, 0) : end]
 
 
-def standing(source: str, position: Vector3, orientation: Quaternion) -> VehicleAnnouncement:
-    """Return the announcement of a vehicle of which no more is known than where it begins."""
+def vehicle_at(source: str, position: Vector3, orientation: Quaternion) -> VehicleAnnouncement:
+    """Return the announcement of a vehicle of which only the first pose is known."""
     return VehicleAnnouncement(
         stamp=0,
         source=source,
@@ -47,14 +47,14 @@ def standing(source: str, position: Vector3, orientation: Quaternion) -> Vehicle
 
 
 def read_image(path: Path, stamp: int, source: str, frame_id: str) -> Image:
-    """Read a colour or grey picture.
+    """Read a colour or grey image.
 
     Raises:
         ReplayError: It is none.
     """
     pixels = _pixels(path)
     if pixels.dtype == np.uint16:
-        raise ReplayError(f"{path}: expected a picture of 8 bits, found one of 16")
+        raise ReplayError(f"{path}: expected an image of 8 bits, found one of 16")
     if pixels.ndim == 3:
         code = cv2.COLOR_BGRA2RGB if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
         pixels = cv2.cvtColor(pixels, code)
@@ -63,7 +63,7 @@ def read_image(path: Path, stamp: int, source: str, frame_id: str) -> Image:
 
 
 def read_depth(path: Path, stamp: int, source: str, frame_id: str, factor: float) -> DepthImage:
-    """Read a depth picture of 16 bits.
+    """Read a depth image of 16 bits.
 
     Args:
         path: The file.
@@ -78,7 +78,7 @@ def read_depth(path: Path, stamp: int, source: str, frame_id: str, factor: float
     steps = _pixels(path)
     if steps.dtype != np.uint16 or steps.ndim != 2:
         raise ReplayError(
-            f"{path}: expected a depth picture of 16 bits, found {steps.dtype} {steps.shape}"
+            f"{path}: expected a depth image of 16 bits, found {steps.dtype} {steps.shape}"
         )
     metres = steps.astype(np.float32) / np.float32(factor)
     metres[steps == 0] = np.inf
@@ -99,7 +99,7 @@ def _pixels(path: Path) -> npt.NDArray[Any]:
         code = np.fromfile(path, np.uint8)
         pixels = cv2.imdecode(code, cv2.IMREAD_UNCHANGED) if code.size else None
     except (OSError, cv2.error) as error:
-        raise ReplayError(f"{path}: expected a picture, found: {error}") from None
+        raise ReplayError(f"{path}: expected an image, found: {error}") from None
     if pixels is None:
-        raise ReplayError(f"{path}: expected a picture, found something else")
+        raise ReplayError(f"{path}: expected an image, found something else")
     return pixels

@@ -22,7 +22,7 @@ _SLICE = SECOND // 10
 
 
 class Replay(Node[ReplayConfig]):
-    """Says what was recorded, when it was said, on either clock.
+    """Sends recorded events again, each at its time, on either clock.
 
     ::
 
@@ -46,8 +46,8 @@ class Replay(Node[ReplayConfig]):
         self._paused_at: int | None = None
         self._resumed = asyncio.Event()
         self._target: int | None = None
-        self._told = 0
-        self._told_left_out = 0
+        self._logged = 0
+        self._logged_left_out = 0
         self.sent = 0
         if self.config.paused:
             self.pause()
@@ -69,7 +69,7 @@ class Replay(Node[ReplayConfig]):
         return self._announcements
 
     async def run(self) -> None:
-        """Say it all, from start to end, and again if that is wanted."""
+        """Send all events, from start to end, and again if that is wanted."""
         assert self._reader is not None
         begin = round(self.config.start * SECOND)
         end = round(self.config.end * SECOND) or None
@@ -93,7 +93,7 @@ class Replay(Node[ReplayConfig]):
             else:
                 break
             self._shift = self.clock.now() - position
-        self._tell_trouble()
+        self._log_trouble()
         if named := ", ".join(sorted(self._choice.unmatched)):
             self.log.warning("only, skip: nothing in the recording is of %s", named)
         self.stop("the recording ended")
@@ -101,7 +101,7 @@ class Replay(Node[ReplayConfig]):
     async def on_shutdown(self) -> None:
         """Close the recording."""
         await self._close_ahead()
-        self._tell_trouble()
+        self._log_trouble()
         if self._reader is not None:
             await self.offload(self._reader.close)
 
@@ -113,7 +113,7 @@ class Replay(Node[ReplayConfig]):
             self.seek(self.config.position)
 
     def pause(self) -> None:
-        """Say nothing until `resume`; the clock goes on."""
+        """Send nothing until `resume`; the clock goes on."""
         if self._paused_at is None:
             self._paused_at = self.clock.now()
             self._resumed.clear()
@@ -138,7 +138,7 @@ class Replay(Node[ReplayConfig]):
         return (now - self._shift) / SECOND
 
     async def _play(self, start: int, end: int | None) -> int | None:
-        """Say what was said from one time to another; return the last time, if anything came."""
+        """Send the events from one time to another; return the last time, if there was any."""
         assert self._reader is not None
         await self._close_ahead()
         events = self._reader.events(start, end, self._choice)
@@ -181,9 +181,9 @@ class Replay(Node[ReplayConfig]):
         self._choice = Choice(config.only, config.skip, announced)
         self._announcements = [each for each in announced if self._choice.announced(each)]
         if config.start:
-            self._announcements = [self._standing(reader, each) for each in self._announcements]
+            self._announcements = [self._starting(reader, each) for each in self._announcements]
 
-    def _standing(self, reader: Reader, announcement: Announcement) -> Announcement:
+    def _starting(self, reader: Reader, announcement: Announcement) -> Announcement:
         """Return a vehicle's announcement with the pose that it has at the start."""
         if not isinstance(announcement, VehicleAnnouncement):
             return announcement
@@ -197,7 +197,7 @@ class Replay(Node[ReplayConfig]):
             return announcement
         return msgspec.structs.replace(
             announcement,
-            control_rate=0.0,  # in mid-recording, nobody knows whether it stands
+            control_rate=0.0,  # in mid-recording, it may be moving
             position=event.position,
             orientation=event.orientation,
         )
@@ -212,17 +212,17 @@ class Replay(Node[ReplayConfig]):
             + "".join(f"; {each}" for each in (self._reader.trouble if self._reader else []))
         )
 
-    def _tell_trouble(self) -> None:
+    def _log_trouble(self) -> None:
         if self._reader is None:
             return
-        for each in self._reader.trouble[self._told :]:
+        for each in self._reader.trouble[self._logged :]:
             self.log.warning("%s: %s", self.config.file, each)
-        self._told = len(self._reader.trouble)
-        if (left_out := self._reader.left_out - self._told_left_out) > 0:
+        self._logged = len(self._reader.trouble)
+        if (left_out := self._reader.left_out - self._logged_left_out) > 0:
             self.log.warning(
                 "%s: %d events cannot be read, and are left out", self.config.file, left_out
             )
-            self._told_left_out += left_out
+            self._logged_left_out += left_out
 
     async def _close_ahead(self) -> None:
         if self._ahead is not None:

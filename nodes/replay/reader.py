@@ -48,7 +48,7 @@ class Reader(ABC):
 
     @abstractmethod
     def announcements(self) -> Sequence[Announcement]:
-        """Return what its nodes announced, or what stands in the place of that.
+        """Return what its nodes announced, or what can be concluded instead.
 
         Raises:
             ReplayError: It cannot be read.
@@ -56,7 +56,7 @@ class Reader(ABC):
 
     @abstractmethod
     def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
-        """Yield the events from `start` to before `end`, in the order in which they were said.
+        """Yield the events from `start` to before `end`, in the order in which they were sent.
 
         Events may share arrays with nothing that changes. Their stamps are on the same clock as
         the times.

@@ -69,8 +69,8 @@ class Recorded(Reader):
 
     def end(self) -> int | None:
         """Return when the recorder ended; `None` if it could not say so."""
-        said = self._contents.metadata.get("visnav", {}).get("end", "")
-        return int(said) if said.isdigit() else None
+        end = self._contents.metadata.get("visnav", {}).get("end", "")
+        return int(end) if end.isdigit() else None
 
     def _event(self, record: Record, holder: Record | None) -> Event:
         lacking = native.lacking(record.data)

@@ -1,10 +1,9 @@
 """Bags of ROS that others made: their messages as events, in our frames (`ros_messages.incoming`).
 
-Messages with a header keep its stamp, unless that is zero; the time of receipt is when they are
-said. Where the two
-are of different clocks (a simulator's and the recording machine's), each counts from its own first.
-Cameras sit where ``/tf_static`` puts their optical frames in ``base_link``; one that it does not
-know looks ahead from the body's origin.
+Messages with a header keep its stamp, unless that is zero; they are sent at their time of receipt.
+Where the two are of different clocks (a simulator's and the recording machine's), each counts
+from its own first. Cameras sit where ``/tf_static`` puts their optical frames in ``base_link``; one
+that it does not know looks ahead from the body's origin.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from events import (
 )
 from nodes.mcap import layout
 from nodes.replay.bag_topics import chosen
-from nodes.replay.folders import standing
+from nodes.replay.folders import vehicle_at
 from nodes.replay.mounting import Mountings
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.replay.settings import Topic, Use
@@ -62,7 +61,7 @@ class RosBag(Reader):
 
     Args:
         path: A folder, or an MCAP or SQLite file.
-        topics: What to read; if empty, what its types and names tell.
+        topics: What to read; if empty, by types and names.
         vehicle: Source of the true poses.
 
     Raises:
@@ -171,7 +170,7 @@ class RosBag(Reader):
         return found
 
     def _origins(self) -> tuple[int, Stamps]:
-        """Return the time of receipt that is 0 from now on, and how stamps are told."""
+        """Return the time of receipt that is 0 from now on, and how stamps are converted."""
         times = [time for _, time, _ in self._firsts.values()]
         found = ((time, _stamp(message)) for _, time, message in self._firsts.values())
         stamped = [(time, at) for time, at in found if at]
@@ -187,7 +186,7 @@ class RosBag(Reader):
                 type_, _, message = self._firsts[name]
                 event = self._event(topic, type_, message)
                 assert isinstance(event, Odometry)
-                yield standing(topic.source, event.position, event.orientation)
+                yield vehicle_at(topic.source, event.position, event.orientation)
         yield from self._cameras(found)
         for name, topic in self._topics.items():
             if topic.use == "imu" and name in self._firsts:

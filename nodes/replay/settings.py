@@ -1,4 +1,4 @@
-"""What the file says of a replay."""
+"""A replay's settings in a run's file."""
 
 from __future__ import annotations
 
@@ -56,22 +56,22 @@ class ReplayConfig(NodeConfig):
             MCAP or SQLite file), or the folder of a data set in the layout of EuRoC or TUM RGB-D.
         start: Where to begin. The run's clock is 0 there, and stamps count from there.
         end: Where to end, on the recording's own time; 0 for its end.
-        linger: How long the run goes on after the last event, for what others have to say of it.
+        linger: How long the run goes on after the last event, so that others can react to it.
             A recording that says when it ended, or an `end`, ends just then.
         loop: Begin again at the end. The clock goes on, and stamps with it.
-        paused: Say nothing; can change in a run. The clock goes on, and what follows comes later.
+        paused: Send nothing; can change in a run. The clock goes on, and what follows comes later.
         position: Where to go on, on the recording's own time, whenever it is set in a run.
         only: Types (``Image``, ``Odometry``) and sources (``drone``, with all below it); an event
             must be of one of the types and from one of the sources, so far as any are named.
-            ``["Event"]`` is everything. If empty: what sensors and the vehicle said, and the
-            true poses; not what pilots, estimators and evaluations said.
+            ``["Event"]`` is everything. If empty: the events of sensors and of the vehicle, and the
+            true poses; not those of pilots, estimators and evaluations.
         skip: Types and sources that are left out.
         memory: Bytes that may be read ahead.
         topics: What is read of a ROS bag, and as what.
         vehicle: Source of a data set's true poses; its cameras are below it. If empty, the
             node's name.
         camera: Intrinsics of a data set in TUM's layout, if it has no camera.yaml.
-        depth_factor: Steps of its depth pictures per metre.
+        depth_factor: Steps of its depth images per metre.
     """
 
     file: InputPath

@@ -2,7 +2,7 @@
 
 J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and
 cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. The world's z points up; it is turned to
-NED by half a turn about x. A depth picture is taken with the colour picture nearest to it, within
+NED by half a turn about x. A depth image is taken with the colour image nearest to it, within
 20 ms as their associate.py does it, and gets its stamp, so that estimators find pairs. Times count
 from the first stamp, or from the epoch that ``camera.yaml`` notes (``epoch_ns``).
 """
@@ -32,7 +32,7 @@ from nodes.replay.folders import (
     in_order,
     read_depth,
     read_image,
-    standing,
+    vehicle_at,
     while_seen,
 )
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
@@ -41,7 +41,7 @@ from nodes.trajectory.formats import read_tum
 from nodes.trajectory.table import read_rows
 
 FARTHEST = 20_000_000
-"""Nanoseconds between a depth picture and its colour picture."""
+"""Nanoseconds between a depth image and its colour image."""
 
 _Rows = list[tuple[int, Path]]
 
@@ -158,7 +158,7 @@ class TumRgbd(Reader):
         )
 
     def _paired(self, depth: _Rows) -> _Rows:
-        """Give each depth picture the stamp of its colour picture; those without are left out."""
+        """Give each depth image the stamp of its colour image; those without are left out."""
         stamps = [stamp for stamp, _ in self._rgb]
         taken: dict[int, tuple[int, Path]] = {}
         for stamp, path in depth:
@@ -168,7 +168,7 @@ class TumRgbd(Reader):
             if distance <= FARTHEST and (near not in taken or distance < taken[near][0]):
                 taken[near] = distance, path
         if left_out := len(depth) - len(taken):
-            self.trouble.append(f"{left_out} depth pictures have no colour picture near them")
+            self.trouble.append(f"{left_out} depth images have no colour image near them")
         return sorted((stamp, path) for stamp, (_, path) in taken.items())
 
     def _announced(self, camera: Pinhole, rate: float) -> list[Announcement]:
@@ -201,7 +201,7 @@ class TumRgbd(Reader):
             begin = self._rgb[0][0]
             row = next((row for row in self._truth if row[0] >= begin), self._truth[0])
             moved = self._moved(*row)
-            announced.insert(0, standing(self._vehicle, moved.position, moved.orientation))
+            announced.insert(0, vehicle_at(self._vehicle, moved.position, moved.orientation))
         return announced
 
     def _index(self, name: str) -> _Rows:

@@ -12,7 +12,7 @@ from events import Event
 E = TypeVar("E", bound=Event)
 
 Numbered = tuple[int, E]
-"""How many events were heard before, and the event."""
+"""How many events came before, and the event."""
 
 
 class EntityLog:

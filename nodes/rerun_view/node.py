@@ -53,7 +53,7 @@ class RerunView(Node[RerunConfig]):
 
     def __init__(self) -> None:
         self._announcements: list[Announcement] = []
-        self._heard = 0
+        self._received = 0
         self._recorder: Any = None
         self._begun = False
         self._selection = ImageSelection(self.config.image_rate)
@@ -82,23 +82,23 @@ class RerunView(Node[RerunConfig]):
     @on(Image, DepthImage, SegmentationImage)
     def images(self, event: Image | DepthImage | SegmentationImage) -> None:
         """Keep some images."""
-        self._heard += 1
+        self._received += 1
         kind = type(event).__name__
         if self._selection.select(kind, event.source, event.frame_id, event.stamp):
-            self._large.offer((self._heard, event))
+            self._large.offer((self._received, event))
 
     @on(TrackedFeatures)
     def features(self, event: TrackedFeatures) -> None:
         """Keep the features of those images."""
-        self._heard += 1
+        self._received += 1
         if self._selection.selected(event.frame_id, event.stamp):
-            self._large.offer((self._heard, event))
+            self._large.offer((self._received, event))
 
     @on(PointCloud)
     def point_clouds(self, event: PointCloud) -> None:
         """Keep clouds."""
-        self._heard += 1
-        self._large.offer((self._heard, event))
+        self._received += 1
+        self._large.offer((self._received, event))
 
     @on(
         Odometry,
@@ -113,8 +113,8 @@ class RerunView(Node[RerunConfig]):
     )
     def measurements(self, event: Event) -> None:
         """Keep what is small."""
-        self._heard += 1
-        self._small.offer((self._heard, event))
+        self._received += 1
+        self._small.offer((self._received, event))
 
     async def run(self) -> None:
         """Pass on the events that have come, again and again.
@@ -144,7 +144,9 @@ class RerunView(Node[RerunConfig]):
         dropped = self._large.dropped + self._small.dropped
         dropped += await self._recorder.call_for(0.0, Recorder.left_out)
         if dropped:
-            self.log.warning("%d of %d events dropped: the view was too slow", dropped, self._heard)
+            self.log.warning(
+                "%d of %d events dropped: the view was too slow", dropped, self._received
+            )
         if self.config.mode == "save" and self.out is not None:
             self.log.info("%s: rerun opens it", self.out / part_name(self, self.config.file))
 
@@ -154,7 +156,7 @@ class RerunView(Node[RerunConfig]):
             await self._recorder.call_for(0.0, Recorder.begin, self._announcements)
 
     def _take(self) -> list[Numbered[Event]]:
-        """Return what waits, in the order in which it was heard."""
+        """Return what waits, in the order in which it came."""
         batch = [
             stream.receive_nowait()
             for stream in (self._large, self._small)

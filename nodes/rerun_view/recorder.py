@@ -4,7 +4,7 @@
     await recorder.call(Recorder.begin, announcements)
     await recorder.call(Recorder.log, batch)
 
-Time is told twice: ``run``, an event's stamp, and ``event``, the order in which they were heard.
+There are two time lines: ``run``, an event's stamp, and ``event``, the order in which they came.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Recorder:
         self._show()
 
     def log(self, batch: Sequence[Numbered[Event]]) -> None:
-        """Put events, in the order in which they were heard.
+        """Put events, in the order in which they came.
 
         What goes into a file is gathered first: each entity's rows have a head of their own.
         """

@@ -29,7 +29,7 @@ _PATIENCE = 15.0
 """Real seconds until a server must listen."""
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
-"""What a terminal is told of colours."""
+"""A terminal's codes for colours."""
 
 _PR_SET_PDEATHSIG = 1
 """prctl(2): which signal a process gets when its parent ends."""
@@ -80,7 +80,7 @@ class Viewer:
     """Rerun's program: a web server that ends with this process, or a window that stays.
 
     The library's own functions for either listen on all of the machine's addresses; the program
-    can be told where.
+    has options for that.
 
     Args:
         config: Mode ``serve`` or ``spawn``; where to listen, and how much to remember.
@@ -127,8 +127,8 @@ class Viewer:
         if self._process.poll() is None:
             return ""
         self._output.seek(0)
-        said = _COLOURS.sub("", self._output.read().decode(errors="replace")).splitlines()
-        errors = [line for line in said if "error" in line.lower()]
+        lines = _COLOURS.sub("", self._output.read().decode(errors="replace")).splitlines()
+        errors = [line for line in lines if "error" in line.lower()]
         return errors[-1] if errors else f"exit code {self._process.returncode}"
 
     def close(self) -> None:

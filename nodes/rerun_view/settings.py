@@ -19,12 +19,12 @@ class RerunConfig(NodeConfig):
 
     Attributes:
         mode: ``save``: into `file`. ``spawn``: in Rerun's own window. ``serve``: in the browser;
-            the log tells the address.
+            the log has the address.
         file: In the run's folder; ``rerun`` opens it.
         web_port: Of the page, for ``serve``.
         port: Of the data, for ``serve`` and ``spawn``.
         host: Where the viewer listens. Whoever reaches it sees all, and can send; hence this
-            machine only, unless said otherwise.
+            machine only, unless the file says otherwise.
         memory: What the server of ``serve`` keeps for browsers that come late.
         image_rate: Images a second of each camera, on the run's clock; of a set (colours,
             depth) all or none. 0: no images.

@@ -1,4 +1,4 @@
-"""What stands in the world: vehicles, paths, estimates, cameras with what they see, clouds."""
+"""What is in the world: vehicles, paths, estimates, cameras with their images, clouds."""
 
 from __future__ import annotations
 

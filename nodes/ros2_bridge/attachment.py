@@ -1,4 +1,4 @@
-"""What goes with every message: its number, when it was said, and by whom.
+"""What goes with every message: its number, when it was sent, and by whom.
 
 A ROS process that gets a malformed attachment ends, so there is one place that makes them.
 """

@@ -1,4 +1,4 @@
-"""What went wrong outside: counted always, told seldom."""
+"""What is wrong with messages from outside: it is always counted, and seldom logged."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-TOLD_EVERY = 5.0
-"""Real seconds."""
+LOG_INTERVAL = 5.0
+"""Real seconds between two log lines about the same."""
 
 
 class Complaints:
-    """Counts of what went wrong, by topic and kind; may be told from any thread.
+    """Counts of what went wrong, by topic and kind. For any thread.
 
     Args:
-        say: Takes a line for the log.
+        log: Takes a line for the log.
         now: Real seconds.
     """
 
     def __init__(
-        self, say: Callable[[str], None], now: Callable[[], float] = time.monotonic
+        self, log: Callable[[str], None], now: Callable[[], float] = time.monotonic
     ) -> None:
         self.counts: Counter[tuple[str, str]] = Counter()
-        self._say = say
+        self._log = log
         self._now = now
-        self._told: dict[tuple[str, str], tuple[float, int]] = {}
+        self._logged: dict[tuple[str, str], tuple[float, int]] = {}
         self._lock = threading.Lock()
 
     def add(self, where: str, kind: str, detail: str = "") -> None:
-        """Count something; say so if nothing like it was said for `TOLD_EVERY`.
+        """Count something; log it if nothing like it was logged for `LOG_INTERVAL`.
 
         Args:
             where: Topic.
@@ -39,11 +39,11 @@ class Complaints:
         with self._lock:
             key, now = (where, kind), self._now()
             self.counts[key] += 1
-            when, before = self._told.get(key, (-TOLD_EVERY, 0))
-            if now - when < TOLD_EVERY:
+            when, before = self._logged.get(key, (-LOG_INTERVAL, 0))
+            if now - when < LOG_INTERVAL:
                 return
             count = self.counts[key]
-            self._told[key] = (now, count)
+            self._logged[key] = (now, count)
             since = count - before
         times = f" ({since} times since the last such line)" if since > 1 else ""
-        self._say(f"{where}: {kind}{': ' if detail else ''}{detail:.300}{times}")
+        self._log(f"{where}: {kind}{': ' if detail else ''}{detail:.300}{times}")

@@ -30,7 +30,6 @@ Take = Callable[[int, Callable[[], bytes]], None]
 WAIT_BEFORE_DROP = 300
 """Microseconds that a put waits for a peer that does not read; Zenoh's default is 1000."""
 
-
 WAITING = 64
 """Messages that Zenoh keeps until they are read; it lets the sender wait when there are more."""
 
@@ -50,8 +49,7 @@ _OURS: dict[str, Any] = {
     "connect/exit_on_failure": False,  # but beside the run; and again if a router goes
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP,
 }
-"""In the place of what Zenoh has where nobody says anything: among that, to listen to all the
-world, and multicast."""
+"""Instead of Zenoh's own defaults, which are to listen on all addresses, and to use multicast."""
 
 _IN_ZENOH = re.compile(r" at /\S+\.rs:\d+\.?")
 _IN_FILE = re.compile(r'Message \{ msg: "(.*)", location: .*line: (\d+), column: (\d+).*')
@@ -133,7 +131,7 @@ class Session:
         subscriber = self._subscriber(topic, late=topic.qos.transient_local)
         self._kept.append(subscriber)
         threading.Thread(
-            target=_read, args=(subscriber, take), name=f"hears {topic.name}", daemon=True
+            target=_read, args=(subscriber, take), name=f"reads {topic.name}", daemon=True
         ).start()
         if self._keys == "rmw_zenoh":
             self._keep(endpoint_token(self._node, self.zid, 0, next(self._ids), "MS", topic))
@@ -144,7 +142,7 @@ class Session:
         """Wait in the caller's thread for a message of which `read` makes something.
 
         Args:
-            topic: Which; a message that was said before, and is kept, counts too.
+            topic: Which; a message that was sent before, and is kept, counts too.
             seconds: For how long; `None` is returned if nothing came, or after `give_up`.
             read: Called as `Take` is; `None` for what is of no use.
         """
@@ -177,7 +175,7 @@ class Session:
         return not thread.is_alive()
 
     def _subscriber(self, topic: Topic, *, late: bool) -> Any:
-        """Declare a subscriber; `late`: one that gets what was said before, and is kept."""
+        """Declare a subscriber; `late`: one that also gets messages that were sent before."""
         key = self._key(topic)
         channel: Any = zenoh.handlers.FifoChannel(WAITING)
         if not late:

@@ -59,6 +59,6 @@ class MessageBuilder:
         Args:
             stamp: Nanoseconds of the run's clock.
             frame_id: Our name of the frame.
-            source: Whose frame it is, which tells one vehicle's ``base_link`` from another's.
+            source: Whose frame it is: each of several vehicles has its own ``base_link``.
         """
         return self._store.header(self._time(stamp), self._names.name(frame_id, source))

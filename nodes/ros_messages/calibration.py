@@ -58,7 +58,7 @@ def camera_info(message: Any) -> CameraInfo:
     }
     if part or message.binning_x > 1 or message.binning_y > 1:
         raise ValueError(
-            "expected a calibration of whole pictures, found binning of "
+            "expected a calibration of whole images, found binning of "
             f"{message.binning_x} x {message.binning_y} and a region of interest of "
             f"{message.roi.width} x {message.roi.height} pixels"
         )

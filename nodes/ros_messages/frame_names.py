@@ -21,7 +21,7 @@ class FrameNames:
 
     Of one vehicle alone, frames have the names of REP 105 (``odom``, ``base_link``). Once there is
     a second, the vehicle's name stands before those of each: ``drone/odom``, ``drone/base_link``.
-    Whose frame is meant follows from who speaks: ``drone/camera`` is of ``drone``.
+    Whose frame is meant follows from the source: ``drone/camera`` is of ``drone``.
     """
 
     def __init__(self) -> None:
@@ -30,12 +30,12 @@ class FrameNames:
         self._vehicles: list[str] = []
 
     def add_vehicle(self, source: str) -> None:
-        """Take in a vehicle."""
+        """Add a vehicle."""
         if source not in self._vehicles:
             self._vehicles.append(source)
 
     def add(self, camera: CameraAnnouncement) -> CameraFrames:
-        """Take in a camera: its frames have its own name, or its vehicle's too if that is taken."""
+        """Add a camera: its frames have its own name, or its vehicle's too if that is taken."""
         if camera.frame_id not in self._cameras:
             name = ros_name(camera.source.rpartition("/")[2])
             if any(known == name for _, known in self._cameras.values()):
@@ -61,7 +61,7 @@ class FrameNames:
         return self._carrier(source) or (self._vehicles[0] if self._vehicles else "")
 
     def name(self, frame_id: str, source: str = "") -> str:
-        """Return what ROS calls a frame that a source speaks of."""
+        """Return what ROS calls a frame that a source names."""
         if frame_id == "map":
             return frame_id
         camera = self.camera(frame_id)

@@ -37,7 +37,7 @@ class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         source: Of the event.
         now: On the run's clock (ns).
-        stamps: How messages tell the time.
+        stamps: How times in messages become stamps.
         frame_id: If set, stands in the place of the message's own.
     """
 

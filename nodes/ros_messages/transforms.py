@@ -1,4 +1,4 @@
-"""What ``/tf`` and ``/tf_static`` say: map → odom → base_link → camera_link → camera_optical_frame.
+"""The frames on ``/tf`` and ``/tf_static``: map, odom, base_link, camera_link, camera_optical_frame.
 
 REP 105: ``odom`` is where the vehicle started, so ``map → odom`` is fixed, and estimates that are
 in ``odom`` stand where they should. Poses in, transforms in ROS's names and axes out; no messages.
@@ -47,7 +47,7 @@ class Transforms:
         """Sources of cameras that nothing carries, to their optical frame."""
 
     def announced(self, announcement: Announcement) -> None:
-        """Take in where a vehicle stands, or where a camera is mounted."""
+        """Add where a vehicle starts, or where a camera is mounted."""
         if isinstance(announcement, VehicleAnnouncement):
             source = announcement.source
             if self._only in {"", source} and source not in self._starts:
@@ -65,7 +65,7 @@ class Transforms:
                 self._mounted[optical] = announcement.source, parent, mounting
 
     def add_static(self, event: TransformStamped) -> bool:
-        """Take in a fixed transform that a node sent; tell whether it is news."""
+        """Add a fixed transform that a node sent; tell whether it is new."""
         key = self._names.vehicle(event.source), event.child_frame_id
         if self._names.camera(event.child_frame_id) or key in self._fixed:
             return False

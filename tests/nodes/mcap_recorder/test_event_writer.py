@@ -53,7 +53,7 @@ def messages(path: Path) -> dict[str, list[Any]]:
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"images": "png"}, {"compression": "lz4"}], ids=["raw", "png", "lz4"]
+    "settings", [{}, {"image_format": "png"}, {"compression": "lz4"}], ids=["raw", "png", "lz4"]
 )
 def test_all_events_come_back_as_they_were(tmp_path: Path, settings: dict[str, Any]) -> None:
     """Every kind of event, announcements included, in order and to the byte."""

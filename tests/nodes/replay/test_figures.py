@@ -119,7 +119,7 @@ def test_tums_depth_has_its_colours_stamp(tum: Reader) -> None:
     assert colours[0].data[0, 0].tolist() == [30, 20, 10]
     assert depths[0].data[0, 1] == 1.0
     assert np.isinf(depths[0].data[0, 0])
-    assert tum.trouble == ["1 depth pictures have no colour picture near them"]
+    assert tum.trouble == ["1 depth images have no colour image near them"]
 
 
 def test_tums_camera_is_as_said_and_never_guessed(tum: Reader, tmp_path: Path) -> None:
@@ -264,7 +264,7 @@ def test_a_missing_picture_is_an_error_when_its_turn_comes(tmp_path: Path) -> No
     last = sorted((folder / "mav0" / "cam0" / "data").iterdir())[-1]
     last.write_bytes(b"no picture")
     found = sets.reader(folder)
-    with pytest.raises(ReplayError, match=rf"{last.name}: expected a picture"):
+    with pytest.raises(ReplayError, match=rf"{last.name}: expected an image"):
         of(found, Image)
 
 

@@ -142,7 +142,7 @@ def test_a_file_without_content_is_no_picture(tmp_path: Path) -> None:
     """And the message is ours, not OpenCV's."""
     path = sets.tum_as_published(tmp_path)
     (path / "rgb" / "1305031102.175304.png").write_bytes(b"")
-    with pytest.raises(ReplayError, match=r"175304\.png: expected a picture, found something else"):
+    with pytest.raises(ReplayError, match=r"175304\.png: expected an image, found something else"):
         sets.reader(path)
 
 

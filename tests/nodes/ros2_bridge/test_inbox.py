@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import Counter
 
-from nodes.ros2_bridge.complaints import TOLD_EVERY, Complaints
+from nodes.ros2_bridge.complaints import LOG_INTERVAL, Complaints
 from nodes.ros2_bridge.inbox import Inbox
 
 
@@ -139,7 +139,7 @@ def test_complaints_are_counted_always_and_told_seldom() -> None:
         complaints.add("/a", "too many messages", "more than 5")
     complaints.add("/b", "too many messages")
     assert told == ["/a: too many messages: more than 5", "/b: too many messages"]
-    clock.now = TOLD_EVERY
+    clock.now = LOG_INTERVAL
     complaints.add("/a", "too many messages", "more than 5")
     assert told[2].endswith("more than 5 (1000 times since the last such line)")
     assert complaints.counts["/a", "too many messages"] == 1001
