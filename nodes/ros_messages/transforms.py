@@ -1,4 +1,4 @@
-"""The frames on ``/tf`` and ``/tf_static``: map, odom, base_link, camera_link, camera_optical_frame.
+"""The frames on ``/tf`` and ``/tf_static``: map, odom, base_link, camera_link, optical frames.
 
 REP 105: ``odom`` is where the vehicle started, so ``map → odom`` is fixed, and estimates that are
 in ``odom`` stand where they should. Poses in, transforms in ROS's names and axes out; no messages.
