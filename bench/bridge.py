@@ -1,7 +1,7 @@
 """What the runtime adds to Zenoh between two processes: round trips and bursts, beside raw Zenoh.
 
 Two nodes of one run in two processes, on the real clock, against two bare Zenoh sessions in the
-same two processes. What is asked is a small event, or a picture; the answer is always small. Blocks
+same two processes. What is asked is a small event, or an image; the answer is always small. Blocks
 of both are measured in turns, in an order that is drawn, so that whatever else the machine does
 falls on both alike; a ratio is that of the two medians.
 """
@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from bench.peers.zenoh_peer import config, free_locator, publisher, subscribe
+from bench.systems.zenoh_system import config, free_locator, publisher, subscribe
 from events import Event, Image
 from runtime import Input, Node, Output
 from runtime.config.model import Config
@@ -78,10 +78,10 @@ class Answered(Event):
 
 
 class Mirror(Node):
-    """Answers each question and each picture, in the other process."""
+    """Answers each question and each image, in the other process."""
 
     questions = Input(Asked, bound=100_000)
-    pictures = Input(Image, bound=1000)
+    images = Input(Image, bound=1000)
     answers = Output(Answered)
 
     async def run(self) -> None:
@@ -92,8 +92,8 @@ class Mirror(Node):
                 self._answer(question.number)
 
     async def _look(self) -> None:
-        async for picture in self.pictures:
-            if picture.source == "asker":
+        async for image in self.images:
+            if image.source == "asker":
                 self._answer(0)
 
     def _answer(self, number: int) -> None:
@@ -104,7 +104,7 @@ class Asker(Node):
     """Measures what it takes to be answered, in turns with raw Zenoh."""
 
     questions = Output(Asked)
-    pictures = Output(Image)
+    images = Output(Image)
     answers = Input(Answered)
 
     samples = 1000
@@ -173,7 +173,7 @@ class Asker(Node):
         if data is None:
             self.questions.send(Asked(stamp=now, source=self.name, number=0, answer=answer))
         else:
-            self.pictures.send(Image(stamp=now, source=self.name, frame_id="f", data=data))
+            self.images.send(Image(stamp=now, source=self.name, frame_id="f", data=data))
 
 
 class Raw:
@@ -218,11 +218,11 @@ class Raw:
 def measure(
     samples: int = 1000, progress: Callable[[str], None] = lambda _: None
 ) -> list[BridgeRow]:
-    """Measure small events and pictures.
+    """Measure small events and images.
 
     Args:
-        samples: Round trips with small events on each side; a quarter with pictures.
-        progress: Told what is measured.
+        samples: Round trips with small events on each side; a quarter with images.
+        progress: Called with what is measured.
     """
     meet, locator = free_locator(), free_locator()
     Asker.samples, Asker.progress, Asker.rows = samples, staticmethod(progress), []

@@ -74,7 +74,7 @@ def stall(
     seconds: Annotated[float, typer.Option(min=0.5, help="Length of each run.")] = 6.0,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each mode, interleaved.")] = 3,
     rate: Annotated[float, typer.Option(min=0.1, help="Hertz of the camera.")] = 10.0,
-    size: Annotated[int, typer.Option(min=16, help="Width and height of its pictures.")] = 512,
+    size: Annotated[int, typer.Option(min=16, help="Width and height of its images.")] = 512,
 ) -> None:
     """Measure how late a 400 Hz tick is without a camera, with one inline and beside the loop."""
     from bench.stall import measure
@@ -131,18 +131,18 @@ def lockstep(
 def bridge(
     json: Json = None,
     samples: Annotated[
-        int, typer.Option(min=100, help="Round trips with small events; a quarter with pictures.")
+        int, typer.Option(min=100, help="Round trips with small events; a quarter with images.")
     ] = 2000,
     repeats: Annotated[int, typer.Option(min=30, help="Pictures encoded for ROS.")] = 300,
 ) -> None:
-    """Measure what crosses between two processes beside raw Zenoh, and ROS pictures' encoding."""
+    """Measure what crosses between two processes beside raw Zenoh, and ROS images' encoding."""
     from bench.bridge import measure
     from bench.ros_images import measure as measure_ros
     from bench.tables import bridge_table, ros_images_table
 
     with _status() as say:
         rows = measure(samples, say)
-        say("pictures for ROS")
+        say("images for ROS")
         ros = measure_ros(repeats)
     _finish(bridge_table(rows), None, rows)
     _finish(ros_images_table(ros), json, [*rows, *ros])
@@ -190,11 +190,13 @@ def everything(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer nodes, rounds, samples.")] = False,
 ) -> None:
     """Run every benchmark, and write the page of results."""
-    from bench.suite import run
+    from bench.page import write
+    from bench.suite import measure
 
+    path = page or out / "RESULTS.md"
     with _status() as say:
-        run(out, page or out / "RESULTS.md", quick=quick, progress=say)
-    print(page or out / "RESULTS.md")
+        write(measure(quick=quick, progress=say), out, path)
+    print(path)
 
 
 @app.command()

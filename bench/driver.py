@@ -19,7 +19,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-import bench.peers
+import bench.systems
 from bench.system import Case, CaseName, Mode, Samples, System
 
 _LIMIT = 120.0
@@ -77,7 +77,7 @@ class Outcome(msgspec.Struct, frozen=True):
 def systems() -> dict[str, list[System]]:
     """Return all systems by module, ours first."""
     modules = ["bench.ours"]
-    modules += [f"bench.peers.{m.name}" for m in pkgutil.iter_modules(bench.peers.__path__)]
+    modules += [f"bench.systems.{m.name}" for m in pkgutil.iter_modules(bench.systems.__path__)]
     found = {}
     for module in modules:
         entries = getattr(importlib.import_module(module), "SYSTEMS", ())
@@ -107,7 +107,7 @@ def measure_all(
         repeats: Rounds.
         only: Parts of names; systems whose name has none of them are left out. Empty: all.
         budget: About how many seconds of round trips one measurement may take.
-        progress: Told what is measured, and the share that is done.
+        progress: Called with what is measured, and the share that is done.
     """
     wanted = tuple(part.lower() for part in only)
     missing: dict[str, str] = {}

@@ -92,7 +92,7 @@ def measure(
     Args:
         windows: Of both kinds together.
         rate: Messages a second of a flood.
-        progress: Told what is being measured.
+        progress: Called with what is being measured.
     """
     progress(f"{windows} windows of {WINDOW:g} s, every other with {rate:g} messages a second")
     _late.clear()

@@ -78,7 +78,7 @@ def measure(
     Args:
         seconds: Simulated, without cameras; a fifth of it with.
         repeats: Of each.
-        progress: Told what is being measured.
+        progress: Called with what is being measured.
     """
     bare, run, cameras = [], [], []
     for round_ in range(repeats):

@@ -13,8 +13,8 @@ import numpy.typing as npt
 import uvloop
 
 from bench.messages import Ping, Pong
-from bench.peers.parts import payloads
 from bench.system import Case, Samples, System
+from bench.systems.parts import payloads
 from runtime import Input, Node, NodeConfig, Output, on, tasks
 from runtime.config.model import Config, RunConfig
 from runtime.digest import Digest

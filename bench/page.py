@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
+
+import msgspec
 
 from bench.driver import Row
+from bench.plots import plot_boxes, plot_scaling
+from bench.suite import Results
 from bench.tables import number
-
-if TYPE_CHECKING:
-    from bench.suite import Results
 
 CAVEATS = """\
 # Results
@@ -37,8 +39,24 @@ Made by `make bench`; do not edit.
 """
 
 
-def page(results: Results, pictures: Mapping[str, Sequence[str]], folder: str) -> str:
-    """Return the whole page as Markdown; the pictures of each case are in `folder`."""
+def write(results: Results, out: Path, page_path: Path) -> None:
+    """Write the page of results, its plots, and the figures themselves.
+
+    Args:
+        results: What was measured.
+        out: Folder for results.json and the plots, made if missing.
+        page_path: The page, Markdown.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    encoded = msgspec.json.format(msgspec.json.encode(results), indent=1)
+    (out / "results.json").write_bytes(encoded + b"\n")
+    plots = _plots(results.rows, out)
+    folder = os.path.relpath(out, page_path.parent)
+    page_path.write_text(page(results, plots, folder), encoding="utf-8")
+
+
+def page(results: Results, plots: Mapping[str, Sequence[str]], folder: str) -> str:
+    """Return the whole page as Markdown; the plots of each case are in `folder`."""
     parts = [CAVEATS, "\n".join(_goals(results)), "\n".join(_stall(results))]
     parts += ["\n".join(_lockstep(results)), "\n".join(_throughput(results))]
     if results.bridge:
@@ -48,7 +66,7 @@ def page(results: Results, pictures: Mapping[str, Sequence[str]], folder: str) -
         ("large", "Large message (4.67 MB), copied"),
         ("large-shared", "Large message, by reference or shared memory"),
     ):
-        parts.append("\n".join(_latency(results.rows, case, title, pictures.get(case, ()), folder)))
+        parts.append("\n".join(_latency(results.rows, case, title, plots.get(case, ()), folder)))
     parts.append("\n".join(_measured(results)))
     return "\n".join(parts).rstrip() + "\n"
 
@@ -169,8 +187,8 @@ def _beside(results: Results) -> Iterator[str]:
             f"| {b.case} | {b.bytes:,} | {number(b.ours_us)} | {number(b.zenoh_us)} "
             f"| {b.ratio:.2f} | {b.ours_per_second:,.0f} | {b.zenoh_per_second:,.0f} |"
         )
-    yield "\nA picture as a message of ROS 2, by the bridge and by rosbags' `serialize_cdr`:\n"
-    yield "| picture | bytes | µs | rosbags' | ratio |"
+    yield "\nAn image as a message of ROS 2, by the bridge and by rosbags' `serialize_cdr`:\n"
+    yield "| image | bytes | µs | rosbags' | ratio |"
     yield "|---|--:|--:|--:|--:|"
     for i in results.ros_images:
         yield (
@@ -197,7 +215,7 @@ def _beside(results: Results) -> Iterator[str]:
 
 
 def _latency(
-    rows: Sequence[Row], case: str, title: str, pictures: Sequence[str], folder: str
+    rows: Sequence[Row], case: str, title: str, plots: Sequence[str], folder: str
 ) -> Iterator[str]:
     yield f"## {title}: median round trip, µs\n"
     for place in ("one process", "processes"):
@@ -215,8 +233,8 @@ def _latency(
             cells = " | ".join(number(medians.get(n)) for n in nodes)
             yield f"| {system} | {mode} | {cells} |"
         yield ""
-    for picture in pictures:
-        yield f"![{picture.removesuffix('.png')}]({folder}/{picture})\n"
+    for plot in plots:
+        yield f"![{plot.removesuffix('.png')}]({folder}/{plot})\n"
 
 
 def _measured(results: Results) -> Iterator[str]:
@@ -231,3 +249,20 @@ def _measured(results: Results) -> Iterator[str]:
         for system, reason in results.missing.items():
             yield f"- {system}: {reason}"
     yield ""
+
+
+def _plots(rows: Sequence[Row], out: Path) -> dict[str, list[str]]:
+    """Draw each case's plots and return their names."""
+    drawn: dict[str, list[str]] = {}
+    for case in dict.fromkeys(row.case for row in rows):
+        own = [row for row in rows if row.case == case]
+        names = drawn.setdefault(case, [])
+        if len({row.nodes for row in own}) > 1:
+            names.append(f"{case}-scaling.png")
+            plot_scaling(own, f"{case} message", out / names[-1])
+        for n in (2, 128):
+            boxed = [row for row in own if row.nodes == n]
+            if boxed:
+                names.append(f"{case}-{n}.png")
+                plot_boxes(boxed, f"{case} message, {n} nodes", out / names[-1])
+    return drawn

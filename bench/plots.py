@@ -1,4 +1,4 @@
-"""Benchmarks' figures as pictures: how systems scale with N, and how their times spread."""
+"""Plots of the benchmarks: how systems scale with N, and how their times spread."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def measure(
         seconds: Of each run.
         repeats: Runs of each case.
         rate: Of the camera, Hz.
-        progress: Told what is measured.
+        progress: Called with what is measured.
     """
     found: dict[str, list[_Run]] = {case: [] for case in CASES}
     for number in range(repeats):

@@ -1,4 +1,4 @@
-"""What a picture costs on its way to ROS 2: encoded as the bridge does it, and by rosbags alone.
+"""What an image costs on its way to ROS 2: encoded as the bridge does it, and by rosbags alone.
 
 Both make the same bytes: CDR of a ``sensor_msgs/msg/Image``. Rosbags gets its message ready-made
 and has only to be told the time. Samples are taken in turns, in an order that is drawn each time,
@@ -26,7 +26,7 @@ WARM_UP = 20
 
 
 class RosImageRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One kind of picture.
+    """One kind of image.
 
     Attributes:
         case: Size and encoding.
@@ -50,7 +50,7 @@ class RosImageRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def measure(repeats: int = 300) -> list[RosImageRow]:
-    """Measure a colour picture and a depth image of 512×512.
+    """Measure a colour image and a depth image of 512×512.
 
     Args:
         repeats: Samples of each side.

@@ -1,4 +1,4 @@
-"""How late a 400 Hz controller gets while pictures are fetched: the thesis's table 6.3, done right.
+"""How late a 400 Hz controller gets while images are fetched: the thesis's table 6.3, done right.
 
 A multirotor hovers on the real clock, controlled at 400 Hz, while a 512×512 RGB-D camera at 10 Hz
 is fetched in one of these ways:
@@ -40,7 +40,7 @@ MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker", "fetch inline",
 
 
 class StallRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One way of fetching pictures.
+    """One way of fetching images.
 
     Attributes:
         mode: Which.
@@ -236,8 +236,8 @@ def measure(
         repeats: Runs of each mode; their order is shuffled in each round.
         modes: Which to measure.
         rate: Hertz of the camera.
-        size: Width and height of its pictures.
-        progress: Told what is being measured.
+        size: Width and height of its images.
+        progress: Called with what is being measured.
     """
     _collected.clear()
     shuffle = random.Random(0).shuffle

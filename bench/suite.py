@@ -1,18 +1,14 @@
-"""All benchmarks in one go, and the page that shows them."""
+"""All benchmarks in one go; `bench.page` shows their results."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from bench import bridge, flood, idle, lockstep, recording, ros_images, stall, throughput
 from bench.driver import Outcome, Row, measure_all
-from bench.page import page
-from bench.plots import plot_boxes, plot_scaling
 from bench.results import environment
 from bench.system import NODES, CaseName
 
@@ -39,18 +35,13 @@ QUICK_SYSTEMS = ("visnav", "plain", "asyncio.queue", "pyee", "thesis")
 """Parts of the names of what a quick run measures: what is quick to start."""
 
 
-def run(
-    out: Path, page_path: Path, *, quick: bool, progress: Callable[..., None] = lambda *_: None
-) -> Results:
-    """Measure everything and write the figures, the plots and the page that shows them.
+def measure(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> Results:
+    """Run all benchmarks.
 
     Args:
-        out: Folder for results.json and the plots, made if missing.
-        page_path: The page, Markdown.
         quick: Measure less: under two minutes.
-        progress: Told what is being measured, and the share of its part that is done.
+        progress: Called with what is being measured, and the share of its part that is done.
     """
-    out.mkdir(parents=True, exist_ok=True)
     few = (2, 16, 128)
     outcomes: list[Outcome] = []
     cases: list[tuple[CaseName, Sequence[int]]] = [
@@ -74,7 +65,7 @@ def run(
     through = throughput.measure()
     progress("idle")
     idling = idle.measure(3.0 if quick else 10.0)
-    results = Results(
+    return Results(
         environment=environment(),
         quick=quick,
         rows=[row for outcome in outcomes for row in outcome.rows],
@@ -88,8 +79,6 @@ def run(
         missing={k: v for outcome in outcomes for k, v in outcome.missing.items()},
         versions={k: v for outcome in outcomes for k, v in outcome.versions.items()},
     )
-    write(results, out, page_path)
-    return results
 
 
 def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> dict[str, Any]:
@@ -102,29 +91,3 @@ def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> d
         ),
         "flood": flood.measure(windows=4 if quick else 30, progress=progress),
     }
-
-
-def write(results: Results, out: Path, page_path: Path) -> None:
-    """Write the page of results, its plots, and the figures themselves."""
-    encoded = msgspec.json.format(msgspec.json.encode(results), indent=1)
-    (out / "results.json").write_bytes(encoded + b"\n")
-    pictures = _plots(results.rows, out)
-    folder = os.path.relpath(out, page_path.parent)
-    page_path.write_text(page(results, pictures, folder), encoding="utf-8")
-
-
-def _plots(rows: Sequence[Row], out: Path) -> dict[str, list[str]]:
-    """Draw each case's plots and return their names."""
-    drawn: dict[str, list[str]] = {}
-    for case in dict.fromkeys(row.case for row in rows):
-        own = [row for row in rows if row.case == case]
-        names = drawn.setdefault(case, [])
-        if len({row.nodes for row in own}) > 1:
-            names.append(f"{case}-scaling.png")
-            plot_scaling(own, f"{case} message", out / names[-1])
-        for n in (2, 128):
-            boxed = [row for row in own if row.nodes == n]
-            if boxed:
-                names.append(f"{case}-{n}.png")
-                plot_boxes(boxed, f"{case} message, {n} nodes", out / names[-1])
-    return drawn

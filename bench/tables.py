@@ -130,9 +130,9 @@ def bridge_table(rows: Sequence[BridgeRow]) -> Table:
 
 
 def ros_images_table(rows: Sequence[RosImageRow]) -> Table:
-    """Return what encoding pictures for ROS costs."""
+    """Return what encoding images for ROS costs."""
     table = _table(
-        "encoding for ROS 2 (µs)", "picture", "bytes", "ours", "rosbags", "ratio", "p99", "rosbags'"
+        "encoding for ROS 2 (µs)", "image", "bytes", "ours", "rosbags", "ratio", "p99", "rosbags'"
     )
     for row in rows:
         table.add_row(

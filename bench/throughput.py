@@ -71,8 +71,8 @@ def measure(bursts: int = 400) -> list[ThroughputRow]:
 async def _measure(bursts: int) -> list[ThroughputRow]:
     tasks.install(asyncio.get_running_loop())
     event = Ping(stamp=0, source="one", receiver=2, number=0)
-    picture = np.zeros((512, 512, 3), np.uint8)
-    image = Image(stamp=0, source="drone/front", frame_id="f", data=picture)
+    pixels = np.zeros((512, 512, 3), np.uint8)
+    image = Image(stamp=0, source="drone/front", frame_id="f", data=pixels)
     at_once = "events, stream, reader resumed by each"
     in_one_wake = "events, stream, all in one wake"
     return [
@@ -84,9 +84,9 @@ async def _measure(bursts: int) -> list[ThroughputRow]:
             "images by reference, stream",
             BATCH,
             await _by_stream(image, bursts, soon=False),
-            picture.nbytes,
+            pixels.nbytes,
         ),
-        *await _worker_rows(picture),
+        *await _worker_rows(pixels),
     ]
 
 
@@ -150,7 +150,7 @@ async def _by_stream(event: Event, bursts: int, *, soon: bool) -> float:
     return float(np.median(taken))
 
 
-async def _worker_rows(picture: npt.NDArray[np.uint8]) -> list[ThroughputRow]:
+async def _worker_rows(pixels: npt.NDArray[np.uint8]) -> list[ThroughputRow]:
     loop = asyncio.get_running_loop()
     clock = RealClock(loop)
     worker = Worker("mirror", clock, Mirror)
@@ -161,10 +161,10 @@ async def _worker_rows(picture: npt.NDArray[np.uint8]) -> list[ThroughputRow]:
             taken = []
             for _ in range(100):
                 begin = time.perf_counter_ns()
-                await asyncio.gather(*(worker.call(Mirror.echo, picture) for _ in range(batch)))
+                await asyncio.gather(*(worker.call(Mirror.echo, pixels) for _ in range(batch)))
                 taken.append((time.perf_counter_ns() - begin) / batch)
             case = "images to a worker and back"
-            rows.append(_row(case, batch, float(np.median(taken)), 2 * picture.nbytes))
+            rows.append(_row(case, batch, float(np.median(taken)), 2 * pixels.nbytes))
         return rows
     finally:
         await asyncio.to_thread(worker.close)

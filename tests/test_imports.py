@@ -1,9 +1,12 @@
-"""Imports go one way: events <- runtime <- sims | nodes <- bench, and bridges stay in one place."""
+"""Imports go one way, events <- runtime <- tools | sims | nodes <- bench, and in no circle."""
 
 from __future__ import annotations
 
 import ast
+import re
+import tomllib
 from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -13,10 +16,14 @@ ROOT = Path(__file__).parent.parent
 MAY_IMPORT = {
     "events": {"events"},
     "runtime": {"events", "runtime"},
+    "runtime.tools": {"events", "runtime", "runtime.tools"},
     "sims": {"events", "runtime", "sims"},
-    "nodes": {"events", "runtime", "nodes"},
-    "bench": {"events", "runtime", "sims", "nodes", "bench"},
+    "nodes": {"events", "runtime", "runtime.tools", "nodes"},
+    "bench": {"events", "runtime", "runtime.tools", "sims", "nodes", "bench"},
 }
+"""Room to rooms; `runtime` is its core, without the tools around it."""
+
+PACKAGES = ("events", "runtime", "sims", "nodes", "bench")
 BRIDGES = {
     "glfw",
     "OpenGL",
@@ -33,57 +40,140 @@ PURE = {"asyncio", "socket", "threading"}
 
 
 def imported(source: str, package: str = "") -> set[str]:
-    """Return the modules that a source imports, also inside functions and by relative name."""
+    """Return what a source imports, also inside functions, for types only, and by relative name.
+
+    Also what it names in a string as a module of a room (``"nodes.report"``, ``"sims.x:Y"``),
+    since such a string is there to be imported; docstrings are not.
+    """
     found: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    documentation = {
+        id(node.value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    }
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             parents = package.split(".")[: len(package.split(".")) + 1 - node.level]
             base = ".".join(parents) + "." if node.level else ""
-            found.add(f"{base}{node.module or ''}".strip("."))
             found |= {f"{base}{node.module or ''}.{alias.name}".strip(".") for alias in node.names}
+        elif isinstance(node, ast.Constant) and id(node) not in documentation:
+            found |= named(node.value)
     return found
 
 
-def rooms_of(modules: set[str]) -> set[str]:
-    return {module.partition(".")[0] for module in modules}
+def named(value: object) -> set[str]:
+    """Return the module that a string names, if it is one of a room."""
+    rooms = "|".join(PACKAGES)
+    match = isinstance(value, str) and re.fullmatch(rf"((?:{rooms})(?:\.\w+)+)(:\w+)?", value)
+    return {match[1]} if match and module_of(match[1]) else set()
+
+
+def room(name: str) -> str:
+    """Return the room of a module, or the package of one that is not ours.
+
+    ``python -m runtime`` is the door of the command line, which is one of the tools.
+    """
+    if name == "runtime.__main__" or f"{name}.".startswith("runtime.tools."):
+        return "runtime.tools"
+    return name.partition(".")[0]
 
 
 @cache
-def sources(room: str) -> list[tuple[str, set[str]]]:
-    """Return each module of a room, by path, and what it imports."""
-    found = []
-    for path in sorted((ROOT / room).rglob("*.py")):
-        name = path.relative_to(ROOT)
-        package = ".".join(name.parent.parts)
-        found.append((str(name), imported(path.read_text(encoding="utf-8"), package)))
+def module_names() -> dict[str, Path]:
+    """Return the path of each module of ours, by its name."""
+    found = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
 
 
-@pytest.mark.parametrize("room", MAY_IMPORT)
-def test_no_arrow_points_up(room: str) -> None:
+def module_of(name: str) -> str | None:
+    """Return the module of ours that ``module`` or ``module.attribute`` is in."""
+    if name in module_names():
+        return name
+    parent = name.rpartition(".")[0]
+    return parent if parent in module_names() else None
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """Return what each module of ours imports: modules, or attributes of them."""
+    found = {}
+    for name, path in module_names().items():
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        found[name] = imported(path.read_text(encoding="utf-8"), package)
+    return found
+
+
+def of_room(where: str) -> Iterator[tuple[str, set[str]]]:
+    return ((name, found) for name, found in imports().items() if room(name) == where)
+
+
+def circles(graph: Mapping[str, Iterable[str]]) -> list[set[str]]:
+    """Return the groups of modules each of which is reached from each other of its group."""
+
+    def reached(start: str) -> set[str]:
+        found: set[str] = set()
+        ahead = [start]
+        while ahead:
+            new = set(graph[ahead.pop()]) - found
+            found |= new
+            ahead += new
+        return found
+
+    reach = {name: reached(name) for name in graph}
+    groups: list[set[str]] = []
+    for name, found in reach.items():
+        if name in found and not any(name in group for group in groups):
+            groups.append({name} | {other for other in found if name in reach[other]})
+    return groups
+
+
+@pytest.mark.parametrize("where", MAY_IMPORT)
+def test_no_arrow_points_up(where: str) -> None:
+    others = {*MAY_IMPORT, "tests", "examples"} - MAY_IMPORT[where]
     upwards = {
-        name: wrong
-        for name, modules in sources(room)
-        if (wrong := rooms_of(modules) & {*MAY_IMPORT, "tests", "examples"} - MAY_IMPORT[room])
+        name: wrong for name, found in of_room(where) if (wrong := set(map(room, found)) & others)
     }
     assert upwards == {}
 
 
+def test_no_circle_closes() -> None:
+    graph = {
+        name: {each for target in found if (each := module_of(target))} - {name}
+        for name, found in imports().items()
+    }
+    assert circles(graph) == []
+
+
+def test_entry_points_name_modules_of_ours() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    groups = project["entry-points"]
+    modules = [value.partition(":")[0] for group in groups.values() for value in group.values()]
+    assert [name for name in modules if name not in module_names()] == []
+    nodes = {value.partition(".")[0] for value in groups["visnav.nodes"].values()}
+    assert nodes == {"sims", "nodes"}
+
+
 def test_events_import_nothing_that_waits_or_talks() -> None:
-    assert {name: found for name, m in sources("events") if (found := rooms_of(m) & PURE)} == {}
+    impure = {name: wrong for name, m in of_room("events") if (wrong := set(map(room, m)) & PURE)}
+    assert impure == {}
 
 
-@pytest.mark.parametrize("room", sorted(MAY_IMPORT.keys() - {"bench"}))
-def test_a_bridge_is_imported_in_one_module_of_a_room_only(room: str) -> None:
-    """A room for two: Zenoh carries both a run's own events and ROS's. (A benchmark's peers each
-    import what they measure.)"""
-    where = defaultdict(set)
-    for name, modules in sources(room):
-        for bridge in rooms_of(modules) & BRIDGES:
-            where[bridge].add(name)
-    assert {bridge: names for bridge, names in where.items() if len(names) > 1} == {}
+@pytest.mark.parametrize("where", sorted(MAY_IMPORT.keys() - {"bench"}))
+def test_a_bridge_is_imported_in_one_module_of_a_room_only(where: str) -> None:
+    """Zenoh carries both a run's own events and ROS's, in a room each. (Each system that the
+    benchmarks measure has a module of its own.)"""
+    users = defaultdict(set)
+    for name, found in of_room(where):
+        for bridge in set(map(room, found)) & BRIDGES:
+            users[bridge].add(name)
+    assert {bridge: names for bridge, names in users.items() if len(names) > 1} == {}
 
 
 @pytest.mark.parametrize(
@@ -95,12 +185,33 @@ def test_a_bridge_is_imported_in_one_module_of_a_room_only(room: str) -> None:
         ("if TYPE_CHECKING:\n    import sims", {"sims"}),
         ("from . import other", {"runtime"}),
         ("from .cli import run", {"runtime"}),
+        ("from .tools.cli import run", {"runtime.tools"}),
         ("text = 'import sims'", set()),
+        ("f('nodes.evaluation')", {"nodes"}),
+        ("f('sims.multirotor:Multirotor')", {"sims"}),
+        ("f('nodes.nothing_of_ours.at_all')", set()),
+        ("'''nodes.evaluation'''", set()),
     ],
 )
 def test_imports_are_found_wherever_they_stand(source: str, found: set[str]) -> None:
-    assert rooms_of(imported(source, "runtime")) == found
+    assert set(map(room, imported(source, "runtime"))) == found
+
+
+@pytest.mark.parametrize(
+    ("graph", "found"),
+    [
+        ({"a": ["b"], "b": ["c"], "c": []}, []),
+        ({"a": ["b", "c"], "b": ["c"], "c": []}, []),
+        ({"a": ["b"], "b": ["c"], "c": ["b"]}, [{"b", "c"}]),
+        (
+            {"a": ["b"], "b": ["c"], "c": ["a"], "d": ["e"], "e": ["d"]},
+            [{"a", "b", "c"}, {"d", "e"}],
+        ),
+    ],
+)
+def test_circles_are_found(graph: dict[str, list[str]], found: list[set[str]]) -> None:
+    assert circles(graph) == found
 
 
 def test_every_room_has_modules_to_look_at() -> None:
-    assert [room for room in MAY_IMPORT if len(sources(room)) < 2] == []
+    assert [where for where in MAY_IMPORT if len(list(of_room(where))) < 2] == []

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.peers import compiled, ros1, thesis_client
-from bench.peers.ros1_graph import GraphError, graph
 from bench.system import Case, CaseName, System
+from bench.systems import compiled, ros1, thesis_client
+from bench.systems.ros1_graph import GraphError, graph
 
 SYSTEMS = (*thesis_client.SYSTEMS, *ros1.SYSTEMS)
 
@@ -101,7 +101,7 @@ def test_graph_ends_its_nodes_when_one_fails(roscpp: System) -> None:
 
 def test_nothing_outlives_the_measuring_process(roscpp: System) -> None:
     code = (
-        "from bench.peers.ros1_graph import graph\n"
+        "from bench.systems.ros1_graph import graph\n"
         "with graph() as ros:\n"
         "    print(ros.start(['sleep', '60']).pid, flush=True)\n"
         "    input()\n"

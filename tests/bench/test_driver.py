@@ -87,7 +87,7 @@ def test_an_unknown_system_is_said_to_be_unknown() -> None:
     from bench.measure import find
 
     with pytest.raises(LookupError, match=r"expected one of .*plain calls.*, found .plane calls."):
-        find("bench.peers.plain", "plane calls")
+        find("bench.systems.plain", "plane calls")
 
 
 def test_the_last_line_of_a_failure_is_its_reason() -> None:

@@ -11,8 +11,9 @@ from bench.bridge import BridgeRow
 from bench.driver import Row
 from bench.idle import IdleRow
 from bench.lockstep import LockstepRow
+from bench.page import write
 from bench.stall import StallRow
-from bench.suite import Results, write
+from bench.suite import Results
 from bench.throughput import ThroughputRow
 
 
@@ -104,7 +105,7 @@ def test_the_page_says_first_what_its_numbers_do_not_show(tmp_path: Path) -> Non
     assert text.rstrip().endswith("- trio channels: not installed")
 
 
-def test_the_pictures_on_the_page_exist(tmp_path: Path) -> None:
+def test_the_plots_on_the_page_exist(tmp_path: Path) -> None:
     """Links lead from the page to plots in another folder."""
     out = tmp_path / "results"
     out.mkdir()
@@ -116,7 +117,7 @@ def test_the_pictures_on_the_page_exist(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_each_picture_stands_once_under_its_own_case(tmp_path: Path) -> None:
+def test_each_plot_stands_once_under_its_own_case(tmp_path: Path) -> None:
     """``large`` and ``large-shared`` begin alike, and yet do not share their pictures."""
     measured = results()
     cases = ("small", "large", "large-shared")

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
-from bench.peers.compiled import KEEP_MEMORY, guarded
+from bench.systems.compiled import KEEP_MEMORY, guarded
 
 MASTER = Path("/usr/bin/rosmaster")
 
@@ -40,12 +40,12 @@ class Graph:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         self._uri = f"http://127.0.0.1:{port}"
-        self._said: dict[int, IO[bytes]] = {}
+        self._outputs: dict[int, IO[bytes]] = {}
         self._await_master(self.start([MASTER, "--core", "-p", str(port)]))
 
     def start(self, command: Sequence[str | Path]) -> subprocess.Popen[bytes]:
         """Start a node; it is ended with the graph at the latest."""
-        said = self._stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
+        output = self._stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
         environment = {
             # Of this Python's packages Debian's is to see nothing.
             **{k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "ROS_"))},
@@ -57,10 +57,14 @@ class Graph:
             "TMPDIR": str(self.directory),
         }
         process = subprocess.Popen(
-            guarded(command), env=environment, stdin=subprocess.DEVNULL, stdout=said, stderr=said
+            guarded(command),
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
         )
         self._stack.callback(_end, process)
-        self._said[process.pid] = said
+        self._outputs[process.pid] = output
         return process
 
     def finish(
@@ -105,9 +109,9 @@ class Graph:
         raise self._error(process, "expected to answer within 20 s")
 
     def _error(self, process: subprocess.Popen[bytes], what: str) -> GraphError:
-        said = self._said[process.pid]
-        said.seek(0)
-        text = said.read().decode(errors="replace").strip()[-2000:]
+        output = self._outputs[process.pid]
+        output.seek(0)
+        text = output.read().decode(errors="replace").strip()[-2000:]
         return GraphError(f"{process.args!r} {what}: {text}")
 
 

@@ -11,7 +11,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from bench.peers.compiled import (
+from bench.system import Case, Samples, System
+from bench.systems.compiled import (
     Program,
     arguments,
     build,
@@ -21,7 +22,6 @@ from bench.peers.compiled import (
     read,
     run,
 )
-from bench.system import Case, Samples, System
 
 PROGRAM = Program(source="thesis_client.cpp")
 

@@ -20,9 +20,9 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from bench.messages import Ping, Pong
-from bench.peers.children import ALL, PATIENCE, PeerError
-from bench.peers.parts import needs, payloads, versions
 from bench.system import Case, Samples, System
+from bench.systems.children import ALL, PATIENCE, PeerError
+from bench.systems.parts import needs, payloads, versions
 
 _BUFFER = 1 << 23
 _Method = TypeVar("_Method", bound=Callable[..., Any])

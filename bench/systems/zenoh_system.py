@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.peers.children import PING, PONG, Job, PeerError, children, number_of, reply_to
-from bench.peers.parts import needs, versions
 from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+from bench.systems.children import PING, PONG, Job, PeerError, children, number_of, reply_to
+from bench.systems.parts import needs, versions
 
 
 def config(zenoh: Any, **endpoints: str) -> Any:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.peers import children
 from bench.system import Case
-from tests.bench.peers import echo
+from bench.systems import children
+from tests.bench.systems import echo
 
 ROOT = Path(__file__).parents[3]
 
@@ -41,7 +41,7 @@ def test_silence_ends_in_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_children_end_with_the_measuring_process(how: signal.Signals) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.bench.peers.echo", ""],
+        [sys.executable, "-m", "tests.bench.systems.echo", ""],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

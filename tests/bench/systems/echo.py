@@ -5,8 +5,8 @@ from __future__ import annotations
 import socket
 import sys
 
-from bench.peers.children import PING, Job, children, number_of, reply_to
 from bench.system import Case, Samples
+from bench.systems.children import PING, Job, children, number_of, reply_to
 
 
 def serve(job: Job) -> None:

@@ -15,8 +15,8 @@ import numpy as np
 import uvloop
 
 from bench.messages import Ping, Pong
-from bench.peers.parts import payloads, versions
 from bench.system import Case, Samples, System
+from bench.systems.parts import payloads, versions
 
 
 async def _listen(number: int, pings: asyncio.Queue[Ping], pongs: asyncio.Queue[Pong]) -> None:

@@ -17,7 +17,8 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-from bench.peers.compiled import (
+from bench.system import Case, Samples, System
+from bench.systems.compiled import (
     Program,
     arguments,
     build,
@@ -25,8 +26,7 @@ from bench.peers.compiled import (
     missing_compiler,
     read,
 )
-from bench.peers.ros1_graph import MASTER, graph
-from bench.system import Case, Samples, System
+from bench.systems.ros1_graph import MASTER, graph
 
 PYTHON = Path("/usr/bin/python3")
 PACKAGES = Path("/usr/lib/python3/dist-packages")

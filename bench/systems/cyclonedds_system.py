@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.peers.children import ALL, Job, children
-from bench.peers.parts import needs, versions
 from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+from bench.systems.children import ALL, Job, children
+from bench.systems.parts import needs, versions
 
 _BYTES = int(np.prod(LARGE_SHAPE)) * 4
 

@@ -1,7 +1,7 @@
 """Helper programs: compiling them into a cache, running them, and reading their samples.
 
-Sources are in ``bench/peers/cpp``. A program is compiled again when a source, the compiler or what
-it is linked with has changed. Programs write their samples as raw int64.
+Sources are in ``bench/systems/cpp``. A program is compiled again when a source, the compiler or
+what it is linked with has changed. Programs write their samples as raw int64.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from bench.messages import Ping, Pong
-from bench.peers.parts import needs, payloads, versions
 from bench.system import Case, Samples, System
+from bench.systems.parts import needs, payloads, versions
 
 
 def measure(case: Case) -> Samples:

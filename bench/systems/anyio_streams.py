@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from bench.messages import Ping, Pong
-from bench.peers.parts import needs, payloads, versions
 from bench.system import Case, Samples, System
+from bench.systems.parts import needs, payloads, versions
 
 
 async def _listen(number: int, pings: Any, pongs: Any) -> None:

@@ -1,9 +1,9 @@
 """asyncio-for-robotics over Zenoh, on uvloop: in one session, and between processes over TCP.
 
 Nodes wait in `Sub.listen_reliable`, which skips nothing, and send with Zenoh itself, as the library
-means it. Messages, sessions and their settings are those of `bench.peers.zenoh_peer`; Zenoh hands
-them to a thread, and that to the loop, in one process too; there, as between processes, the last
-node's reply may be there before all others have the ping.
+means it. Messages, sessions and their settings are those of `bench.systems.zenoh_system`; Zenoh
+hands them to a thread, and that to the loop, in one process too; there, as between processes, the
+last node's reply may be there before all others have the ping.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import uvloop
 
-from bench.peers.children import ALL, PATIENCE, Job, PeerError, children, number_of, reply_to
-from bench.peers.parts import needs, versions
-from bench.peers.zenoh_peer import config, free_locator, header, pinger, publisher
 from bench.system import Case, Samples, System
+from bench.systems.children import ALL, PATIENCE, Job, PeerError, children, number_of, reply_to
+from bench.systems.parts import needs, versions
+from bench.systems.zenoh_system import config, free_locator, header, pinger, publisher
 
 
 async def _listen(node: int, session: Any, *, large: bool) -> None:

@@ -1,4 +1,4 @@
-"""What the peers' modules share: which packages are here, and what pings carry."""
+"""What the modules of systems share: which packages are here, and what pings carry."""
 
 from __future__ import annotations
 

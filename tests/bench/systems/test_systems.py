@@ -12,12 +12,12 @@ import msgspec
 import numpy as np
 import pytest
 
-import bench.peers
+import bench.systems
 from bench.system import Case, System
 
 ROOT = Path(__file__).parents[3]
 MODULES = sorted(
-    f"bench.peers.{module.name}" for module in pkgutil.iter_modules(bench.peers.__path__)
+    f"bench.systems.{module.name}" for module in pkgutil.iter_modules(bench.systems.__path__)
 )
 SYSTEMS: list[tuple[str, System]] = [
     (module, system)
@@ -43,7 +43,7 @@ def test_names_are_unique() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("module", MODULES)
-def test_importing_a_module_does_not_import_its_peer(module: str) -> None:
+def test_importing_a_module_does_not_import_its_system(module: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", IMPORTED.format(module=module)],
         cwd=ROOT,

@@ -1,7 +1,7 @@
 """iceoryx2 between processes, in shared memory: polled, or woken by its events.
 
 A ping is written into memory that the publisher lends, and read where it lies. ``large`` copies the
-array into it; ``large-shared`` writes the header only, as a producer would that makes its pictures
+array into it; ``large-shared`` writes the header only, as a producer would that makes its images
 in lent memory. Publishers wait rather than drop. Polling keeps a core busy a node, and is measured
 for no more nodes than there are cores; with events each node sleeps in a listener.
 """
@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.peers.children import ALL, Job, children
-from bench.peers.parts import needs, versions
 from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+from bench.systems.children import ALL, Job, children
+from bench.systems.parts import needs, versions
 
 _BYTES = int(np.prod(LARGE_SHAPE)) * 4
 _POLLS = 100_000

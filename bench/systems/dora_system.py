@@ -22,7 +22,8 @@ from typing import Any
 
 import msgspec
 
-from bench.peers.children import (
+from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+from bench.systems.children import (
     PATIENCE,
     PING,
     Crew,
@@ -32,8 +33,7 @@ from bench.peers.children import (
     number_of,
     reply_to,
 )
-from bench.peers.parts import needs, versions
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+from bench.systems.parts import needs, versions
 
 _DORA = (sys.executable, "-c", "import sys, dora_cli; sys.exit(dora_cli.py_main())")
 _POOL = 1 << 26
@@ -148,8 +148,8 @@ def run(number: int, case: str) -> None:
         header = array
         if case != "small":
             array.reshape(LARGE_SHAPE)
-            said = event["metadata"]
-            header = PING.pack(said["stamp"], 1, said["receiver"], said["number"])
+            metadata = event["metadata"]
+            header = PING.pack(metadata["stamp"], 1, metadata["receiver"], metadata["number"])
         pong = reply_to(number, header)
         if pong is not None:
             node.send_output("pong", pong)
@@ -190,8 +190,8 @@ def _exchange(case: Case, crew: Crew, port: int) -> Samples:
         node.send_output("ping", PING.pack(stamp, 1, receiver, number))
 
     def send_large(stamp: int, receiver: int, number: int) -> None:
-        said = {"stamp": stamp, "receiver": receiver, "number": number}
-        node.send_output("ping", pyarrow.array(array), said)
+        metadata = {"stamp": stamp, "receiver": receiver, "number": number}
+        node.send_output("ping", pyarrow.array(array), metadata)
 
     def receive() -> int | None:
         event = node.next(timeout=1.0)

@@ -1,9 +1,10 @@
 """Nodes in processes of their own: starting and ending them, and the exchange with them.
 
-Node 1 is the measuring process. The others run ``python -m bench.peers.children MODULE JOB``, which
-calls `serve` of a peer's module; they end with the block that started them, or when the measuring
-process is gone for whatever reason. Headers of pings and pongs are packed structs. A round trip
-ends when the last node's reply is there; others may still be on the way to having the ping.
+Node 1 is the measuring process. The others run ``python -m bench.systems.children MODULE JOB``,
+which calls `serve` of a system's module; they end with the block that started them, or when the
+measuring process is gone for whatever reason. Headers of pings and pongs are packed structs. A
+round trip ends when the last node's reply is there; others may still be on the way to having the
+ping.
 
 Before anything is measured, node 1 calls the roll until all have answered, so that a subscription
 that is still on its way loses no ping.
@@ -90,10 +91,10 @@ class Crew:
         Raises:
             PeerError: A process has ended, or the waiting has taken too long.
         """
-        for node, (process, said) in self._nodes.items():
+        for node, (process, output) in self._nodes.items():
             if process.poll() is not None:
-                said.seek(0)
-                text = said.read().decode(errors="replace").strip()[-2000:]
+                output.seek(0)
+                text = output.read().decode(errors="replace").strip()[-2000:]
                 raise PeerError(f"node {node} ended with {process.returncode}: {text}")
         if time.perf_counter_ns() - since > PATIENCE * 1e9:
             raise PeerError(f"{awaited}: nothing came for {PATIENCE:g} s")
@@ -140,14 +141,14 @@ def children(module: str, case: Case, address: str, variant: str = "") -> Iterat
         stack.callback(_end, nodes)
         for node in range(2, case.nodes + 1):
             job = Job(node=node, nodes=case.nodes, case=case.case, address=address, variant=variant)
-            said = stack.enter_context(tempfile.TemporaryFile())
+            output = stack.enter_context(tempfile.TemporaryFile())
             process = subprocess.Popen(
                 [sys.executable, "-m", __name__, module, msgspec.json.encode(job).decode()],
                 stdin=subprocess.PIPE,
-                stdout=said,
-                stderr=said,
+                stdout=output,
+                stderr=output,
             )
-            nodes[node] = process, said
+            nodes[node] = process, output
         yield Crew(nodes)
 
 

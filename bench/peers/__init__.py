@@ -1,5 +1,0 @@
-"""What this runtime is measured beside: one module a peer, each with a `SYSTEMS` tuple.
-
-A module must import without its peer being installed; `System.missing` says what is. Nothing here
-is needed to use the project.
-"""
