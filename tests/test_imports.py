@@ -40,35 +40,39 @@ PURE = {"asyncio", "socket", "threading"}
 
 
 def imported(source: str, package: str = "") -> set[str]:
-    """Return what a source imports, also inside functions, for types only, and by relative name.
-
-    Also what it names in a string as a module of a room (``"nodes.report"``, ``"sims.x:Y"``),
-    since such a string is there to be imported; docstrings are not.
-    """
+    """Return what a source imports, also inside functions, for types only, and by relative name."""
     found: set[str] = set()
-    tree = ast.parse(source)
-    documentation = {
-        id(node.value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-    }
-    for node in ast.walk(tree):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             parents = package.split(".")[: len(package.split(".")) + 1 - node.level]
             base = ".".join(parents) + "." if node.level else ""
             found |= {f"{base}{node.module or ''}.{alias.name}".strip(".") for alias in node.names}
-        elif isinstance(node, ast.Constant) and id(node) not in documentation:
-            found |= named(node.value)
     return found
 
 
-def named(value: object) -> set[str]:
-    """Return the module that a string names, if it is one of a room."""
-    rooms = "|".join(PACKAGES)
-    match = isinstance(value, str) and re.fullmatch(rf"((?:{rooms})(?:\.\w+)+)(:\w+)?", value)
-    return {match[1]} if match and module_of(match[1]) else set()
+def named(source: str) -> set[str]:
+    """Return the modules of ours that strings name: ``"nodes.report"``, ``"sims.x:Y"``.
+
+    Such a string is there to be imported later, or by another process; docstrings are not.
+    """
+    tree = ast.parse(source)
+    documentation = {
+        id(node.value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    }
+    strings = (
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and id(node) not in documentation
+    )
+    pattern = re.compile(rf"((?:{'|'.join(PACKAGES)})(?:\.\w+)+)(:\w+)?")
+    matches = filter(None, map(pattern.fullmatch, strings))
+    return {match[1] for match in matches if module_of(match[1])}
 
 
 def room(name: str) -> str:
@@ -143,6 +147,17 @@ def test_no_arrow_points_up(where: str) -> None:
     assert upwards == {}
 
 
+@pytest.mark.parametrize("where", MAY_IMPORT)
+def test_no_string_points_up(where: str) -> None:
+    others = MAY_IMPORT.keys() - MAY_IMPORT[where]
+    upwards = {
+        name: wrong
+        for name, _ in of_room(where)
+        if (wrong := set(map(room, named(module_names()[name].read_text("utf-8")))) & others)
+    }
+    assert upwards == {}
+
+
 def test_no_circle_closes() -> None:
     graph = {
         name: {each for target in found if (each := module_of(target))} - {name}
@@ -187,14 +202,24 @@ def test_a_bridge_is_imported_in_one_module_of_a_room_only(where: str) -> None:
         ("from .cli import run", {"runtime"}),
         ("from .tools.cli import run", {"runtime.tools"}),
         ("text = 'import sims'", set()),
-        ("f('nodes.evaluation')", {"nodes"}),
-        ("f('sims.multirotor:Multirotor')", {"sims"}),
-        ("f('nodes.nothing_of_ours.at_all')", set()),
-        ("'''nodes.evaluation'''", set()),
     ],
 )
 def test_imports_are_found_wherever_they_stand(source: str, found: set[str]) -> None:
     assert set(map(room, imported(source, "runtime"))) == found
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("f('nodes.evaluation')", {"nodes.evaluation"}),
+        ("f('sims.multirotor:Multirotor')", {"sims.multirotor"}),
+        ("f('nodes.nothing_of_ours.at_all')", set()),
+        ("f('see nodes.evaluation')", set()),
+        ("'''nodes.evaluation'''", set()),
+    ],
+)
+def test_modules_are_found_in_strings(source: str, found: set[str]) -> None:
+    assert named(source) == found
 
 
 @pytest.mark.parametrize(
