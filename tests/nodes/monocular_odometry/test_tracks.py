@@ -1,4 +1,4 @@
-"""Corners on their way: what is kept of them, and how they are followed."""
+"""Corners: where new ones are found, and what is kept of them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,9 @@ import numpy as np
 
 from nodes.monocular_odometry.corners import SPACING, new_corners
 from nodes.monocular_odometry.tracks import Tracks
-from nodes.odometry.flow import follow_both_ways
-from nodes.odometry.images import inside
-from tests.nodes.monocular_odometry.world import FLAT, INFO, look, pose
+from tests.nodes.monocular_odometry.world import FLAT, look, pose
 
-HERE, THERE = look(pose(), FLAT), look(pose(x=0.1), FLAT)
-SHIFT = -0.1 / 2.0 * INFO.fx
-"""Columns by which the floor moves between the two pictures."""
+HERE = look(pose(), FLAT)
 
 
 def test_tracks_remember_their_views_and_hand_over_landmarks_that_leave() -> None:
@@ -38,24 +34,3 @@ def test_corners_keep_away_from_each_other_and_from_those_that_are_taken() -> No
     assert gaps.min() > SPACING - 1
     assert len(some) == 40
     assert new_corners(np.zeros_like(HERE), some, 40).shape == (0, 2)
-
-
-def test_corners_are_followed_to_where_the_floor_has_moved() -> None:
-    corners = new_corners(HERE, np.empty((0, 2)), 60)
-    corners = corners[corners[:, 0] > 40]
-    for guess, levels in ((corners, 3), (corners + np.array([SHIFT + 2, 1.0]), 1)):
-        found, good = follow_both_ways(HERE, THERE, corners, guess, 15, levels)
-        assert good.mean() > 0.9
-        np.testing.assert_allclose(found[good] - corners[good], [[SHIFT, 0]] * good.sum(), atol=0.2)
-
-
-def test_a_corner_that_does_not_come_back_is_not_good() -> None:
-    corners = new_corners(HERE, np.empty((0, 2)), 60)
-    strange = look(pose(x=5.0, y=3.0), FLAT)
-    _, good = follow_both_ways(HERE, strange, corners, corners, 15, 1)
-    assert good.mean() < 0.3
-
-
-def test_the_rim_is_not_inside() -> None:
-    pixels = np.array([[3.0, 3.0], [2.9, 3.0], [6.9, 4.0], [7.0, 4.0], [5.0, 5.0]])
-    assert inside(pixels, (8, 10), 3).tolist() == [True, False, True, False, False]

@@ -10,7 +10,7 @@ from events import EstimatorAnnouncement, Event
 from nodes.orb_slam3 import OrbSlam3
 from runtime.errors import NodeError, RefusedError
 from runtime.testing import run_nodes, spec
-from tests.nodes.test_estimation import camera
+from tests.nodes.estimation.test_estimator import camera
 
 
 def announced(mode: str) -> EstimatorAnnouncement:

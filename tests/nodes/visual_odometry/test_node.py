@@ -13,7 +13,7 @@ from nodes.monocular_odometry import MonocularOdometry
 from nodes.visual_odometry import VisualOdometry
 from runtime import Node, Output, Tick, every
 from runtime.testing import run_nodes, spec
-from tests.nodes.test_estimation import LOOKING_AHEAD, MS, camera, vehicle
+from tests.nodes.estimation.test_estimator import LOOKING_AHEAD, MS, camera, vehicle
 from tests.nodes.visual_odometry.world import INFO, look, pose
 from tests.runtime.samples_runs import supervise
 
