@@ -1,6 +1,6 @@
 """Visual odometry of a single camera: sparse, semi-direct, with local bundle adjustment.
 
-`odometry` is the method, `initialization` makes its first map, `local_map` extends it; `tracks` has
+`tracker` is the method, `initialization` makes its first map, `local_map` extends it; `tracks` has
 the corners, `views` and `bundle` the geometry, `node` the node.
 """
 

@@ -1,6 +1,6 @@
 """The map: the last key frames, the corners followed from the newest one, and their points.
 
-Poses between key frames are computed in `nodes.monocular_odometry.odometry`.
+Poses between key frames are computed in `nodes.monocular_odometry.tracker`.
 """
 
 from __future__ import annotations

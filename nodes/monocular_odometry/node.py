@@ -8,8 +8,8 @@ import cv2
 
 from events import CameraInfo, Image
 from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig
-from nodes.monocular_odometry.odometry import MonocularOdometry as Odometry
 from nodes.monocular_odometry.settings import MonocularSettings
+from nodes.monocular_odometry.tracker import MonocularTracker
 from runtime import Bundle
 
 
@@ -23,10 +23,10 @@ class MonocularOdometryConfig(EstimatorConfig):
     """Settings of monocular odometry.
 
     Attributes:
-        settings: Settings of the method.
+        tracker: Settings of the tracker.
     """
 
-    settings: MonocularSettings = MonocularSettings()
+    tracker: MonocularSettings = MonocularSettings()
 
 
 class MonocularOdometry(Estimator[MonocularOdometryConfig]):
@@ -39,11 +39,11 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
     frames = Bundle(Frame, keep="latest")
 
     async def on_ready(self) -> None:
-        """Start the odometry, in a process of its own."""
-        self._odometry = await self.worker(
-            make_odometry,
+        """Start the tracker, in a process of its own."""
+        self._tracker = await self.worker(
+            make_tracker,
             self.the_camera().info,
-            self.config.settings,
+            self.config.tracker,
             latency=self.config.latency,
             env=WORKER_ENVIRONMENT,
         )
@@ -51,12 +51,12 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
     async def run(self) -> None:
         """Track each image; nothing is sent until there is a map."""
         async for (image,) in self.frames:
-            result = await self._odometry.call(Odometry.track, image.stamp, image.data)
+            result = await self._tracker.call(MonocularTracker.track, image.stamp, image.data)
             if result is not None:
                 self.publish(image, result)
 
 
-def make_odometry(info: CameraInfo, settings: MonocularSettings) -> Odometry:
-    """Make the odometry in the process that will run it."""
+def make_tracker(info: CameraInfo, settings: MonocularSettings) -> MonocularTracker:
+    """Make the tracker in the process that will run it."""
     cv2.setNumThreads(1)
-    return Odometry(info, settings)
+    return MonocularTracker(info, settings)

@@ -40,7 +40,7 @@ class DenseSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     reset_timeout: Annotated[float, msgspec.Meta(ge=0)] = 1.0
 
 
-class DenseOdometry:
+class DenseTracker:
     """Tracks an RGB-D camera from key frame to key frame. Equal images give equal poses.
 
     Args:

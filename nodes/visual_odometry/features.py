@@ -129,7 +129,7 @@ class MapMatch(msgspec.Struct, frozen=True, eq=False):
         return float(self.agree.sum()) / (len(self.rows) + len(self.missed))
 
 
-class FeatureOdometry:
+class FeatureTracker:
     """Tracks an RGB-D camera. Equal images give equal poses, to the bit.
 
     Args:

@@ -17,8 +17,8 @@ from nodes.estimation import (
     TrackingResult,
 )
 from nodes.odometry.images import Depth
-from nodes.visual_odometry.dense import DenseOdometry, DenseSettings
-from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
+from nodes.visual_odometry.dense import DenseSettings, DenseTracker
+from nodes.visual_odometry.features import FeatureSettings, FeatureTracker
 from runtime import Bundle
 
 
@@ -85,5 +85,5 @@ def make_tracker(config: VisualOdometryConfig, info: CameraInfo) -> Tracker:
     """Make the tracker that the settings ask for, in the process that will run it."""
     cv2.setNumThreads(1)
     if config.method == "dense":
-        return DenseOdometry(info, config.dense)
-    return FeatureOdometry(info, config.features)
+        return DenseTracker(info, config.dense)
+    return FeatureTracker(info, config.features)

@@ -74,4 +74,4 @@ def test_it_says_that_its_scale_is_free_and_nothing_before_it_has_a_map() -> Non
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):
-        run_node(MonocularOdometry, config={"settings": settings})
+        run_node(MonocularOdometry, config={"tracker": settings})

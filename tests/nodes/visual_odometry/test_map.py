@@ -9,7 +9,7 @@ from events.poses import inverse
 from nodes.odometry.images import Floats
 from nodes.odometry.pose import rays
 from nodes.visual_odometry.corners import find_corners, squares
-from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
+from nodes.visual_odometry.features import FeatureSettings, FeatureTracker
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import find_patches
 from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
@@ -171,7 +171,7 @@ def test_forgetting_a_key_frame_leaves_the_others_as_they_were() -> None:
 
 
 def test_few_key_frames_remembered_do_for_a_path() -> None:
-    tracker = FeatureOdometry(INFO, FeatureSettings(keyframes=2, keyframe_shift=8.0))
+    tracker = FeatureTracker(INFO, FeatureSettings(keyframes=2, keyframe_shift=8.0))
     for index in range(30):
         there = pose(x=0.02 * index, yaw=0.2 * index)
         said = tracker.track(index * 33_000_000, *look(there))
@@ -180,7 +180,7 @@ def test_few_key_frames_remembered_do_for_a_path() -> None:
 
 
 def test_pictures_without_depth_are_followed_on_the_map_there_is() -> None:
-    tracker = FeatureOdometry(INFO)
+    tracker = FeatureTracker(INFO)
     for index in range(12):
         image, depth = look(there := pose(x=0.02 * index))
         said = tracker.track(index * 33_000_000, image, depth if index < 3 else depth * np.inf)
@@ -189,7 +189,7 @@ def test_pictures_without_depth_are_followed_on_the_map_there_is() -> None:
 
 
 def test_a_lost_camera_finds_a_key_frame_that_optical_flow_does_not_reach() -> None:
-    tracker = FeatureOdometry(INFO, FeatureSettings(keyframe_shift=30.0))
+    tracker = FeatureTracker(INFO, FeatureSettings(keyframe_shift=30.0))
     for index in range(28):
         tracker.track(index * 33_000_000, *look(pose(x=0.12 * index)))
     dark = np.zeros((240, 320), np.uint8), np.full((240, 320), np.inf, np.float32)

@@ -11,13 +11,13 @@ import pytest
 from events import CameraInfo
 from nodes.estimation import TrackingResult
 from nodes.odometry.images import Floats
-from nodes.visual_odometry.dense import DenseOdometry
-from nodes.visual_odometry.features import FeatureOdometry, FeatureSettings
+from nodes.visual_odometry.dense import DenseTracker
+from nodes.visual_odometry.features import FeatureSettings, FeatureTracker
 from nodes.visual_odometry.node import Tracker
 from tests.nodes.visual_odometry.world import INFO, look, pose
 
 Make = Callable[[CameraInfo], Tracker]
-METHODS = pytest.mark.parametrize("make", [FeatureOdometry, DenseOdometry])
+METHODS = pytest.mark.parametrize("make", [FeatureTracker, DenseTracker])
 FRAME = 33_000_000
 
 
@@ -118,7 +118,7 @@ def test_darkness_from_the_start_is_lost_until_something_is_seen(make: Make) -> 
 
 
 def test_features_find_a_place_again_that_they_were_carried_to() -> None:
-    tracker, path = FeatureOdometry(INFO), RIGHT
+    tracker, path = FeatureTracker(INFO), RIGHT
     follow(tracker, path)
     dark = np.zeros((240, 320), np.uint8), np.full((240, 320), np.inf, np.float32)
     tracker.track(20 * FRAME, *dark)
@@ -130,7 +130,7 @@ def test_features_find_a_place_again_that_they_were_carried_to() -> None:
 
 def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
     settings = FeatureSettings(reset_timeout=0.1)
-    tracker = FeatureOdometry(INFO, settings)
+    tracker = FeatureTracker(INFO, settings)
     follow(tracker, RIGHT)
     strange = pose(x=40.0)  # past the wall's end there is none
     far = pose(x=-6.0, y=6.0)  # another part of the wall
@@ -142,6 +142,6 @@ def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
 
 
 def test_features_tell_what_they_followed() -> None:
-    *_, said = follow(FeatureOdometry(INFO), RIGHT)
+    *_, said = follow(FeatureTracker(INFO), RIGHT)
     assert said.points.shape == (len(said.inliers), 2)
     assert said.inliers.sum() > 50

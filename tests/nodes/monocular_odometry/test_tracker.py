@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from nodes.estimation import TrackingResult
-from nodes.monocular_odometry.odometry import MonocularOdometry
 from nodes.monocular_odometry.settings import MonocularSettings
+from nodes.monocular_odometry.tracker import MonocularTracker
 from tests.nodes.monocular_odometry.world import (
     BOARD,
     FLAT,
@@ -38,7 +38,7 @@ def pictures(path: list[Place], tiles: tuple[Tile, ...] = RELIEF) -> list[Grey]:
     return [seen(place, tiles) for place in path]
 
 
-def follow(odometry: MonocularOdometry, images: list[Grey], start: int = 0) -> list[TrackingResult]:
+def follow(odometry: MonocularTracker, images: list[Grey], start: int = 0) -> list[TrackingResult]:
     return [odometry.track((start + i) * FRAME, image) or NO_MAP for i, image in enumerate(images)]
 
 
@@ -72,7 +72,7 @@ MOTIONS: dict[str, list[Place]] = {
 @pytest.mark.slow
 @pytest.mark.parametrize("path", MOTIONS.values(), ids=MOTIONS)
 def test_a_motion_has_its_direction_and_its_turn(path: list[Place]) -> None:
-    *_, last = follow(MonocularOdometry(INFO), pictures(path))
+    *_, last = follow(MonocularTracker(INFO), pictures(path))
     assert last is not NO_MAP
     assert not last.lost
     true = pose(*path[-1])
@@ -84,7 +84,7 @@ def test_a_motion_has_its_direction_and_its_turn(path: list[Place]) -> None:
 @pytest.mark.parametrize("tiles", [FLAT, STEPPED, RELIEF], ids=["flat", "stepped", "relief"])
 def test_the_unit_of_length_stays(tiles: tuple[Tile, ...]) -> None:
     path: list[Place] = [(0.07 * i, 0.005 * i, 0.004 * i, 0.2 * i) for i in range(34)]
-    said = follow(MonocularOdometry(INFO), pictures(path, tiles))
+    said = follow(MonocularTracker(INFO), pictures(path, tiles))
     known = [i for i, each in enumerate(said) if each is not NO_MAP]
     assert known[0] < 14
     units = [unit(said[i], path[i]) for i in known]
@@ -93,12 +93,12 @@ def test_the_unit_of_length_stays(tiles: tuple[Tile, ...]) -> None:
 
 
 def test_the_unit_is_the_median_depth_of_the_first_picture() -> None:
-    *_, last = follow(MonocularOdometry(INFO), pictures(RIGHT, FLAT))
+    *_, last = follow(MonocularTracker(INFO), pictures(RIGHT, FLAT))
     assert unit(last, RIGHT[-1]) == pytest.approx(2.0, rel=5e-3)
 
 
 def test_a_camera_that_hurries_is_followed() -> None:
-    odometry = MonocularOdometry(INFO)
+    odometry = MonocularTracker(INFO)
     follow(odometry, pictures(RIGHT, FLAT))
     hurry: list[Place] = [(1.15 + 0.35 * i, 0.1 * i) for i in range(1, 7)]  # 28 pixels a picture
     said = follow(odometry, pictures(hurry, FLAT), 24)
@@ -109,7 +109,7 @@ def test_a_camera_that_hurries_is_followed() -> None:
 @pytest.mark.slow
 def test_landmarks_that_leave_are_replaced_by_far_ones_in_time() -> None:
     path: list[Place] = [(0.06 * i,) for i in range(50)]
-    said = follow(MonocularOdometry(INFO), pictures(path, BOARD))
+    said = follow(MonocularTracker(INFO), pictures(path, BOARD))
     known = [each for each in said if each is not NO_MAP]
     assert not any(each.lost for each in known)
     assert unit(known[-1], path[-1]) == pytest.approx(
@@ -121,7 +121,7 @@ def test_what_moves_by_itself_does_not_agree() -> None:
     on: list[Place] = [(1.15 + 0.05 * i,) for i in range(1, 4)]
     thing = pictures([(9.0, 4.0)], FLAT)[0][40:120, 60:140]
     images = pictures([*RIGHT, *on], FLAT)
-    odometry = MonocularOdometry(INFO)
+    odometry = MonocularTracker(INFO)
     for i, image in enumerate(images):
         moving = image.copy()
         row = 60 + (2 * (i - 22) if i > 22 else 0)
@@ -139,7 +139,7 @@ def test_what_moves_by_itself_does_not_agree() -> None:
 
 
 def test_nothing_is_known_before_there_is_a_map() -> None:
-    said = follow(MonocularOdometry(INFO), [DARK, DARK, *pictures(RIGHT)])
+    said = follow(MonocularTracker(INFO), [DARK, DARK, *pictures(RIGHT)])
     first = next(i for i, each in enumerate(said) if each is not NO_MAP)
     assert first > 5
     assert not any(each.lost for each in said[first:])
@@ -150,18 +150,18 @@ def test_nothing_is_known_before_there_is_a_map() -> None:
     "path", [[(0.0,)] * 12, [(0.0, 0.0, 0.0, 3.0 * i) for i in range(12)]], ids=["rest", "turning"]
 )
 def test_without_a_way_there_is_no_map(path: list[Place]) -> None:
-    assert all(each is NO_MAP for each in follow(MonocularOdometry(INFO), pictures(path)))
+    assert all(each is NO_MAP for each in follow(MonocularTracker(INFO), pictures(path)))
 
 
 def test_a_camera_that_turned_first_begins_once_it_moves() -> None:
     turn: list[Place] = [(0.0, 0.0, 0.0, 2.0 * i) for i in range(8)]
     away: list[Place] = [(0.05 * i, 0.0, 0.0, 14.0) for i in range(16)]
-    assert follow(MonocularOdometry(INFO), pictures(turn + away))[-1] is not NO_MAP
+    assert follow(MonocularTracker(INFO), pictures(turn + away))[-1] is not NO_MAP
 
 
 def test_equal_pictures_give_equal_bits() -> None:
     images = [*pictures(RIGHT), DARK, *pictures(RIGHT[-3:])]
-    one, other = (follow(MonocularOdometry(INFO), images) for _ in range(2))
+    one, other = (follow(MonocularTracker(INFO), images) for _ in range(2))
     for a, b in zip(one, other, strict=True):
         assert a.pose.tobytes() == b.pose.tobytes()
         assert a.points.tobytes() == b.points.tobytes()
@@ -169,7 +169,7 @@ def test_equal_pictures_give_equal_bits() -> None:
 
 
 def test_colour_is_seen_as_grey() -> None:
-    grey, colour = MonocularOdometry(INFO), MonocularOdometry(INFO)
+    grey, colour = MonocularTracker(INFO), MonocularTracker(INFO)
     images = pictures(RIGHT[:16])
     *_, a = follow(grey, images)
     *_, b = follow(colour, [np.repeat(image[..., None], 3, axis=2) for image in images])
@@ -178,13 +178,13 @@ def test_colour_is_seen_as_grey() -> None:
 
 
 def test_it_tells_what_it_followed() -> None:
-    *_, last = follow(MonocularOdometry(INFO), pictures(RIGHT))
+    *_, last = follow(MonocularTracker(INFO), pictures(RIGHT))
     assert last.points.shape == (len(last.inliers), 2)
     assert last.inliers.sum() > 60
 
 
 def test_a_dark_moment_is_lost_and_regained_with_the_same_unit() -> None:
-    odometry = MonocularOdometry(INFO)
+    odometry = MonocularTracker(INFO)
     *_, before = follow(odometry, pictures(RIGHT))
     dark = follow(odometry, [DARK] * 3, 24)
     assert all(each.lost and each is not NO_MAP and each.reason for each in dark)
@@ -210,7 +210,7 @@ def elsewhere(count: int) -> list[Grey]:
 
 @pytest.mark.slow
 def test_a_new_map_waits_for_the_timeout_says_so_and_goes_on_from_the_last_pose() -> None:
-    odometry = MonocularOdometry(INFO, MonocularSettings(reset_timeout=0.15))
+    odometry = MonocularTracker(INFO, MonocularSettings(reset_timeout=0.15))
     *_, before = follow(odometry, pictures(DOWN_AND_ASIDE, FLAT))
     assert not before.lost
     said = follow(odometry, elsewhere(20), len(DOWN_AND_ASIDE))
@@ -231,14 +231,14 @@ def test_a_new_map_waits_for_the_timeout_says_so_and_goes_on_from_the_last_pose(
 
 @pytest.mark.slow
 def test_before_the_timeout_there_is_no_new_map() -> None:
-    odometry = MonocularOdometry(INFO, MonocularSettings(reset_timeout=10.0))
+    odometry = MonocularTracker(INFO, MonocularSettings(reset_timeout=10.0))
     follow(odometry, pictures(RIGHT, FLAT))
     assert all(each.lost for each in follow(odometry, elsewhere(8), 24))
 
 
 @pytest.mark.slow
 def test_a_known_place_is_better_than_a_new_map_even_after_the_timeout() -> None:
-    odometry = MonocularOdometry(INFO, MonocularSettings(reset_timeout=0.1))
+    odometry = MonocularTracker(INFO, MonocularSettings(reset_timeout=0.1))
     *_, before = follow(odometry, pictures(RIGHT))
     assert all(each.lost for each in follow(odometry, [DARK] * 20, 24))
     *_, after = follow(odometry, pictures(RIGHT[-1:] * 3), 44)
@@ -247,7 +247,7 @@ def test_a_known_place_is_better_than_a_new_map_even_after_the_timeout() -> None
 
 
 def test_a_picture_of_another_size_is_refused() -> None:
-    odometry = MonocularOdometry(INFO)
+    odometry = MonocularTracker(INFO)
     for wrong in (DARK[:90], np.zeros((INFO.height, INFO.width, 4), np.uint8)):
         with pytest.raises(ValueError, match="image: expected 256×192 pixels"):
             odometry.track(0, wrong)
@@ -256,11 +256,11 @@ def test_a_picture_of_another_size_is_refused() -> None:
 def test_a_distorted_camera_is_refused() -> None:
     bent = msgspec.structs.replace(INFO, distortion=(0.1, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="without distortion"):
-        MonocularOdometry(bent)
+        MonocularTracker(bent)
 
 
 def test_a_place_is_found_again_after_being_carried_there() -> None:
-    odometry = MonocularOdometry(INFO)
+    odometry = MonocularTracker(INFO)
     *_, before = follow(odometry, pictures(RIGHT))
     odometry.track(24 * FRAME, DARK)
     there: Place = (0.75, 0.1, 0.0, 3.0)  # much farther than optical flow reaches

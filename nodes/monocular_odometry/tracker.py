@@ -39,7 +39,7 @@ _ORB_POINTS = 1000
 """Points by which the image of a lost camera is described."""
 
 
-class MonocularOdometry:
+class MonocularTracker:
     """Tracks a single camera. Equal images give equal poses, to the bit.
 
     Args:
