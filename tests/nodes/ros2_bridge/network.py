@@ -41,7 +41,7 @@ compressed_depth = "inverse"
 topic = "battery"
 type = "sensor_msgs/msg/BatteryState"
 event = "tests.nodes.ros2_bridge.mappings:Battery"
-mapping = "tests.nodes.ros2_bridge.mappings:tell_battery"
+mapping = "tests.nodes.ros2_bridge.mappings:make_battery"
 [[nodes.subscriptions]]
 topic = "/cmd_vel"
 type = "geometry_msgs/msg/Twist"
