@@ -9,18 +9,17 @@ EuRoC's own those of its IMU, which is no FRD, but cameras and truth agree on it
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from events import (
-    Announcement,
     CameraAnnouncement,
     CameraInfo,
     DepthImage,
-    Event,
     Image,
     Imu,
     ImuAnnouncement,
@@ -30,13 +29,13 @@ from events.frames import flip_yz, rotation_to_ned
 from events.poses import pose_tuples
 from events.rotations import rotate_inverse
 from nodes.replay.folders import (
-    in_order,
-    read_depth,
+    FolderReader,
+    Rows,
     read_image,
     vehicle_at,
     while_seen,
 )
-from nodes.replay.reader import Reader, ReplayError, Timed, Wants
+from nodes.replay.reader import ReplayError
 from nodes.trajectory.table import read_rows
 
 _TRUTH = "state_groundtruth_estimate0"
@@ -77,7 +76,7 @@ class Sensor(msgspec.Struct, frozen=True):
         return found
 
 
-class Euroc(Reader):
+class Euroc(FolderReader):
     """Reads the cameras, the first IMU and the ground truth of a data set.
 
     Args:
@@ -89,19 +88,18 @@ class Euroc(Reader):
     """
 
     def __init__(self, folder: Path, vehicle: str) -> None:
-        super().__init__()
-        self._folder = folder
-        self._vehicle = vehicle
+        super().__init__(folder, vehicle)
         self._images: dict[str, list[tuple[int, Path]]] = {}
         self._depths: dict[str, tuple[list[tuple[int, Path]], float]] = {}
-        self._announcements: list[Announcement] = []
         try:
             for camera in sorted(folder.glob("cam[0-9]*")):
                 self._announcements.append(self._camera(camera))
-            self._imu = self._rows("imu0", 7, "timestamp, w x 3, a x 3")
+            self._imu = self._table("imu0", 7, "timestamp, w x 3, a x 3")
             if self._imu:
                 self._announcements.append(self._imu_announcement())
-            self._truth = self._rows(_TRUTH, 17, "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3")
+            self._truth = self._table(
+                _TRUTH, 17, "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3"
+            )
         except ReplayError:
             raise
         except ValueError as error:
@@ -117,46 +115,18 @@ class Euroc(Reader):
             images = [rows[0][0] for rows in self._images.values() if rows]
             first = min(images, default=self._truth[0][0])
             row = next((row for row in self._truth if row[0] >= first), self._truth[0])
-            moved = self._moved(*row)
-            self._announcements.insert(0, vehicle_at(vehicle, moved.position, moved.orientation))
+            self._announcements.insert(0, vehicle_at(self._odometry(*row)))
 
-    def announcements(self) -> Sequence[Announcement]:
-        """Return the vehicle where it begins, its cameras and its IMU."""
-        return self._announcements
-
-    def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
+    def _rows(self) -> Iterator[Rows]:
         """Yield IMU, truth and images, all at their own stamps."""
-
-        def inside(stamp: int) -> bool:
-            time = stamp - self._origin
-            return start <= time and (end is None or time < end)
-
-        streams: list[Iterator[Event]] = []
-        if wants(Imu, f"{self._vehicle}/imu0"):
-            streams.append(self._measured(*row) for row in self._imu if inside(row[0]))
-        if wants(Odometry, self._vehicle):
-            streams.append(self._moved(*row) for row in self._truth if inside(row[0]))
+        yield Rows(Imu, f"{self._vehicle}/imu0", self._imu, self._measurement)
+        yield Rows(Odometry, self._vehicle, self._truth, self._odometry)
         for source, (rows, factor) in self._depths.items():
-            if wants(DepthImage, source):
-                streams.append(
-                    self._seen_depths(source, (row for row in rows if inside(row[0])), factor)
-                )
+            yield Rows(DepthImage, source, rows, partial(self._depth_image, source, factor))
         for source, rows in self._images.items():
-            if wants(Image, source):
-                streams.append(self._seen(source, (row for row in rows if inside(row[0]))))
-        return in_order(streams)
+            yield Rows(Image, source, rows, partial(self._image, source))
 
-    def _seen(self, source: str, rows: Iterator[tuple[int, Path]]) -> Iterator[Event]:
-        for stamp, path in rows:
-            yield read_image(path, stamp - self._origin, source, f"{source}_optical")
-
-    def _seen_depths(
-        self, source: str, rows: Iterator[tuple[int, Path]], factor: float
-    ) -> Iterator[Event]:
-        for stamp, path in rows:
-            yield read_depth(path, stamp - self._origin, source, f"{source}_optical", factor)
-
-    def _measured(self, stamp: int, values: list[float]) -> Imu:
+    def _measurement(self, stamp: int, values: list[float]) -> Imu:
         return Imu(
             stamp=stamp - self._origin,
             source=f"{self._vehicle}/imu0",
@@ -165,7 +135,7 @@ class Euroc(Reader):
             linear_acceleration=(values[3], values[4], values[5]),
         )
 
-    def _moved(self, stamp: int, values: list[float]) -> Odometry:
+    def _odometry(self, stamp: int, values: list[float]) -> Odometry:
         """Return the truth; the data set has no angular velocity, so that is 0."""
         x, y, z, qw, qx, qy, qz, u, v, w = values[:10]
         return Odometry(
@@ -237,7 +207,7 @@ class Euroc(Reader):
         rows = read_rows(folder / "data.csv", ",", (2,), "timestamp, filename")
         return sorted((row.nanoseconds(), folder / "data" / row.fields[1]) for row in rows)
 
-    def _rows(self, name: str, columns: int, meaning: str) -> list[tuple[int, list[float]]]:
+    def _table(self, name: str, columns: int, meaning: str) -> list[tuple[int, list[float]]]:
         path = self._folder / name / "data.csv"
         if not path.is_file():
             return []

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import bisect
 import heapq
-from collections.abc import Iterable, Iterator
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from events import DepthImage, Event, Image, Quaternion, Vector3, VehicleAnnouncement
-from nodes.replay.reader import ReplayError, Timed
+from events import Announcement, DepthImage, Event, Image, Odometry, VehicleAnnouncement
+from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 
 R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
 
@@ -33,17 +34,77 @@ def while_seen(truth: list[R], first: int, last: int) -> list[R]:
     return truth[max(begin, 0) : end]
 
 
-def vehicle_at(source: str, position: Vector3, orientation: Quaternion) -> VehicleAnnouncement:
+def vehicle_at(pose: Odometry) -> VehicleAnnouncement:
     """Return the announcement of a vehicle of which only the first pose is known."""
     return VehicleAnnouncement(
         stamp=0,
-        source=source,
+        source=pose.source,
         mass=0.0,
         max_thrust=0.0,
         control_rate=0.0,
-        position=position,
-        orientation=orientation,
+        position=pose.position,
+        orientation=pose.orientation,
     )
+
+
+class Rows(NamedTuple):
+    """Rows of a data set, in order, and what makes events of them.
+
+    Attributes:
+        kind: Type of the events.
+        source: Of the events.
+        rows: The first field of each is its stamp (ns).
+        make: Called with the fields of a row.
+    """
+
+    kind: type[Event]
+    source: str
+    rows: Sequence[tuple[Any, ...]]
+    make: Callable[..., Event]
+
+
+class FolderReader(Reader):
+    """Reads a data set in a folder, whose stamps are its times too.
+
+    Args:
+        folder: Where it is.
+        vehicle: Source of the truth; sensors are below it.
+    """
+
+    def __init__(self, folder: Path, vehicle: str) -> None:
+        super().__init__()
+        self._folder = folder
+        self._vehicle = vehicle
+        self._origin = 0
+        """The stamp in the data set (ns) that is 0 in the run."""
+        self._announcements: list[Announcement] = []
+
+    def announcements(self) -> Sequence[Announcement]:
+        """Return the vehicle where it begins, and its sensors."""
+        return self._announcements
+
+    def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
+        """Yield all events by their stamps; of one stamp, those of earlier `Rows` first."""
+
+        def made(each: Rows) -> Iterator[Event]:
+            for row in each.rows:
+                time = row[0] - self._origin
+                if start <= time and (end is None or time < end):
+                    yield each.make(*row)
+
+        wanted = (made(each) for each in self._rows() if wants(each.kind, each.source))
+        merged = heapq.merge(*wanted, key=lambda event: event.stamp)
+        return (Timed(event.stamp, event) for event in merged)
+
+    @abstractmethod
+    def _rows(self) -> Iterator[Rows]:
+        """Yield what there is."""
+
+    def _image(self, source: str, stamp: int, path: Path) -> Image:
+        return read_image(path, stamp - self._origin, source, f"{source}_optical")
+
+    def _depth_image(self, source: str, factor: float, stamp: int, path: Path) -> DepthImage:
+        return read_depth(path, stamp - self._origin, source, f"{source}_optical", factor)
 
 
 def read_image(path: Path, stamp: int, source: str, frame_id: str) -> Image:
@@ -83,15 +144,6 @@ def read_depth(path: Path, stamp: int, source: str, frame_id: str, factor: float
     metres = steps.astype(np.float32) / np.float32(factor)
     metres[steps == 0] = np.inf
     return DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=metres)
-
-
-def in_order(streams: Iterable[Iterable[Event]]) -> Iterator[Timed]:
-    """Merge streams of events, each in order of stamps, which are the times too.
-
-    Of events of one stamp, the earlier stream's come first.
-    """
-    merged = heapq.merge(*streams, key=lambda event: event.stamp)
-    return (Timed(event.stamp, event) for event in merged)
 
 
 def _pixels(path: Path) -> npt.NDArray[Any]:

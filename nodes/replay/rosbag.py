@@ -186,7 +186,7 @@ class RosBag(Reader):
                 type_, _, message = self._firsts[name]
                 event = self._event(topic, type_, message)
                 assert isinstance(event, Odometry)
-                yield vehicle_at(topic.source, event.position, event.orientation)
+                yield vehicle_at(event)
         yield from self._cameras(found)
         for name, topic in self._topics.items():
             if topic.use == "imu" and name in self._firsts:

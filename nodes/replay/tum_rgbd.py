@@ -10,7 +10,8 @@ from the first stamp, or from the epoch that ``camera.yaml`` notes (``epoch_ns``
 from __future__ import annotations
 
 import bisect
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from events import (
@@ -18,7 +19,6 @@ from events import (
     CameraAnnouncement,
     CameraInfo,
     DepthImage,
-    Event,
     Image,
     Odometry,
     PoseStamped,
@@ -29,13 +29,13 @@ from events.frames import OPTICAL_TO_FRD, flip_yz, rotation_to_ned
 from events.rotations import inverse, multiply
 from nodes.replay.euroc import noted_epoch, read_sensor
 from nodes.replay.folders import (
-    in_order,
-    read_depth,
+    FolderReader,
+    Rows,
     read_image,
     vehicle_at,
     while_seen,
 )
-from nodes.replay.reader import Reader, ReplayError, Timed, Wants
+from nodes.replay.reader import ReplayError
 from nodes.replay.settings import Pinhole
 from nodes.trajectory.formats import read_tum
 from nodes.trajectory.table import read_rows
@@ -43,10 +43,10 @@ from nodes.trajectory.table import read_rows
 FARTHEST = 20_000_000
 """Nanoseconds between a depth image and its colour image."""
 
-_Rows = list[tuple[int, Path]]
+_Images = list[tuple[int, Path]]
 
 
-class TumRgbd(Reader):
+class TumRgbd(FolderReader):
     """Reads colour, depth and the camera's true poses.
 
     The camera sits in the body's origin and looks ahead, so that the body's pose (FRD) is known
@@ -65,9 +65,7 @@ class TumRgbd(Reader):
     def __init__(
         self, folder: Path, vehicle: str, camera: Pinhole | None, depth_factor: float
     ) -> None:
-        super().__init__()
-        self._folder = folder
-        self._vehicle = vehicle
+        super().__init__(folder, vehicle)
         self._source = f"{vehicle}/camera"
         self._frame_id = f"{self._source}_optical"
         try:
@@ -106,39 +104,16 @@ class TumRgbd(Reader):
         self._origin = min(firsts + noted_epoch(calibration))
         self._announcements = self._announced(camera, rate)
 
-    def announcements(self) -> Sequence[Announcement]:
-        """Return the body where it begins, and the camera."""
-        return self._announcements
+    def _rows(self) -> Iterator[Rows]:
+        """Yield truth (as the body's pose and as the camera's), depth and colour."""
+        source = self._source
+        yield Rows(Odometry, self._vehicle, self._truth, self._odometry)
+        yield Rows(PoseStamped, source, self._truth, self._camera_pose)
+        depth_image = partial(self._depth_image, source, self._factor)
+        yield Rows(DepthImage, source, self._depth, depth_image)
+        yield Rows(Image, source, self._rgb, partial(self._image, source))
 
-    def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
-        """Yield truth (as the camera's pose and as the body's), depth and colour."""
-
-        def inside(stamp: int) -> bool:
-            time = stamp - self._origin
-            return start <= time and (end is None or time < end)
-
-        streams: list[Iterator[Event]] = []
-        truth = [row for row in self._truth if inside(row[0])]
-        if wants(Odometry, self._vehicle):
-            streams.append(self._moved(*row) for row in truth)
-        if wants(PoseStamped, self._source):
-            streams.append(self._placed(*row) for row in truth)
-        if wants(DepthImage, self._source):
-            streams.append(self._depths([row for row in self._depth if inside(row[0])]))
-        if wants(Image, self._source):
-            streams.append(self._images([row for row in self._rgb if inside(row[0])]))
-        return in_order(streams)
-
-    def _images(self, rows: _Rows) -> Iterator[Event]:
-        for stamp, path in rows:
-            yield read_image(path, stamp - self._origin, self._source, self._frame_id)
-
-    def _depths(self, rows: _Rows) -> Iterator[Event]:
-        for stamp, path in rows:
-            time = stamp - self._origin
-            yield read_depth(path, time, self._source, self._frame_id, self._factor)
-
-    def _moved(self, stamp: int, position: Vector3, optical: Quaternion) -> Odometry:
+    def _odometry(self, stamp: int, position: Vector3, optical: Quaternion) -> Odometry:
         """Return the truth; the data set has no velocities, so they are 0."""
         return Odometry(
             stamp=stamp - self._origin,
@@ -149,7 +124,7 @@ class TumRgbd(Reader):
             angular_velocity=(0.0, 0.0, 0.0),
         )
 
-    def _placed(self, stamp: int, position: Vector3, optical: Quaternion) -> PoseStamped:
+    def _camera_pose(self, stamp: int, position: Vector3, optical: Quaternion) -> PoseStamped:
         return PoseStamped(
             stamp=stamp - self._origin,
             source=self._source,
@@ -157,7 +132,7 @@ class TumRgbd(Reader):
             orientation=optical,
         )
 
-    def _paired(self, depth: _Rows) -> _Rows:
+    def _paired(self, depth: _Images) -> _Images:
         """Give each depth image the stamp of its colour image; those without are left out."""
         stamps = [stamp for stamp, _ in self._rgb]
         taken: dict[int, tuple[int, Path]] = {}
@@ -200,11 +175,10 @@ class TumRgbd(Reader):
         if self._truth:
             begin = self._rgb[0][0]
             row = next((row for row in self._truth if row[0] >= begin), self._truth[0])
-            moved = self._moved(*row)
-            announced.insert(0, vehicle_at(self._vehicle, moved.position, moved.orientation))
+            announced.insert(0, vehicle_at(self._odometry(*row)))
         return announced
 
-    def _index(self, name: str) -> _Rows:
+    def _index(self, name: str) -> _Images:
         rows = read_rows(self._folder / name, None, (2,), "timestamp filename")
         return sorted((row.seconds(), self._folder / row.fields[1]) for row in rows)
 
@@ -222,6 +196,6 @@ class TumRgbd(Reader):
         return [(stamp, flip_yz(place), rotation_to_ned(turn)) for stamp, place, turn in rows]
 
 
-def _rate(rows: _Rows) -> float:
+def _rate(rows: _Images) -> float:
     lasts = rows[-1][0] - rows[0][0]
     return (len(rows) - 1) * 1e9 / lasts if lasts else 30.0
