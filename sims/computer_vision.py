@@ -112,7 +112,9 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         if self._rows is not None and not self._follow(tick.stamp):
             self.stop("trajectory ended")
             return
-        self._drift(tick.stamp)
+        self._position, self._orientation = self._drifted(
+            (tick.stamp - self._stamp) / 1e9, tick.stamp
+        )
         self._stamp = tick.stamp
         before, after = (self._pose_in(sign * MOMENT / 2, tick.stamp) for sign in (-1, 1))
         qvel = qvel_between(pose_to_qpos(*before), pose_to_qpos(*after), MOMENT)
@@ -131,10 +133,6 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         qpos = pose_to_qpos(self._position, self._orientation)
         for camera in self.config.cameras:
             self.rig.expose(camera.name, tick.stamp, qpos, qvel)
-
-    def _drift(self, stamp: int) -> None:
-        """Move with the last velocity since the last update."""
-        self._position, self._orientation = self._drifted((stamp - self._stamp) / 1e9, stamp)
 
     def _pose_in(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
         """Return the pose some seconds after `stamp`, or before it if negative."""

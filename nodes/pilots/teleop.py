@@ -42,6 +42,8 @@ _MOTIONS: dict[str, tuple[int, int, int, int]] = {
 }
 """Signs of x, y, z and yaw rate in the ``heading`` frame: x ahead, y to the right, z down."""
 
+_COMMANDS: dict[str, type[Command]] = {"land": Land, "hover": Hover, "arm": Arm, "disarm": Disarm}
+
 _STILL: Vector3 = (0.0, 0.0, 0.0)
 
 
@@ -204,16 +206,10 @@ class Teleop(Node[TeleopConfig]):
             case "takeoff":
                 altitude = self.config.altitude
                 self.commands.send(Takeoff(stamp=stamp, source=source, altitude=altitude))
-            case "land":
-                self.commands.send(Land(stamp=stamp, source=source))
-            case "hover":
-                self.commands.send(Hover(stamp=stamp, source=source))
-            case "arm":
-                self.commands.send(Arm(stamp=stamp, source=source))
-            case "disarm":
-                self.commands.send(Disarm(stamp=stamp, source=source))
             case "quit":
                 self.shutdowns.send(Shutdown(stamp=stamp, source=source, reason="quit by key"))
+            case _:
+                self.commands.send(_COMMANDS[action](stamp=stamp, source=source))
 
 
 def approach(now: Vector3, goal: Vector3, step: float) -> Vector3:

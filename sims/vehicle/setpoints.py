@@ -1,4 +1,4 @@
-"""Which set-points there are, and which of them cannot be followed. No control."""
+"""The set-points that the control can follow, and a check of their values."""
 
 from __future__ import annotations
 

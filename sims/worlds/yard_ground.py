@@ -1,7 +1,7 @@
 """The ground of `yard`, in one image: asphalt, slabs, lawn, paint, and the sun's shadows.
 
-Shadows are painted, not drawn: they cost nothing per frame. Where things stand is therefore said
-here (x north, y west, metres, as in `sims.worlds.yard`).
+Shadows are painted, not drawn: they cost nothing per frame. The positions of objects are therefore
+given here (x north, y west, metres, as in `sims.worlds.yard`).
 """
 
 from __future__ import annotations
