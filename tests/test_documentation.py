@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import re
 import shlex
+import signal
+import socket
 import subprocess
 import sys
 import tomllib
@@ -15,10 +18,18 @@ from typing import NamedTuple
 import jsonschema
 import pytest
 
+from runtime.config.reading import find_node, load
+from runtime.tools.cli.run import chosen
+from tests.runtime.tools.samples_cli import command_here, start, summary
+
 ROOT = Path(__file__).parents[1]
 SCHEMA = json.loads((ROOT / "docs/reference/config.schema.json").read_text(encoding="utf-8"))
-PAGES = sorted([*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
-PAGES = [page for page in PAGES if page.is_file()]
+PAGES = sorted(
+    [
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "tools/configuration.md")),
+    ]
+)
 ABOUT_FILES = {"pyproject.toml"}
 """Titles of blocks in TOML that are no configuration."""
 
@@ -79,17 +90,9 @@ def test_every_block_says_its_language() -> None:
 
 
 @pytest.mark.parametrize("block", blocks("python"), ids=str)
-def test_python_runs(block: Block, tmp_path: Path) -> None:
+def test_python_runs(block: Block) -> None:
     """As a module of its own: an assertion in it is one of ours."""
-    (tmp_path / "snippet.py").write_text(block.text, encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "-W", "error", str(tmp_path / "snippet.py")],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "PATH": ""},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    exec(compile(block.text, str(block), "exec"), {"__name__": "snippet"})
 
 
 @pytest.mark.parametrize("block", blocks("toml"), ids=str)
@@ -106,10 +109,6 @@ def test_toml_keeps_to_the_schema(block: Block) -> None:
 @pytest.mark.parametrize("words", sorted(set(commands())))
 def test_commands_name_what_there_is(words: str) -> None:
     """The command exists, so do its files and options, and the settings that it changes."""
-    from runtime.config.reading import load
-    from runtime.tools.cli.run import chosen
-    from tests.runtime.tools.samples_cli import command_here
-
     name, *arguments = shlex.split(words)
     help_ = command_here(name, "--help", folder=ROOT)
     assert help_.returncode == 0, help_.stderr
@@ -125,6 +124,67 @@ def test_commands_name_what_there_is(words: str) -> None:
         settings = load(ROOT / file, changes)
         if "--only" in arguments:
             chosen(settings, arguments[arguments.index("--only") + 1])
+
+
+def test_nodes_on_the_pages_exist() -> None:
+    """Whatever is named as `nodes.x:Y` can be put into a file."""
+    named = {
+        (page, name)
+        for page in PAGES
+        for name in re.findall(
+            r"\b(?:nodes|sims)(?:\.\w+)+:[A-Z]\w+", page.read_text(encoding="utf-8")
+        )
+    }
+    assert len(named) >= 12
+    for page, name in sorted(named):
+        find_node(name, str(page))
+
+
+def test_files_on_the_pages_exist() -> None:
+    """Paths in the project that a page names in code."""
+    paths = r"`((?:examples|docs|tests|bench|runtime|nodes|sims)/[\w./-]+)`"
+    for page in PAGES:
+        for path in re.findall(paths, page.read_text(encoding="utf-8")):
+            assert (ROOT / path).exists(), f"{page}: {path}"
+
+
+@pytest.mark.slow
+def test_the_bridge_of_the_page_steers_and_answers(tmp_path: Path) -> None:
+    """In a run in real time: it takes velocities from UDP, and says where the vehicle is."""
+    (bridge,) = (block for block in blocks("python") if block.title == "udp_bridge.py")
+    (tmp_path / "udp_bridge.py").write_text(bridge.text, encoding="utf-8")
+    with socket.socket(type=socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    (tmp_path / "run.toml").write_text(
+        f"""
+        [run]
+        clock = "real"
+        [[nodes]]
+        name = "drone"
+        type = "sims.multirotor:Multirotor"
+        [[nodes]]
+        name = "udp"
+        type = "udp_bridge:UdpBridge"
+        port = {port}
+        """
+    )
+    with (
+        start(["run", "run.toml", "--out", "out", "--quiet"], tmp_path) as process,
+        socket.socket(type=socket.SOCK_DGRAM) as client,
+    ):
+        client.settimeout(0.1)
+        client.connect(("127.0.0.1", port))
+        answer = b""
+        while not answer and process.poll() is None:
+            with contextlib.suppress(ConnectionRefusedError, TimeoutError):  # not yet there
+                client.send(b"0.5 0 0")
+                answer = client.recv(1024)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 0, errors
+    assert len(answer.decode().split(",")) == 3
+    assert summary(tmp_path / "out")["events"]["VelocitySetpoint"] >= 1
 
 
 @pytest.mark.slow
