@@ -14,9 +14,12 @@ import queue
 import sys
 from collections.abc import Callable, Iterator, MutableMapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from runtime.errors import FatalError
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 TRACE = 5
 LEVELS = {
@@ -128,8 +131,10 @@ def logging_to(
             each.close()
 
 
-def terminal_handler() -> logging.Handler:
+def terminal_handler(console: Console | None = None) -> logging.Handler:
     """Return a handler that prints to standard error, in colour where that is a terminal.
+
+    A console may be given that other things are drawn on, too, such as a progress bar.
 
     It leaves out tracebacks, and what the command line says itself when the run is over (records
     with `told`).
@@ -137,9 +142,8 @@ def terminal_handler() -> logging.Handler:
     from rich.console import Console
     from rich.logging import RichHandler
 
-    handler = RichHandler(
-        console=Console(stderr=True), show_path=False, show_time=False, markup=False
-    )
+    console = console or Console(stderr=True)
+    handler = RichHandler(console=console, show_path=False, show_time=False, markup=False)
     handler.setFormatter(_OneLine("%(seconds)9.3f %(speaker)s: %(message)s"))
     handler.addFilter(lambda record: not getattr(record, "told", False))
     return handler

@@ -40,6 +40,25 @@ def prepare(out: Path, config: Config) -> None:
         write(out / "config.toml", tomli_w.dumps(to_builtins(config)).encode())
 
 
+def keep_earlier(out: Path) -> Path | None:
+    """Move the folder of an earlier run to ``NAME.1``, in the place of what was kept there before.
+
+    Returns:
+        Where it is now; `None` if there is no folder that a run has made.
+
+    Raises:
+        ResultsError: It cannot be moved, or ``NAME.1`` is not a run's.
+    """
+    if not (out / MARKER).is_file():
+        return None
+    kept = out.with_name(f"{out.name}.1")
+    with _readable(out):
+        claim(kept)
+        shutil.rmtree(kept)
+        out.rename(kept)
+    return kept
+
+
 def claim(out: Path) -> None:
     """Make a folder, if it is missing, and mark it as a run's.
 

@@ -29,6 +29,7 @@ def vocabulary(
     others, and best in its own.
     """
     import msgspec
+    from rich.console import Console
 
     from nodes.orb_slam3.training import VocabularyTrainer, VocabularyTrainerConfig
     from runtime.config.model import Config, NodeSpec
@@ -57,10 +58,11 @@ def vocabulary(
     run = msgspec.structs.replace(
         settings.run, shutdown_limit=Duration(_SHUTDOWN_LIMIT), digest=False
     )
+    console = Console(stderr=True)
     execute(
         Config(run=run, nodes=(*others, spec)),
-        handlers=[terminal_handler()],
-        watch=None if quiet else progress(run),
+        handlers=[terminal_handler(console)],
+        watch=None if quiet else progress(run, console),
     )
     print(f"vocabulary: {options.file()}")
     if out is None:

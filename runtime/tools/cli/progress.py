@@ -21,15 +21,20 @@ _LINE_PERIOD = 10.0
 
 
 def progress(
-    run: RunConfig,
+    run: RunConfig, console: Console
 ) -> Callable[[Supervisor], contextlib.AbstractContextManager[None]]:
-    """Return what `execute` takes as `watch`."""
-    return lambda supervisor: _watching(run, supervisor)
+    """Return what `execute` takes as `watch`.
+
+    Args:
+        run: The run's settings.
+        console: Where to draw. What else is printed there, such as log lines, appears above the
+            bar.
+    """
+    return lambda supervisor: _watching(run, supervisor, console)
 
 
 @contextlib.contextmanager
-def _watching(run: RunConfig, supervisor: Supervisor) -> Iterator[None]:
-    console = Console(stderr=True)
+def _watching(run: RunConfig, supervisor: Supervisor, console: Console) -> Iterator[None]:
     end = threading.Event()
     show = _draw if console.is_terminal else _print
     thread = threading.Thread(

@@ -81,13 +81,16 @@ def run(
     """Run the nodes of a file until they, its duration or Ctrl-C end the run.
 
     Results go to runs/<name> (with --only, to runs/<name>-<first node>): summary.json, log.txt,
-    the resolved config.toml, and whatever the nodes write. Ends with 0, also after Ctrl-C, SIGTERM,
-    SIGHUP or a closed window (a second Ctrl-C is immediate); with 1 if a threshold of the run was
-    not met; with 2 if something failed.
+    the resolved config.toml, and whatever the nodes write. The results of an earlier run of that
+    name are kept as runs/<name>.1; those that were there before are removed.
+
+    Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
+    immediate); with 1 if a threshold of the run was not met; with 2 if something failed.
     """
     from runtime.config.reading import load
     from runtime.execute import execute
-    from runtime.tools.cli.watching import Lookers
+    from runtime.results import keep_earlier
+    from runtime.tools.cli.observers import Observers
 
     changes = list(overrides or [])
     if log is not None and log is not Log.events:
@@ -97,13 +100,15 @@ def run(
     look_at(settings, nodes_here)
     name = "-".join([settings.run.name, *nodes_here[:1]])
     folder = out or Path("runs") / name
-    lookers = Lookers(settings, name, quiet=quiet, trace=trace, top=top, web=web)
+    if out is None and (kept := keep_earlier(folder)) and not quiet:
+        print(f"the earlier run in {folder} is now {kept}", file=sys.stderr)
+    observers = Observers(settings, name, quiet=quiet, trace=trace, top=top, web=web)
     summary = execute(
         settings,
         folder,
-        handlers=lookers.handlers,
+        handlers=observers.handlers,
         log_events=log is Log.events,
-        watch=lookers.watch,
+        watch=observers.watch,
         only=nodes_here,
     )
     if not quiet:
@@ -160,16 +165,19 @@ def report(summary: Summary, folder: Path) -> None:
     console = Console()
     for table in run_tables(summary):
         console.print(table)
-    speed = summary.sim_seconds / max(summary.wall_seconds, 1e-9)
     digest = summary.digest or "off"
     if summary.digest and summary.not_deterministic:
         digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
     if summary.verdict is not None:
         _judge(console, summary.verdict)
     page = ": open report.html" if (folder / "report.html").is_file() else ""
+    took = ""
+    if summary.clock == "lockstep":
+        speed = summary.sim_seconds / max(summary.wall_seconds, 1e-9)
+        took = f" in {summary.wall_seconds:.1f} s ({speed:.1f} × real time)"
     console.print(
-        f"{summary.sim_seconds:.1f} s on the {summary.clock} clock in "
-        f"{summary.wall_seconds:.1f} s ({speed:.1f} × real time), ended by: {summary.reason}\n"
+        f"{summary.sim_seconds:.1f} s on the {summary.clock} clock{took}, "
+        f"ended by: {summary.reason}\n"
         f"digest {digest}   results in [bold]{folder}[/bold]{page}",
         highlight=False,
     )

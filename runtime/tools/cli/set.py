@@ -22,4 +22,5 @@ def set_(
     from runtime.tools.monitor.client import ask
     from runtime.tools.monitor.command import Set
 
-    print(ask(find(run), Set(text=change)))
+    found = find(run)
+    print(f"run {found.stem.rpartition('-')[0]}: {ask(found, Set(text=change))}")

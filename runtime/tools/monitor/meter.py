@@ -9,7 +9,7 @@ from events import Event
 from runtime.clock import Clock
 from runtime.instruments import Call, Instrument
 from runtime.sender import Sender
-from runtime.tools.monitor.window import Amount
+from runtime.tools.monitor.recent import Amount
 
 
 class Sum:

@@ -19,6 +19,7 @@ from runtime.summary import count_drops
 from runtime.supervisor import Supervisor
 from runtime.tools.monitor.command import Command, Pause, Restart, Resume, Set, Speed, Step, Stop
 from runtime.tools.monitor.meter import Meter
+from runtime.tools.monitor.recent import RecentSamples, Sample
 from runtime.tools.monitor.records import LastRecords
 from runtime.tools.monitor.snapshot import (
     ClockState,
@@ -31,7 +32,6 @@ from runtime.tools.monitor.snapshot import (
     TickState,
 )
 from runtime.tools.monitor.timekeeping import Timekeeper
-from runtime.tools.monitor.window import Sample, Window
 
 
 class Observer:
@@ -50,7 +50,7 @@ class Observer:
         self._records = records
         self._keeper = Timekeeper(self._state.clock, over=lambda: bool(self._state.reason))
         self._meter: Meter | None = None
-        self._window = Window(self._sample())
+        self._recent = RecentSamples(self._sample())
         self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}
         """Of each node, and how they were shown: they seldom change."""
         self._number = 0
@@ -60,14 +60,14 @@ class Observer:
         if self._meter is None:
             self._meter = Meter(self._state.clock)
             self._supervisor.instruments.attach(self._meter)
-            self._window = Window(self._sample())
+            self._recent = RecentSamples(self._sample())
 
     def end(self) -> None:
         """Measure no more: nobody looks."""
         if self._meter is not None:
             self._supervisor.instruments.detach(self._meter)
             self._meter = None
-            self._window = Window(self._sample())
+            self._recent = RecentSamples(self._sample())
 
     # Seeing.
 
@@ -76,7 +76,7 @@ class Observer:
         state = self._state
         self._number += 1
         sample = self._sample()
-        self._window.add(sample)
+        self._recent.add(sample)
         now = sample.run
         return Snapshot(
             run=self._config.run.name,
@@ -87,7 +87,7 @@ class Observer:
                 kind=state.clock.kind,
                 now=now / SECOND,
                 duration=float(self._config.run.duration),
-                speed=self._window.run / self._window.real,
+                speed=self._recent.run / self._recent.real,
                 asked=self._keeper.asked,
                 paused=self._keeper.paused,
                 fixed=self._keeper.fixed(),
@@ -138,7 +138,7 @@ class Observer:
         )
 
     def _node(self, runner: NodeRunner) -> NodeState:
-        steps, real = self._window.node(runner.spec.name), self._window.real
+        steps, real = self._recent.node(runner.spec.name), self._recent.real
         return NodeState(
             name=runner.spec.name,
             type=runner.spec.type_name,
@@ -178,13 +178,13 @@ class Observer:
         last = self._meter.outputs if self._meter is not None else {}
         found = []
         for name, event in events.items():
-            flow = self._window.output(name)
+            flow = self._recent.output(name)
             found.append(
                 OutputState(
                     name=name,
                     event=event,
                     count=sample.sent[name],
-                    rate=self._window.rate(name),
+                    rate=self._recent.rate(name),
                     age=(sample.run - last[name].last) / SECOND if name in last else None,
                     latency_ms=flow.total / flow.times / 1e6 if flow.times else None,
                     latency_max_ms=flow.longest / 1e6 if flow.times else None,

@@ -29,7 +29,7 @@ _STOPPED = {"Ctrl-C", "SIGTERM", "SIGHUP"}
 _LONGEST_ERROR = 300
 
 
-class Verdict(msgspec.Struct, frozen=True):
+class RunVerdict(msgspec.Struct, frozen=True):
     """The part of a run's summary that says how well it went."""
 
     passed: bool | None
@@ -44,7 +44,7 @@ class Ended(msgspec.Struct, frozen=True):
     wall_seconds: float
     digest: str | None = None
     not_deterministic: list[str] = []
-    verdict: Verdict | None = None
+    verdict: RunVerdict | None = None
     workers: dict[str, dict[str, float | None]] = {}
 
 

@@ -29,7 +29,7 @@ IDENTITIES = 8192
 How = Literal["begins", "follows", "holds"]
 
 
-class Said(msgspec.Struct, eq=False):
+class SentEvent(msgspec.Struct, eq=False):
     """One event, and what it came from.
 
     Attributes:
@@ -52,12 +52,12 @@ class Said(msgspec.Struct, eq=False):
     stamp: int
     seen: bool = False
     how: How = "begins"
-    cause: Said | None = None
+    cause: SentEvent | None = None
 
-    def path(self) -> list[Said]:
+    def path(self) -> list[SentEvent]:
         """Return all events from the sensor's to this one."""
-        found: list[Said] = []
-        each: Said | None = self
+        found: list[SentEvent] = []
+        each: SentEvent | None = self
         while each is not None:
             found.append(each)
             each = each.cause
@@ -68,17 +68,17 @@ class _Past:
     """What a node has heard that comes from a sensor."""
 
     def __init__(self) -> None:
-        self.by_stamp: OrderedDict[int, list[Said]] = OrderedDict()
-        self.newest: Said | None = None
+        self.by_stamp: OrderedDict[int, list[SentEvent]] = OrderedDict()
+        self.newest: SentEvent | None = None
 
-    def add(self, said: Said) -> None:
-        self.by_stamp.setdefault(said.stamp, []).append(said)
+    def add(self, sent: SentEvent) -> None:
+        self.by_stamp.setdefault(sent.stamp, []).append(sent)
         if len(self.by_stamp) > REMEMBERED:
             self.by_stamp.popitem(last=False)
-        if said.seen or self.newest is None or not self.newest.seen:
-            self.newest = said
+        if sent.seen or self.newest is None or not self.newest.seen:
+            self.newest = sent
 
-    def of_stamp(self, stamp: int) -> Iterator[Said]:
+    def of_stamp(self, stamp: int) -> Iterator[SentEvent]:
         """Yield what was heard with this stamp, the best to build on first."""
         yield from sorted(
             self.by_stamp.get(stamp, ()), key=lambda s: (s.seen, s.time), reverse=True
@@ -99,7 +99,7 @@ class Causes:
         self._kinds = kinds
         self._hearers = hearers
         self._pasts: dict[str, _Past] = {}
-        self._by_identity: OrderedDict[int, tuple[Said, tuple[str, ...]]] = OrderedDict()
+        self._by_identity: OrderedDict[int, tuple[SentEvent, tuple[str, ...]]] = OrderedDict()
         """Events, and who heard them."""
 
     def add(
@@ -112,7 +112,7 @@ class Causes:
         stamp: int,
         identity: int,
         given: int,
-    ) -> Said:
+    ) -> SentEvent:
         """Take the next event and return it with what it came from.
 
         Args:
@@ -126,46 +126,46 @@ class Causes:
             given: The `id` of what the step that sent it had been given; 0 if nothing.
         """
         node, kind = sender.partition(".")[0], self._kinds[event]
-        said = Said(time, run, node, event, source, stamp)
+        sent = SentEvent(time, run, node, event, source, stamp)
         # Another event may lie where one lay that has come from elsewhere.
         found, heard = self._by_identity.get(given, (None, ()))
-        self._trace_back(said, kind, found if node in heard else None)
-        said.seen = kind.seen if said.cause is None else said.cause.seen
+        self._trace_back(sent, kind, found if node in heard else None)
+        sent.seen = kind.seen if sent.cause is None else sent.cause.seen
         hearers = self._hearers.get((sender, event, source), ())
-        self._by_identity[identity] = said, hearers
+        self._by_identity[identity] = sent, hearers
         self._by_identity.move_to_end(identity)
         if len(self._by_identity) > IDENTITIES:
             self._by_identity.popitem(last=False)
-        if not kind.asked and (kind.sensed or said.cause is not None):
+        if not kind.asked and (kind.sensed or sent.cause is not None):
             for hearer in hearers:
                 if hearer != node:
-                    self._pasts.setdefault(hearer, _Past()).add(said)
-        return said
+                    self._pasts.setdefault(hearer, _Past()).add(sent)
+        return sent
 
-    def _trace_back(self, said: Said, kind: Kind, given: Said | None) -> None:
-        past = self._pasts.get(said.node) or _Past()
-        if given is not None and (given.node == said.node or not self._leads_anywhere(given)):
+    def _trace_back(self, sent: SentEvent, kind: Kind, given: SentEvent | None) -> None:
+        past = self._pasts.get(sent.node) or _Past()
+        if given is not None and (given.node == sent.node or not self._leads_anywhere(given)):
             given = None
-        followed: list[Said] = []
+        followed: list[SentEvent] = []
         if not kind.asked:  # whose stamp is when it was sent, and tells nothing
-            if given is not None and given.stamp == said.stamp:
+            if given is not None and given.stamp == sent.stamp:
                 followed.append(given)
-            followed += past.of_stamp(said.stamp)
+            followed += past.of_stamp(sent.stamp)
         if given is not None and not kind.sensed:
             followed.append(given)
         for cause in followed:
-            if _passes(cause, said.node):
-                said.cause, said.how = cause, "follows"
+            if _passes(cause, sent.node):
+                sent.cause, sent.how = cause, "follows"
                 return
         newest = past.newest
-        if newest is not None and not kind.sensed and _passes(newest, said.node):
-            said.cause, said.how = newest, "holds"
+        if newest is not None and not kind.sensed and _passes(newest, sent.node):
+            sent.cause, sent.how = newest, "holds"
 
-    def _leads_anywhere(self, said: Said) -> bool:
-        kind = self._kinds[said.event]
-        return not kind.asked and (kind.sensed or said.cause is not None)
+    def _leads_anywhere(self, sent: SentEvent) -> bool:
+        kind = self._kinds[sent.event]
+        return not kind.asked and (kind.sensed or sent.cause is not None)
 
 
-def _passes(said: Said, node: str) -> bool:
+def _passes(sent: SentEvent, node: str) -> bool:
     """Tell whether a path can go on to a node: it goes through none twice."""
-    return all(each.node != node for each in said.path())
+    return all(each.node != node for each in sent.path())

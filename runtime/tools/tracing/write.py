@@ -14,7 +14,7 @@ from typing import IO, Any
 
 import msgspec
 
-from runtime.tools.tracing.causes import Causes, Said
+from runtime.tools.tracing.causes import Causes, SentEvent
 from runtime.tools.tracing.spool import Pace, Spool
 
 MADE_BY = "python -m runtime run --trace"
@@ -136,7 +136,7 @@ class _Writer:
             "run_s": run / 1e9,
             "stamp_s": stamp / 1e9,
         }
-        path: list[Said] = []
+        path: list[SentEvent] = []
         if self._spool.kinds[event].asked and said.cause is not None:
             path = said.path()
             begin = self._exposure(path[0])
@@ -149,11 +149,11 @@ class _Writer:
         if path:
             yield from self._flow(path)
 
-    def _exposure(self, said: Said) -> int:
+    def _exposure(self, said: SentEvent) -> int:
         """Return when in real time a sensor's event was true."""
         return min(self._moments.of(said.stamp, said.time), said.time)
 
-    def _flow(self, path: list[Said]) -> Iterator[dict[str, Any]]:
+    def _flow(self, path: list[SentEvent]) -> Iterator[dict[str, Any]]:
         """Draw arrows from an exposure over all that was sent to a set-point."""
         self._flows += 1
         first = path[0]
@@ -226,7 +226,7 @@ class _Moments:
         return self._times[index] if index < len(self._times) else latest
 
 
-def describe(path: list[Said]) -> str:
+def describe(path: list[SentEvent]) -> str:
     """Return a path as text: ``→`` where an event follows from another, ``⇢`` where it may."""
     arrows = {"begins": "", "follows": " → ", "holds": " ⇢ "}
     return "".join(

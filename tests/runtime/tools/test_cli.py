@@ -28,7 +28,9 @@ def processor_time(*arguments: str) -> float:
 def test_help_comes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """It imports little beyond what it cannot do without, however slow the machine is just now."""
     monkeypatch.chdir(ROOT)
-    least = min(processor_time("-c", "import numpy, typer.rich_utils") for _ in range(3))
+    least = min(
+        processor_time("-c", "import importlib.metadata, numpy, typer.rich_utils") for _ in range(3)
+    )
     assert min(processor_time("-m", "runtime", "--help") for _ in range(3)) < 1.8 * least
 
 
@@ -60,6 +62,25 @@ def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) 
     other = command("run", path, "--set", "run.seed=1", "-q", folder=tmp_path)
     assert other.returncode == 0
     assert summary(results)["digest"] != first["digest"]
+
+
+def test_the_results_of_an_earlier_run_are_kept_once(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "Noise", run="duration = 1")
+    runs = tmp_path / "runs"
+    for seed in range(3):
+        done = command("run", path, "--set", f"run.seed={seed}", folder=tmp_path)
+        assert done.returncode == 0
+        kept = "the earlier run in runs/sample is now runs/sample.1\n" if seed else ""
+        assert done.stderr == kept
+    assert sorted(each.name for each in runs.iterdir()) == ["sample", "sample.1"]
+    seeds = [summary(runs / name)["seed"] for name in ("sample.1", "sample")]
+    assert seeds == [1, 2]
+    (runs / "sample.1" / ".visnav-run").unlink()
+    (runs / "sample.1" / "summary.json").write_text("mine")
+    done = command("run", path, folder=tmp_path)
+    assert done.returncode == 2
+    assert "runs/sample.1: expected a new or empty folder" in done.stderr
+    assert summary(runs / "sample")["seed"] == 2
 
 
 @pytest.mark.slow

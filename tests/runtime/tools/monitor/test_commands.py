@@ -53,7 +53,7 @@ def test_a_parameter_is_set_from_another_terminal(tmp_path: Path, sockets: Path)
     with running(tmp_path) as process:
         _wait_for(sockets, process)
         done = command("set", "pilot.gain=2", folder=tmp_path)
-        assert (done.returncode, done.stdout) == (0, "gain = 2.0\n")
+        assert (done.returncode, done.stdout) == (0, "run sample: gain = 2.0\n")
         refused = command("set", "pilot.height=3", "--run", "sample", folder=tmp_path)
         assert refused.returncode == 2
         assert "error: pilot.height: cannot change while the run goes on" in refused.stderr

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from runtime.tools.tracing.causes import Causes, Said
+from runtime.tools.tracing.causes import Causes, SentEvent
 from runtime.tools.tracing.spool import Kind
 
 KINDS = {
@@ -28,7 +28,7 @@ class Story:
         self.causes = Causes(KINDS, HEARERS)
         self.number = 0
 
-    def __call__(self, sender: str, event: str, stamp: int, given: int = 0) -> Said:
+    def __call__(self, sender: str, event: str, stamp: int, given: int = 0) -> SentEvent:
         self.number += 1
         source = sender.partition(".")[0]
         return self.causes.add(
@@ -36,8 +36,8 @@ class Story:
         )
 
 
-def path(said: Said) -> list[tuple[str, str]]:
-    return [(each.event, each.how) for each in said.path()]
+def path(sent: SentEvent) -> list[tuple[str, str]]:
+    return [(each.event, each.how) for each in sent.path()]
 
 
 def test_an_estimate_follows_from_the_image_whose_stamp_it_bears() -> None:
@@ -45,9 +45,9 @@ def test_an_estimate_follows_from_the_image_whose_stamp_it_bears() -> None:
     tell("drone.images", "Image", 10)
     tell("drone.images", "Image", 20)
     tell("drone.imu", "Imu", 20)
-    said = tell("vo.poses", "Pose", 10)
-    assert path(said) == [("Image", "begins"), ("Pose", "follows")]
-    assert said.path()[0].stamp == 10
+    sent = tell("vo.poses", "Pose", 10)
+    assert path(sent) == [("Image", "begins"), ("Pose", "follows")]
+    assert sent.path()[0].stamp == 10
 
 
 def test_of_two_sensors_of_one_stamp_the_camera_counts() -> None:
@@ -62,9 +62,9 @@ def test_what_a_node_sends_on_hearing_an_event_follows_from_it() -> None:
     tell("drone.images", "Image", 10)
     pose = tell("vo.poses", "Pose", 10)
     tell("drone.images", "Image", 20)
-    said = tell("pilot.setpoints", "Setpoint", 25, given=2)
-    assert said.cause is pose
-    assert path(said) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "follows")]
+    sent = tell("pilot.setpoints", "Setpoint", 25, given=2)
+    assert sent.cause is pose
+    assert path(sent) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "follows")]
 
 
 def test_what_a_node_sends_by_itself_holds_the_newest_of_a_camera() -> None:
@@ -72,8 +72,8 @@ def test_what_a_node_sends_by_itself_holds_the_newest_of_a_camera() -> None:
     tell("drone.images", "Image", 10)
     tell("vo.poses", "Pose", 10)
     tell("drone.imu", "Imu", 30)
-    said = tell("pilot.setpoints", "Setpoint", 30)  # the stamp of the IMU, by chance
-    assert path(said) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "holds")]
+    sent = tell("pilot.setpoints", "Setpoint", 30)  # the stamp of the IMU, by chance
+    assert path(sent) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "holds")]
 
 
 def test_no_path_goes_on_behind_a_set_point_or_through_a_node_twice() -> None:
@@ -101,5 +101,5 @@ def test_nothing_follows_from_what_its_node_does_not_hear() -> None:
     tell("drone.images", "Image", 10)
     tell("vo.poses", "Pose", 10)
     tell("drone.notes", "Note", 12, given=2)
-    said = tell("pilot.setpoints", "Setpoint", 13, given=3)  # which is vo's alone
-    assert path(said) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "holds")]
+    sent = tell("pilot.setpoints", "Setpoint", 13, given=3)  # which is vo's alone
+    assert path(sent) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "holds")]

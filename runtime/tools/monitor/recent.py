@@ -52,7 +52,7 @@ class Sample(NamedTuple):
     outputs: Mapping[str, Amount]
 
 
-class Window:
+class RecentSamples:
     """The last samples.
 
     Args:

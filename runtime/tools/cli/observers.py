@@ -1,4 +1,4 @@
-"""What looks on while a run goes: progress bar, trace, monitor; each a context around the run."""
+"""The observers of a run: progress bar, trace and monitor, each a context around the run."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Watch = Callable[["Supervisor"], contextlib.AbstractContextManager[None]]
 """What `execute` takes as `watch`."""
 
 
-class Lookers:
-    """All who look at one run.
+class Observers:
+    """The observers of one run.
 
     Args:
         settings: Of the run.
@@ -46,6 +46,8 @@ class Lookers:
         top: bool,
         web: int | None,
     ) -> None:
+        from rich.console import Console
+
         from runtime.logs import terminal_handler
         from runtime.tools.cli.progress import progress
         from runtime.tools.monitor.records import LastRecords
@@ -54,9 +56,10 @@ class Lookers:
         self.handlers: list[logging.Handler] = [records]
         watches: list[Watch] = []
         if not top:
-            self.handlers.append(terminal_handler())
+            console = Console(stderr=True)  # one for both: the bar makes room for log lines
+            self.handlers.append(terminal_handler(console))
             if not quiet:
-                watches.append(progress(settings.run))
+                watches.append(progress(settings.run, console))
         watches.append(_monitored(settings, name, records, top, web))
         if trace is not None:
             watches.append(_traced(trace, name))
@@ -126,4 +129,4 @@ def _beside(*arguments: str) -> Iterator[None]:
 def _tell_when_gone(process: subprocess.Popen[bytes], over: threading.Event) -> None:
     process.wait()
     if not over.is_set():
-        print("nobody looks any more; the run goes on, Ctrl-C ends it", file=sys.stderr)
+        print("the monitor was closed; the run goes on, Ctrl-C ends it", file=sys.stderr)
