@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from runtime.summary import commit
 from runtime.summary import environment as versions
 
 
 def environment() -> dict[str, str]:
     """Return machine, versions and commit."""
-    try:
-        commit = subprocess.run(
-            ["git", "describe", "--always", "--dirty"],  # noqa: S607
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
-    return {**versions(), "cpu": _cpu(), "commit": commit}
+    return {**versions(), "cpu": _cpu(), "commit": commit(Path(__file__).parent) or "unknown"}
 
 
 def write_json(path: Path, rows: list[Any], **more: Any) -> None:

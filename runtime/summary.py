@@ -5,9 +5,14 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import re
+import shlex
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -173,7 +178,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         stalls: Times the loop did not turn, by node.
         longest_stalls: The worst of them, by node.
         announcements: What nodes said they provide.
-        environment: Machine and versions.
+        environment: Machine and versions; the command line, and the commit of the current folder.
         processes: Where which nodes ran, if not all in one process.
         workers: What workers cost, by ``node.Factory``.
     """
@@ -281,7 +286,7 @@ def summarise(
         announcements=[
             {"type": type(a).__name__, **plain(a, a.source)} for a in state.announcements
         ],
-        environment=environment(),
+        environment={**environment(), "command": command_line(), "commit": commit()},
         workers={name: WorkerSummary.of(each) for name, each in state.costs.items()},
     )
 
@@ -353,3 +358,30 @@ def environment() -> dict[str, str]:
         "python": platform.python_version(),
         **versions,
     }
+
+
+_SECRET = re.compile(r"(secret\s*=\s*)(?!\W*(?:file|env):).*", re.DOTALL)
+"""A secret in a setting of the command line, unless it only says where the secret is."""
+
+
+def command_line() -> str:
+    """Return the command that started this process, without Python's folder and secrets."""
+    program, *arguments = sys.orig_argv
+    shown = [_SECRET.sub(r"\1…", each) for each in arguments]
+    return shlex.join([Path(program).name, *shown])
+
+
+def commit(folder: Path | None = None) -> str:
+    """Return the commit of a folder's files, with ``-dirty`` if they differ; empty without git.
+
+    Args:
+        folder: Somewhere in a repository; the current folder if not given.
+    """
+    command = ["git", "describe", "--always", "--dirty"]
+    try:
+        done = subprocess.run(  # noqa: S603
+            command, cwd=folder, capture_output=True, text=True, check=True, timeout=5.0
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout.strip()

@@ -215,11 +215,18 @@ def judge(
     moved = aligned.trajectory
     absolute = absolute_error(there, moved)
     path = flight.length()
+    north, east, down = absolute.axes_rmse_m
     figures |= {
         "scale": aligned.scale,
         "ate_rmse_m": absolute.rmse_m,
         "ate_percent": 100.0 * absolute.rmse_m / path if path > 0 else None,
+        "ate_mean_m": absolute.mean_m,
+        "ate_median_m": absolute.median_m,
+        "ate_std_m": absolute.std_m,
         "ate_max_m": absolute.max_m,
+        "ate_north_rmse_m": north,
+        "ate_east_rmse_m": east,
+        "ate_down_rmse_m": down,
         "mse_m2": absolute.mse_m2,
         "rot_rmse_deg": absolute.rotation_rmse_deg,
     }

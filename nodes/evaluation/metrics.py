@@ -29,8 +29,10 @@ class AbsoluteError(msgspec.Struct, frozen=True):
         rmse_m: Root mean square of the position errors.
         mean_m: Their mean.
         median_m: Their median.
+        std_m: Their standard deviation.
         max_m: The greatest.
         mse_m2: Their mean square.
+        axes_rmse_m: Root mean squares along x, y and z of the truth's frame.
         rotation_rmse_deg: Root mean square of the angles between the orientations.
         rotation_max_deg: The greatest angle.
     """
@@ -38,8 +40,10 @@ class AbsoluteError(msgspec.Struct, frozen=True):
     rmse_m: float
     mean_m: float
     median_m: float
+    std_m: float
     max_m: float
     mse_m2: float
+    axes_rmse_m: tuple[float, float, float]
     rotation_rmse_deg: float
     rotation_max_deg: float
 
@@ -74,12 +78,15 @@ def absolute_error(truth: Trajectory, estimate: Trajectory) -> AbsoluteError:
     errors = position_errors(truth.positions, estimate.positions)
     angles = np.degrees(rotation_errors(truth.orientations, estimate.orientations))
     mse = float(np.mean(errors**2))
+    x, y, z = (estimate.positions - truth.positions).T
     return AbsoluteError(
         rmse_m=math.sqrt(mse),
         mean_m=float(errors.mean()),
         median_m=float(np.median(errors)),
+        std_m=float(errors.std()),
         max_m=float(errors.max()),
         mse_m2=mse,
+        axes_rmse_m=(_rms(x), _rms(y), _rms(z)),
         rotation_rmse_deg=_rms(angles),
         rotation_max_deg=float(angles.max()),
     )

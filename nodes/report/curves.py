@@ -80,6 +80,35 @@ def _shade(run: Run, axis: Any) -> None:
             axis.axvspan(a, b, facecolor=each.color, alpha=0.18, lw=0, zorder=0.5)
 
 
+def draw_axes(run: Run) -> Plot | None:
+    """Draw the position error of each estimate along north, east and down over time."""
+    known = [(e, e.aligned) for e in run.estimators if e.aligned is not None]
+    if run.truth is None or not known:
+        return None
+    figure = sheet(4.6, names=[each.name for each, _ in known])
+    axes: Any = figure.subplots(3, 1, sharex=True)
+    for each, aligned in known:
+        inside = aligned.take(run.truth.covers(aligned.stamps))
+        errors = inside.positions - run.truth.at(inside.stamps).positions
+        some = thin(len(inside))
+        stamps = inside.stamps[some]
+        lines = broken(errors[some], stamps, each.lost).T
+        for axis, line in zip(axes, lines, strict=True):
+            seconds = (stamps - run.start) / SECOND
+            axis.plot(seconds, line, color=each.color, lw=1.2, label=label(each.name))
+    for axis, name in zip(axes, ("north", "east", "down"), strict=True):
+        axis.set_ylabel(f"{name} (m)")
+    axes[0].margins(x=0.01)
+    axes[2].set_xlabel("time (s)")
+    legend_above(figure, axes[0])
+    return Plot(
+        "axes",
+        figure,
+        "Position error along each axis",
+        "Estimate less truth, along north, east and down, at the time of each image.",
+    )
+
+
 def draw_distributions(run: Run) -> Plot | None:
     """Draw what share of errors is below a value: at image time and at the control ticks."""
     known = [e for e in run.estimators if e.of_images is not None or e.of_ticks is not None]
@@ -138,24 +167,28 @@ def draw_latency(run: Run) -> Plot | None:
         return None
     figure = sheet(3.0, names=[each.name for each in run.estimators])
     axes: Any = figure.subplots(1, 2)
-    _histogram(axes[0], took, "from exposure to estimate (ms)", "share of estimates (%)")
-    _histogram(axes[1], age, "age of the newest pose (ms)", "share of control ticks (%)")
+    _shares(axes[0], took, "from exposure to estimate (ms)", "share of estimates up to (%)")
+    _shares(axes[1], age, "age of the newest pose (ms)", "share of control ticks up to (%)")
     axes[0].set_title("latency")
-    axes[1].set_title("what a controller has to go by")
+    axes[1].set_title("newest pose of a controller")
     legend_above(figure, axes[0] if took else axes[1])
     return Plot(
         "latency",
         figure,
         "Latency",
         "Left: from the exposure of an image to the arrival of its pose. Right: how long ago that "
-        "exposure was, at each tick of the controller. What lies beyond the axis (the last pose of "
-        "an estimator that is lost gets old) is gathered in the last bar.",
+        "exposure was, at each tick of the controller. Each line tells what share took at most so "
+        "long. Far longer times, as of the last pose of one that is lost, are cut off.",
     )
 
 
-def _histogram(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, ylabel: str) -> None:
-    """Draw outlined histograms on common bins."""
-    axis.set(xlabel=xlabel, ylabel=ylabel)
+def _shares(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, ylabel: str) -> None:
+    """Draw what share of the values of each estimator is at most so large.
+
+    A histogram of values that come in steps, as those of a fixed latency or of ticks do, would
+    have gaps wherever its bins do not fit the steps.
+    """
+    axis.set(xlabel=xlabel, ylabel=ylabel, ylim=(0, 101))
     if not series:
         axis.text(0.5, 0.5, "not known", ha="center", transform=axis.transAxes, color="#777777")
         return
@@ -163,13 +196,14 @@ def _histogram(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, y
     # An estimator that was lost has a few poses of any age: the rest is to be seen as well.
     high = max(min(float(np.percentile(v, 99.5)), 5.0 * float(np.median(v))) for _, v in series)
     margin = max(0.05 * (high - low), 5.0)
-    bins = np.linspace(max(low - margin, 0.0), high + margin, 61)
+    left, right = max(low - margin, 0.0), high + margin
+    shares = np.linspace(0.0, 100.0, 401)
     for each, values in series:
-        counts, _ = np.histogram(np.minimum(values, bins[-1]), bins)
-        share = 100.0 * counts / len(values)
-        axis.stairs(share, bins, color=each.color, lw=1.3, label=label(each.name))
-        axis.stairs(share, bins, color=each.color, alpha=0.15, fill=True)
-    axis.set_xlim(bins[0], bins[-1])
+        line = np.percentile(values, shares, method="inverted_cdf")
+        x = np.concatenate([[left], line, [max(right, line[-1])]])
+        y = np.concatenate([[0.0], shares, [100.0]])
+        axis.step(x, y, color=each.color, lw=1.3, label=label(each.name), where="post")
+    axis.set_xlim(left, right)
 
 
 def draw_relative(run: Run) -> Plot | None:

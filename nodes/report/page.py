@@ -14,7 +14,13 @@ import numpy as np
 from nodes.report import tables
 from nodes.report.clouds import draw_clouds
 from nodes.report.contents import Run
-from nodes.report.curves import draw_distributions, draw_errors, draw_latency, draw_relative
+from nodes.report.curves import (
+    draw_axes,
+    draw_distributions,
+    draw_errors,
+    draw_latency,
+    draw_relative,
+)
 from nodes.report.folder import read_run
 from nodes.report.frames import draw_frames, read_picture
 from nodes.report.style import Plot, drawing
@@ -23,7 +29,16 @@ from runtime.summary import WORKER_COLUMNS
 
 PAGE = "report.html"
 PLOTS = "plots"
-_OURS = ("trajectories", "errors", "distributions", "latency", "relative", "frames_*", "clouds_*")
+_OURS = (
+    "trajectories",
+    "errors",
+    "axes",
+    "distributions",
+    "latency",
+    "relative",
+    "frames_*",
+    "clouds_*",
+)
 """Names of the figures; those of an earlier report are removed."""
 
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 88]
@@ -64,7 +79,14 @@ def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:
             old.unlink()
     shown: list[list[dict[str, str]]] = [[], [], []]
     if formats:
-        curves = (draw_trajectories, draw_errors, draw_distributions, draw_latency, draw_relative)
+        curves = (
+            draw_trajectories,
+            draw_errors,
+            draw_axes,
+            draw_distributions,
+            draw_latency,
+            draw_relative,
+        )
         with drawing():
             for place, found in zip(
                 shown,

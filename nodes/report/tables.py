@@ -13,7 +13,13 @@ from nodes.report.style import number
 MAIN = {
     "ate_rmse_m": ("absolute trajectory error (ATE), RMS", "m"),
     "ate_percent": ("ATE in percent of the path", "%"),
+    "ate_mean_m": ("mean position error", "m"),
+    "ate_median_m": ("median position error", "m"),
+    "ate_std_m": ("standard deviation of the position error", "m"),
     "ate_max_m": ("greatest position error", "m"),
+    "ate_north_rmse_m": ("position error along north, RMS", "m"),
+    "ate_east_rmse_m": ("position error along east, RMS", "m"),
+    "ate_down_rmse_m": ("position error along down, RMS", "m"),
     "rot_rmse_deg": ("rotation error, RMS", "°"),
     "rpe_trans_percent": ("relative pose error (RPE), position", "%"),
     "rpe_rot_deg_per_m": ("relative pose error (RPE), rotation", "°/m"),
@@ -120,6 +126,10 @@ def facts(run: Run) -> list[tuple[str, str]]:
     if f.wall_seconds is not None:
         speed = (f.sim_seconds or 0.0) / max(f.wall_seconds, 1e-9)
         rows.append(("real time", f"{f.wall_seconds:.2f} s ({number(speed)} × real time)"))
+    if command := f.environment.get("command"):
+        rows.append(("command", command))
+    if commit := f.environment.get("commit"):
+        rows.append(("commit", commit))
     if f.reason is not None:
         rows.append(("ended by", f.reason))
     if f.error is not None:

@@ -81,6 +81,19 @@ def test_pictures_are_drawn(tmp_path: Path) -> None:
         assert picture.std() > 5
 
 
+@pytest.mark.parametrize(("east", "seconds"), [(0.0, 20), (1.0, 20), (0.0, 1)])
+def test_a_straight_flight_and_one_on_the_spot_are_drawn_as_large(
+    tmp_path: Path, east: float, seconds: int
+) -> None:
+    """Axes without breadth would be a line: half of the plot's height is the view from above."""
+    log(tmp_path, [odometry(500_000_000 * k, east * k) for k in range(2 * seconds)])
+    picture = cv2.imread(str(tmp_path / "flight.png"), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    left = picture[:, : picture.shape[1] * 2 // 5]
+    rows = np.flatnonzero((left < 200).any(axis=1))
+    assert rows[-1] - rows[0] > picture.shape[0] // 3
+
+
 def test_the_sheet_never_holds_more_than_it_should() -> None:
     """A long flight halves what the sheet holds and doubles the interval."""
     kept: list[int] = []

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ from runtime import Duration, Input, Node
 from runtime.config.model import Config, RunConfig
 from runtime.errors import ResultsError
 from runtime.execute import execute
-from runtime.summary import Summary
+from runtime.summary import Summary, command_line, commit
 from runtime.testing import run_nodes, spec
 from runtime.tools.cli.tables import run_tables
 from tests.runtime.samples import Diarist, Failing, Painter, Ping, Reader, Speaker
@@ -109,3 +112,22 @@ def test_the_digest_is_of_what_was_said(tmp_path: Path) -> None:
 def test_a_result_for_tests_counts_drops_too() -> None:
     result = run_nodes([spec(Speaker, "s"), spec(Lazy, "lazy")])
     assert result.drops["lazy.some"].dropped == 6
+
+
+def test_the_command_line_is_kept_without_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["run", "a b.toml", "--set", "network.secret=abc", "network.secret=file:key"]
+    monkeypatch.setattr(sys, "orig_argv", ["/opt/bin/python3", "-m", "runtime", *arguments])
+    shown = command_line()
+    assert shown.startswith("python3 -m runtime run 'a b.toml' --set ")
+    assert "abc" not in shown
+    assert "network.secret=file:key" in shown
+
+
+def test_the_commit_is_that_of_the_folder_if_there_is_one(tmp_path: Path) -> None:
+    assert commit(tmp_path) == ""
+    for command in (
+        ["init", "-q"],
+        ["-c", "user.name=a", "-c", "user.email=a", "commit", "-q", "--allow-empty", "-m", "a"],
+    ):
+        subprocess.run(["git", *command], cwd=tmp_path, check=True)
+    assert re.fullmatch("[0-9a-f]{7,40}", commit(tmp_path))

@@ -52,7 +52,7 @@ def test_absolute_errors_are_evos(seed: int, n: int) -> None:
     estimate = noisy(truth, seed=seed + 1)
     ours = absolute_error(truth, estimate)
     shifts = ape(truth, estimate, evo.PoseRelation.translation_part)
-    for name in ("rmse", "mean", "median", "max"):
+    for name in ("rmse", "mean", "median", "std", "max"):
         assert getattr(ours, f"{name}_m") == pytest.approx(shifts[name], abs=1e-9)
     assert ours.mse_m2 == pytest.approx(shifts["sse"] / n, abs=1e-9)
     turns = ape(truth, estimate, evo.PoseRelation.rotation_angle_deg)
@@ -184,6 +184,15 @@ def test_the_angle_of_one_pose_is_that_of_many(seed: int, radians: float) -> Non
     assert angle_between(tuple(p), tuple(q)) == pytest.approx(radians, abs=1e-9)
     assert angle_between(tuple(p), tuple(-q)) == pytest.approx(radians, abs=1e-9)
     assert rotation_errors(p[None], q[None])[0] == pytest.approx(radians, abs=1e-9)
+
+
+def test_errors_by_axis_are_those_of_the_axis_that_is_off() -> None:
+    truth = walk(50)
+    off = np.where(np.arange(50)[:, None] % 2, 1.0, -1.0) * [0.0, 0.2, 0.1]
+    estimate = Trajectory(truth.stamps, truth.positions + off, truth.orientations)
+    found = absolute_error(truth, estimate)
+    assert found.axes_rmse_m == pytest.approx((0.0, 0.2, 0.1), abs=1e-12)
+    assert sum(value**2 for value in found.axes_rmse_m) == pytest.approx(found.mse_m2)
 
 
 def test_the_distance_of_one_pose() -> None:

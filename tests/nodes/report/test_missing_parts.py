@@ -101,7 +101,7 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
         assert name in page.text
     names = {p.name for p in (tmp_path / "plots").iterdir()}
     assert names == {
-        f"{plot}.{kind}" for plot in ("trajectories", "relative") for kind in ("png", "svg")
+        f"{plot}.{kind}" for plot in ("trajectories", "relative", "axes") for kind in ("png", "svg")
     }
 
 

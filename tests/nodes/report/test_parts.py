@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 
 from nodes.evaluation.coverage import Interval
+from nodes.evaluation.judging import Thresholds
+from nodes.report.curves import draw_latency
+from nodes.report.folder import read_run
 from nodes.report.ply import read_ply
 from nodes.report.poses import broken, gaps, read_poses
 from nodes.report.splat import Shown, View, paint
-from nodes.report.style import label, number
+from nodes.report.style import drawing, label, number
+from nodes.report.trajectories import draw_trajectories
+from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import read_tum, write_tum
-from tests.nodes.report.folders import SECOND, ply, recorded, walk
+from tests.nodes.report.folders import SECOND, evaluated, ply, recorded, walk
 
 
 def test_poses_are_read_as_the_strict_reader_reads_them(tmp_path: Path) -> None:
@@ -153,3 +158,39 @@ def test_what_is_no_such_cloud_is_said(tmp_path: Path, content: bytes, found: st
 )
 def test_numbers_have_three_digits(value: float, text: str) -> None:
     assert number(value) == text
+
+
+def test_a_fixed_latency_and_ages_in_steps_of_a_tick_give_lines_that_only_rise(
+    tmp_path: Path,
+) -> None:
+    truth = walk(20)
+    evaluated(tmp_path, truth, {"vo": recorded(truth)}, Thresholds())
+    with drawing():
+        plot = draw_latency(read_run(tmp_path))
+        assert plot is not None
+        for axis in plot.figure.axes:
+            (line,) = axis.get_lines()
+            x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+            assert (np.diff(x) >= 0).all()
+            assert (np.diff(y) >= 0).all()
+            assert (y[0], y[-1]) == (0.0, 100.0)
+
+
+def test_the_start_is_seen_around_an_end_on_the_same_spot(tmp_path: Path) -> None:
+    """A ring around a square, not one mark on the other: a round trip has both on one spot."""
+    truth = walk(20)
+    home = truth.positions - np.linspace(0, 1, len(truth))[:, None] * (
+        truth.positions[-1] - truth.positions[0]
+    )
+    (tmp_path / "trajectories").mkdir()
+    write_tum(
+        tmp_path / "trajectories" / "truth.tum", Trajectory(truth.stamps, home, truth.orientations)
+    )
+    with drawing():
+        plot = draw_trajectories(read_run(tmp_path))
+    assert plot is not None
+    marks = {line.get_label(): line for line in plot.figure.axes[0].get_lines()}
+    start, end = marks["start"], marks["end"]
+    assert np.allclose(start.get_xydata(), end.get_xydata())
+    assert start.get_markerfacecolor() == "none"
+    assert start.get_markersize() > 2 * end.get_markersize()

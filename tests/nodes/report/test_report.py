@@ -98,6 +98,7 @@ def test_every_section_has_its_title(page: Page) -> None:
     for title in (
         "Trajectories",
         "Errors over time",
+        "Position error along each axis",
         "Distribution of the errors",
         "Latency",
         "Relative error over path length",
@@ -152,6 +153,7 @@ def test_the_page_needs_nothing_beside_it(page: Page) -> None:
 def test_every_picture_is_one_and_shows_something(run: Path, page: Page) -> None:
     pictures = sorted((run / "plots").glob("*.png"))
     assert [p.name for p in pictures] == [
+        "axes.png",
         "clouds_1.png",
         "distributions.png",
         "errors.png",
