@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-all check fix docs wheel peers bench bench-quick orbslam3 pictures clean
+.PHONY: help setup demo test test-slow test-all check fix docs wheel peers bench bench-quick orbslam3 images clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -61,7 +61,7 @@ docs: $(READY)  ## Build the documentation into build/site; every broken link is
 wheel: $(READY)  ## Build the wheel into dist.
 	$(BIN)/python -m build --outdir dist .
 
-orbslam3: $(READY)  ## Install ORB-SLAM3 (GPL) and train its vocabulary from rendered pictures.
+orbslam3: $(READY)  ## Install ORB-SLAM3 (GPL) and train its vocabulary from rendered images.
 	$(BIN)/python -m pip install --quiet -e '.[orbslam3]'
 	@sh tools/system_packages.sh orbslam3 $(BIN)/python
 	$(BIN)/python -m runtime vocabulary config.toml
@@ -76,11 +76,11 @@ bench: $(READY)  ## Run every benchmark and write bench/results/RESULTS.md (abou
 bench-quick: $(READY)  ## Run the quick benchmarks (under two minutes).
 	$(BIN)/python -m runtime bench all --quick --out runs/bench-quick
 
-pictures: demo $(READY)  ## Make the README's pictures anew (needs Chromium for two of them; minutes).
-	$(BIN)/python tools/readme_pictures.py
+images: demo $(READY)  ## Make the images of the documentation anew (needs Chromium for two of them; minutes).
+	$(BIN)/python tools/readme_images.py
 	$(BIN)/python -m runtime run examples/rerun.toml
-	$(BIN)/python tools/view_picture.py runs/rerun/flight.rrd docs/images/rerun.png
-	$(BIN)/python tools/monitor_pictures.py
+	$(BIN)/python tools/viewer_image.py runs/rerun/flight.rrd docs/images/rerun.png
+	$(BIN)/python tools/monitor_images.py
 
 clean:  ## Remove the environment, results and caches.
 	rm -rf $(VENV) runs sweeps .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

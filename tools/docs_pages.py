@@ -1,6 +1,6 @@
 """The pages of the documentation that are made from the code, as a hook of MkDocs.
 
-Commands, nodes and the tables of a file are read from their typed declarations, the picture of
+Commands, nodes and the tables of a file are read from their typed declarations, the drawing of
 the architecture from the imports, each time the site is built: so they cannot drift.
 """
 

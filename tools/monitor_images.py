@@ -25,7 +25,7 @@ FLYING = 8.0
 
 
 def main() -> None:
-    """Make both pictures."""
+    """Make both images."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
         sys.exit("expected chromium, found none")
@@ -78,16 +78,16 @@ async def _look(folder: Path, browser: str) -> None:
     await web.wait()
 
 
-def _draw(browser: str, url: str, picture: Path, width: int, height: int) -> None:
+def _draw(browser: str, url: str, image: Path, width: int, height: int) -> None:
     subprocess.run(  # noqa: S603  # found on the path, and told all it does
         [
             browser, "--headless", "--no-sandbox", "--hide-scrollbars", "--timeout=6000",
-            f"--window-size={width},{height}", f"--screenshot={picture}", url,
+            f"--window-size={width},{height}", f"--screenshot={image}", url,
         ],
         check=True, capture_output=True, timeout=60,
         preexec_fn=_stand_back,
     )  # fmt: skip
-    print(f"{picture}: {picture.stat().st_size / 1e3:.0f} kB")
+    print(f"{image}: {image.stat().st_size / 1e3:.0f} kB")
 
 
 def _stand_back() -> None:

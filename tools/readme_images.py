@@ -1,4 +1,4 @@
-"""Make the README's pictures from the results of `make demo`."""
+"""Make the README's images from the results of `make demo`."""
 
 from __future__ import annotations
 

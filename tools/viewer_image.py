@@ -1,7 +1,7 @@
-"""Make a picture of what Rerun shows of a recording: `python tools/view_picture.py RRD PNG`.
+"""Make an image of what Rerun shows of a recording: `python tools/viewer_image.py RRD PNG`.
 
 Serves the recording on this machine, opens it in a headless Chromium (which renders in software,
-so it takes a few minutes), and waits until the picture no longer changes.
+so it takes a few minutes), and waits until the image no longer changes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TOP = 32
 """Pixels of the viewer's own bar, which is left out."""
 
 PATIENCE = 240.0
-"""Seconds until the picture must be there."""
+"""Seconds until the image must be there."""
 
 STILL = 4
 """Captures in a row, two seconds apart, that must be equal."""
@@ -41,15 +41,15 @@ STILL = 4
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 
 
-def main(recording: str, picture: str) -> None:
-    """Make the picture."""
+def main(recording: str, out: str) -> None:
+    """Make the image."""
     with serving(Path(recording)) as address, browser() as page:
         page.call("Emulation.setEmulatedMedia", features=[_DARK])
         page.call("Page.navigate", url=address)
         png = page.still()
     image = Image.open(io.BytesIO(png)).convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    image.save(picture, optimize=True)
-    print(f"{picture}: {Path(picture).stat().st_size / 1e3:.0f} kB")
+    image.save(out, optimize=True)
+    print(f"{out}: {Path(out).stat().st_size / 1e3:.0f} kB")
 
 
 @contextmanager
@@ -128,7 +128,7 @@ class Page:
         end, last, equal = time.monotonic() + PATIENCE, b"", 0
         while equal < STILL:
             if time.monotonic() > end:
-                print("the picture still changes; this is the last of it", file=sys.stderr)
+                print("the image still changes; this is the last of it", file=sys.stderr)
                 break
             time.sleep(2.0)
             shot = self.call("Page.captureScreenshot", format="png", clip=clip)["data"]
@@ -156,7 +156,7 @@ def _debugging_port(file: Path) -> int:
 
 
 def _is_full(png: bytes) -> bool:
-    """Tell whether there is more on a picture than an empty page."""
+    """Tell whether there is more on a image than an empty page."""
     return len(png) > 100_000
 
 
