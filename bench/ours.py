@@ -15,7 +15,7 @@ import uvloop
 from bench.messages import Ping, Pong
 from bench.system import Case, Samples, System
 from bench.systems.parts import payloads
-from runtime import Input, Node, NodeConfig, Output, on, tasks
+from runtime import Input, Node, NodeConfig, Output, on, task_factory
 from runtime.config.model import Config, RunConfig
 from runtime.digest import Digest
 from runtime.real_clock import RealClock
@@ -134,7 +134,7 @@ def measure(case: Case, digest: bool = False) -> Samples:
 
     async def main() -> Any:
         loop = asyncio.get_running_loop()
-        tasks.install(loop)
+        task_factory.install(loop)
         clock = RealClock(loop)
         supervisor = Supervisor(config, clock, [Digest()] if digest else [])
         await supervisor.main()

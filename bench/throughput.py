@@ -15,7 +15,7 @@ import uvloop
 
 from bench.messages import Ping
 from events import Event, Image, PoseEstimate, Quaternion, Vector3
-from runtime import tasks
+from runtime import task_factory
 from runtime.real_clock import RealClock
 from runtime.sender import Listener, Sender
 from runtime.streams import Stream
@@ -69,7 +69,7 @@ def measure(bursts: int = 400) -> list[ThroughputRow]:
 
 
 async def _measure(bursts: int) -> list[ThroughputRow]:
-    tasks.install(asyncio.get_running_loop())
+    task_factory.install(asyncio.get_running_loop())
     event = Ping(stamp=0, source="one", receiver=2, number=0)
     pixels = np.zeros((512, 512, 3), np.uint8)
     image = Image(stamp=0, source="drone/front", frame_id="f", data=pixels)

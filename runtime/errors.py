@@ -4,6 +4,7 @@
     ├── ConfigError            the file or the command line: expected, found, where
     ├── DeclarationError       a node's class: a port, handler or tick is declared wrongly
     ├── MissingDependencyError something to install; the message says how
+    ├── UnsupportedInterpreterError  this Python cannot do what the file asks for
     ├── NodeError              a node failed while running
     │   ├── FatalError         …because it said so itself (`log.fatal`)
     │   ├── RefusedError       …because it refused what another node announced
@@ -58,6 +59,10 @@ class DeclarationError(VisnavError):
 
 class MissingDependencyError(VisnavError):
     """A library is missing; the message holds the command that installs it."""
+
+
+class UnsupportedInterpreterError(VisnavError):
+    """The interpreter cannot do what the file asks for; another Python can."""
 
 
 class NodeError(VisnavError):

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from events import Event
-from runtime import event_loop, results, tasks
+from runtime import event_loop, lockstep, results, task_factory
 from runtime.clock import Clock
 from runtime.config.model import Config, RunConfig
 from runtime.digest import Digest
@@ -80,8 +80,13 @@ def execute(
 
 
 def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
-    """Return a new loop for the clock that a run asks for."""
+    """Return a new loop for the clock that a run asks for.
+
+    Raises:
+        UnsupportedInterpreterError: Time cannot be simulated on this interpreter.
+    """
     if run.clock == "lockstep":
+        lockstep.check_interpreter()
         return LockstepLoop(speed=None if run.speed in {None, "max"} else run.speed)  # type: ignore[arg-type]
     try:
         import uvloop
@@ -133,7 +138,7 @@ class _Run:
     async def main(self) -> Summary:
         """Run the nodes to their end, and put together what there is to say of it."""
         loop, run = asyncio.get_running_loop(), self._config.run
-        tasks.install(loop)
+        task_factory.install(loop)
         clock = self._clock = make_clock(run, loop)
         self.supervisor = supervisor = Supervisor(
             self._config, clock, self._taps, self._out, self._only

@@ -18,6 +18,7 @@ import asyncio
 import concurrent.futures
 import contextlib
 import contextvars
+import functools
 import heapq
 import itertools
 import selectors
@@ -26,7 +27,9 @@ from collections.abc import Callable
 from typing import Any, Literal, Protocol, TypeVar
 
 from runtime.clock import Clock
-from runtime.schedule import SECOND, Schedule
+from runtime.errors import UnsupportedInterpreterError
+from runtime.schedule import SECOND, Once, Schedule
+from runtime.self_test import PYTHON, passes
 
 R = TypeVar("R")
 _Work = concurrent.futures.Future[Any]
@@ -228,6 +231,40 @@ class LockstepLoop(asyncio.SelectorEventLoop):
             self._wall_origin = wall - self.now * self._pace
         rest = self._wall_origin + due * self._pace - wall
         return self._jumping.wait(rest) if rest > 0 else []
+
+
+@functools.cache
+def check_interpreter() -> None:
+    """Check that simulated time goes on this interpreter as it does on others.
+
+    Raises:
+        UnsupportedInterpreterError: It does not, and there is no other way to simulate it.
+    """
+    if not passes(LockstepLoop, _exercise):
+        raise UnsupportedInterpreterError(
+            f"expected an asyncio on which time can be simulated, such as Python's from 3.11 to "
+            f'3.14, found {PYTHON}: use one of those, or clock = "real"'
+        )
+
+
+async def _exercise(loop: asyncio.AbstractEventLoop) -> bool:
+    """Wait for timers, the schedule and work beside the loop; return whether the order is right."""
+    assert isinstance(loop, LockstepLoop)
+    order: list[tuple[str, float]] = []
+
+    def note(name: str) -> None:
+        order.append((name, loop.time()))
+
+    for name in "abcdef":  # at one time; a bare heap would mix them
+        loop.call_at(2.0, note, name)
+    loop.call_at(3.0, note, "cancelled").cancel()
+    loop.schedule.add(2 * SECOND, Once(lambda: note("schedule")))
+    loop.schedule.add(SECOND, Once(lambda: note("early")))
+    work = loop.run_in_executor(None, note, "beside")
+    await work
+    await asyncio.sleep(2.5)
+    expected = [("beside", 0.0), ("early", 1.0), *((name, 2.0) for name in [*"abcdef", "schedule"])]
+    return order == expected and loop.now == 5 * SECOND // 2
 
 
 class LockstepClock(Clock):

@@ -129,6 +129,32 @@ class Stream(Generic[T]):
             self._room.set()
         return event
 
+    @types.coroutine
+    def _next_by_future(self) -> Generator[Any, Any, T]:
+        """Wait as `__anext__` does, on a future: for tasks that accept nothing else."""
+        if self._buffer:
+            self._taken += 1
+            if self._taken == TURN:
+                self._taken = 0
+                yield
+        while not self._buffer:
+            if self._closed:
+                raise StopAsyncIteration
+            if self.waiter is not None:
+                raise ChannelBusyError(f"{self.name}: another coroutine waits here already")
+            self.waiter = waiter = _FutureWaiter(self)
+            try:
+                yield from waiter.future
+            finally:
+                if self.waiter is waiter:
+                    self.waiter = None
+        return self.receive_nowait()
+
+    @classmethod
+    def use_futures(cls) -> None:
+        """Have all streams wait on asyncio's own futures from now on."""
+        cls.__anext__ = cls._next_by_future  # type: ignore[method-assign]
+
     async def receive(self) -> T:
         """Wait for the next event and take it.
 
@@ -302,3 +328,19 @@ class _ForeignTask:
         """Tell the task how its wait ended; called by the task."""
         if self._cancelled is not None:
             raise self._cancelled
+
+
+class _FutureWaiter:
+    """A reader that waits on a future of asyncio's."""
+
+    def __init__(self, stream: Stream[Any]) -> None:
+        self.future = asyncio.get_running_loop().create_future()
+        self._stream = stream
+
+    def resume(self, event: Any) -> None:
+        self._stream.keep(event)
+        self.resume_soon()
+
+    def resume_soon(self) -> None:
+        if not self.future.done():
+            self.future.set_result(None)

@@ -8,14 +8,14 @@ coroutine waits for anything but a stream, ends, or is cancelled. The task is as
 coroutine is stepped in the task's own context with the task as the current one, so it cannot
 tell in which of the two ways it was resumed.
 
-`install(loop)` makes every task of a loop such a task. Not here: buffers (`runtime.streams`).
+`runtime.task_factory` makes every task of a loop such a task. Not here: buffers
+(`runtime.streams`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextvars
-import functools
 import sys
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any
@@ -44,13 +44,14 @@ if sys.version_info >= (3, 14):
         def pop(loop: asyncio.AbstractEventLoop, _: None) -> None:
             _swap_current_task(loop, None)
 
-    _current_tasks: Any = _CurrentTasks()
+    current_tasks: Any = _CurrentTasks()
 else:
-    # One dictionary access is a tenth of `_leave_task` and `_enter_task` together.
-    from asyncio.tasks import _current_tasks  # type: ignore[attr-defined]
+    # One dictionary access is a tenth of `_leave_task` and `_enter_task` together. Where there is
+    # no such dictionary, `runtime.task_factory` finds that this one does not serve.
+    current_tasks = getattr(asyncio.tasks, "_current_tasks", {})
 
 
-class _Nesting:
+class Nesting:
     """How many resumptions are nested in one another on a loop just now; and a count of tasks."""
 
     __slots__ = ("depth", "tasks")
@@ -58,24 +59,6 @@ class _Nesting:
     def __init__(self) -> None:
         self.depth = 0
         self.tasks = 0
-
-
-class _Task(asyncio.Task[Any]):
-    """A task whose place in a set does not depend on its address.
-
-    Whoever goes through a set of tasks (a `TaskGroup` that cancels them, a caller of
-    `asyncio.wait`) does so in the same order in equal runs.
-    """
-
-    tasks = 0
-    """How many this one has made: its own count, so that nobody who looks on changes it."""
-
-    def __init__(self, number: int, coro: Coroutine[Any, Any, Any], **options: Any) -> None:
-        self._number = number
-        super().__init__(coro, **options)
-
-    def __hash__(self) -> int:
-        return self._number
 
 
 class _Gate(asyncio.Future[None]):
@@ -111,7 +94,7 @@ class ResumableCoroutine(Coroutine[Any, Any, Any]):
         coro: Coroutine[Any, Any, Any],
         loop: asyncio.AbstractEventLoop,
         context: contextvars.Context,
-        nesting: _Nesting,
+        nesting: Nesting,
     ) -> None:
         self.__name__: str = getattr(coro, "__qualname__", "?")
         self._coro = coro
@@ -258,7 +241,7 @@ class FanOut:
         if event.__class__ is not self.expected and self._check is not None:
             self._check(event)
         self.sent += 1
-        tasks, loop, sender, nesting = _current_tasks, None, None, _NOTHING
+        tasks, loop, sender, nesting = current_tasks, None, None, _NOTHING
         try:
             for stream in self.streams:
                 steps = stream.waiter
@@ -309,32 +292,6 @@ def _set_current_task(
 ) -> None:
     """Put a task back in its place as the running one; without a loop it never left that."""
     if task is not None:
-        _current_tasks[loop] = task
+        current_tasks[loop] = task
     elif loop is not None:
-        _current_tasks.pop(loop, None)
-
-
-def _task_factory(
-    nesting: _Nesting,
-    loop: asyncio.AbstractEventLoop,
-    coro: Coroutine[Any, Any, Any],
-    context: contextvars.Context | None = None,
-    **options: Any,
-) -> asyncio.Task[Any]:
-    """Make a task whose coroutine streams can step.
-
-    A task that is given a context shares it, and a context cannot be entered twice; such a task
-    stays a stock one, which streams wake through the loop.
-    """
-    if context is None:
-        context = contextvars.copy_context()
-        coro = ResumableCoroutine(coro, loop, context, nesting)
-    parent: Any = _current_tasks.get(loop)
-    counter = parent if isinstance(parent, _Task) else nesting
-    counter.tasks += 1
-    return _Task(counter.tasks, coro, loop=loop, context=context, **options)
-
-
-def install(loop: asyncio.AbstractEventLoop) -> None:
-    """Make every task created on `loop` from now on one that streams can step."""
-    loop.set_task_factory(functools.partial(_task_factory, _Nesting()))
+        current_tasks.pop(loop, None)

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from events import Announcement, Event
-from runtime import tasks
+from runtime import task_factory
 from runtime.config.model import Config, NodeSpec, OnError, RunConfig
 from runtime.config.reading import convert
 from runtime.links import LinkConfig
@@ -62,7 +62,7 @@ def run_in_lockstep(main: Coroutine[Any, Any, R]) -> R:
 
     async def prepared() -> R:
         loop = asyncio.get_running_loop()
-        tasks.install(loop)
+        task_factory.install(loop)
         return await loop.create_task(main)
 
     with asyncio.Runner(loop_factory=LockstepLoop) as runner:

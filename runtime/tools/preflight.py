@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 import msgspec
 
 from events import Announcement
-from runtime import tasks
+from runtime import task_factory
 from runtime.clock import Clock
 from runtime.config.model import Config, NodeSpec
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
@@ -85,7 +85,7 @@ def of_nodes(config: Config) -> Findings:
 
 async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> None:
     loop = asyncio.get_running_loop()
-    tasks.install(loop)
+    task_factory.install(loop)
     clock = make_clock(config.run, loop)
     host = _DryHost(config.run.seed, clock)
     created: set[asyncio.Task[Any]] = set()

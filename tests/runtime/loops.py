@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import uvloop
 
-from runtime import tasks
+from runtime import task_factory
 from runtime.lockstep import LockstepLoop
 
 R = TypeVar("R")
@@ -35,7 +35,7 @@ class Run:
             loop = asyncio.get_running_loop()
             loop.set_exception_handler(lambda _, context: reported.append(context))
             if self.ours:
-                tasks.install(loop)
+                task_factory.install(loop)
             return await loop.create_task(main)
 
         debug = self.loop == "asyncio"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from events import Event, Image, ParameterChanged, PoseEstimate, VelocitySetpoint
-from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on, tasks
+from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on, task_factory
 from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.config.parameters import Changeable
 from runtime.digest import Digest
@@ -174,7 +174,7 @@ def look(
         digest(sender, event)
 
     async def main() -> None:
-        tasks.install(loop)
+        task_factory.install(loop)
         supervisor = Supervisor(config, make_clock(config.run, loop), [tap])
         beside = loop.create_task(after_start(supervisor, body)) if body else None
         with watch(supervisor) if watch else contextlib.nullcontext():

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from events import Event
-from runtime import Duration, tasks
+from runtime import Duration, task_factory
 from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.execute import make_clock, make_loop
 from runtime.sender import Sender
@@ -40,7 +40,7 @@ def supervise(
         sent.append(event)
 
     async def main() -> Outcome:
-        tasks.install(loop)
+        task_factory.install(loop)
         clock = make_clock(config.run, loop)
         supervisor = Supervisor(config, clock, [tap], out)
         try:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol, TypeVar
 
-from runtime import tasks
+from runtime import task_factory
 from runtime.clock import Clock
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.real_clock import RealClock
@@ -66,7 +66,7 @@ def on_clock(lockstep: bool, speed: float, main: Callable[[Clock], Coroutine[Any
 
     async def prepared() -> R:
         loop = asyncio.get_running_loop()
-        tasks.install(loop)
+        task_factory.install(loop)
         clock = LockstepClock(loop) if isinstance(loop, LockstepLoop) else RealClock(loop, speed)
         assert clock.now() == 0
         clock.start()

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import pytest
 import uvloop
 
-from runtime import Node, Tick, every, tasks
+from runtime import Node, Tick, every, task_factory
 from runtime.config.model import Config, RunConfig
 from runtime.execute import make_clock, make_loop
 from runtime.lockstep import LockstepLoop
@@ -76,7 +76,7 @@ def watch(*nodes: type[Node[Any]], clock: str, duration: float = 0.25) -> LoopWa
     dogs: list[LoopWatchdog] = []
 
     async def main() -> None:
-        tasks.install(loop)
+        task_factory.install(loop)
         dogs.append(LoopWatchdog(loop, 0.04, reports.append))
         kept = make_clock(config.run, loop)
         dogs[0].start()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime import Worker, tasks
+from runtime import Worker, task_factory
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.real_clock import RealClock
@@ -30,7 +30,7 @@ async def worker(*args: Any, **options: Any) -> AsyncIterator[Worker[Plant]]:
     loop = asyncio.get_running_loop()
     lockstep = isinstance(loop, LockstepLoop)
     clock = LockstepClock(loop) if lockstep else RealClock(loop)  # type: ignore[arg-type]
-    tasks.install(loop)
+    task_factory.install(loop)
     made: Worker[Plant] = await asyncio.to_thread(
         Worker, "plant", clock, options.pop("factory", Plant), *args, **options
     )

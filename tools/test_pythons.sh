@@ -1,0 +1,39 @@
+#!/bin/sh
+# Test events and the runtime's core on every Python from 3.11 on that this machine has.
+#
+#   sh tools/test_pythons.sh [pytest's options]
+#
+# Interpreters are those on PATH and those of pyenv. Each gets an environment of its own,
+# .venv-X.Y, with what these tests need. The script fails if one cannot be made or a test fails.
+set -u
+cd "$(dirname "$0")/.." || exit 1
+
+tests="tests/events tests/runtime --ignore=tests/runtime/tools --ignore=tests/runtime/peers"
+needs="hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist"
+
+# "X.Y path" for each interpreter, the first of each version.
+interpreters() {
+    for python in python3 $(seq -f 'python3.%.0f' 11 19) \
+        "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.*/bin/python3; do
+        "$python" -c 'import sys
+if sys.version_info >= (3, 11): print("%d.%d" % sys.version_info[:2], sys.executable)' 2>/dev/null
+    done | sort -t. -k2,2n -s | awk '!seen[$1]++'
+}
+
+failed=""
+found="$(interpreters)"
+echo "$found" | {
+    while read -r version python; do
+        venv=".venv-$version"
+        echo "Python $version ($python)"
+        if ! [ -e "$venv/.ready" ]; then
+            # shellcheck disable=SC2086
+            "$python" -m venv "$venv" && "$venv/bin/python" -m pip install --quiet -e . $needs &&
+                touch "$venv/.ready" || { failed="$failed $version"; continue; }
+        fi
+        # shellcheck disable=SC2086
+        "$venv/bin/python" -m pytest -q -n 2 -m "not slow" -p no:cacheprovider "$@" $tests \
+            </dev/null || failed="$failed $version"
+    done
+    [ -z "$failed" ] || { echo "failed on:$failed"; exit 1; }
+}
