@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from nodes.replay.reader import ReplayError
-from nodes.replay.settings import Topic, Use
+from nodes.replay.settings import BagTopic, Use
 from runtime.errors import suggest
 
 TYPES: dict[Use, tuple[str, ...]] = {
@@ -35,8 +35,8 @@ _PARTS = {
 
 
 def chosen(
-    found: Mapping[str, tuple[str, int]], wanted: tuple[Topic, ...], vehicle: str
-) -> dict[str, Topic]:
+    found: Mapping[str, tuple[str, int]], wanted: tuple[BagTopic, ...], vehicle: str
+) -> dict[str, BagTopic]:
     """Return the topics to read, by name, with all sources filled in.
 
     Args:
@@ -64,7 +64,7 @@ def chosen(
     if not taken:
         raise ReplayError(f"expected topics of cameras, IMUs or poses, found: {there or 'none'}")
     return {
-        topic.topic: Topic(
+        topic.topic: BagTopic(
             topic=topic.topic,
             use=topic.use,
             source=topic.source or _source(topic, vehicle),
@@ -74,8 +74,8 @@ def chosen(
     }
 
 
-def _guessed(found: Mapping[str, tuple[str, int]]) -> list[Topic]:
-    taken: list[Topic] = []
+def _guessed(found: Mapping[str, tuple[str, int]]) -> list[BagTopic]:
+    taken: list[BagTopic] = []
     truth = False
     for name, (type_, count) in sorted(found.items()):
         use: Use | None = None
@@ -94,11 +94,11 @@ def _guessed(found: Mapping[str, tuple[str, int]]) -> list[Topic]:
         elif type_ == "nav_msgs/msg/Odometry" and not truth:
             use, truth = "odometry", True
         if use is not None and "segmentation" not in name:
-            taken.append(Topic(topic=name, use=use))
+            taken.append(BagTopic(topic=name, use=use))
     return taken
 
 
-def _source(topic: Topic, vehicle: str) -> str:
+def _source(topic: BagTopic, vehicle: str) -> str:
     """Return the source of a topic's events: of a camera, its namespace, below the vehicle."""
     if topic.use in {"odometry", "truth"}:
         return vehicle

@@ -32,7 +32,7 @@ from nodes.replay.bag_topics import chosen
 from nodes.replay.folders import vehicle_at
 from nodes.replay.mounting import Mountings
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
-from nodes.replay.settings import Topic, Use
+from nodes.replay.settings import BagTopic, Use
 from nodes.ros_messages.calibration import camera_announcement
 from nodes.ros_messages.depth import decode_compressed
 from nodes.ros_messages.incoming import READERS, MessageContext, estimate
@@ -68,7 +68,7 @@ class RosBag(Reader):
         ReplayError: It cannot be read, or a topic is not there.
     """
 
-    def __init__(self, path: Path, topics: tuple[Topic, ...], vehicle: str) -> None:
+    def __init__(self, path: Path, topics: tuple[BagTopic, ...], vehicle: str) -> None:
         super().__init__()
         self._path = path
         self._vehicle = vehicle
@@ -120,7 +120,7 @@ class RosBag(Reader):
         """Close the bag."""
         self._bag.close()
 
-    def _event(self, topic: Topic, type_: str, message: Any) -> Event:
+    def _event(self, topic: BagTopic, type_: str, message: Any) -> Event:
         if 0 < (at := _stamp(message)) < self._stamps.offset:
             early = (self._stamps.offset - at) / 1e9
             raise ValueError(
@@ -137,7 +137,9 @@ class RosBag(Reader):
         assert event is not None
         return event
 
-    def _truth(self, topic: Topic, type_: str, message: Any, context: MessageContext) -> Odometry:
+    def _truth(
+        self, topic: BagTopic, type_: str, message: Any, context: MessageContext
+    ) -> Odometry:
         """Read a true pose; it is in ``map`` unless the settings say otherwise."""
         context = msgspec.structs.replace(context, frame_id=topic.frame_id or "map")
         if type_ == "nav_msgs/msg/Odometry":

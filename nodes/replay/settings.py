@@ -12,7 +12,7 @@ from runtime.paths import InputPath
 Use = Literal["image", "depth", "imu", "odometry", "truth", "estimate", "camera"]
 
 
-class Topic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class BagTopic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A topic of a ROS bag, and what its messages become.
 
     Attributes:
@@ -84,7 +84,7 @@ class ReplayConfig(NodeConfig):
     only: tuple[str, ...] = ()
     skip: tuple[str, ...] = ()
     memory: Annotated[int, msgspec.Meta(ge=1 << 20)] = 128 << 20
-    topics: tuple[Topic, ...] = ()
+    topics: tuple[BagTopic, ...] = ()
     vehicle: str = ""
     camera: Pinhole | None = None
     depth_factor: Annotated[float, msgspec.Meta(gt=0)] = 5000.0

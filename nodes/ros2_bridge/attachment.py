@@ -8,6 +8,8 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
+import xxhash
+
 _LAYOUT = struct.Struct("<qqB16s")
 """Two numbers, and a buffer of 16 bytes after its length, in Zenoh's own serialisation."""
 
@@ -20,12 +22,20 @@ class Attachment(NamedTuple):
     Attributes:
         sequence: Number of the message from its publisher, from 1.
         stamp: Wall clock, nanoseconds since 1970.
-        gid: The publisher's, 16 bytes.
+        gid: The 16 bytes by which ROS tells one publisher from another.
     """
 
     sequence: int
     stamp: int
     gid: bytes
+
+
+def gid(token: str) -> bytes:
+    """Return the GID of the owner of a liveliness token, as rmw_zenoh_cpp makes it.
+
+    It is the token's XXH3 hash of 128 bits, its low 64 bits first, little endian.
+    """
+    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 
 def pack(attachment: Attachment) -> bytes:

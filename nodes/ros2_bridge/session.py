@@ -17,8 +17,7 @@ from typing import Any, Literal, TypeVar
 
 import zenoh
 
-from nodes.ros2_bridge.attachment import Attachment, pack
-from nodes.ros2_bridge.gid import gid
+from nodes.ros2_bridge.attachment import Attachment, gid, pack
 from nodes.ros2_bridge.keys import NodeName, data_key, endpoint_token, node_token, ros2dds_key
 from nodes.ros_messages.topics import Topic
 

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from nodes.ros2_bridge.attachment import unpack
-from nodes.ros2_bridge.gid import gid
+from nodes.ros2_bridge.attachment import gid, unpack
 from tests.nodes.ros2_bridge.network import bridged_run, client, zenoh_session
 from tests.nodes.ros_messages import samples
 

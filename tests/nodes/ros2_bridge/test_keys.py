@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import zenoh
 
-from nodes.ros2_bridge.attachment import SIZE, Attachment, pack, unpack
-from nodes.ros2_bridge.gid import gid
+from nodes.ros2_bridge.attachment import SIZE, Attachment, gid, pack, unpack
 from nodes.ros2_bridge.keys import (
     NodeName,
     data_key,

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from nodes.ros2_bridge.attachment import unpack
-from nodes.ros2_bridge.gid import gid
+from nodes.ros2_bridge.attachment import gid, unpack
 from nodes.ros2_bridge.keys import NodeName, data_key, endpoint_token, node_token
 from nodes.ros2_bridge.session import Session, SessionError, _configuration
 from nodes.ros_messages.topics import Qos, Topic

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from nodes.viewing.selection import ImageSelection
+from events import PlannedPose, PositionSetpoint
+from nodes.viewing.selection import ImageSelection, PlanSelection
 
 
 def test_of_thirty_pictures_a_second_five_are_kept_and_of_one_exposure_all() -> None:
@@ -20,3 +21,17 @@ def test_of_thirty_pictures_a_second_five_are_kept_and_of_one_exposure_all() -> 
 
 def test_without_a_rate_there_are_no_pictures() -> None:
     assert not ImageSelection(0.0).select("Image", "a", "a", 0)
+
+
+def test_set_points_are_the_plan_only_where_there_is_none() -> None:
+    plan, point = (
+        PlannedPose(stamp=0, source="tour", position=(0.0, 0.0, 0.0), yaw=0.0),
+        PositionSetpoint(stamp=0, source="tour", position=(0.0, 0.0, 0.0), yaw=0.0),
+    )
+    selection = PlanSelection()
+    assert [selection.select(each) for each in (point, plan, point, plan)] == [
+        True,
+        True,
+        False,
+        True,
+    ]
