@@ -1,7 +1,7 @@
 """Data sets in the layouts of EuRoC and TUM RGB-D, recorded while a run goes on.
 
 `node` listens; `euroc` and `tum_rgbd` are the layouts, `recording` what they have in common,
-`rig` the choice of sensors, `world` the frame of the ground truth, `rows` and `pictures` the files.
+`rig` the choice of sensors, `rows` and `images` the files.
 """
 
 from nodes.dataset.node import DatasetConfig, DatasetWriter

@@ -2,7 +2,7 @@
 
 M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016;
 projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets. The body's frame is FRD, and
-the IMU's. Depth pictures, which the original lacks, stand beside the cameras.
+the IMU's. Depth images, which the original lacks, stand beside the cameras.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, PoseSta
 from events.frames import flip_yz, rotation_to_nwu
 from events.poses import pose_matrix
 from events.rotations import rotate
-from nodes.dataset.pictures import PictureFile, in_16_bits, in_grey
+from nodes.dataset.images import ImageFile, in_16_bits, in_grey
 from nodes.dataset.recording import Recording, real
 from nodes.dataset.rig import WORLD_AXES, Rig
 from nodes.dataset.rows import RowFile
@@ -32,7 +32,7 @@ _BODY = "body: x forward, y right, z down"
 
 
 class Euroc(Recording):
-    """Grey pictures of all the rig's cameras, the IMU, and the body's poses.
+    """Grey images of all the rig's cameras, the IMU, and the body's poses.
 
     ::
 
@@ -58,13 +58,13 @@ class Euroc(Recording):
                     f"found it in the frame {parent!r}"
                 )
         self.write("mav0/body.yaml", f'comment: "{rig.body}; {_BODY}"\n{self.epoch_line()}')
-        self._pictures: dict[str, tuple[str, RowFile]] = {}
+        self._images: dict[str, tuple[str, RowFile]] = {}
         self._depths: dict[str, tuple[str, RowFile]] = {}
         for number, camera in enumerate(rig.cameras):
-            # With colour, a camera's grey pictures have a source of their own.
+            # With colour, a camera's grey images have a source of their own.
             own_grey = {"rgb", "grey"} <= {*camera.images}
             source = f"{camera.source}/grey" if own_grey else camera.source
-            self._pictures[source] = self._camera(f"cam{number}", camera, "camera")
+            self._images[source] = self._camera(f"cam{number}", camera, "camera")
             if "depth" in camera.images:
                 note = (
                     f"depth_factor: {real(depth_factor)}  "
@@ -80,14 +80,14 @@ class Euroc(Recording):
         self._places: set[Vector3] = set()  # no more than two
         self._describe_truth("velocities as the vehicle said them")
 
-    def picture(self, event: Image) -> PictureFile | None:
-        """Note a picture of one of the cameras."""
-        return self._note(self._pictures, event, functools.partial(PictureFile, convert=in_grey))
+    def image(self, event: Image) -> ImageFile | None:
+        """Note an image of one of the cameras."""
+        return self._note(self._images, event, functools.partial(ImageFile, convert=in_grey))
 
-    def depth(self, event: DepthImage) -> PictureFile | None:
-        """Note a depth picture of one of the cameras."""
+    def depth(self, event: DepthImage) -> ImageFile | None:
+        """Note a depth image of one of the cameras."""
         convert = functools.partial(in_16_bits, factor=self.depth_factor)
-        return self._note(self._depths, event, functools.partial(PictureFile, convert=convert))
+        return self._note(self._depths, event, functools.partial(ImageFile, convert=convert))
 
     def pose(self, event: PoseStamped) -> None:
         """Do nothing: the cameras' mountings say where they are on the body."""
@@ -137,8 +137,8 @@ class Euroc(Recording):
         self,
         places: dict[str, tuple[str, RowFile]],
         event: Image | DepthImage,
-        make: functools.partial[PictureFile],
-    ) -> PictureFile | None:
+        make: functools.partial[ImageFile],
+    ) -> ImageFile | None:
         if event.source not in places:
             return None
         name, rows = places[event.source]

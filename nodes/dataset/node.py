@@ -11,7 +11,7 @@ import msgspec
 
 from events import Announcement, DepthImage, Image, Imu, Odometry, PoseStamped
 from nodes.dataset.euroc import Euroc
-from nodes.dataset.pictures import PictureFile
+from nodes.dataset.images import ImageFile
 from nodes.dataset.recording import Recording
 from nodes.dataset.rig import choose
 from nodes.dataset.tum_rgbd import TumRgbd
@@ -22,10 +22,10 @@ from runtime.errors import ConfigError
 from runtime.paths import OutputPath
 
 _AT_ONCE = 4
-"""Pictures that are being written."""
+"""Images that are being written."""
 
 _WAITING = 64
-"""Pictures of a kind that wait for that. In lockstep, time waits for the files, and none ever has
+"""Images of a kind that wait for that. In lockstep, time waits for the files, and none ever has
 to be dropped; in real time the oldest is, and the run's summary counts it."""
 
 
@@ -33,11 +33,11 @@ class DatasetConfig(NodeConfig):
     """Settings of a recorded data set.
 
     Attributes:
-        format: ``euroc``: grey pictures of all cameras of the first camera's vehicle (and depth),
-            IMU, the vehicle's poses. ``tum_rgbd``: colour and depth pictures of the first camera
+        format: ``euroc``: grey images of all cameras of the first camera's vehicle (and depth),
+            IMU, the vehicle's poses. ``tum_rgbd``: colour and depth images of the first camera
             and its poses.
         folder: Its name in the run's folder. A data set that was there is removed.
-        depth_factor: Steps of a depth picture per metre; 65535 of them are the limit, so 5000
+        depth_factor: Steps of a depth image per metre; 65535 of them are the limit, so 5000
             reach 13.1 m, and depth beyond that is written as none.
         epoch: The run's time 0 in the files: a date (ISO 8601), or nanoseconds of Unix time. It
             is noted in them (``epoch_ns``), and `nodes.replay` counts from there.
@@ -67,8 +67,8 @@ class DatasetWriter(Node[DatasetConfig]):
         """Make room."""
         self._announcements: list[Announcement] = []
         self._recording: Recording | None = None
-        self._unwritten: set[PictureFile] = set()
-        self._queue: asyncio.Queue[PictureFile] = asyncio.Queue(maxsize=1)
+        self._unwritten: set[ImageFile] = set()
+        self._queue: asyncio.Queue[ImageFile] = asyncio.Queue(maxsize=1)
         if self.out is not None:
             self._folder = self.out / part_name(self, self.config.folder)
             await self.offload(_make_empty, self._folder)
@@ -78,13 +78,13 @@ class DatasetWriter(Node[DatasetConfig]):
         self._announcements.append(announcement)
 
     async def run(self) -> None:
-        """Have pictures written as they come."""
+        """Have images written as they come."""
         self._open()
         for _ in range(_AT_ONCE):
             self.start(self._write())
         self.start(self._take_depth_images())
         async for image in self.images:
-            if (file := self._picture(image)) is not None:
+            if (file := self._image(image)) is not None:
                 await self._queue.put(file)
 
     async def _take_depth_images(self) -> None:
@@ -93,7 +93,7 @@ class DatasetWriter(Node[DatasetConfig]):
                 await self._queue.put(file)
 
     async def _write(self) -> None:
-        """Write one picture after the other, beside the loop."""
+        """Write one image after the other, beside the loop."""
         while True:
             file = await self._queue.get()
             await self.offload(file)
@@ -122,7 +122,7 @@ class DatasetWriter(Node[DatasetConfig]):
         if self._recording is None:
             return
         for _ in range(self.images.statistics().buffered):
-            self._picture(self.images.receive_nowait())
+            self._image(self.images.receive_nowait())
         for _ in range(self.depth_images.statistics().buffered):
             self._depth(self.depth_images.receive_nowait())
         await self.offload(_finish, self._recording, list(self._unwritten))
@@ -130,7 +130,7 @@ class DatasetWriter(Node[DatasetConfig]):
             self.log.warning("%s", each)
         dropped = self.images.statistics().dropped + self.depth_images.statistics().dropped
         if dropped:
-            self.log.warning("%d pictures are missing: writing was too slow for them", dropped)
+            self.log.warning("%d images are missing: writing was too slow for them", dropped)
         if left_out := self._recording.left_out():
             self.log.warning("%d events came out of order and are left out", left_out)
         if empty := self._recording.empty():
@@ -148,16 +148,16 @@ class DatasetWriter(Node[DatasetConfig]):
                 self.log.fatal("%s", error)
         return self._recording
 
-    def _picture(self, event: Image) -> PictureFile | None:
+    def _image(self, event: Image) -> ImageFile | None:
         recording = self._open()
-        return self._keep(recording.picture(event) if recording is not None else None)
+        return self._keep(recording.image(event) if recording is not None else None)
 
-    def _depth(self, event: DepthImage) -> PictureFile | None:
+    def _depth(self, event: DepthImage) -> ImageFile | None:
         recording = self._open()
         return self._keep(recording.depth(event) if recording is not None else None)
 
-    def _keep(self, file: PictureFile | None) -> PictureFile | None:
-        """Remember a picture until it is written, should the run end before."""
+    def _keep(self, file: ImageFile | None) -> ImageFile | None:
+        """Remember an image until it is written, should the run end before."""
         if file is not None:
             self._unwritten.add(file)
         return file
@@ -179,8 +179,8 @@ def _make_empty(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
 
 
-def _finish(recording: Recording, files: list[PictureFile]) -> None:
-    """Write the rest; pictures that another thread is writing are waited for."""
+def _finish(recording: Recording, files: list[ImageFile]) -> None:
+    """Write the rest; images that another thread is writing are waited for."""
     try:
         for file in files:
             file()

@@ -1,6 +1,6 @@
-"""What recordings of all layouts have in common: events in, rows and pictures out.
+"""What recordings of all layouts have in common: events in, rows and images out.
 
-Rows are written at once; a picture is returned as a `PictureFile`, for whoever has time to write
+Rows are written at once; an image is returned as a `ImageFile`, for whoever has time to write
 it. Nothing here waits or knows a clock.
 """
 
@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 
 from events import DepthImage, Image, Imu, Odometry, PoseStamped
-from nodes.dataset.pictures import PictureFile
+from nodes.dataset.images import ImageFile
 from nodes.dataset.rig import Rig
 from nodes.dataset.rows import RowFile
 
@@ -21,7 +21,7 @@ class Recording(ABC):
     Args:
         folder: Where; it exists and is empty.
         rig: The sensors. Events of others are passed over.
-        depth_factor: Steps of a depth picture per metre.
+        depth_factor: Steps of a depth image per metre.
         epoch: The run's time 0 in the files, nanoseconds of Unix time.
     """
 
@@ -33,12 +33,12 @@ class Recording(ABC):
         self.files: list[RowFile] = []
 
     @abstractmethod
-    def picture(self, event: Image) -> PictureFile | None:
-        """Note a picture, and return what is left to write."""
+    def image(self, event: Image) -> ImageFile | None:
+        """Note an image, and return what is left to write."""
 
     @abstractmethod
-    def depth(self, event: DepthImage) -> PictureFile | None:
-        """Note a depth picture, and return what is left to write."""
+    def depth(self, event: DepthImage) -> ImageFile | None:
+        """Note a depth image, and return what is left to write."""
 
     @abstractmethod
     def pose(self, event: PoseStamped) -> None:

@@ -36,7 +36,7 @@ def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
         named: A source to keep to: a camera, or a body; None for the first camera's body.
 
     Raises:
-        ValueError: No such camera gives pictures.
+        ValueError: No such camera gives images.
     """
     announced = [a for a in announcements if isinstance(a, CameraAnnouncement)]
     able = [a for a in announced if {"rgb", "grey"} & {*a.images}]
@@ -62,5 +62,5 @@ def body_of(source: str) -> str:
 
 
 def _belongs(camera: CameraAnnouncement, named: str) -> bool:
-    """Tell whether a camera is the named source, below it, or (its grey pictures) above it."""
+    """Tell whether a camera is the named source, below it, or (its grey images) above it."""
     return f"{camera.source}/".startswith(f"{named}/") or named == f"{camera.source}/grey"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from events import DepthImage, Image, Imu, Odometry, PoseStamped
 from events.frames import flip_yz, rotation_to_nwu
-from nodes.dataset.pictures import PictureFile, in_16_bits, in_colour
+from nodes.dataset.images import ImageFile, in_16_bits, in_colour
 from nodes.dataset.recording import Recording, real
 from nodes.dataset.rig import WORLD_AXES, Rig
 from nodes.dataset.rows import RowFile
@@ -20,7 +20,7 @@ from nodes.trajectory.table import seconds_text
 
 
 class TumRgbd(Recording):
-    """Pictures of the rig's first camera and its poses, `depth_factor` 5000 in the original.
+    """Images of the rig's first camera and its poses, `depth_factor` 5000 in the original.
 
     ::
 
@@ -55,18 +55,18 @@ class TumRgbd(Recording):
         self._unpaired: dict[int, str] = {}  # by stamp: rgb or depth, whichever came
         self.write("camera.yaml", self._calibration())
 
-    def picture(self, event: Image) -> PictureFile | None:
-        """Note a picture of the camera: in colour if it has any."""
+    def image(self, event: Image) -> ImageFile | None:
+        """Note an image of the camera: in colour if it has any."""
         if event.source != self._camera.source or not self._add("rgb", event.stamp):
             return None
-        return PictureFile(self._path("rgb", event.stamp), event.data, in_colour)
+        return ImageFile(self._path("rgb", event.stamp), event.data, in_colour)
 
-    def depth(self, event: DepthImage) -> PictureFile | None:
-        """Note a depth picture of the camera."""
+    def depth(self, event: DepthImage) -> ImageFile | None:
+        """Note a depth image of the camera."""
         if event.source != self._camera.source or not self._add("depth", event.stamp):
             return None
         convert = functools.partial(in_16_bits, factor=self.depth_factor)
-        return PictureFile(self._path("depth", event.stamp), event.data, convert)
+        return ImageFile(self._path("depth", event.stamp), event.data, convert)
 
     def pose(self, event: PoseStamped) -> None:
         """Note where the camera is."""
@@ -85,7 +85,7 @@ class TumRgbd(Recording):
             self._files["accelerometer"].add(event.stamp, row)
 
     def _add(self, kind: str, stamp: int) -> bool:
-        """Note a picture, and its partner if that has come; tell whether it is in order."""
+        """Note an image, and its partner if that has come; tell whether it is in order."""
         name = f"{self._seconds(stamp)} {kind}/{self._seconds(stamp)}.png"
         if kind not in self._files or not self._files[kind].add(stamp, f"{name}\n"):
             return False

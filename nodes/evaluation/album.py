@@ -1,4 +1,4 @@
-"""Sample pictures with what estimators followed in them, spread evenly over a run."""
+"""Sample images with the features of estimators, spread evenly over a run."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from nodes.evaluation.results import file_name
 SECOND = 1_000_000_000
 
 _WAITING = 30
-"""Pictures whose features may still come."""
+"""Images whose features may still come."""
 _RECENT_GREEN, _OUTLIER_RED = (90, 255, 60), (60, 70, 255)  # blue, green, red
 
 
 class Album:
-    """Keeps about `size` pictures of each estimator, whatever the length of the run.
+    """Keeps about `size` images of each estimator, whatever the length of the run.
 
     Args:
-        size: How many pictures, at most.
+        size: How many images, at most.
     """
 
     def __init__(self, size: int) -> None:
@@ -31,16 +31,16 @@ class Album:
         self._interval: dict[str, int] = {}
         self._next: dict[str, int] = {}
 
-    def see(self, image: Image) -> None:
-        """Hold a picture until its features have come."""
+    def add_image(self, image: Image) -> None:
+        """Hold an image until its features have come."""
         if not self._size:
             return
         self._images[image.frame_id, image.stamp] = image
         if len(self._images) > _WAITING:
             del self._images[next(iter(self._images))]
 
-    def follow(self, features: TrackedFeatures) -> None:
-        """Keep the picture that these were followed in, if it is time for another."""
+    def add_features(self, features: TrackedFeatures) -> None:
+        """Keep the image of these features, if it is time for another."""
         name = features.source
         if features.stamp < self._next.get(name, 0):
             return
@@ -68,7 +68,7 @@ class Album:
 
 
 def draw_features(image: Image, features: TrackedFeatures) -> np.ndarray:
-    """Return the picture (blue, green, red) with a ring on each feature: green, or red if odd."""
+    """Return the image (blue, green, red) with a ring on each feature: green, or red if odd."""
     code = cv2.COLOR_GRAY2BGR if image.data.ndim == 2 else cv2.COLOR_RGB2BGR
     canvas = cv2.cvtColor(image.data, code)
     radius = max(round(image.data.shape[1] / 170), 2)

@@ -103,7 +103,7 @@ class Errors(msgspec.Struct, frozen=True, eq=False):
     """Errors over time, one row a pose; all arrays of shape (n,).
 
     Attributes:
-        stamps: Nanoseconds: of the picture, or of the control tick.
+        stamps: Nanoseconds: of the image, or of the control tick.
         since: Nanoseconds: when the estimate came; for ticks, the stamp of the pose there was.
         position: Metres, after alignment.
         rotation: Radians, after alignment.

@@ -142,7 +142,7 @@ class Evaluation(Node[EvaluationConfig]):
         stamps = self._frames.setdefault(event.source, array("q"))
         if not stamps or event.stamp > stamps[-1]:
             stamps.append(event.stamp)
-        self._album.see(event)
+        self._album.add_image(event)
 
     @on(Collision)
     def collisions(self, event: Collision) -> None:  # noqa: ARG002
@@ -152,7 +152,7 @@ class Evaluation(Node[EvaluationConfig]):
     @on(TrackedFeatures)
     def features(self, event: TrackedFeatures) -> None:
         """Keep an image and its features at intervals."""
-        self._album.follow(event)
+        self._album.add_features(event)
 
     async def on_shutdown(self) -> None:
         """Judge, and write what came of it."""

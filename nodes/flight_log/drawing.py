@@ -39,7 +39,7 @@ def draw_flight(flight: Trajectory, hits: Sequence[tuple[float, float]], out: Pa
             [["above", "height"], ["above", "speed"]], width_ratios=[1.25, 1]
         )
         above: Any = axes["above"]
-        points = above.scatter(y, x, c=speed, s=5, cmap="viridis")
+        points = above.scatter(y, x, c=speed, s=5, cmap="viridis", vmin=0.0)
         mark_ends(above, (y[0], x[0]), (y[-1], x[-1]), LINE)
         if hits:
             above.plot([e for _, e in hits], [n for n, _ in hits], "kx", ms=9, label="collision")
@@ -52,7 +52,8 @@ def draw_flight(flight: Trajectory, hits: Sequence[tuple[float, float]], out: Pa
         axes["height"].plot(seconds, -z, color=LINE)
         axes["height"].set(ylabel="height (m)", title="over time")
         axes["speed"].plot(seconds, speed, color=LINE)
-        axes["speed"].set(xlabel="time (s)", ylabel="speed (m/s)")
+        top = max(1.05 * float(speed.max()), 0.1)
+        axes["speed"].set(xlabel="time (s)", ylabel="speed (m/s)", ylim=(0.0, top))
         figure.savefig(out, dpi=DPI, metadata={"Software": None})
 
 

@@ -17,7 +17,7 @@ from nodes.report.splat import MOST, Shown, View, paint
 from nodes.report.style import DPI, WIDTH, Plot, label, sheet
 
 ABREAST = 3
-"""Clouds side by side in one picture."""
+"""Clouds side by side in one figure."""
 
 _ENOUGH = 100_000
 """Points that say where a cloud lies."""
@@ -37,7 +37,7 @@ _DETAIL = 3.6
 def draw_clouds(run: Run) -> list[Plot]:
     """Draw all clouds that can be read; `Run.missing` says which cannot.
 
-    If there are many, each picture has the first again to hold the others against.
+    If there are many, each figure has the first again to hold the others against.
     """
     height = _ceiling(run)
     clouds = []
@@ -172,9 +172,9 @@ def _aspect(view: View) -> float:
 
 def _show(axis: Any, cloud: Shown, view: View, pixels: float, dot: int | None) -> int:
     """Paint a cloud into some axes; return the width of its dots."""
-    picture, dot = paint(cloud, view, pixels, dot)
+    image, dot = paint(cloud, view, pixels, dot)
     extent = (view.low[0], view.high[0], view.low[1], view.high[1])
-    axis.imshow(picture, extent=extent, interpolation="nearest")
+    axis.imshow(image, extent=extent, interpolation="nearest")
     axis.grid(visible=False)
     axis.set_title(f"{label(cloud.name)}: {view.title}")
     if view.labels is not None:

@@ -49,7 +49,7 @@ class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
     Attributes:
         name: Its source.
-        color: In every picture.
+        color: In every figure.
         figures: From the verdict; empty if there is none.
         aligned: Its poses in the truth's frame.
         of_images: Errors of each pose at the time of its image.
@@ -76,7 +76,7 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         truth: True poses.
         plan: Where the pilot meant to be.
         estimators: By order of the verdict.
-        frames: Sample pictures with features, by estimator's file name.
+        frames: Sample images with features, by estimator's file name.
         clouds: Files of clouds.
         images: Images that other nodes left.
         config: Text of ``config.toml``.
@@ -104,6 +104,6 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
     @property
     def start(self) -> int:
-        """What times in the pictures count from: 0, or for stamps of a calendar the first one."""
+        """What times in the figures count from: 0, or for stamps of a calendar the first one."""
         first = int(self.truth.stamps[0]) if self.truth is not None else 0
         return first if first > 1e15 else 0

@@ -64,7 +64,7 @@ class _Reader:
             if verdict is not None and verdict.estimators and facts.verdict is None:
                 self.missing.append(
                     "evaluation/verdict.json is of an earlier run: by its summary, nobody was "
-                    "judged in this one. Trajectories and pictures may be that one's, too"
+                    "judged in this one. Trajectories and figures may be that one's, too"
                 )
                 verdict = None
             verdict = verdict or facts.verdict
@@ -136,7 +136,7 @@ class _Reader:
             if isinstance(counted, int | float) and abs(counted - known) > _ABOUT:
                 self.missing.append(
                     f"{name}: lost for {counted:.1f} s by the figures; gaps between its poses "
-                    f"tell of {known:.1f} s, which are what the pictures show"
+                    f"tell of {known:.1f} s, which are what the figures show"
                 )
         return msgspec.structs.replace(
             found, aligned=aligned, of_images=errors, of_ticks=ticks, lost=lost

@@ -17,7 +17,7 @@ from nodes.report.style import DPI, WIDTH, Plot, label, sheet
 _COLUMNS = 4
 _MOST = 12
 _GAP = 6
-"""Pixels between pictures."""
+"""Pixels between images."""
 _CAPTION = 26
 """Pixels above each."""
 
@@ -37,18 +37,18 @@ def draw_frames(run: Run) -> list[Plot]:
     return plots
 
 
-def read_picture(path: Path) -> npt.NDArray[Any]:
-    """Read a picture: red, green, blue, shape (h, w, 3).
+def read_image(path: Path) -> npt.NDArray[Any]:
+    """Read an image: red, green, blue, shape (h, w, 3).
 
     Raises:
         OSError: It cannot be read.
         ValueError: It is none.
     """
     data = np.fromfile(path, np.uint8)
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
-    if picture is None:
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
+    if image is None:
         raise ValueError(f"expected a JPEG or PNG, found {data[:8].tobytes()!r}")
-    return picture
+    return image
 
 
 def _sheet(run: Run, paths: list[Path]) -> Figure | None:
@@ -58,31 +58,31 @@ def _sheet(run: Run, paths: list[Path]) -> Figure | None:
     shown = []
     for path in paths:
         try:
-            picture = read_picture(path)
+            image = read_image(path)
         except (OSError, ValueError) as error:
             run.missing.append(f"frames/{path.name} cannot be read: {error}")
             continue
-        height = max(round(picture.shape[0] * width / picture.shape[1]), 1)
-        small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        height = max(round(image.shape[0] * width / image.shape[1]), 1)
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         shown.append((_caption(run, path), small))
     if not shown:
         return None
-    tallest = max(picture.shape[0] for _, picture in shown) + _CAPTION + _GAP
+    tallest = max(image.shape[0] for _, image in shown) + _CAPTION + _GAP
     rows = math.ceil(len(shown) / columns)
     canvas = np.full((rows * tallest, columns * (width + _GAP) - _GAP, 3), 255, np.uint8)
     figure = sheet(canvas.shape[0] / DPI, constrained=False, width=canvas.shape[1] / DPI)
     axis: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axis.set_axis_off()
-    for k, (text, picture) in enumerate(shown):
+    for k, (text, image) in enumerate(shown):
         top, left = k // columns * tallest, k % columns * (width + _GAP)
-        canvas[top + _CAPTION : top + _CAPTION + picture.shape[0], left : left + width] = picture
+        canvas[top + _CAPTION : top + _CAPTION + image.shape[0], left : left + width] = image
         axis.text(left + 2, top + _CAPTION - 6, text, fontsize=9, color="#222222")
     axis.imshow(canvas, interpolation="nearest", aspect="auto")
     return figure
 
 
 def _caption(run: Run, path: Path) -> str:
-    """Return the time of a picture, from the stamp at the end of its name."""
+    """Return the time of an image, from the stamp at the end of its name."""
     stamp = path.stem.rpartition("_")[2]
     if not stamp.isdecimal():
         return label(path.stem)

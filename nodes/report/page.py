@@ -22,7 +22,7 @@ from nodes.report.curves import (
     draw_relative,
 )
 from nodes.report.folder import read_run
-from nodes.report.frames import draw_frames, read_picture
+from nodes.report.frames import draw_frames, read_image
 from nodes.report.style import Plot, drawing
 from nodes.report.trajectories import draw_trajectories
 from runtime.summary import WORKER_COLUMNS
@@ -134,7 +134,7 @@ def render(
 def _can_be_read(run: Run, path: Path) -> bool:
     """Tell whether a file that another node left is an image; `Run.missing` says if not."""
     try:
-        read_picture(path)
+        read_image(path)
     except (OSError, ValueError) as error:
         run.missing.append(f"{path.name} cannot be read: {error}")
         return False

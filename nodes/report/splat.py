@@ -38,10 +38,10 @@ class View(msgspec.Struct, frozen=True, eq=False):
 
     Attributes:
         title: What is seen.
-        axes: East, north, up to right, up on the picture, towards the viewer; shape (3, 3).
-        low: Corner of the picture, metres right and up, shape (2,).
+        axes: East, north, up to right, up on the image, towards the viewer; shape (3, 3).
+        low: Corner of the image, metres right and up, shape (2,).
         high: The opposite corner.
-        labels: Of the axes, right and up; none, and a picture has a scale bar instead.
+        labels: Of the axes, right and up; none, and an image has a scale bar instead.
     """
 
     title: str
@@ -60,7 +60,7 @@ def visible(cloud: Shown, view: View, pixels: float) -> tuple[Indices, Indices, 
         pixels: To a metre.
 
     Returns:
-        Their rows and columns in the picture, and their numbers in the cloud; each of shape (m,),
+        Their rows and columns in the image, and their numbers in the cloud; each of shape (m,),
         the farthest first.
     """
     width = _size(view, pixels)[1]
@@ -83,7 +83,7 @@ def visible(cloud: Shown, view: View, pixels: float) -> tuple[Indices, Indices, 
 
 
 def paint(cloud: Shown, view: View, pixels: float, dot: int | None = None) -> Painting:
-    """Return what a view shows of a cloud as a picture, shape (h, w, 3), and its width of dots.
+    """Return what a view shows of a cloud as an image, shape (h, w, 3), and its width of dots.
 
     Args:
         cloud: East, north, up; with colours.
@@ -98,14 +98,14 @@ def paint(cloud: Shown, view: View, pixels: float, dot: int | None = None) -> Pa
     spread = np.arange(dot) - (dot - 1) // 2
     rows = np.clip(row[:, None, None] + spread[:, None], 0, height - 1)
     columns = np.clip(column[:, None, None] + spread, 0, width - 1)
-    picture = np.full((height * width, 3), _BACKGROUND)
+    image = np.full((height * width, 3), _BACKGROUND)
     # Where several dots lie on one pixel, numpy keeps the last: the nearest.
     painted = np.repeat(cloud.colors[number], dot * dot, axis=0)
-    picture[(rows * width + columns).reshape(-1)] = painted
-    return picture.reshape(height, width, 3), dot
+    image[(rows * width + columns).reshape(-1)] = painted
+    return image.reshape(height, width, 3), dot
 
 
 def _size(view: View, pixels: float) -> tuple[int, int]:
-    """Return a picture's height and width in pixels."""
+    """Return an image's height and width in pixels."""
     across, up = np.maximum(np.ceil((view.high - view.low) * pixels), 1).astype(int).tolist()
     return up, across

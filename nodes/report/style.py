@@ -1,4 +1,4 @@
-"""How a report looks: one colour for each estimator in every picture, plain axes, few digits."""
+"""How a report looks: one colour for each estimator in every figure, plain axes, few digits."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ LINE = COLORS[0]
 """Of what belongs to no estimator."""
 
 WIDTH = 10.0
-"""Inches of a picture across the page."""
+"""Inches of a figure across the page."""
 DPI = 110
 
 _MOST = 2500
-"""Points of a line; more than that no picture shows."""
+"""Points of a line; more than that no figure shows."""
 
 _LETTERS, _HANDLE = 115, 8
 """Letters of a legend across the page; letters that a line and its margin take."""

@@ -64,7 +64,7 @@ def imu_announcement(body: str = "drone", frame: str = "base_link") -> ImuAnnoun
 
 
 def image(stamp: int, source: str = "drone/front", *, grey: bool = False) -> Image:
-    """Return a picture that is another at every stamp."""
+    """Return an image that is another at every stamp."""
     rng = np.random.default_rng(stamp)
     data = rng.integers(0, 255, (3, 4) if grey else (3, 4, 3), np.uint8)
     encoding = "mono8" if grey else "rgb8"
@@ -109,7 +109,7 @@ def flight(frames: int = 3) -> list[Event]:
 
 
 def png(path: Path) -> npt.NDArray[Any]:
-    """Return a picture as it is stored, colours as RGB."""
+    """Return an image as it is stored, colours as RGB."""
     data: Any = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert data is not None, path
     return np.asarray(data[..., ::-1] if data.ndim == 3 else data)

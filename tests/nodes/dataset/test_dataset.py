@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from events import Event, Odometry, Shutdown
 from nodes.dataset import DatasetWriter
-from nodes.dataset.pictures import PictureFile
+from nodes.dataset.images import ImageFile
 from nodes.trajectory.formats import read_euroc, read_tum
 from runtime.errors import ConfigError, FatalError, NodeError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
@@ -54,9 +54,9 @@ def names(folder: Path) -> set[str]:
 
 def test_tum_rgbd_has_its_files(tmp_path: Path) -> None:
     data = record(tmp_path, flight(), "tum_rgbd")
-    pictures = {f"{kind}/{s}.png" for kind in ("rgb", "depth") for s in SECONDS}
+    images = {f"{kind}/{s}.png" for kind in ("rgb", "depth") for s in SECONDS}
     texts = {"rgb", "depth", "associations", "groundtruth", "accelerometer"}
-    assert names(data) == {*pictures, *(f"{name}.txt" for name in texts), "camera.yaml"}
+    assert names(data) == {*images, *(f"{name}.txt" for name in texts), "camera.yaml"}
     assert table(data / "rgb.txt") == [[s, f"rgb/{s}.png"] for s in SECONDS]
     assert table(data / "depth.txt") == [[s, f"depth/{s}.png"] for s in SECONDS]
     pairs = [[s, f"rgb/{s}.png", s, f"depth/{s}.png"] for s in SECONDS]
@@ -73,7 +73,7 @@ def test_tum_rgbd_has_what_the_events_said(tmp_path: Path) -> None:
         assert (deep[0, :3].tolist(), deep[2, 3]) == ([0, 65500, 0], 7500)
     truth = read_tum(data / "groundtruth.txt")
     assert truth.positions[0].tolist() == [1.0, -2.0, 3.0]
-    # The optical axis points north, the pictures' right east: minus west.
+    # The optical axis points north, the images' right east: minus west.
     assert truth.matrices()[0, :3, :3] == pytest.approx(
         np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     )
@@ -97,7 +97,7 @@ def test_heads_of_tum_files_are_three_lines_and_name_the_world(tmp_path: Path) -
     assert evos.check()[0]
 
 
-def test_pictures_and_depth_without_a_partner_are_in_no_pair(tmp_path: Path) -> None:
+def test_images_and_depth_without_a_partner_are_in_no_pair(tmp_path: Path) -> None:
     events = [e for e in flight(4) if not (e.stamp == 30_000_000 and type(e).__name__ == "Image")]
     events = [
         e for e in events if not (e.stamp and e.stamp < 90_000_000 and "pth" in repr(type(e)))
@@ -245,8 +245,8 @@ def test_what_is_not_written_when_the_run_ends_is_written_then(tmp_path: Path) -
         assert all(png(data / "data" / each).shape == (3, 4) for each in listed)
 
 
-def test_a_few_pictures_are_written_at_once_and_none_is_lost(tmp_path: Path) -> None:
-    """A burst at one moment, and 200 pictures a nanosecond apart: simulated time waits."""
+def test_a_few_images_are_written_at_once_and_none_is_lost(tmp_path: Path) -> None:
+    """A burst at one moment, and 200 images a nanosecond apart: simulated time waits."""
     at_once: list[int] = [0, 0]  # now, most
 
     class Watched(DatasetWriter):
@@ -312,10 +312,10 @@ def test_without_a_folder_for_the_run_it_writes_nothing() -> None:
 def test_a_disk_that_takes_no_more_ends_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(self: PictureFile) -> None:
+    def full(self: ImageFile) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(PictureFile, "__call__", full)
+    monkeypatch.setattr(ImageFile, "__call__", full)
     with pytest.raises(NodeError, match="No space left on device"):
         record(tmp_path, flight(), "euroc")
 

@@ -1,4 +1,4 @@
-"""The parts of a data set: its world, its pictures, its rows, its sensors."""
+"""The parts of a data set: its world, its images, its rows, its sensors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from events import Announcement
-from nodes.dataset.pictures import Picture, PictureFile, in_16_bits, in_colour, in_grey
+from nodes.dataset.images import ImageFile, Pixels, in_16_bits, in_colour, in_grey
 from nodes.dataset.rig import choose
 from nodes.dataset.rows import RowFile
 from tests.nodes.dataset.samples import camera, image, imu_announcement, png
@@ -30,14 +30,14 @@ def test_colours_and_greys() -> None:
     assert abs(in_grey(colour) - luma).max() < 0.6
 
 
-def test_a_picture_is_written_once_however_often_it_is_asked_for(tmp_path: Path) -> None:
+def test_an_image_is_written_once_however_often_it_is_asked_for(tmp_path: Path) -> None:
     calls = []
 
-    def convert(data: Picture) -> Picture:
+    def convert(data: Pixels) -> Pixels:
         calls.append(1)
         return data
 
-    file = PictureFile(tmp_path / "a.png", image(1, grey=True).data, convert)
+    file = ImageFile(tmp_path / "a.png", image(1, grey=True).data, convert)
     with ThreadPoolExecutor(4) as pool:
         for done in [pool.submit(file) for _ in range(8)]:
             done.result()
@@ -45,8 +45,8 @@ def test_a_picture_is_written_once_however_often_it_is_asked_for(tmp_path: Path)
     assert (png(tmp_path / "a.png") == image(1, grey=True).data).all()
 
 
-def test_a_picture_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    file = PictureFile(tmp_path / "missing" / "a.png", image(1).data, in_colour)
+def test_an_image_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    file = ImageFile(tmp_path / "missing" / "a.png", image(1).data, in_colour)
     with pytest.raises(FileNotFoundError, match=r"missing/a\.png"):
         file()
 

@@ -1,4 +1,4 @@
-"""Recorded pictures, depth, intrinsics and poses agree with each other, in both layouts."""
+"""Recorded images, depth, intrinsics and poses agree with each other, in both layouts."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tum(folder: Path) -> tuple[list[Any], list[Any], Floats, Floats]:
-    """Return pictures, depths (m), K, and the camera's poses."""
+    """Return images, depths (m), K, and the camera's poses."""
     pairs = table(folder / "associations.txt")
     found = yaml(folder / "camera.yaml")
     truth = read_tum(folder / "groundtruth.txt")
@@ -82,8 +82,8 @@ def euroc(folder: Path) -> tuple[list[Any], list[Any], Floats, Floats]:
 @pytest.mark.parametrize("read", [tum, euroc])
 def test_what_one_frame_sees_stands_where_another_sees_it(read: Any, run: Path) -> None:
     """Points of the first frame, by its depth and pose, land on the last at the same depth."""
-    pictures, depths, k, poses = read(run / read.__name__)
-    assert len(pictures) == 11
+    images, depths, k, poses = read(run / read.__name__)
+    assert len(images) == 11
     first, last = depths[0], depths[-1]
     rows, columns = np.nonzero(first)
     rays = np.linalg.inv(k) @ np.stack([columns, rows, np.ones(len(rows))])
@@ -97,8 +97,8 @@ def test_what_one_frame_sees_stands_where_another_sees_it(read: Any, run: Path) 
     seen = last[v, u]
     close = abs(seen - z) < 0.02 * z
     assert close.mean() > 0.85
-    before = pictures[0][rows, columns][there][inside][close].astype(float)
-    after = pictures[-1][v, u][close].astype(float)
+    before = images[0][rows, columns][there][inside][close].astype(float)
+    after = images[-1][v, u][close].astype(float)
     assert np.corrcoef(before, after)[0, 1] > 0.7
 
 
@@ -116,14 +116,14 @@ def test_the_recorded_velocity_is_that_of_the_poses(run: Path) -> None:
 def test_the_world_is_z_up(run: Path) -> None:
     _, _, _, poses = tum(run / "tum")
     assert (poses[:, 2, 3] > 1.0).all()
-    # The pictures' down is the world's down, but for the mounting's 5 and 10 degrees.
+    # The images' down is the world's down, but for the mounting's 5 and 10 degrees.
     assert (poses[:, 2, 1] < -0.9).all()
 
 
-def test_both_layouts_have_the_same_pictures_and_poses(run: Path) -> None:
-    pictures, depths, k, poses = tum(run / "tum")
+def test_both_layouts_have_the_same_images_and_poses(run: Path) -> None:
+    images, depths, k, poses = tum(run / "tum")
     greys, others, other_k, other_poses = euroc(run / "euroc")
-    assert (np.array(pictures) == np.array(greys)).all()
+    assert (np.array(images) == np.array(greys)).all()
     assert (np.array(depths) == np.array(others)).all()
     assert k.tolist() == other_k.tolist()
     assert abs(poses - other_poses).max() < 1e-8

@@ -26,7 +26,7 @@ from events import (
 from events.poses import pose_matrix
 from events.rotations import rotate
 from nodes.dataset.euroc import Euroc
-from nodes.dataset.pictures import in_grey
+from nodes.dataset.images import in_grey
 from nodes.dataset.rig import choose
 from nodes.dataset.tum_rgbd import TumRgbd
 from nodes.replay.choice import Choice
@@ -289,7 +289,7 @@ def test_every_stamp_of_a_data_set_comes_back(
     zero = epoch_of(epoch if isinstance(epoch, int) else str(epoch))
     recording = (Euroc if layout == "euroc" else TumRgbd)(folder, rig, 5000.0, zero)
     for stamp in stamps:
-        for file in (recording.picture(image(stamp)), recording.depth(depth(stamp))):
+        for file in (recording.image(image(stamp)), recording.depth(depth(stamp))):
             assert file is not None
             file()
         recording.imu(imu(stamp))

@@ -1,4 +1,4 @@
-"""Pictures as PNG files: colour, grey, and depth in 16 bits."""
+"""Images as PNG files: colour, grey, and depth in 16 bits."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Picture = npt.NDArray[Any]
+Pixels = npt.NDArray[Any]
 
 _DEPTH = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 """A third of the default's size, at half as much time again; colours gain nothing by it."""
 
 
-class PictureFile:
-    """A picture on its way to a file: call it to write it, from any thread, as often as need be.
+class ImageFile:
+    """An image on its way to a file: call it to write it, from any thread, as often as need be.
 
     Args:
         path: The file.
-        data: The picture, as an event has it.
+        data: The image, as an event has it.
         convert: Makes of it what is written.
     """
 
-    def __init__(self, path: Path, data: Picture, convert: Callable[[Picture], Picture]) -> None:
+    def __init__(self, path: Path, data: Pixels, convert: Callable[[Pixels], Pixels]) -> None:
         self._path = path
-        self._data: Picture | None = data
+        self._data: Pixels | None = data
         self._convert = convert
         self._lock = threading.Lock()
 
@@ -40,20 +40,20 @@ class PictureFile:
         """
         with self._lock:
             if self._data is not None:
-                picture = self._convert(self._data)
-                flags = _DEPTH if picture.dtype == np.uint16 else ()
-                _, code = cv2.imencode(".png", picture, flags)
+                image = self._convert(self._data)
+                flags = _DEPTH if image.dtype == np.uint16 else ()
+                _, code = cv2.imencode(".png", image, flags)
                 self._path.write_bytes(code.tobytes())
                 self._data = None
 
 
-def in_colour(data: Picture) -> Picture:
-    """Return an ``rgb8`` or ``mono8`` picture as OpenCV writes it."""
+def in_colour(data: Pixels) -> Pixels:
+    """Return an ``rgb8`` or ``mono8`` image as OpenCV writes it."""
     return cv2.cvtColor(data, cv2.COLOR_RGB2BGR) if data.ndim == 3 else data
 
 
-def in_grey(data: Picture) -> Picture:
-    """Return an ``rgb8`` or ``mono8`` picture in grey (ITU-R BT.601)."""
+def in_grey(data: Pixels) -> Pixels:
+    """Return an ``rgb8`` or ``mono8`` image in grey (ITU-R BT.601)."""
     return cv2.cvtColor(data, cv2.COLOR_RGB2GRAY) if data.ndim == 3 else data
 
 
