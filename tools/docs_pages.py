@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import typer
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -89,7 +91,9 @@ def _default(parameter: Any) -> str:
 def configuration_page() -> str:
     """Return the page of what a file may hold besides the settings of nodes."""
     text = (ROOT / "tools" / "configuration.md").read_text(encoding="utf-8")
-    for key, cls in {"run": RunConfig, "network": NetworkConfig, "link": LinkConfig}.items():
+    tables: dict[str, type[msgspec.Struct]]
+    tables = {"run": RunConfig, "network": NetworkConfig, "link": LinkConfig}
+    for key, cls in tables.items():
         text = text.replace(f"{{{{ {key} }}}}", "\n".join(_settings(describe_settings(cls))))
     return text
 
@@ -231,7 +235,7 @@ def _prose(text: str) -> str:
     return re.sub(r"(`[^`]*`|^ {4}.*$)|<", lambda m: m[1] or "&lt;", text, flags=re.MULTILINE)
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
     if not rows:
         return []
     cells = [" | ".join(" ".join(c.split()).replace("|", "\\|") for c in row) for row in rows]
