@@ -127,6 +127,9 @@ def nodes_page(nodes: dict[str, type[Node[Any]]]) -> str:
         rates = [(f"`{tick.name}`", tick.rate, _prose(tick.doc)) for tick in node.ticks]
         lines += ["", *_table(("called", "at", "what it does"), rates)]
         lines += ["", *_settings(node.settings)]
+        if cls.files:
+            files = ", ".join(f"`{file}`" for file in cls.files)
+            lines += ["", f"Writes into the run's folder: {files}."]
     return "\n".join(lines) + "\n"
 
 
