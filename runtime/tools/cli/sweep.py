@@ -48,8 +48,8 @@ def sweep(
     """Run a file with every combination of some settings, and compare how well it went.
 
     Each run is a process of its own; one that fails is a row of the table. Results go to
-    sweeps/<name>: table.csv, summary.csv, plots/, each run's folder in runs/, and, since they
-    depend on the machine, timing.csv and what workers cost in costs.csv.
+    sweeps/<name>: index.html shows all of them; table.csv, summary.csv, plots/, each run's folder
+    in runs/, and, since they depend on the machine, timing.csv and what workers cost in costs.csv.
     Called again, only what is missing or has failed is run. Ends with 0 if every run came to its
     end, whether or not it met its thresholds; with 2 if one failed; with 130 after Ctrl-C.
     """
@@ -79,11 +79,14 @@ def sweep(
         raise typer.Exit(130) from None
     sweeping.write_tables(plan, rows)
     sweeping.draw_plots(plan, rows)
+    page = sweeping.write_page(plan, rows)
     console = Console()
     if not console.is_terminal:
         console.width = _WIDTH
     console.print(summary_table(plan, sweeping.summarise(plan, rows)))
-    console.print(f"{len(rows)} runs   results in [bold]{plan.out}[/bold]", highlight=False)
+    console.print(
+        f"{len(rows)} runs   results in [bold]{plan.out}[/bold]: open {page.name}", highlight=False
+    )
     if display.failed:
         typer.echo(f"error: {display.failed} of {len(rows)} runs failed", err=True)
         raise typer.Exit(2)

@@ -3,7 +3,8 @@
     config.toml, --vary, --seeds  →  Plan of Jobs  →  Executor  →  Rows  →  tables and plots
 
 Read in this order: `values` (what ``--vary`` says), `plan` (which runs there are), `process` (one
-run), `rows` (what is remembered of it), `execute` (all runs), `tables` and `plots` (the result).
+run), `rows` (what is remembered of it), `execute` (all runs), `tables`, `plots` and `page` (the
+result).
 `console` is what a terminal shows meanwhile; the command itself is `runtime.tools.cli.sweep`.
 
 The executor may be any of `concurrent.futures`, also one that spreads the runs over machines on
@@ -14,6 +15,7 @@ which the project is installed. With Dask (``pip install distributed``)::
         rows = sweep(plan, client.get_executor(pure=False))
     write_tables(plan, rows)
     draw_plots(plan, rows)
+    write_page(plan, rows)
 
 ``pure=False`` lets a failed run be tried again. A job carries its settings as text; what it reads
 besides (modules beside the file, trajectories, worlds) must be found at the same paths on every
@@ -22,6 +24,7 @@ is shared. The rows come back in any case.
 """
 
 from runtime.tools.sweep.execute import Watch, sweep
+from runtime.tools.sweep.page import write_page
 from runtime.tools.sweep.plan import Job, Plan, make_plan
 from runtime.tools.sweep.plots import draw_plots
 from runtime.tools.sweep.process import Children, run_job
@@ -39,5 +42,6 @@ __all__ = [
     "run_job",
     "summarise",
     "sweep",
+    "write_page",
     "write_tables",
 ]

@@ -112,7 +112,7 @@ def summary_table(plan: Plan, combinations: Sequence[Combination]) -> Table:
     names = [n for n in MAIN_FIGURES if any(n in each.figures for each in combinations)]
     table = Table(title="medians over the seeds", title_justify="left")
     for parameter in plan.parameters:
-        table.add_column(parameter.path)
+        table.add_column(parameter.path, overflow="fold")
     table.add_column("estimator")
     for name in ["runs", "failed", "passed", *names]:
         table.add_column(name.replace("_", " "), justify="right")

@@ -44,7 +44,7 @@ class Line(msgspec.Struct, frozen=True):
 
 
 def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
-    """Draw a picture for each parameter into ``plots/``, if the runs have something to show."""
+    """Draw a plot for each parameter into ``plots/``, if the runs have something to show."""
     own = [row for _, row in in_order(plan, rows)]
     failures = sum(bool(row["error"]) for row in own)
     note = f"{failures} of {len(own)} runs failed and are not shown" if failures else ""

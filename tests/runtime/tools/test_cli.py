@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from runtime.summary import Summary, TickSummary
+from runtime.tools.cli.graph import layers
 from tests.runtime.tools.samples_cli import ROOT, command, command_here, config_file, summary
 
 pytestmark = pytest.mark.timeout(180)
@@ -147,6 +148,21 @@ def test_graph_prints_mermaid_or_draws(tmp_path: Path) -> None:
     done = command_here("graph", path, "--out", "graph.png", folder=tmp_path)
     assert (done.returncode, done.stdout) == (0, "graph.png\n")
     assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("pairs", "expected"),
+    [
+        ([], [["a", "b", "c", "d"]]),
+        ([("a", "b"), ("b", "c"), ("a", "c"), ("a", "d")], [["a"], ["b", "d"], ["c"]]),
+        ([("a", "b"), ("b", "a"), ("b", "c")], [["a", "d"], ["b"], ["c"]]),
+        ([("d", "a"), ("a", "b"), ("b", "d")], [["a", "c"], ["b"], ["d"]]),
+    ],
+)
+def test_a_graph_goes_from_senders_to_receivers(
+    pairs: list[tuple[str, str]], expected: list[list[str]]
+) -> None:
+    assert layers(["a", "b", "c", "d"], pairs) == expected
 
 
 def test_nodes_describes_ports_and_settings(tmp_path: Path) -> None:

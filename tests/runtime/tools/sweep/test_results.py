@@ -1,4 +1,4 @@
-"""Rows as tables and pictures."""
+"""Rows as tables, plots and a page."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from matplotlib.image import imread
 
-from runtime.tools.sweep import Row, draw_plots, summarise, write_tables
+from runtime.tools.sweep import Row, draw_plots, summarise, write_page, write_tables
 from runtime.tools.sweep.plots import lines
 from runtime.tools.sweep.rows import failed
 from runtime.tools.sweep.tables import Spread
@@ -65,6 +65,23 @@ def test_a_summary_has_the_spread_over_the_seeds_and_counts_what_failed(tmp_path
     assert line["ate_rmse_m_median"] == ""
 
 
+def test_a_page_shows_figures_plots_and_runs_with_their_reports(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.rate=1,2", seeds=2)
+    rows = [pretend(job) for job in plan.jobs]
+    rows[3] = failed(plan.jobs[3], "out <of> order")
+    folder = Path(plan.jobs[0].out)
+    folder.mkdir(parents=True)
+    (folder / "report.html").touch()
+    draw_plots(plan, rows)
+    page = write_page(plan, rows).read_text(encoding="utf-8")
+    assert "<th>judge.rate</th>" in page
+    assert '<td class="n">1.035<br><span class="soft">1.03 to 1.04</span></td>' in page
+    assert '<img src="plots/judge.rate.png"' in page
+    assert page.count(">open</a>") == 1
+    assert f'<a href="runs/{plan.jobs[0].id}/report.html">open</a>' in page
+    assert '<td class="bad">out &lt;of&gt; order</td>' in page
+
+
 def with_ate(row: Row, **ate: float | None) -> Row:
     row["estimators"] = {name: {"ate_percent": value} for name, value in ate.items()}
     return row
@@ -96,7 +113,7 @@ def test_many_combinations_become_one_line_with_quartiles(tmp_path: Path) -> Non
     assert len(lines(plan, rows, plan.parameters[1], "ate_percent")) == 4
 
 
-def test_a_picture_for_each_parameter(tmp_path: Path) -> None:
+def test_a_plot_for_each_parameter(tmp_path: Path) -> None:
     plan = plan_in(tmp_path, "judge.latency=0ms,80ms", "judge.method=flow,depth", seeds=2)
     rows = [pretend(job) for job in plan.jobs]
     drawn = draw_plots(plan, rows)
