@@ -12,19 +12,10 @@ from events import (
     DepthImage,
     Event,
     Image,
-    Imu,
-    Odometry,
-    PlannedPose,
     PointCloud,
-    PoseEstimate,
-    PoseStamped,
-    PositionSetpoint,
-    Score,
     TrackedFeatures,
-    TrackingEvent,
-    VehicleEvent,
 )
-from nodes.foxglove_server.publishing import Publishing
+from nodes.foxglove_server.publishing import LARGE, SMALL, Publishing
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
 from nodes.viewing.selection import ImageSelection
@@ -57,7 +48,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         self._selection = ImageSelection(self.config.image_rate)
         self._queues: dict[type[Event], Stream[Any]] = {
             kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
-            for kind in (Image, DepthImage, TrackedFeatures, PointCloud)
+            for kind in LARGE
         }
 
     async def on_startup(self) -> None:
@@ -84,16 +75,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         except VisnavError as error:
             self.log.fatal("%s", error)
         self._server = server
-        self._publishing = publishing = Publishing(server, self.config)
-        self._small: dict[type[Event], Callable[[Any], None]] = {
-            Odometry: publishing.odometry,
-            PoseEstimate: publishing.estimate,
-            PoseStamped: publishing.camera_pose,
-            Imu: publishing.imu,
-            Score: publishing.score,
-            PlannedPose: publishing.plan,
-            PositionSetpoint: publishing.plan,
-        }
+        self._publishing = Publishing(server, self.config)
         self.log.info("open %s in Foxglove", server.address)
 
     def on_announcement(self, announcement: Announcement) -> None:
@@ -105,13 +87,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         """Pass on images and point clouds beside the loop, each kind in order."""
         publishing = self._publishing
         assert publishing is not None
-        large: dict[type[Event], Callable[[Any], None]] = {
-            Image: publishing.image,
-            DepthImage: publishing.depth,
-            TrackedFeatures: publishing.features,
-            PointCloud: publishing.cloud,
-        }
-        for kind, put in large.items():
+        for kind, put in publishing.large.items():
             self.start(self._pass_on(self._queues[kind], put))
 
     async def on_shutdown(self) -> None:
@@ -141,20 +117,11 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         """Pass on a point cloud."""
         self._queues[PointCloud].offer(event)
 
-    @on(Odometry, PoseEstimate, PoseStamped, Imu, Score, PlannedPose, PositionSetpoint)
+    @on(*SMALL)
     def measurements(self, event: Event) -> None:
         """Pass on what is small, at once."""
-        kind = type(event)
-        put = self._small.get(kind) or next(
-            p for k, p in self._small.items() if issubclass(kind, k)
-        )
-        put(event)
-
-    @on(TrackingEvent, VehicleEvent)
-    def log_events(self, event: Event) -> None:
-        """Put an event into the viewers' log, in words."""
         if self._publishing is not None:
-            self._publishing.logged(event)
+            self._publishing.small(event)
 
     @every(hz="clock_rate")
     def send_time(self, tick: Tick) -> None:  # noqa: ARG002

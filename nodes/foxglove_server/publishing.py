@@ -7,6 +7,7 @@ viewers that have no other up.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from events import (
@@ -27,8 +28,10 @@ from events import (
     Quaternion,
     Score,
     TrackedFeatures,
+    TrackingEvent,
     Vector3,
     VehicleAnnouncement,
+    VehicleEvent,
 )
 from nodes.foxglove_server.messages import IMU_SCHEMA, SCORE_SCHEMA, Messages
 from nodes.foxglove_server.scene import Trail
@@ -41,6 +44,16 @@ from nodes.viewing.selection import PlanSelection
 
 _MAP_IN_WORLD: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
 """North, east, down in east, north, up."""
+
+
+LARGE: tuple[type[Event], ...] = (Image, DepthImage, TrackedFeatures, PointCloud)
+"""Events whose messages take long to make: `Publishing.large` has a function for each."""
+
+SMALL: tuple[type[Event], ...] = (
+    *(Odometry, PoseEstimate, PoseStamped, Imu, Score),
+    *(PlannedPose, PositionSetpoint, TrackingEvent, VehicleEvent),
+)
+"""Events that `Publishing.small` takes."""
 
 
 class Publishing:
@@ -65,6 +78,9 @@ class Publishing:
         self._drawn: list[Any] = []
         self._static: list[Any] = []
         self._plan = PlanSelection()
+        self.large: dict[type[Event], Callable[[Any], None]] = dict(
+            zip(LARGE, (self.image, self.depth, self.features, self.cloud), strict=True)
+        )
         for topic, kind in (
             ("/tf", "FrameTransforms"),
             ("/tf_static", "FrameTransforms"),
@@ -144,6 +160,24 @@ class Publishing:
         self._server.latch(topic, lambda: message, event.stamp)
 
     # At once.
+
+    def small(self, event: Event) -> None:
+        """Put the messages of an event that is no image and no point cloud."""
+        match event:
+            case Odometry():
+                self.odometry(event)
+            case PoseEstimate():
+                self.estimate(event)
+            case PoseStamped():
+                self.camera_pose(event)
+            case Imu():
+                self.imu(event)
+            case Score():
+                self.score(event)
+            case PlannedPose() | PositionSetpoint():
+                self.plan(event)
+            case TrackingEvent() | VehicleEvent():
+                self.logged(event)
 
     def odometry(self, event: Odometry) -> None:
         """Put where a vehicle truly is, as a message and as a transform."""

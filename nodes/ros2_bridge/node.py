@@ -16,21 +16,11 @@ from events import (
     DepthImage,
     EstimatorAnnouncement,
     Event,
-    FluidPressure,
     Image,
     Imu,
-    LaserScan3D,
-    MagneticField,
-    NavSatFix,
     Odometry,
-    PointCloud,
     PoseEstimate,
-    PoseStamped,
-    Range,
-    Score,
-    SegmentationImage,
     Setpoint,
-    TransformStamped,
 )
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.inbox import Inbox
@@ -41,7 +31,7 @@ from nodes.ros2_bridge.outgoing_topic import OutgoingTopic
 from nodes.ros2_bridge.session import Publisher, Session, SessionError
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
 from nodes.ros_messages.calibration import camera_announcement
-from nodes.ros_messages.publishing import Publishing
+from nodes.ros_messages.publishing import LARGE, SMALL, Publishing
 from nodes.ros_messages.stamps import Stamps, Time
 from nodes.ros_messages.typestore import TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
@@ -84,7 +74,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self._publishing: Publishing[Publisher] | None = None
         self._queues: dict[type[Event], Stream[Any]] = {
             kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
-            for kind in (Image, DepthImage, SegmentationImage, PointCloud, LaserScan3D)
+            for kind in LARGE
         }
         self._incoming: list[IncomingTopic] = []
         self._unread: list[Stream[bytes]] = []
@@ -220,15 +210,12 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         if not await self.offload(session.close):
             self.log.warning("a peer that stands still keeps the session from closing")
 
-    @on(Image, DepthImage, SegmentationImage, PointCloud, LaserScan3D)
+    @on(*LARGE)
     def images_and_clouds(self, event: Event) -> None:
         """Publish an image or a point cloud beside the loop."""
         self._queues[next(kind for kind in self._queues if isinstance(event, kind))].offer(event)
 
-    @on(
-        *(Odometry, PoseStamped, PoseEstimate, TransformStamped, Score),
-        *(Imu, Range, FluidPressure, MagneticField, NavSatFix),
-    )
+    @on(*SMALL)
     def measurements(self, event: Event) -> None:
         """Publish what is small, at once."""
         if self._publishing is not None:

@@ -55,6 +55,21 @@ from nodes.ros_messages.transforms import Transforms
 from nodes.ros_messages.typestore import TypeStore
 from runtime.schedule import SECOND
 
+LARGE: tuple[type[Event], ...] = (
+    Image,
+    DepthImage,
+    SegmentationImage,
+    PointCloud,
+    LaserScan3D,
+)
+"""Events whose messages take long to make: `Publishing.large` has a function for each."""
+
+SMALL: tuple[type[Event], ...] = (
+    *(Odometry, PoseStamped, PoseEstimate, TransformStamped, Score),
+    *(Imu, Range, FluidPressure, MagneticField, NavSatFix),
+)
+"""Events that `Publishing.small` takes."""
+
 
 class Publisher(Protocol):
     """Takes the messages of one topic."""
@@ -186,7 +201,7 @@ class Publishing(Generic[P]):
 
     def knows(self, kind: type[Event]) -> bool:
         """Tell whether `small` has a message for events of a type."""
-        return issubclass(kind, tuple(self._small))
+        return issubclass(kind, SMALL)
 
     def small(self, event: Event) -> None:
         """Put the messages of an event that is no image and no point cloud."""
