@@ -1,16 +1,23 @@
-"""The runtime: nodes as coroutines on one event loop, talking through awaitable channels.
+"""The runtime: nodes as coroutines on one event loop that talk through typed, awaitable channels.
 
-Read in this order: `node` (what an author writes), `ports` and `bundles` (what it declares),
-`sender`, `streams` and `links` (how an event gets from one node to another), `steps` (why that is
-quick), `schedule`, `clock`, `lockstep` and `realtime` (time), `worker` and `shared` (slow work),
-`graph`, `life`, `supervisor`, `execute`, `driver`, `results` and `summary` (a run, its end, its
-folder), `config` and `paths` (the file), `preflight` (what `check` says of it), `wire` and `peers`
-(a run in several processes). `parameters` and `changing` (settings that change in a run),
-`watchdog`, `standstill` and `places` (who holds it up), `costs`, `probes`, `tracing` and `monitor`
-(looking on) can wait. `testing` is for tests of nodes.
+Read the core in this order:
+
+- What an author writes: `node`, with its declarations in `ports` and `bundles`.
+- How an event gets from node to node: `sender`, `streams`, `links`, `graph`; and what makes it
+  quick: `tasks`, `task_factory`.
+- Time: `schedule`, `clock`, `lockstep`, `real_clock`, `time_limits`.
+- A run: `node_runner`, `node_host`, `startup`, `run_state`, `supervisor`, `execute`, `event_loop`.
+- What a run leaves: `digest`, `summary`, `results`, `logs`.
+- `config`: the file; `units` and `paths` are types of settings.
+- `workers`: objects in processes of their own.
+- `watchdogs`, `code_location`: who blocks the loop or holds up the run.
+- `parameter_server`: settings that change in a run. `instruments`: hooks for who looks on.
+- `wire` and `peers`: events as bytes, and a run in several processes.
+
+`testing` is for tests of nodes. `tools` is no part of the core: the command line, the monitor,
+tracing and sweeps.
 """
 
-from runtime import neighbours as _neighbours  # noqa: F401  # first, as it checks `events`
 from runtime.bundles import Bundle
 from runtime.clock import Clock
 from runtime.config.parameters import Changeable

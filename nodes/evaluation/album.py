@@ -9,8 +9,7 @@ import numpy as np
 
 from events import Image, TrackedFeatures
 from nodes.evaluation.results import file_name
-
-SECOND = 1_000_000_000
+from runtime.schedule import SECOND
 
 _WAITING = 30
 """Images whose features may still come."""

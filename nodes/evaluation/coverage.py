@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-Stamps = npt.NDArray[np.int64]
+from runtime.schedule import SECOND
 
-SECOND = 1_000_000_000
+Stamps = npt.NDArray[np.int64]
 
 
 class Interval(NamedTuple):

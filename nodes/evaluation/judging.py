@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.alignment import How, align, transform
-from nodes.evaluation.coverage import SECOND, Interval, Stamps, choose_frames, cover, seconds
+from nodes.evaluation.coverage import Interval, Stamps, choose_frames, cover, seconds
 from nodes.evaluation.metrics import (
     absolute_error,
     drift_percent,
@@ -23,6 +23,7 @@ from nodes.evaluation.metrics import (
 )
 from nodes.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory, associate
+from runtime.schedule import SECOND
 
 Floats = npt.NDArray[np.float64]
 

@@ -12,9 +12,10 @@ from nodes.mcap.disk import RecordingError
 from nodes.mcap_recorder.backlog import Backlog
 from nodes.mcap_recorder.requests import WriteRequest
 from nodes.mcap_recorder.settings import McapRecorderConfig
-from nodes.mcap_recorder.writer_process import STANDSTILL, WriterProcess, spare_cores
+from nodes.mcap_recorder.writer_process import STANDSTILL, WriterProcess
 from nodes.trajectory.growing import part_name
 from runtime import Input, Node
+from runtime.workers.worker import spare_cores
 
 _WAITING = 1 << 16
 """Events that may come while simulated time waits: more than are ever sent at one moment."""

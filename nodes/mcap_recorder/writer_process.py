@@ -263,10 +263,3 @@ class WriterProcess:
                 self._child.wait(1.0)
             code = self._child.returncode
             return Reply("gone", f"{self.path}: the process that writes it ended with {code}")
-
-
-def spare_cores() -> tuple[int, ...]:
-    """Return all cores but the first, which is left to the loop; none if there is no other."""
-    if not hasattr(os, "sched_getaffinity"):
-        return ()
-    return tuple(sorted(os.sched_getaffinity(0))[1:])

@@ -14,8 +14,7 @@ from nodes.replay.formats import open_reader
 from nodes.replay.reader import Reader, ReplayError
 from nodes.replay.settings import ReplayConfig
 from runtime import Node, Output
-
-SECOND = 1_000_000_000
+from runtime.schedule import SECOND
 
 _SLICE = SECOND // 10
 """In real time, how long a sleep may keep `seek` waiting (ns)."""

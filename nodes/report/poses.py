@@ -14,11 +14,11 @@ from nodes.evaluation.judging import Errors
 from nodes.evaluation.metrics import position_errors, rotation_errors
 from nodes.trajectory import Trajectory, associate
 from nodes.trajectory.formats import read_tum
+from runtime.schedule import SECOND
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-SECOND = 1_000_000_000
 GAP = SECOND // 2
 """Silence that counts as lost (ns)."""
 

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
-SECOND = 1_000_000_000
-"""Nanoseconds."""
+from runtime.schedule import SECOND
 
 _TOO_LATE = 1 << 63
 """The first number of nanoseconds that 64 bits do not hold."""

@@ -72,20 +72,20 @@ def _at(value: Any, path: str) -> Any:
 
 def _fields_at(type_: Any, path: str) -> list[str]:
     """Return the names of the settings that are known at a path."""
-    struct = _struct_in(_type_at(type_, path))
+    struct = struct_in(_type_at(type_, path))
     return [] if struct is None else list(struct.__struct_encode_fields__)
 
 
 def _type_at(type_: Any, path: str) -> Any:
     """Return the type of the setting at a path; `None` if there is none."""
     for name in re.findall(r"\.([\w-]+)", path):
-        struct = _struct_in(type_)
+        struct = struct_in(type_)
         fields = () if struct is None else msgspec.structs.fields(struct)
         type_ = next((f.type for f in fields if f.encode_name == name), None)
     return type_
 
 
-def _struct_in(type_: Any) -> type[msgspec.Struct] | None:
+def struct_in(type_: Any) -> type[msgspec.Struct] | None:
     """Return the struct that a type is, or is a list of."""
     while type_ is not None and not hasattr(type_, "__struct_fields__"):
         type_ = next(iter(get_args(type_)), None)

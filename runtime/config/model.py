@@ -118,13 +118,13 @@ def to_builtins(config: Config) -> dict[str, Any]:
         if not network["secret"].startswith(("env:", "file:")):
             del network["secret"]
         table["network"] = network
-    return _without_none(table | {"nodes": nodes})  # type: ignore[no-any-return]
+    return without_none(table | {"nodes": nodes})  # type: ignore[no-any-return]
 
 
-def _without_none(value: Any) -> Any:
+def without_none(value: Any) -> Any:
     """Leave out what is not set: TOML has no null."""
     if isinstance(value, dict):
-        return {k: _without_none(v) for k, v in value.items() if v is not None}
+        return {k: without_none(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):
-        return [_without_none(v) for v in value]
+        return [without_none(v) for v in value]
     return value

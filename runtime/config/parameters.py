@@ -15,11 +15,13 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin
+from typing import Annotated, Any, NamedTuple, TypeVar, get_origin
 
 import msgspec
 import tomli_w
 
+from runtime.config.messages import struct_in
+from runtime.config.model import without_none
 from runtime.config.override import override
 from runtime.config.reading import convert
 from runtime.errors import ConfigError
@@ -84,7 +86,7 @@ def changeable(type_: type[msgspec.Struct], before: str = "") -> list[str]:
     found = []
     for field in _fields(type_):
         key = f"{before}{field.encode_name}"
-        inner = _struct_in(field.type)
+        inner = struct_in(field.type)
         if is_marked(field.type):
             found.append(key)
         elif inner is not None:
@@ -117,16 +119,8 @@ def toml(value: Any) -> str:
 
 def _table(config: msgspec.Struct) -> dict[str, Any]:
     """Return settings as `tomllib` would read them; what is not set is left out."""
-    found: dict[str, Any] = _without_none(msgspec.to_builtins(config, enc_hook=plain))
+    found: dict[str, Any] = without_none(msgspec.to_builtins(config, enc_hook=plain))
     return found
-
-
-def _without_none(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _without_none(v) for k, v in value.items() if v is not None}
-    if isinstance(value, list | tuple):
-        return [_without_none(v) for v in value]
-    return value
 
 
 def _differences(before: Any, after: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -161,7 +155,7 @@ def _may_change(type_: Any, path: tuple[str, ...]) -> bool:
             continue
         if is_marked(field.type):
             return True
-        struct = _struct_in(field.type)
+        struct = struct_in(field.type)
     return False
 
 
@@ -176,13 +170,6 @@ def is_marked(type_: Any) -> bool:
     return any(isinstance(m, msgspec.Meta) and (m.extra or {}).get(_MARK) for m in marks)
 
 
-def _struct_in(type_: Any) -> Any:
-    """Return the struct that a type is, or is a list of."""
-    while type_ is not None and not hasattr(type_, "__struct_fields__"):
-        type_ = next(iter(get_args(type_)), None)
-    return type_
-
-
 def settings(config: NodeConfig) -> dict[str, str]:
     """Return the settings that can change with their values, as `Change.values`."""
     found: dict[str, str] = {}
@@ -190,7 +177,7 @@ def settings(config: NodeConfig) -> dict[str, str]:
     def walk(type_: Any, value: Any, before: str) -> None:
         for field in _fields(type_):
             key, inner = f"{before}{field.encode_name}", value.get(field.encode_name)
-            struct = _struct_in(field.type)
+            struct = struct_in(field.type)
             if inner is None:
                 continue
             if is_marked(field.type):

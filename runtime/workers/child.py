@@ -67,7 +67,7 @@ def _end_with_the_run(connection: socket.socket) -> None:
 def _make(pipe: SharedPipe, message: bytearray) -> Any:
     factory, args, niceness, cores = pipe.unpack(message)
     os.nice(niceness)
-    if cores is not None:  # before any library starts threads, which inherit it
+    if cores:  # before any library starts threads, which inherit it
         os.sched_setaffinity(0, cores)
     return factory(*args)
 

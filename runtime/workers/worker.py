@@ -111,7 +111,7 @@ class Worker(Generic[W]):
             functools.partial(_Process, each, timeout, environment, printed, died, self.costs)
             for each in names
         ]
-        cores = _spare_cores() if clock.kind == "real" else None
+        cores = spare_cores() if clock.kind == "real" else ()
         self._to_make = factory, args, niceness, cores
 
     async def ready(self) -> None:
@@ -184,16 +184,15 @@ class Worker(Generic[W]):
                 process.join(until)
 
 
-def _spare_cores() -> set[int] | None:
-    """Return all cores but one, which is left to the loop; `None` where there is no choice.
+def spare_cores() -> tuple[int, ...]:
+    """Return all cores but the first, which is left to the loop; none if there is no other.
 
     On two cores with a camera rendering, this brings the 99th percentile of a 400 Hz tick's
     lateness from three times that without a camera down to the same.
     """
     if not hasattr(os, "sched_getaffinity"):
-        return None
-    cores = sorted(os.sched_getaffinity(0))
-    return set(cores[1:]) or None
+        return ()
+    return tuple(sorted(os.sched_getaffinity(0))[1:])
 
 
 class _Process:
