@@ -14,13 +14,14 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "inputs": ("input", "holds", "fullest", "of", "dropped"),
     "links": ("link", "lost", "thinned"),
     "ticks": ("tick", "Hz", "calls", "missed", "late p99 µs", "max µs"),
+    "settings": ("setting that can change", "value"),
 }
 """Titles of columns, by table."""
 
-LEFT, RIGHT = ("nodes", "ticks", "inputs", "links"), ("outputs",)
+LEFT, RIGHT = ("nodes", "ticks", "inputs", "links"), ("outputs", "settings")
 """Where the tables stand."""
 
-_WORDS = {"condition", "event"}
+_WORDS = {"condition", "event", "value"}
 """Columns of words; all others but the first are numbers."""
 
 
@@ -115,6 +116,14 @@ def _ticks(snapshot: Snapshot) -> Rows:
     ]
 
 
+def _settings(snapshot: Snapshot) -> Rows:
+    return [
+        (f"{node.name}.{key}", value)
+        for node in snapshot.nodes
+        for key, value in node.settings.items()
+    ]
+
+
 def _number(value: float | None, form: str) -> str:
     return "" if value is None else format(value, form)
 
@@ -125,4 +134,5 @@ _TABLES: dict[str, Callable[[Snapshot], Rows]] = {
     "inputs": _inputs,
     "links": _links,
     "ticks": _ticks,
+    "settings": _settings,
 }

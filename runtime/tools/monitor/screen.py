@@ -230,11 +230,7 @@ class Screen(App[str]):
         """Ask for a setting of the node under the cursor."""
         if self.snapshot is None:
             return
-        known = [
-            f"{node.name}.{key}={value}"
-            for node in self.snapshot.nodes
-            for key, value in node.settings.items()
-        ]
+        known = ["=".join(row) for row in rows("settings", self.snapshot)]
         prompt = self.query_one("#prompt", Input)
         prompt.suggester = SuggestFromList(known)
         mine = [text for text in known if text.startswith(f"{self._chosen()}.")]

@@ -188,11 +188,6 @@ def shown(snapshot: Snapshot) -> dict[str, Any]:
         "speed": aim(snapshot.clock),
         "fixed": snapshot.clock.fixed,
         "tables": {name: rows(name, snapshot) for name in COLUMNS},
-        "settings": [
-            f"{node.name}.{key}={value}"
-            for node in snapshot.nodes
-            for key, value in node.settings.items()
-        ],
         "log": [msgspec.to_builtins(line) for line in snapshot.log],
     }
 

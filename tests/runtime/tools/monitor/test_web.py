@@ -128,7 +128,8 @@ async def test_snapshots_come_as_events_and_so_does_the_end() -> None:
     assert first["headline"].startswith("sample   1.500")
     assert second["headline"].startswith("sample   2.000")
     assert second["tables"]["nodes"][0][0] == "drone"
-    assert second["settings"] == ["pilot.gain=1.0", "pilot.patience=0.5"]
+    settings = [["pilot.gain", "1.0"], ["pilot.patience", "0.5"]]
+    assert second["tables"]["settings"] == settings
 
 
 async def test_a_page_that_is_slow_still_sees_how_it_ended() -> None:
