@@ -8,7 +8,7 @@ from runtime.tools.cli.common import ConfigFile, Overrides, warn
 
 
 def check(config: ConfigFile, overrides: Overrides = None) -> None:
-    """Say what is wrong with a file, without flying: a line for each mistake.
+    """Check a file without flying: print a line for each mistake.
 
     The settings are read, and the nodes are brought up to where the first update would be: worlds,
     recordings and other files are opened, cameras and vehicles announced, and every node says

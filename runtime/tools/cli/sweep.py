@@ -45,7 +45,7 @@ def sweep(
         bool, typer.Option("--fresh", help="Run everything, also what is finished already.")
     ] = False,
 ) -> None:
-    """Run a file with every combination of some settings, and compare how well it went.
+    """Run a file with every combination of some settings, and compare the results.
 
     Each run is a process of its own; one that fails is a row of the table. Results go to
     sweeps/<name>: index.html shows all of them; table.csv, summary.csv, plots/, each run's folder

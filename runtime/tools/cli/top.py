@@ -1,4 +1,4 @@
-"""``top``: a run in a terminal, while it goes."""
+"""``top``: a monitor of a run, in a terminal."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Run = Annotated[str | None, typer.Argument(help="Name of the run; needed if ther
 
 def top(
     run: Run = None,
-    leave: Annotated[bool, typer.Option("--leave", help="Go when the run is over.")] = False,
+    leave: Annotated[bool, typer.Option("--leave", help="Quit when the run ends.")] = False,
 ) -> None:
-    """Watch a run in a terminal, and have a say in it.
+    """Monitor a run in a terminal, and control it.
 
-    Its nodes, channels, clock and log; keys pause it, step it, change its speed, restart a node,
-    set a parameter, end the run. Quitting leaves the run alone.
+    It shows nodes, channels, clock, settings and log. Keys pause the run, step it, change its
+    speed or a setting, restart a node and end the run. Quitting does not affect the run.
     """
     import asyncio
 

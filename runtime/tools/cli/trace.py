@@ -1,4 +1,4 @@
-"""``trace``: what a trace tells in figures."""
+"""``trace``: latencies and loads of a trace, as tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def trace(
     file: Annotated[Path, typer.Argument(help="A trace that run --trace wrote.")],
 ) -> None:
-    """Show how long sensors took to become set-points, and who had the loop.
+    """Show the latency from sensors to set-points, and how much of the loop each node had.
 
     A path is the events from an exposure to a set-point: → where one follows from another (it
     bears its stamp, or was sent on hearing it), ⇢ where a node goes at a rate of its own, and it

@@ -1,4 +1,4 @@
-"""``web``: a run as a page in a browser, while it goes."""
+"""``web``: a monitor of a run, as a page in a browser."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def web(
     ] = None,
     leave: Annotated[bool, typer.Option("--leave", help="End with the run.")] = False,
 ) -> None:
-    """Show a run as a live page, with the same figures and commands as top.
+    """Monitor a run on a live page, with the same figures and commands as top.
 
-    The page is on this machine only, and only for who has the address that is printed.
+    The page is served on this machine only, and only to those who have the address that is printed.
     """
     import asyncio
 
