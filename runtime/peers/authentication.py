@@ -18,7 +18,7 @@ import struct
 
 from runtime.errors import PeerError, WireError
 
-VERSION = 1
+VERSION = 2
 """Of the messages of `runtime.peers.messages`; processes of different ones do not meet."""
 
 NONCE = 16

@@ -42,13 +42,13 @@ class JointShutdown:
         went: Told that some are not waited for any more.
 
     Attributes:
-        retired: Nodes of other processes that have ended.
+        ended_nodes: Nodes of other processes that have ended.
         at_work: Whether a node here is about to end.
         heard_at: When the last word of another process came, on `time.monotonic`.
     """
 
     def __init__(self, membership: Membership, went: Callable[[], None]) -> None:
-        self.retired: set[str] = set()
+        self.ended_nodes: set[str] = set()
         self.at_work = False
         self.heard_at = 0.0
         self._membership = membership
@@ -72,15 +72,17 @@ class JointShutdown:
         nodes = self._membership.nodes
         after = set(nodes[nodes.index(node) + 1 if node else 0 :])
         await self._membership.until(
-            lambda: not any(after & {*m.nodes} - self.retired for m in self._membership.present()),
+            lambda: (
+                not any(after & {*m.nodes} - self.ended_nodes for m in self._membership.present())
+            ),
             despite=True,
-            whom=lambda m: bool(after & {*m.nodes} - self.retired),
+            whom=lambda m: bool(after & {*m.nodes} - self.ended_nodes),
         )
         self.at_work = bool(node)
 
-    def parted(self, member: Member, part: Summary) -> None:
+    def take_summary(self, member: Member, part: Summary) -> None:
         """Take in what another process has to say of the run."""
-        member.parted = part
+        member.final_summary = part
         self._with_summary[member.number] = member
         member.outbox.send(SummaryReceived())
 
@@ -91,17 +93,20 @@ class JointShutdown:
         try:
             async with real_time_limit(PARTING):
                 await membership.until(
-                    lambda: all(m.parted and m.has_ours for m in membership.present()), despite=True
+                    lambda: all(
+                        m.final_summary and m.has_our_summary for m in membership.present()
+                    ),
+                    despite=True,
                 )
         except TimeoutError:
-            silent = [name_of(m.nodes) for m in membership.present() if m.parted is None]
+            silent = [name_of(m.nodes) for m in membership.present() if m.final_summary is None]
             log.warning("no summary of %s", "; ".join(silent))
         parts = {membership.me: mine}
         processes = {membership.me: ProcessSummary(list(membership.here), membership.hello.place)}
         for member in [*self._with_summary.values(), *membership.present()]:
             processes[member.number] = member.summary()
-            if member.parted is not None:
-                parts[member.number] = member.parted
+            if member.final_summary is not None:
+                parts[member.number] = member.final_summary
         return merged(
             [part for _, part in sorted(parts.items())], [p for _, p in sorted(processes.items())]
         )
@@ -129,7 +134,7 @@ class JointShutdown:
     def _give_up(self) -> None:
         """End without those who say nothing."""
         membership = self._membership
-        if silent := [m for m in membership.present() if not m.has_ours]:
+        if silent := [m for m in membership.present() if not m.has_our_summary]:
             names = "; ".join(name_of(m.nodes) for m in silent)
             log.error("%s: expected a word within %g s; the run ends without it", names, SILENCE)
             if membership.ended is not None:

@@ -49,11 +49,11 @@ class Member:
         announced: What its nodes announced.
         ready: Whether its nodes can begin.
         begin: When the first update is, if it has said so.
-        told: What it was told that nodes here hear.
-        parted: What it had to say of the run.
+        subscriptions: Of nodes here, as it was sent them.
+        final_summary: What it had to say of the run.
         outgoing: Memory that was offered to it.
         incoming: Memory of its own that we see.
-        has_ours: Whether it has what we had to say of the run.
+        has_our_summary: Whether it has what we had to say of the run.
     """
 
     def __init__(
@@ -76,27 +76,27 @@ class Member:
         self.announced: Announcements | None = None
         self.ready = False
         self.begin: FirstUpdate | None = None
-        self.told: tuple[Subscription, ...] | None = None
+        self.subscriptions: tuple[Subscription, ...] | None = None
         self._arrived = 0
-        self.parted: Summary | None = None
+        self.final_summary: Summary | None = None
         self.outgoing: Outgoing | None = None
         self.incoming: Incoming | None = None
-        self.has_ours = False
+        self.has_our_summary = False
         self.outbox = Outbox(
             id_, lambda message, payload: put(sealing.seal(message, payload), payload), failed
         )
 
-    def event(self, said: EventMessage, payload: bytes) -> Event:
+    def event(self, message: EventMessage, payload: bytes) -> Event:
         """Return the event that it said.
 
         Raises:
             WireError: There is none that is known here.
         """
-        if said.place is None:
+        if message.place is None:
             return unpack(payload)
         if self.incoming is None:
             raise WireError("expected an event as a payload, found its place in unknown memory")
-        return unpack(self.incoming.frame(*said.place))
+        return unpack(self.incoming.frame(*message.place))
 
     def acknowledge(self, count: int) -> None:
         """Take in that so many bytes came, and tell it once in a while."""

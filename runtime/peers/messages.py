@@ -54,7 +54,7 @@ class Hello(Message, frozen=True):
 class Announcements(Message, frozen=True):
     """What each of my nodes announced, as frames of `runtime.wire`."""
 
-    said: dict[str, tuple[bytes, ...]]
+    by_node: dict[str, tuple[bytes, ...]]
 
 
 class Subscription(msgspec.Struct, frozen=True):

@@ -134,7 +134,7 @@ class Peers:
         everything = dict(said)
         for member in others():
             if member.announced is not None:
-                for name, frames in member.announced.said.items():
+                for name, frames in member.announced.by_node.items():
                     try:
                         everything[name] = [_announcement(frame) for frame in frames]
                     except WireError as error:
@@ -216,8 +216,8 @@ class Peers:
         self._remote.connect(listeners, fault)
         wanted = subscriptions(each for each in listeners if each.node != "run")
         for member in self._membership.present():
-            if member.told != wanted:
-                member.told = wanted
+            if member.subscriptions != wanted:
+                member.subscriptions = wanted
                 member.outbox.send(Subscriptions(wanted))
 
     def stopping(self, reason: str, error: Exception | None, *, from_peer: bool) -> None:
@@ -276,7 +276,7 @@ class Peers:
             ):  # first, since there are many
                 self._do(member.number, message, event)
             case Announcements():
-                if not message.said.keys() <= {*member.nodes}:
+                if not message.by_node.keys() <= {*member.nodes}:
                     raise WireError("expected announcements of its own nodes")
                 member.announced = message
                 if self._begun:  # it was gone, and needs ours again
@@ -286,9 +286,9 @@ class Peers:
                     part = msgspec.json.decode(message.part, type=Summary)
                 except (msgspec.DecodeError, RecursionError) as error:
                     raise WireError(f"expected a part of the summary, found: {error}") from None
-                self.shutdown.parted(member, part)
+                self.shutdown.take_summary(member, part)
             case SummaryReceived():
-                member.has_ours = True
+                member.has_our_summary = True
             case FirstUpdate():
                 member.begin = message
             case Ready() if not member.ready:
@@ -328,8 +328,8 @@ class Peers:
         ):
             self._lost_early.append(member)
             return
-        lost = set(member.nodes) - self.shutdown.retired
-        self.shutdown.retired |= lost
+        lost = set(member.nodes) - self.shutdown.ended_nodes
+        self.shutdown.ended_nodes |= lost
         name = name_of(member.nodes)
         gone = PeerError(f"{name}: {member.over} ({member.place})")
         if not (self._begun or self._ends):
@@ -395,7 +395,7 @@ class Peers:
                     failed = PeerError(f"at {where}: {message.error}") if message.error else None
                     self._run.stop(message.reason, failed, from_peer=True)
                 case NodeEnded():
-                    self.shutdown.retired.add(message.node)
+                    self.shutdown.ended_nodes.add(message.node)
         except WireError as error:
             log.warning("from process %d: %s", number, error)
         self._membership.notify()
@@ -409,7 +409,7 @@ class Peers:
         self._take_back(member)
 
     def _take_back(self, member: Member) -> None:
-        self.shutdown.retired -= {*member.nodes}
+        self.shutdown.ended_nodes -= {*member.nodes}
         self._apart.discard(member.number)
         self._gather(new=(member.number,))
         self._run.connect()

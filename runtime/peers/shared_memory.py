@@ -24,7 +24,7 @@ import numpy as np
 from runtime.errors import WireError
 from runtime.peers.messages import MemoryOffer
 from runtime.wire import Packed
-from runtime.workers.shared_memory import Arena, Window, anonymous_file
+from runtime.workers.shared_memory import Arena, MappedFile, anonymous_file
 
 log = logging.getLogger("visnav.runtime")
 
@@ -81,7 +81,7 @@ class Incoming:
     """
 
     def __init__(self, fd: int) -> None:
-        self._window = Window(fd)
+        self._window = MappedFile(fd)
         weakref.finalize(self, self._window.close)
 
     @classmethod

@@ -50,7 +50,7 @@ class ProgressWatchdog:
         self._thread_id = threading.get_ident()
         self._main = threading.current_thread() is threading.main_thread()
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="standstill", daemon=True)
+        self._thread = threading.Thread(target=self._watch, name="progress", daemon=True)
 
     def __enter__(self) -> None:
         if self._limit > 0:

@@ -126,7 +126,7 @@ class Arena:
             self._map = mmap.mmap(self._fd, length)
 
 
-class Window:
+class MappedFile:
     """The reader's side of a file.
 
     Args:
@@ -168,7 +168,7 @@ class SharedPipe:
         self._readable = select.poll()
         self._readable.register(connection, select.POLLIN)
         self._arena = Arena(out_fd)
-        self._window = Window(in_fd)
+        self._window = MappedFile(in_fd)
         self._returned: collections.deque[int] = collections.deque()
         self._unsent: collections.deque[memoryview] = collections.deque()
         self._sending = threading.Lock()
