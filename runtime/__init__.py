@@ -18,6 +18,7 @@ Read the core in this order:
 tracing and sweeps.
 """
 
+from runtime import neighbours as _neighbours  # noqa: F401  # first, as it checks `events`
 from runtime.bundles import Bundle
 from runtime.clock import Clock
 from runtime.config.parameters import Changeable
