@@ -39,8 +39,9 @@ from nodes.ros_messages.incoming import READERS, MessageContext, estimate
 from nodes.ros_messages.stamps import Stamps
 from nodes.ros_messages.typestore import Bag
 from runtime.errors import VisnavError
+from runtime.schedule import SECOND
 
-_SAME_CLOCK = 60 * 1_000_000_000
+_SAME_CLOCK = 60 * SECOND
 """Nanoseconds between stamp and receipt above which they are of different clocks."""
 
 _EVENTS: dict[Use, type[Event]] = {
@@ -262,7 +263,7 @@ def _readable(path: Path) -> Iterator[None]:
 def _stamp(message: Any) -> int:
     """Return a header's stamp (ns); 0 if it has none."""
     stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
 class _AsPose:
