@@ -76,9 +76,9 @@ class Euroc(Recording):
             self._imu = self.rows("mav0/imu0/data.csv", _IMU_HEADER)
             self.write("mav0/imu0/sensor.yaml", self._imu_yaml())
         self._truth = self.rows(f"{_TRUTH}/data.csv", f"{EUROC_HEADER}\n")
-        self._velocity_said = False
+        self._velocity_known = False
         self._places: set[Vector3] = set()  # no more than two
-        self._describe_truth("velocities as the vehicle said them")
+        self._describe_truth("velocities as the vehicle sent them")
 
     def image(self, event: Image) -> ImageFile | None:
         """Note an image of one of the cameras."""
@@ -95,7 +95,7 @@ class Euroc(Recording):
     def odometry(self, event: Odometry) -> None:
         """Note where the body is, and its velocity in the world."""
         if event.source == self.rig.body:
-            self._velocity_said |= any(event.linear_velocity)
+            self._velocity_known |= any(event.linear_velocity)
             if len(self._places) < 2:
                 self._places.add(event.position)
             row = euroc_row(
@@ -122,12 +122,12 @@ class Euroc(Recording):
     def warnings(self) -> list[str]:
         """Return what a reader should know."""
         if self._velocity_unknown:
-            return ["the vehicle moved and said no velocity: those of the ground truth are zeros"]
+            return ["the vehicle moved and sent no velocity: those of the ground truth are zeros"]
         return []
 
     @property
     def _velocity_unknown(self) -> bool:
-        return len(self._places) > 1 and not self._velocity_said
+        return len(self._places) > 1 and not self._velocity_known
 
     def _describe_truth(self, velocities: str) -> None:
         comment = f"{WORLD_AXES}; {_BODY}; true poses, {velocities}, biases not recorded (zeros)"

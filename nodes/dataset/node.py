@@ -53,9 +53,9 @@ class DatasetConfig(NodeConfig):
 
 
 class DatasetWriter(Node[DatasetConfig]):
-    """Writes what cameras, an IMU and the ground truth say, as EuRoC or TUM RGB-D have it.
+    """Writes images, IMU measurements and the ground truth in the layout of EuRoC or TUM RGB-D.
 
-    Which camera (or vehicle) can be said with ``inputs = { images = "drone/front" }``. The world
+    Which camera (or vehicle) can be chosen by ``inputs = { images = "drone/front" }``. The world
     of the files is z up: north, west, up. After a restart a numbered folder (``dataset-2``) holds
     what came then.
     """

@@ -45,7 +45,7 @@ def align(estimate: Trajectory, truth: Trajectory, how: How) -> Alignment:
 
     Raises:
         ValueError: The stamps differ; or all positions of one lie on a line (or a point), and
-            so say nothing of the rotation about it.
+            so determine nothing of the rotation about it.
     """
     if how not in get_args(How):
         known = ", ".join(get_args(How))

@@ -55,7 +55,7 @@ class Coverage(msgspec.Struct, frozen=True):
         return 100.0 * self.answered / self.frames
 
 
-def cover(frames: Stamps, poses: Stamps, gap: int, said: Sequence[Interval] = ()) -> Coverage:
+def cover(frames: Stamps, poses: Stamps, gap: int, announced: Sequence[Interval] = ()) -> Coverage:
     """Return what poses cover of a flight.
 
     Lost is what a user means by it: no pose for longer than `gap` although there were images, or
@@ -65,7 +65,7 @@ def cover(frames: Stamps, poses: Stamps, gap: int, said: Sequence[Interval] = ()
         frames: Stamps of the images, strictly rising, shape (n,), n ≥ 1.
         poses: Stamps of the poses, strictly rising, shape (m,).
         gap: Silence that counts (ns).
-        said: Intervals in which the estimator said that it was lost, in any order.
+        announced: Intervals in which the estimator itself reported that it was lost, in any order.
     """
     first, last = int(frames[0]), int(frames[-1])
     has_pose = answered(frames, poses)
@@ -77,7 +77,7 @@ def cover(frames: Stamps, poses: Stamps, gap: int, said: Sequence[Interval] = ()
         - unanswered[np.searchsorted(frames, starts, side="left")]
     )
     silent = np.flatnonzero((ends - starts > gap) & (missing > 0))
-    clipped = [Interval(max(s, first), min(e, last)) for s, e in said]
+    clipped = [Interval(max(s, first), min(e, last)) for s, e in announced]
     lost = [Interval(int(starts[k]), int(ends[k])) for k in silent]
     lost += [each for each in clipped if each.end > each.start]
     return Coverage(Interval(first, last), len(frames), int(has_pose.sum()), union(lost))
@@ -102,7 +102,7 @@ def choose_frames(cameras: Mapping[str, Stamps], poses: Stamps) -> Stamps | None
     """Return the stamps of the camera that an estimator follows: most of its poses have them.
 
     Args:
-        cameras: Stamps of the images by camera, in the order in which they were first heard.
+        cameras: Stamps of the images by camera, in the order of their first images.
         poses: Stamps of the estimator's poses.
 
     Returns:

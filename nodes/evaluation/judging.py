@@ -1,4 +1,4 @@
-"""From what an estimator said and the truth to figures, and from figures to a verdict.
+"""From the estimates and the truth to figures, and from figures to a verdict.
 
 Pure functions; `nodes.evaluation.node` collects, and `nodes.evaluation.results` writes.
 """
@@ -129,8 +129,8 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
 
     Attributes:
         figures: Its figures, by name (a unit is the name's end).
-        estimate: What it said, as it said it.
-        aligned: The same in the truth's frame, where there is a truth; `None` if it said nothing.
+        estimate: Its estimates, as it sent them.
+        aligned: The same in the truth's frame, where there is a truth; `None` if it sent none.
         of_images: Errors of each pose at the time of its image.
         of_ticks: Errors of the newest pose there was at each control tick.
         lost: When it had no pose.
@@ -158,7 +158,7 @@ def judge(
     """Judge an estimator against the truth.
 
     Args:
-        record: What it said.
+        record: What it sent.
         truth: The true poses of the same body.
         cameras: Stamps of the images (ns), strictly rising, by camera. The flight is from the
             first to the last image of the camera that the estimator follows; without cameras it
@@ -180,7 +180,7 @@ def judge(
         waits = min(max(usual, 0), round(gap * SECOND))
     due = truth.stamps if frames is None else frames
     due = due[: max(int(np.searchsorted(due, end - waits, side="right")), 1)]
-    coverage = cover(due, poses, round(gap * SECOND), record.said_lost(end))
+    coverage = cover(due, poses, round(gap * SECOND), record.reported_lost(end))
     inside = (truth.stamps >= coverage.flight.start) & (truth.stamps <= coverage.flight.end)
     flight = truth.take(inside) if inside.any() else truth
     figures: dict[str, Any] = {

@@ -23,10 +23,10 @@ class LiveErrors:
         """Return the errors of an estimate: metres, radians."""
         position, orientation = event.position, event.orientation
         if event.frame_id != "map":
-            said = pose_matrix(position, orientation)
+            matrix = pose_matrix(position, orientation)
             if self._origin is None:
-                self._origin = pose_matrix(*truth) @ np.linalg.inv(said)
-            position, orientation = pose_tuples(self._origin @ said)
+                self._origin = pose_matrix(*truth) @ np.linalg.inv(matrix)
+            position, orientation = pose_tuples(self._origin @ matrix)
         distance = position_error(truth[0], position)
         self.count += 1
         self.sum_of_squares += distance * distance

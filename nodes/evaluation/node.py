@@ -64,7 +64,7 @@ class EvaluationConfig(NodeConfig):
 
 
 class Evaluation(Node[EvaluationConfig]):
-    """Judges every estimator that it hears against the odometry of one vehicle.
+    """Judges every estimator that it receives against the odometry of one vehicle.
 
     Errors are sent as `Score` as the estimates come; the rest is written at the end, and the
     verdict put into the run's summary.
@@ -113,7 +113,7 @@ class Evaluation(Node[EvaluationConfig]):
 
     @on(PoseEstimate)
     def estimates(self, event: PoseEstimate) -> None:
-        """Note an estimate, and say how good it is."""
+        """Note an estimate, and send its errors as scores."""
         if self._closed:
             return
         name, now = event.source, self.clock.now()
@@ -121,15 +121,15 @@ class Evaluation(Node[EvaluationConfig]):
         if not record.add(event, now):
             return
         self._append(name, event)
-        self._say(event, "latency", (now - event.stamp) / 1e9, "s")
+        self._score(event, "latency", (now - event.stamp) / 1e9, "s")
         truth = self._recent.at(event.stamp)
         if truth is None or record.scale_free:
             return
         live = self._live.setdefault(name, LiveErrors())
         distance, angle = live.of(event, truth)
-        self._say(event, "position_error", distance, "m")
-        self._say(event, "rotation_error", angle, "rad")
-        self._say(event, "mean_square_error", live.mean_square, "m^2")
+        self._score(event, "position_error", distance, "m")
+        self._score(event, "rotation_error", angle, "rad")
+        self._score(event, "mean_square_error", live.mean_square, "m^2")
 
     @on(TrackingEvent)
     def tracking_events(self, event: TrackingEvent) -> None:
@@ -160,7 +160,7 @@ class Evaluation(Node[EvaluationConfig]):
         for file in self._files.values():
             file.close()
         if not self._records and self.clock.now() > 0:
-            self.log.warning("no estimator has announced itself or said anything")
+            self.log.warning("no estimator has announced itself or sent an estimate")
         judgements, verdict = await self.offload(self._finish, self.clock.now())
         for name, judgement in judgements.items():
             figures = verdict["estimators"][name]
@@ -189,7 +189,7 @@ class Evaluation(Node[EvaluationConfig]):
             if self.restarts:
                 failed.append(
                     f"{self.name}: expected it to judge the whole flight, found that it was "
-                    "restarted: what was said before is not in the figures"
+                    "restarted: what was sent before is not in the figures"
                 )
             passed = not failed if failed or config.thresholds.given else None
             estimators[name] = {"passed": passed, **judgement.figures, "failed": failed}
@@ -212,7 +212,7 @@ class Evaluation(Node[EvaluationConfig]):
         cameras: dict[str, npt.NDArray[np.int64]],
         end: int,
     ) -> Judgement:
-        """Judge one estimator; whatever it said, the others are judged."""
+        """Judge one estimator; whatever it sent, the others are judged."""
         if truth is None:
             why = "expected a truth to hold it against, found no odometry"
             return Judgement(figures={"why": why}, estimate=None)
@@ -234,7 +234,7 @@ class Evaluation(Node[EvaluationConfig]):
             return Judgement(figures={"why": why}, estimate=None)
 
     def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
-        """Add a pose to a file: should the run be killed, what was said until then is there."""
+        """Add a pose to a file: should the run be killed, what was sent until then is there."""
         if self.out is None:
             return
         file = self._files.get(name)
@@ -242,12 +242,12 @@ class Evaluation(Node[EvaluationConfig]):
             folder = self.out / "trajectories"
             folder.mkdir(exist_ok=True)
             path = folder / f"{file_name(name)}.tum"
-            frame = "map (NED)" if name == "truth" else f"{event.frame_id}, as it was said"
+            frame = "map (NED)" if name == "truth" else f"{event.frame_id}, as it was sent"
             head = f"# {FRAMES.format(frame)}\n"
             file = self._files[name] = GrowingFile(self, path, head)
         file.add(tum_row(event.stamp, event.position, event.orientation))
 
-    def _say(self, event: PoseEstimate, metric: str, value: float, unit: str) -> None:
+    def _score(self, event: PoseEstimate, metric: str, value: float, unit: str) -> None:
         self.scores.send(
             Score(
                 stamp=event.stamp,

@@ -1,4 +1,4 @@
-"""What one estimator said while a run went on, and what is wrong with it on the face of it."""
+"""What one estimator sent during a run, and what is plainly wrong with it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _AHEAD = 1_000_000
 class EstimatorRecord:
     """Everything that came from one estimator.
 
-    Its trajectory is made of the poses in the frame in which it spoke first, with stamps that
+    Its trajectory is made of the poses in the frame of its first pose, with stamps that
     rise. All others are counted, and are no poses of the flight:
 
     Args:
@@ -27,10 +27,10 @@ class EstimatorRecord:
 
     Attributes:
         rows: The poses of its trajectory.
-        repeated: Poses whose stamp was not later than the one before: said twice, or backwards.
+        repeated: Poses whose stamp was not later than the one before: sent twice, or backwards.
         future: Poses of a time that had not come when they arrived.
         elsewhere: Poses in another frame than the first one.
-        restarts: How often it began to speak in another frame: each time it has lost where it is.
+        restarts: How often it changed to another frame: each time it has lost where it is.
     """
 
     def __init__(self, scale_free: bool = False, method: str = "") -> None:
@@ -77,11 +77,11 @@ class EstimatorRecord:
         """Return when each pose of the trajectory came (ns), shape (n,)."""
         return np.array(self._arrivals, np.int64)
 
-    def said_lost(self, end: int) -> list[Interval]:
-        """Return when it was lost by its own word.
+    def reported_lost(self, end: int) -> list[Interval]:
+        """Return when it was lost by its own tracking events.
 
         Args:
-            end: Of the run (ns); it is lost until then if it does not say that it has regained.
+            end: Of the run (ns); it is lost until then if it does not report that it has regained.
         """
         found = []
         since: int | None = None

@@ -1,7 +1,7 @@
 """What an evaluation leaves in a run's folder, for people, for plots and for other tools.
 
 trajectories/truth.tum              the true poses; it grows with the run
-trajectories/<estimator>.tum        the estimates as they were said; likewise
+trajectories/<estimator>.tum        the estimates as they were sent; likewise
 trajectories/plan.tum               where the pilot meant to be
 evaluation/<estimator>.csv          errors of each estimate at the time of its image
 evaluation/<estimator>.lost.csv     when it had no pose

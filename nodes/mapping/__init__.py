@@ -1,4 +1,4 @@
-"""A coloured cloud of what a camera with depth saw, put together by the true pose."""
+"""A coloured cloud from the images of a camera with depth, put together by its true poses."""
 
 from nodes.mapping.node import Mapping, MappingConfig
 

@@ -28,14 +28,14 @@ class TransformError(LookupError):
     """A transform is not known. The message says what is.
 
     TransformError
-    ├── UnknownFrameError        nothing was ever said of a frame
+    ├── UnknownFrameError        no transform has named a frame
     ├── UnconnectedFramesError   no chain of transforms leads from one frame to the other
-    └── UnknownTimeError         one link of the chain was not told of that time, or no more is
+    └── UnknownTimeError         a transform of the chain is not known at that time, or no more
     """
 
 
 class UnknownFrameError(TransformError):
-    """Nothing was ever said of a frame."""
+    """No transform has named the frame."""
 
 
 class UnconnectedFramesError(TransformError):
@@ -94,7 +94,7 @@ class TransformTree:
 
         Args:
             event: The pose.
-            child_frame_id: Whose pose it is, which the event does not say.
+            child_frame_id: Whose pose it is, which the event does not name.
 
         Raises:
             ValueError: As for `add`.
@@ -118,7 +118,7 @@ class TransformTree:
             float64, shape (4, 4).
 
         Raises:
-            UnknownFrameError: Nothing was ever said of one of the frames.
+            UnknownFrameError: No transform has named one of the frames.
             UnconnectedFramesError: They are in different trees.
             UnknownTimeError: `stamp` lies outside what is remembered of a transform between them.
         """
@@ -136,7 +136,7 @@ class TransformTree:
         """Return the first and last stamp (ns) known of a frame in its parent; None: all times.
 
         Raises:
-            UnknownFrameError: Nothing was said of the frame, or it has no parent.
+            UnknownFrameError: No transform has named the frame, or it has no parent.
         """
         if child not in self._edges:
             raise UnknownFrameError(f"expected a frame with a parent, found {child!r}")

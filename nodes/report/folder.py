@@ -1,7 +1,7 @@
 """What a run left in its folder, read for the report.
 
 Everything is optional, as a run may have been killed at any time: what is not there, or cannot be
-read, is said in `Run.missing`, and the rest of the report goes on without it.
+read, is named in `Run.missing`, and the rest of the report goes on without it.
 """
 
 from __future__ import annotations
@@ -97,10 +97,10 @@ class _Reader:
     def _estimators(self, verdict: Verdict | None, truth: Trajectory | None) -> list[Estimator]:
         figures = {} if verdict is None else verdict.estimators
         files = {file_name(name): name for name in figures}
-        said = {p.stem for p in (self.folder / "trajectories").glob("*.tum")} - _NO_ESTIMATES
-        files |= {file: file for file in sorted(said - set(files))}
+        sent = {p.stem for p in (self.folder / "trajectories").glob("*.tum")} - _NO_ESTIMATES
+        files |= {file: file for file in sorted(sent - set(files))}
         if not files:
-            self.missing.append("no estimator has said anything, and none was judged")
+            self.missing.append("no estimator has sent anything, and none was judged")
         return [
             self._estimator(file, name, COLORS[k % len(COLORS)], figures.get(name, {}), truth)
             for k, (file, name) in enumerate(files.items())
@@ -114,14 +114,14 @@ class _Reader:
         errors = self._try(f"evaluation/{file}.csv", _errors)
         ticks = self._try(f"evaluation/{file}.ticks.csv", _errors)
         if aligned is None:
-            said = self._try(f"trajectories/{file}.tum", read_poses)
-            if said is None:
+            estimate = self._try(f"trajectories/{file}.tum", read_poses)
+            if estimate is None:
                 why = figures.get("why") or "it left no poses"
                 self.missing.append(f"{name}: no curves: {why}")
                 return found
             if truth is not None:
                 try:
-                    aligned, errors = lay_on(truth, said)
+                    aligned, errors = lay_on(truth, estimate)
                 except ValueError as error:
                     self.missing.append(f"{name}: no curves: {error}")
                     return found

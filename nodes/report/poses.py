@@ -38,13 +38,13 @@ def read_poses(path: Path) -> Trajectory:
     return poses
 
 
-def lay_on(truth: Trajectory, said: Trajectory) -> tuple[Trajectory, Errors]:
+def lay_on(truth: Trajectory, estimate: Trajectory) -> tuple[Trajectory, Errors]:
     """Lay an estimate's first pose on the true one, and return what it is off from there.
 
     Raises:
         ValueError: They have no time in common.
     """
-    there, kept = associate(truth, said)
+    there, kept = associate(truth, estimate)
     moved = align(kept, there, "origin").trajectory
     errors = Errors(
         stamps=moved.stamps,

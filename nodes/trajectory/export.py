@@ -1,7 +1,7 @@
 """A run's trajectories, as files for evo and for the tools of other data sets.
 
 A run leaves them as ``trajectories/truth.tum`` and ``trajectories/<estimator>.tum``, in ``map``
-(NED) or the estimator's own frame, just as the estimator said them; nothing here aligns them.
+(NED) or the estimator's own frame, just as the estimator sent them; nothing here aligns them.
 
 Stamps of an export are Unix time: its files say which epoch is the run's time 0. TUM's files keep
 the run's frames; EuRoC's world is z up (north, west, up), as that data set's own; KITTI's poses are
@@ -31,7 +31,7 @@ PLAN = "plan"
 
 _COMMENT = {
     ("tum", TRUTH): "ground truth: base_link (FRD) in map (NED: x north, y east, z down)",
-    ("tum", ""): "estimate, as it was said: base_link (FRD) in the estimator's frame",
+    ("tum", ""): "estimate, as it was sent: base_link (FRD) in the estimator's frame",
     ("euroc", TRUTH): "ground truth: base_link (FRD) in the world (x north, y west, z up)",
     ("euroc", ""): "estimate: base_link (FRD) in the estimator's frame, turned to z up",
 }
@@ -78,10 +78,10 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     mounted = _mounting(run) if pairs else np.eye(4)
-    for name, (true, said) in pairs.items():
+    for name, (true, estimate) in pairs.items():
         for path, poses in (
             (folder / f"{name}.{TRUTH}.kitti.txt", true),
-            (folder / f"{name}.kitti.txt", said),
+            (folder / f"{name}.kitti.txt", estimate),
         ):
             matrices = poses.matrices() @ mounted
             matrices = np.linalg.inv(matrices[0]) @ matrices

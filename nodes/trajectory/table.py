@@ -15,7 +15,7 @@ _TOO_LATE = 1 << 63
 """The first number of nanoseconds that 64 bits do not hold."""
 
 EPOCH = "2020-01-01T00:00:00Z"
-"""When a run begins in files of other tools, unless somebody says otherwise. They expect stamps of
+"""When a run begins in files of other tools, if nothing else is set. They expect stamps of
 Unix time: with 19 digits names sort, and Kalibr can take the last nine for nanoseconds."""
 
 _LATEST = 7 << 60
@@ -25,29 +25,29 @@ _SHOWN = 60
 """Characters of a wrong line that a message shows."""
 
 
-def epoch_of(said: int | str) -> int:
+def epoch_of(given: int | str) -> int:
     """Return an epoch in nanoseconds of Unix time.
 
     Args:
-        said: Nanoseconds, or a date as ISO 8601 has it; UTC if it names no zone.
+        given: Nanoseconds, or a date as ISO 8601 has it; UTC if it names no zone.
 
     Raises:
         ValueError: It is neither, before 1970 or after 2225.
     """
     expected = "expected nanoseconds of Unix time or a date as 2020-01-01T00:00:00Z"
     try:
-        if isinstance(said, int) or said.isdecimal():
-            epoch = int(said)
+        if isinstance(given, int) or given.isdecimal():
+            epoch = int(given)
         else:
-            date = dt.datetime.fromisoformat(said)
+            date = dt.datetime.fromisoformat(given)
             if date.tzinfo is None:
                 date = date.replace(tzinfo=dt.UTC)
             since = date - dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
             epoch = since // dt.timedelta(microseconds=1) * 1000
     except (ValueError, OverflowError):
-        raise ValueError(f"epoch: {expected}, found {said!r:.60}") from None
+        raise ValueError(f"epoch: {expected}, found {given!r:.60}") from None
     if not 0 <= epoch <= _LATEST:
-        raise ValueError(f"epoch: {expected}, from 1970 to 2225, found {said!r:.60}")
+        raise ValueError(f"epoch: {expected}, from 1970 to 2225, found {given!r:.60}")
     return epoch
 
 

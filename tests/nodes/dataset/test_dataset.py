@@ -356,7 +356,7 @@ def test_a_velocity_that_nobody_says_is_not_called_true(
     said = tmp_path / "said"
     unsaid = tmp_path / "unsaid"
     path = "mav0/state_groundtruth_estimate0/sensor.yaml"
-    assert "as the vehicle said" in yaml(record(said, flight(), "euroc") / path)["comment"]
+    assert "as the vehicle sent" in yaml(record(said, flight(), "euroc") / path)["comment"]
     still = (0.0, 0.0, 0.0)
     events = [
         msgspec.structs.replace(each, linear_velocity=still, position=(each.stamp / 1e9, 0.0, 0.0))
@@ -365,7 +365,7 @@ def test_a_velocity_that_nobody_says_is_not_called_true(
         for each in flight()
     ]
     assert "velocities unknown" in yaml(record(unsaid, events, "euroc") / path)["comment"]
-    assert "said no velocity: those of the ground truth are zeros" in caplog.text
+    assert "sent no velocity: those of the ground truth are zeros" in caplog.text
 
 
 class Restarted(DatasetWriter):

@@ -52,7 +52,7 @@ def test_a_run_of_which_only_the_log_is_left(tmp_path: Path) -> None:
     (tmp_path / "log.txt").write_text("    0.000000 ERROR    drone: broken\n")
     page = Page(write_report(tmp_path))
     assert "nobody was judged" in page.text
-    assert "no estimator has said anything" in page.text
+    assert "no estimator has sent anything" in page.text
     assert "trajectories/truth.tum is not there" in page.text
     assert "drone: broken" in page.text
     assert list((tmp_path / "plots").iterdir()) == []
