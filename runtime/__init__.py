@@ -2,7 +2,8 @@
 
 Read the core in this order:
 
-- What an author writes: `node`, with its declarations in `ports` and `bundles`.
+- What an author writes: `node`, with its declarations in `ports`, `bundles`
+  and `declarations`.
 - How an event gets from node to node: `sender`, `streams`, `links`, `graph`; and what makes it
   quick: `tasks`, `task_factory`.
 - Time: `schedule`, `clock`, `lockstep`, `real_clock`, `time_limits`.

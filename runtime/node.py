@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import functools
-import inspect
 import zlib
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
@@ -22,12 +21,11 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from events import Announcement
-from runtime.bundles import Bundle, Matcher
+from runtime.bundles import Matcher
 from runtime.clock import Clock
-from runtime.errors import DeclarationError
+from runtime.declarations import Declared, read_declarations
 from runtime.json_values import plain
 from runtime.logs import NodeLogger
-from runtime.ports import Handles, Input, Output, Ticks
 from runtime.schedule import SECOND, Tick, Ticker
 from runtime.sender import Sender
 from runtime.streams import Stream
@@ -54,31 +52,6 @@ class NodeConfig(msgspec.Struct, metaclass=_ConfigMeta, frozen=True, kw_only=Tru
 
 
 C = TypeVar("C", bound=NodeConfig, default=NodeConfig)
-
-
-class Declared(msgspec.Struct):
-    """What a node's class declares, by attribute name, in the order of the class body."""
-
-    inputs: dict[str, Input[Any]]
-    bundles: dict[str, Bundle[Any]]
-    outputs: dict[str, Output[Any]]
-    handlers: dict[str, Handles]
-    ticks: dict[str, Ticks]
-    listening: list[str]
-    """Inputs, bundles and handlers, in the order in which they hear an event."""
-
-    def bundle_fields(self) -> list[str]:
-        """Return ``bundle.field`` for all fields of all bundles."""
-        return [f"{name}.{field}" for name, b in self.bundles.items() for field in b.fields]
-
-    def optional_fields(self) -> list[str]:
-        """Return ``bundle.field`` for the fields that a set can do without."""
-        return [
-            f"{name}.{field}"
-            for name, bundle in self.bundles.items()
-            for field, each in bundle.fields.items()
-            if each.kind == "maybe"
-        ]
 
 
 class Host(Protocol):
@@ -172,7 +145,7 @@ class Node(Generic[C]):
                 argument = getattr(argument, "__bound__", argument)  # of a base for several nodes
                 if isinstance(argument, type) and issubclass(argument, NodeConfig):
                     cls.config_type = argument
-        cls.declared = _declared(cls)
+        cls.declared = read_declarations(cls, Node)
 
     # Phases, in order. Override those you need.
 
@@ -378,51 +351,3 @@ def matchers(node: Node[Any]) -> dict[str, Matcher[Any]]:
 def senders(node: Node[Any]) -> dict[str, Sender[Any]]:
     """Return a node's senders by port."""
     return {port: getattr(node, port) for port in node.declared.outputs}
-
-
-def _declared(cls: type[Node[Any]]) -> Declared:
-    """Read the declarations of a class and its bases."""
-    _check_phases(cls)
-    found = Declared({}, {}, {}, {}, {}, [])
-    names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
-    for name in names:
-        value = getattr(cls, name, None)
-        if isinstance(value, Input | Bundle | Output) and name in _RESERVED:
-            raise DeclarationError(
-                f"{cls.__name__}.{name}: every node has an attribute of this name; "
-                "call the port something else"
-            )
-        if isinstance(value, Input):
-            found.inputs[name] = value
-        elif isinstance(value, Bundle):
-            found.bundles[name] = value
-        elif isinstance(value, Output):
-            found.outputs[name] = value
-        if handles := getattr(value, "__handles__", None):
-            found.handlers[name] = handles
-        if ticks := getattr(value, "__ticks__", None):
-            found.ticks[name] = ticks
-        if name in found.inputs or name in found.bundles or name in found.handlers:
-            found.listening.append(name)
-    return found
-
-
-def _check_phases(cls: type[Node[Any]]) -> None:
-    """Raise `DeclarationError` for a phase that is a coroutine function and should not, or not."""
-    for phase, method in vars(cls).items():
-        meant = vars(Node).get(phase)
-        if not inspect.isfunction(method) or not inspect.isfunction(meant):
-            continue
-        awaited = inspect.iscoroutinefunction(meant)
-        if inspect.iscoroutinefunction(inspect.unwrap(method)) != awaited:
-            expected, found = f"async def {phase}", f"def {phase}"
-            if inspect.isasyncgenfunction(method):
-                found = f"async def {phase} with a yield in it"
-            if not awaited:
-                expected, found = f"def {phase}", f"async def {phase}"
-            raise DeclarationError(
-                f"{cls.__name__}.{phase}: expected `{expected}`, found `{found}`"
-            )
-
-
-_RESERVED = {*vars(Node), *Node.__annotations__}
