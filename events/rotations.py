@@ -135,11 +135,11 @@ def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
         b: Unit quaternion; the result for a share of 1 is the same rotation.
         share: Number in [0, 1].
     """
-    cosine = a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[0] * b[0]
+    cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     sign = -1.0 if cosine < 0.0 else 1.0
     angle = acos(min(sign * cosine, 1.0))
-    if angle < 1e-6:  # nothing to divide by; the two are the same but for rounding
-        return b if sign > 0.0 else (-b[0], -b[1], -b[2], -b[3])
-    first, second, whole = sin((1.0 - share) * angle), sign * sin(share * angle), sin(angle)
-    w, x, y, z = ((first * p + second * q) / whole for p, q in zip(a, b, strict=True))
+    first, second = 1.0 - share, sign * share
+    if angle > 1e-6:  # below, sines are their angles, and there is nothing to divide by
+        first, second = sin(first * angle) / sin(angle), sign * sin(share * angle) / sin(angle)
+    w, x, y, z = (first * p + second * q for p, q in zip(a, b, strict=True))
     return (w, x, y, z)

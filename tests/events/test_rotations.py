@@ -6,7 +6,7 @@ from math import cos, isclose, pi, sin
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -90,6 +90,7 @@ def test_a_tiny_angle_is_not_lost() -> None:
 
 
 @given(orientations, orientations, st.floats(0.0, 1.0), st.booleans())
+@example(rotations.IDENTITY, rotations.from_yaw(1e-6), 0.0, False)
 def test_slerp_is_scipys_on_the_shorter_arc(
     a: Quaternion, b: Quaternion, share: float, other_sign: bool
 ) -> None:
