@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-all check fix docs wheel peers bench bench-quick orbslam3 images clean
+.PHONY: help setup demo test test-slow test-pythons test-all check fix docs wheel peers bench bench-quick orbslam3 images clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -44,7 +44,10 @@ test-slow: $(READY)  ## Run the slow tests; what fails is repeated once, alone.
 		echo "Repeated once, alone, is what failed above:"; \
 		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m slow; }
 
-test-all: test test-slow  ## Run all tests.
+test-pythons: $(READY)  ## Run the core's tests on every other Python that is here.
+	@sh tools/test_pythons.sh
+
+test-all: test test-slow test-pythons  ## Run all tests.
 
 check: $(READY)  ## Check style and types.
 	$(BIN)/ruff check .

@@ -30,7 +30,7 @@ BUSY = "while True: pass"
 def flight(folder: Path) -> Path:
     """Write the standard tour without what estimates and judges into a folder."""
     table = tomllib.loads(CONFIG.read_text())
-    judges = {"odometry", "evaluation"}
+    judges = {"odometry", "evaluation", "report"}
     table["nodes"] = [node for node in table["nodes"] if node["name"] not in judges]
     path = folder / "flight.toml"
     path.write_text(tomli_w.dumps(table))
