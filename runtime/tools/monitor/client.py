@@ -15,6 +15,8 @@ from runtime.tools.monitor.command import (
     Answer,
     Asked,
     Command,
+    EncodedImage,
+    ImageRequest,
     Watch,
     decode_from_run,
     encode,
@@ -32,7 +34,7 @@ class Client:
         self._reader = reader
         self._writer = writer
         self._numbers = itertools.count()
-        self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        self._waiting: dict[int, asyncio.Future[Answer | EncodedImage]] = {}
         self._over = False
 
     @classmethod
@@ -72,19 +74,35 @@ class Client:
                 self._settle(_gone(number))
             self.close()
 
-    def _settle(self, answer: Answer) -> None:
+    def _settle(self, answer: Answer | EncodedImage) -> None:
         waiting = self._waiting.pop(answer.number, None)
         if waiting is not None and not waiting.done():  # else nobody waits any more
             waiting.set_result(answer)
 
     async def ask(self, command: Command) -> Answer:
         """Ask the run to do something, and return what came of it."""
-        number = next(self._numbers)
+        answer = await self._request(Asked(number=next(self._numbers), command=command))
+        assert isinstance(answer, Answer)
+        return answer
+
+    async def image(self, camera: str) -> bytes:
+        """Return the newest image of one of a snapshot's cameras, as JPEG.
+
+        Raises:
+            CommandError: There is none, or the run does not answer.
+        """
+        answer = await self._request(ImageRequest(number=next(self._numbers), camera=camera))
+        if isinstance(answer, Answer):
+            raise CommandError(answer.text)
+        return answer.jpeg
+
+    async def _request(self, request: Asked | ImageRequest) -> Answer | EncodedImage:
+        number = request.number
         if self._over:
             return _gone(number)
-        waiting: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        waiting: asyncio.Future[Answer | EncodedImage] = asyncio.get_running_loop().create_future()
         self._waiting[number] = waiting
-        self._writer.write(encode(Asked(number=number, command=command)) + b"\n")
+        self._writer.write(encode(request) + b"\n")
         try:
             async with asyncio.timeout(PATIENCE):
                 return await waiting

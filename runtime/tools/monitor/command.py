@@ -62,6 +62,13 @@ class Asked(msgspec.Struct, frozen=True, kw_only=True, tag="ask"):
     command: Command
 
 
+class ImageRequest(msgspec.Struct, frozen=True, kw_only=True, tag="image"):
+    """Asks for the newest image of one of a snapshot's cameras; answered while somebody watches."""
+
+    number: int
+    camera: str
+
+
 class Watch(msgspec.Struct, frozen=True, tag="watch"):
     """Asks for snapshots, as long as the connection lasts."""
 
@@ -80,8 +87,20 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, tag="answer"):
     text: str
 
 
-FromClient = Asked | Watch
-FromRun = Snapshot | Answer
+class EncodedImage(msgspec.Struct, frozen=True, kw_only=True, tag="jpeg"):
+    """The image that was asked for.
+
+    Attributes:
+        number: Of the request.
+        jpeg: The image, made small.
+    """
+
+    number: int
+    jpeg: bytes
+
+
+FromClient = Asked | ImageRequest | Watch
+FromRun = Snapshot | Answer | EncodedImage
 
 encode = msgspec.json.Encoder().encode
 decode_from_client = msgspec.json.Decoder(FromClient).decode

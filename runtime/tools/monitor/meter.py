@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from events import Event
+from events import Event, Image
 from runtime.clock import Clock
 from runtime.instruments import Call, Instrument
 from runtime.sender import Sender
@@ -40,11 +40,13 @@ class Meter(Instrument):
     Attributes:
         nodes: What each node had of the loop, by name: its steps, less what they called in others.
         outputs: What lay between stamp and delivery of each output's events, by ``node.port``.
+        images: The newest image of each camera, by ``node.port: source``.
     """
 
     def __init__(self, clock: Clock) -> None:
         self.nodes: dict[str, Sum] = {}
         self.outputs: dict[str, Sum] = {}
+        self.images: dict[str, Image] = {}
         self._clock = clock
         self._inner = [0]
         """Nanoseconds that the steps within the one that runs have taken."""
@@ -84,3 +86,5 @@ class Meter(Instrument):
         flow.last = now
         if latency > flow.longest:
             flow.longest = latency
+        if isinstance(event, Image):
+            self.images[f"{name}: {event.source}"] = event

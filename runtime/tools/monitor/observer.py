@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from events import Image
 from runtime.config.model import Config
 from runtime.config.parameters import settings
 from runtime.errors import CommandError, suggest
@@ -119,8 +120,22 @@ class Observer:
                 )
                 for name, ticker in state.tickers.items()
             ],
+            cameras=sorted(self._meter.images) if self._meter is not None else [],
             log=self._records.lines(),
         )
+
+    def image(self, camera: str) -> Image:
+        """Return the newest image of one of a snapshot's cameras.
+
+        Raises:
+            CommandError: There is no such camera, or nobody looks.
+        """
+        images = self._meter.images if self._meter is not None else {}
+        if camera not in images:
+            raise CommandError(
+                f"expected a camera that has sent images, found {camera!r}{suggest(camera, images)}"
+            )
+        return images[camera]
 
     def _sample(self) -> Sample:
         """Return what has been added up since the last time."""

@@ -1,8 +1,8 @@
 """The end of the monitor that is in the run: a Unix socket, served by a thread of its own.
 
-The run's loop does nothing but make a snapshot or do what it was asked, when the thread asks it
-to; encoding and sending is the thread's. The rhythm is the thread's, too, because time on the
-run's loop may be simulated.
+The run's loop does nothing but make a snapshot or carry a command out, when the thread asks it to;
+the thread encodes and sends, and keeps the rhythm, because time on the run's loop may be simulated.
+Images are encoded in another thread.
 """
 
 from __future__ import annotations
@@ -24,11 +24,14 @@ from runtime.tools.monitor.command import (
     UNREADABLE,
     Answer,
     Asked,
+    EncodedImage,
+    ImageRequest,
     Set,
     Watch,
     decode_from_client,
     encode,
 )
+from runtime.tools.monitor.images import ImageEncoder
 from runtime.tools.monitor.observer import Observer, told
 
 R = TypeVar("R")
@@ -67,6 +70,7 @@ class Server:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._end = asyncio.Event()
         self._last = b""
+        self._encoder = ImageEncoder()
         self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
 
     def start(self) -> bool:
@@ -184,11 +188,13 @@ class Server:
         match message:
             case Watch():
                 self._watching.add(writer)
-            case Asked():
+            case Asked() | ImageRequest():
                 writer.write(encode(await self._answer(message)) + b"\n")
 
-    async def _answer(self, asked: Asked) -> Answer:
+    async def _answer(self, asked: Asked | ImageRequest) -> Answer | EncodedImage:
         try:
+            if isinstance(asked, ImageRequest):
+                return await self._image(asked)
             text = await self._on_run_loop(lambda: self._observer.do(asked.command))
         except VisnavError as error:
             return Answer(number=asked.number, done=False, text=str(error))
@@ -199,6 +205,13 @@ class Server:
         if not isinstance(asked.command, Set):  # which says so itself
             log.info("asked by hand: %s", told(asked.command))
         return Answer(number=asked.number, done=True, text=text)
+
+    async def _image(self, asked: ImageRequest) -> EncodedImage:
+        jpeg = await self._encoder.encode(
+            asked.camera,
+            lambda: self._on_run_loop(lambda: self._observer.image(asked.camera)),
+        )
+        return EncodedImage(number=asked.number, jpeg=jpeg)
 
     async def _on_run_loop(self, call: Callable[[], R]) -> R:
         """Have a function called on the run's loop, and return its result."""

@@ -145,6 +145,7 @@ class Snapshot(_Data, frozen=True, tag="snapshot"):
         inputs: Of all nodes.
         links: All there are.
         ticks: Of all nodes.
+        cameras: Whose images can be asked for: those that sent one since somebody looks.
         log: The last records.
     """
 
@@ -158,4 +159,5 @@ class Snapshot(_Data, frozen=True, tag="snapshot"):
     inputs: list[InputState]
     links: list[LinkState]
     ticks: list[TickState]
+    cameras: list[str]
     log: list[LogLine]

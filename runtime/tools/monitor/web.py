@@ -1,4 +1,4 @@
-"""The monitor as a page: the same tables, live, and the same commands.
+"""The monitor as a page: the same tables and commands as in a terminal, and a camera's images.
 
 Served on this machine only. Whoever has the address with its token may command the run: other
 users of the machine do not know it, and other pages in the browser can neither read it nor send
@@ -18,7 +18,7 @@ from urllib.parse import quote
 import jinja2
 import msgspec
 
-from runtime.errors import VisnavError
+from runtime.errors import CommandError, VisnavError
 from runtime.tools.monitor.client import Client
 from runtime.tools.monitor.command import (
     QUICKEST,
@@ -107,10 +107,12 @@ class Page:
                 async for data in self._events():
                     writer.write(data)
                     await writer.drain()
+            case "GET", "/image":
+                writer.write(response(200, await self._image(request), "image/jpeg"))
             case "POST", "/command":
                 answer = await self._command(request)
                 writer.write(response(200, encode(answer), "application/json"))
-            case _, "/" | "/events" | "/command":
+            case _, "/" | "/events" | "/image" | "/command":
                 raise HttpError(405, f"{request.path} takes no {request.method}")
             case _:
                 raise HttpError(404, f"there is no {request.path}")
@@ -150,7 +152,7 @@ class Page:
         )
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
-            "connect-src 'self'; img-src data:; frame-ancestors 'none'; base-uri 'none'; "
+            "connect-src 'self'; img-src 'self'; frame-ancestors 'none'; base-uri 'none'; "
             "form-action 'none'"
         )
         return response(
@@ -170,6 +172,12 @@ class Page:
         finally:
             self._pages.discard(page)
 
+    async def _image(self, request: Request) -> bytes:
+        try:
+            return await self._client.image(request.query.get("camera", ""))
+        except CommandError as error:
+            raise HttpError(404, str(error)) from None
+
     async def _command(self, request: Request) -> Answer:
         try:
             command = decode_command(request.body)
@@ -187,6 +195,7 @@ def shown(snapshot: Snapshot) -> dict[str, Any]:
         "paused": snapshot.clock.paused,
         "speed": aim(snapshot.clock),
         "fixed": snapshot.clock.fixed,
+        "cameras": snapshot.cameras,
         "tables": {name: rows(name, snapshot) for name in COLUMNS},
         "log": [msgspec.to_builtins(line) for line in snapshot.log],
     }

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from runtime.errors import CommandError
 from runtime.tools.monitor.command import Answer, Command
 from runtime.tools.monitor.snapshot import (
     ClockState,
@@ -65,6 +66,7 @@ def snapshot(**changes: Any) -> Snapshot:
                 name="drone.control", hz=400, calls=600, missed=0, late_p99_us=12, late_max_us=90
             )
         ],
+        cameras=["drone.images: drone/front"],
         log=[LogLine(number=0, seconds=0.5, level="WARNING", speaker="pilot", text="[b]wind[/b]")],
     )
     rest = {k: v for k, v in changes.items() if not k.startswith("clock_")}
@@ -89,3 +91,9 @@ class Stand:
         """Remember a command."""
         self.asked.append(command)
         return Answer(number=0, done=True, text="so be it")
+
+    async def image(self, camera: str) -> bytes:
+        """Return something for the one camera there is."""
+        if camera != "drone.images: drone/front":
+            raise CommandError(f"found {camera!r}")
+        return b"\xff\xd8 a JPEG"

@@ -85,6 +85,31 @@ def test_snapshots_come_and_commands_are_answered(clock: str) -> None:
     assert looked.supervisor.instruments.attached == ()
 
 
+def test_images_come_to_those_who_watch_and_ask() -> None:
+    async def looking() -> None:
+        connection = await Client.connect(find("sample"))
+        asked: asyncio.Task[Any] | None = None
+        async for found in connection.snapshots():
+            if asked is None and found.cameras:
+                asked = asyncio.create_task(_images(connection, found.cameras))
+            elif asked is not None and asked.done():
+                connection.close()
+                break
+        assert asked is not None
+        asked.result()
+
+    looked = served(lambda: asyncio.run(looking()), "real")  # a thread's work holds simulated time
+    assert looked.supervisor.instruments.attached == ()
+
+
+async def _images(connection: Client, cameras: list[str]) -> None:
+    assert cameras == ["drone.images: drone/front"]
+    jpeg = await connection.image(cameras[0])
+    assert jpeg[:2] == b"\xff\xd8"
+    with pytest.raises(VisnavError, match="expected a camera that has sent images"):
+        await connection.image("drone.images: drone/rear")
+
+
 def test_a_command_needs_no_more_than_a_line(sockets: Path) -> None:
     def outside() -> None:
         path = find(None)
@@ -295,6 +320,8 @@ async def test_a_late_answer_and_the_end_disturb_nobody(monkeypatch: pytest.Monk
     assert [seen.run async for seen in connection.snapshots()] == ["sample"]
     monkeypatch.setattr(client, "PATIENCE", 60.0)
     assert (await connection.ask(Stop())).text == "the run is over"
+    with pytest.raises(VisnavError, match="the run is over"):
+        await connection.image("drone.images: drone/front")
 
 
 @pytest.mark.parametrize("line", [b"nonsense\n", b'{"type":"snapshot","run":1}\n', b"\xff\n"])

@@ -36,7 +36,7 @@ async def say(port: int, request: str, body: str = "") -> str:
     writer.write(f"{request.replace('PORT', str(port))}\r\n\r\n{body}".encode())
     answer = await asyncio.wait_for(reader.read(), 5)
     writer.close()
-    return answer.decode()
+    return answer.decode(errors="surrogateescape")
 
 
 def get(path: str, host: str = "127.0.0.1:PORT") -> str:
@@ -74,6 +74,9 @@ async def test_the_page_comes_with_the_token_and_runs_no_script_but_its_own() ->
         (f"PUT /?token={TOKEN} HTTP/1.1\r\nHost: localhost", 405),
         ("nonsense", 400),
         ("GET http://[ HTTP/1.1\r\nHost: localhost", 400),
+        (get("/image"), 403),
+        (get(f"/image?token={TOKEN}"), 404),
+        (get(f"/image?token={TOKEN}&camera=drone.depth"), 404),
         (get("/") + "\r\nContent-Length: many", 400),
         (get("/") + "\r\nContent-Length: 9999999", 413),
         (get("/") + "\r\nContent-Length: " + "9" * 5000, 413),
@@ -90,8 +93,23 @@ async def test_the_page_shows_at_once_what_is_known() -> None:
     async with serving(stand) as port:
         await say(port, get(f"/?token={TOKEN}"))
         page = await say(port, get(f"/?token={TOKEN}"))
-    assert 'const first = {"fixed": "", "headline": "sample ' in page
+    assert (
+        'const first = {"cameras": ["drone.images: drone/front"], "fixed": "", "headline": "sample '
+        in page
+    )
     assert "[b]wind[/b]" in page
+
+
+async def test_the_image_of_the_chosen_camera_is_served() -> None:
+    async with serving(Stand(snapshot())) as port:
+        camera = "drone.images:%20drone/front"
+        head, _, jpeg = (await say(port, get(f"/image?token={TOKEN}&camera={camera}"))).partition(
+            "\r\n\r\n"
+        )
+    assert head.startswith("HTTP/1.1 200")
+    assert "content-type: image/jpeg" in head
+    assert "cache-control: no-store" in head
+    assert jpeg.endswith("a JPEG")
 
 
 async def test_commands_go_to_the_run_if_they_bear_the_token() -> None:
@@ -128,6 +146,7 @@ async def test_snapshots_come_as_events_and_so_does_the_end() -> None:
     assert first["headline"].startswith("sample   1.500")
     assert second["headline"].startswith("sample   2.000")
     assert second["tables"]["nodes"][0][0] == "drone"
+    assert second["cameras"] == ["drone.images: drone/front"]
     settings = [["pilot.gain", "1.0"], ["pilot.patience", "0.5"]]
     assert second["tables"]["settings"] == settings
 
