@@ -99,7 +99,7 @@ def test_the_library_listens_where_no_page_can_find_it(server: Server) -> None:
 def test_who_says_something_else_is_sent_away_and_others_are_served(
     server: Server, words: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gate, "_HEAD_TIMEOUT", 0.2)
+    monkeypatch.setattr(gate, "_HEAD_TIMEOUT", 1.0)
     with socket.create_connection(("127.0.0.1", port_of(server))) as other:
         other.settimeout(10.0)
         with contextlib.suppress(OSError):  # it need not hear all of it

@@ -98,7 +98,8 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         process.communicate()
 
 
-@pytest.mark.parametrize("clock", ["lockstep", pytest.param("real", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
 def test_a_killed_process_ends_the_run_which_says_who_it_was(rig: Rig, clock: str) -> None:
     rig.write(clock=clock, on_error="stop")
     there, here = rig.start("one,other", "there"), rig.start("asker", "here")

@@ -27,7 +27,8 @@ def port_of(config: Config) -> int:
     return int(found[1])
 
 
-@pytest.mark.parametrize("shared", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shared", [True, False])
 def test_in_lockstep_the_digest_is_that_of_one_process(shared: bool) -> None:
     """Each process reaches the other where its own file says."""
     config = settings(*THREE, duration=0.2, shared=shared)
