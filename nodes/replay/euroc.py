@@ -8,6 +8,7 @@ EuRoC's own those of its IMU, which is no FRD, but cameras and truth agree on it
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from functools import partial
@@ -25,6 +26,7 @@ from events import (
     ImuAnnouncement,
     Odometry,
 )
+from events.checks import UNIT_TOLERANCE
 from events.frames import flip_yz, rotation_to_ned
 from events.poses import pose_tuples
 from events.rotations import rotate_inverse
@@ -98,7 +100,10 @@ class Euroc(FolderReader):
             if self._imu:
                 self._announcements.append(self._imu_announcement())
             self._truth = self._table(
-                _TRUTH, 17, "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3"
+                _TRUTH,
+                17,
+                "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3",
+                quaternion=slice(3, 7),
             )
         except ReplayError:
             raise
@@ -207,12 +212,19 @@ class Euroc(FolderReader):
         rows = read_rows(folder / "data.csv", ",", (2,), "timestamp, filename")
         return sorted((row.nanoseconds(), folder / "data" / row.fields[1]) for row in rows)
 
-    def _table(self, name: str, columns: int, meaning: str) -> list[tuple[int, list[float]]]:
+    def _table(
+        self, name: str, columns: int, meaning: str, quaternion: slice | None = None
+    ) -> list[tuple[int, list[float]]]:
         path = self._folder / name / "data.csv"
         if not path.is_file():
             return []
-        rows = read_rows(path, ",", (columns,), meaning)
-        return sorted((row.nanoseconds(), row.numbers(1, columns)) for row in rows)
+        found = []
+        for row in read_rows(path, ",", (columns,), meaning):
+            values = row.numbers(1, columns)
+            if quaternion and abs(math.hypot(*values[quaternion]) - 1.0) > UNIT_TOLERANCE:
+                row.wrong("a quaternion of length 1", f"w x y z = {values[quaternion]}")
+            found.append((row.nanoseconds(), values))
+        return sorted(found)
 
 
 def noted_epoch(path: Path) -> list[int]:

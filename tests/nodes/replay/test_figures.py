@@ -258,6 +258,16 @@ def test_a_damaged_description_is_an_error(tmp_path: Path, old: str, new: str, w
         read_sensor(tmp_path / "missing")
 
 
+def test_a_damaged_orientation_of_the_truth_is_an_error_of_its_line(tmp_path: Path) -> None:
+    folder = sets.euroc_as_published(tmp_path)
+    file = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    head, row = file.read_text().splitlines()[:2]
+    cells = row.split(",")
+    file.write_text("\n".join([head, ",".join([*cells[:4], "0.9", "0", "0", "0", *cells[8:]]), ""]))
+    with pytest.raises(ReplayError, match=r"data\.csv:2: expected a quaternion of length 1"):
+        sets.reader(folder)
+
+
 def test_a_missing_picture_is_an_error_when_its_turn_comes(tmp_path: Path) -> None:
     """It names the file."""
     folder = sets.euroc_as_published(tmp_path)
