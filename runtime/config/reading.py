@@ -77,11 +77,16 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Config:
     except RecursionError:
         raise ConfigError(f"{path}: expected TOML, found brackets nested too deep") from None
     folder = path.resolve().parent
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))
+    find_modules_in(folder)
     for change in overrides:
         override(table, change)
     return parse(table, path.name, folder)
+
+
+def find_modules_in(folder: Path) -> None:
+    """Have modules of nodes looked for in a folder, too, after all other places."""
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
 
 
 def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> Config:

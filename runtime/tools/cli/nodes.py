@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -25,7 +26,7 @@ def nodes(
     """
     from rich.console import Console
 
-    from runtime.config.reading import find_node
+    from runtime.config.reading import find_modules_in, find_node
     from runtime.errors import ConfigError, suggest
     from runtime.tools.cli.common import warn
     from runtime.tools.describe import describe
@@ -36,6 +37,7 @@ def nodes(
         name: cls for name, cls in found.items() if which is None or which.lower() in name.lower()
     }
     if not shown and which is not None and ":" in which:
+        find_modules_in(Path.cwd())
         shown = {which: find_node(which, "nodes")}
     if not shown:
         raise ConfigError(

@@ -183,6 +183,9 @@ def test_nodes_describes_any_node_that_can_be_imported(tmp_path: Path) -> None:
     done = command_here("nodes", "tests.runtime.samples:Speaker", folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "pings  Ping (output)" in done.stdout
+    (tmp_path / "beside_me.py").write_text("from tests.runtime.samples import Speaker as Mine\n")
+    done = command_here("nodes", "beside_me:Mine", folder=tmp_path)
+    assert "pings  Ping (output)" in done.stdout, done.stderr
     done = command_here("nodes", "tests.runtime.samples:Nobody", folder=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: nodes: expected a node of tests.runtime.samples, found")
