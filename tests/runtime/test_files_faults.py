@@ -174,7 +174,7 @@ def test_a_run_that_cannot_be_looked_at_goes_on(where: str, tmp_path: Path) -> N
     folder = where if where.startswith("/") else str(tmp_path / where)
     done = run_limited(tmp_path, XDG_RUNTIME_DIR=folder)
     assert done.returncode == 0
-    assert "nobody can look at this run" in done.stderr
+    assert "no monitor can connect to this run" in done.stderr
     assert "Traceback" not in done.stderr
     assert summary(tmp_path / "runs" / "sample")["reason"] == "duration"
 

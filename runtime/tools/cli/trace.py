@@ -45,7 +45,7 @@ def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
     from rich.table import Table
     from rich.text import Text
 
-    from runtime.tools.tracing.paths import paths, quantile, shares
+    from runtime.tools.tracing.paths import node_loads, paths, quantile
 
     routes = paths(found)
     for number, route in enumerate(routes, 1):
@@ -69,7 +69,7 @@ def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
         "node", "steps", "loop ms", "share", "longest ms", "in",
         title="on the loop", title_justify="left",
     )  # fmt: skip
-    for share in shares(found):
+    for share in node_loads(found):
         table.add_row(
             _for(encoding, share.node),
             f"{share.steps}",

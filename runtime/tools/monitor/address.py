@@ -1,4 +1,4 @@
-"""Where runs listen: a Unix socket each, in a folder that is its user's alone."""
+"""Where runs listen: each at a Unix socket, in a folder that only its user can enter."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _LONGEST = 100
 
 
 def socket_of(run: str) -> Path:
-    """Return where a run of this process is to listen.
+    """Return the path of the socket for a run of this process.
 
     Raises:
-        CommandError: The folder is no good.
+        CommandError: The folder cannot be used, or others could enter it.
     """
     place, end = user_folder(), f"-{os.getpid()}.sock"
-    for other in place.glob("*.sock"):  # what killed runs have left goes at the next occasion
+    for other in place.glob("*.sock"):  # what killed runs have left is removed
         _answers(other)
     name = re.sub(r"[^\w.-]", "_", run)
     room = _LONGEST - len(os.fsencode(place)) - 1 - len(end)
@@ -31,7 +31,7 @@ def socket_of(run: str) -> Path:
 
 
 def runs() -> dict[str, Path]:
-    """Return the runs that listen now, by name; of two of one name the process is named, too."""
+    """Return the runs that listen now, by name; ``name-process`` where two have the same name."""
     listening = [path for path in sorted(user_folder().glob("*.sock")) if _answers(path)]
     names = [path.stem.rpartition("-")[0] for path in listening]
     return {
@@ -41,14 +41,14 @@ def runs() -> dict[str, Path]:
 
 
 def find(run: str | None) -> Path:
-    """Return where a run listens.
+    """Return the path of a run's socket.
 
     Args:
         run: Its name, ``name-process`` if there are two, or the path of its socket; `None` if
-            there is but one.
+            there is only one.
 
     Raises:
-        CommandError: There is none such, or none at all, or there are several.
+        CommandError: There is no such run, no run at all, or several without a name given.
     """
     if run is not None and run.endswith(".sock"):
         return Path(run)
@@ -64,7 +64,7 @@ def find(run: str | None) -> Path:
 
 
 def _answers(path: Path) -> bool:
-    """Tell whether somebody listens at a socket; remove what a killed run has left."""
+    """Tell whether a run listens at a socket; remove one that a killed run has left."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(1.0)
         try:

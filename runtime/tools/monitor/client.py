@@ -1,4 +1,4 @@
-"""The end of the monitor that is not in the run: snapshots in, commands out."""
+"""A client of a run's monitor: snapshots in, commands out."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from runtime.tools.monitor.command import (
     LONGEST_LINE,
     UNREADABLE,
     Answer,
-    Asked,
     Command,
+    CommandRequest,
     EncodedImage,
     ImageRequest,
-    Watch,
+    WatchRequest,
     decode_from_run,
     encode,
 )
 from runtime.tools.monitor.snapshot import Snapshot
 
-PATIENCE = 10.0
-"""Real seconds that a run gets to answer a command."""
+ANSWER_TIMEOUT = 10.0
+"""Real seconds within which a run must answer a command."""
 
 
 class Client:
@@ -42,21 +42,21 @@ class Client:
         """Connect to a run.
 
         Raises:
-            CommandError: Nobody listens there.
+            CommandError: No run listens there.
         """
         try:
             reader, writer = await asyncio.open_unix_connection(path, limit=LONGEST_LINE)
         except OSError as error:
-            raise _nobody(path, error) from None
+            raise _not_listening(path, error) from None
         return cls(reader, writer)
 
     async def snapshots(self) -> AsyncIterator[Snapshot]:
-        """Yield snapshots until the run is over; answers come only while somebody iterates.
+        """Yield snapshots until the run is over; answers are received only meanwhile.
 
         Raises:
-            CommandError: What comes is not to be understood.
+            CommandError: The run is of another version.
         """
-        self._writer.write(encode(Watch()) + b"\n")
+        self._writer.write(encode(WatchRequest()) + b"\n")
         try:
             async for line in self._reader:
                 message = decode_from_run(line)
@@ -71,17 +71,17 @@ class Client:
         finally:
             self._over = True
             for number in list(self._waiting):
-                self._settle(_gone(number))
+                self._settle(_run_over(number))
             self.close()
 
     def _settle(self, answer: Answer | EncodedImage) -> None:
         waiting = self._waiting.pop(answer.number, None)
-        if waiting is not None and not waiting.done():  # else nobody waits any more
+        if waiting is not None and not waiting.done():  # else it came too late
             waiting.set_result(answer)
 
     async def ask(self, command: Command) -> Answer:
-        """Ask the run to do something, and return what came of it."""
-        answer = await self._request(Asked(number=next(self._numbers), command=command))
+        """Send a command to the run, and return its answer."""
+        answer = await self._request(CommandRequest(number=next(self._numbers), command=command))
         assert isinstance(answer, Answer)
         return answer
 
@@ -96,52 +96,52 @@ class Client:
             raise CommandError(answer.text)
         return answer.jpeg
 
-    async def _request(self, request: Asked | ImageRequest) -> Answer | EncodedImage:
+    async def _request(self, request: CommandRequest | ImageRequest) -> Answer | EncodedImage:
         number = request.number
         if self._over:
-            return _gone(number)
+            return _run_over(number)
         waiting: asyncio.Future[Answer | EncodedImage] = asyncio.get_running_loop().create_future()
         self._waiting[number] = waiting
         self._writer.write(encode(request) + b"\n")
         try:
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(ANSWER_TIMEOUT):
                 return await waiting
         except TimeoutError:
             self._waiting.pop(number, None)
             return Answer(number=number, done=False, text="the run does not answer")
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._writer.close()
 
 
 def ask(path: Path, command: Command) -> str:
-    """Ask a run to do something, from outside any loop, and return what was done.
+    """Send a command to a run, without an event loop, and return what was done.
 
     Raises:
-        CommandError: Nobody listens there, or it was not done.
+        CommandError: No run listens there, or it refused.
     """
     with socket.socket(socket.AF_UNIX) as connection:
-        connection.settimeout(PATIENCE)
+        connection.settimeout(ANSWER_TIMEOUT)
         try:
             connection.connect(str(path))
-            connection.sendall(encode(Asked(number=0, command=command)) + b"\n")
+            connection.sendall(encode(CommandRequest(number=0, command=command)) + b"\n")
             line = connection.makefile("rb").readline(LONGEST_LINE)
             answer = decode_from_run(line)
         except TimeoutError:
             raise CommandError("the run does not answer") from None
         except (OSError, *UNREADABLE) as error:
-            raise _nobody(path, error) from None
+            raise _not_listening(path, error) from None
     assert isinstance(answer, Answer)
     if not answer.done:
         raise CommandError(answer.text)
     return answer.text
 
 
-def _gone(number: int) -> Answer:
+def _run_over(number: int) -> Answer:
     return Answer(number=number, done=False, text="the run is over")
 
 
-def _nobody(path: Path, error: Exception) -> CommandError:
+def _not_listening(path: Path, error: Exception) -> CommandError:
     reason = getattr(error, "strerror", None) or "it ended"
     return CommandError(f"expected a run that listens at {path}: {reason}")

@@ -1,4 +1,4 @@
-"""What there is to say to a run, and what crosses the connection: one JSON object a line."""
+"""Commands to a run, and all messages of the connection: one JSON object per line."""
 
 from __future__ import annotations
 
@@ -9,44 +9,46 @@ import msgspec
 from runtime.tools.monitor.snapshot import Snapshot
 
 SLOWEST, QUICKEST = 1e-3, 1e6
-"""Speeds that can be asked for."""
+"""Limits of the speed, in simulated seconds per real second."""
 
 
-class _Asked(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", forbid_unknown_fields=True):
+class _Command(
+    msgspec.Struct, frozen=True, kw_only=True, tag_field="do", forbid_unknown_fields=True
+):
     """Base of the commands."""
 
 
-class Pause(_Asked, frozen=True, tag="pause"):
-    """Let simulated time stand."""
+class Pause(_Command, frozen=True, tag="pause"):
+    """Pause simulated time."""
 
 
-class Resume(_Asked, frozen=True, tag="resume"):
-    """Let it run again."""
+class Resume(_Command, frozen=True, tag="resume"):
+    """Resume simulated time."""
 
 
-class Step(_Asked, frozen=True, tag="step"):
-    """Let it run for some seconds, and then stand; without a number, to the next thing due."""
+class Step(_Command, frozen=True, tag="step"):
+    """Run for some seconds and pause; without a number, up to what is due next."""
 
     seconds: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
 
 
-class Speed(_Asked, frozen=True, tag="speed"):
-    """Let it run at so many simulated seconds per real second; without a number, its fastest."""
+class Speed(_Command, frozen=True, tag="speed"):
+    """Set how many simulated seconds pass per real second; without a number, as many as can."""
 
     factor: Annotated[float, msgspec.Meta(ge=SLOWEST, le=QUICKEST)] | None = None
 
 
-class Restart(_Asked, frozen=True, tag="restart"):
-    """Shut a node down and start it anew."""
+class Restart(_Command, frozen=True, tag="restart"):
+    """Shut a node down and start it again."""
 
     node: str
 
 
-class Stop(_Asked, frozen=True, tag="stop"):
+class Stop(_Command, frozen=True, tag="stop"):
     """End the run in order."""
 
 
-class Set(_Asked, frozen=True, tag="set"):
+class Set(_Command, frozen=True, tag="set"):
     """Change a setting of a node: ``node.key=value``, the value in TOML or a bare word."""
 
     text: str
@@ -55,8 +57,8 @@ class Set(_Asked, frozen=True, tag="set"):
 Command = Pause | Resume | Step | Speed | Restart | Stop | Set
 
 
-class Asked(msgspec.Struct, frozen=True, kw_only=True, tag="ask"):
-    """A command on its way to a run; `number` comes back with the answer."""
+class CommandRequest(msgspec.Struct, frozen=True, kw_only=True, tag="ask"):
+    """A command to a run; its answer has the same `number`."""
 
     number: int
     command: Command
@@ -69,16 +71,16 @@ class ImageRequest(msgspec.Struct, frozen=True, kw_only=True, tag="image"):
     camera: str
 
 
-class Watch(msgspec.Struct, frozen=True, tag="watch"):
-    """Asks for snapshots, as long as the connection lasts."""
+class WatchRequest(msgspec.Struct, frozen=True, tag="watch"):
+    """Asks for snapshots for as long as the connection lasts."""
 
 
 class Answer(msgspec.Struct, frozen=True, kw_only=True, tag="answer"):
-    """What came of a command.
+    """The answer to a command, or why there is no image.
 
     Attributes:
-        number: Of the command.
-        done: Whether it was done.
+        number: Of the request.
+        done: Whether it was carried out.
         text: What was done, or why not.
     """
 
@@ -99,7 +101,7 @@ class EncodedImage(msgspec.Struct, frozen=True, kw_only=True, tag="jpeg"):
     jpeg: bytes
 
 
-FromClient = Asked | ImageRequest | Watch
+FromClient = CommandRequest | ImageRequest | WatchRequest
 FromRun = Snapshot | Answer | EncodedImage
 
 encode = msgspec.json.Encoder().encode
@@ -108,7 +110,7 @@ decode_from_run = msgspec.json.Decoder(FromRun).decode
 decode_command = msgspec.json.Decoder(Command).decode
 
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
-"""What decoding raises: no JSON, no text, something else, or nested too deeply."""
+"""What decoding raises: invalid JSON, invalid UTF-8, another type, or too deep nesting."""
 
 LONGEST_COMMAND = 256 << 10
 """Bytes of a line to a run at most."""

@@ -1,4 +1,4 @@
-"""As much of HTTP as a page on this machine needs: a request, a response, server-sent events.
+"""The part of HTTP that a page on this machine needs: a request, a response, server-sent events.
 
 Protocols: RFC 9112 (HTTP/1.1); "Server-sent events" in the HTML standard.
 """

@@ -1,4 +1,4 @@
-"""Measuring what nodes have of the loop, and how old events are, while somebody looks."""
+"""Measures how much of the loop nodes take, and how old events are, while somebody watches."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from runtime.sender import Sender
 from runtime.tools.monitor.recent import Amount
 
 
-class Sum:
-    """Durations since the last look: nanoseconds."""
+class DurationSum:
+    """Durations since the last snapshot, nanoseconds."""
 
     __slots__ = ("count", "last", "longest", "total")
 
@@ -25,27 +25,27 @@ class Sum:
         """When the last one ended, on the run's clock (ns); of outputs only."""
 
     def take(self) -> Amount:
-        """Return what was added up, and begin anew."""
+        """Return the sum, and start again from zero."""
         amount = Amount(self.count, self.total, self.longest)
         self.count = self.total = self.longest = 0
         return amount
 
 
 class Meter(Instrument):
-    """An instrument that adds up.
+    """An instrument that adds up durations, and keeps the newest images.
 
     Args:
         clock: The run's clock.
 
     Attributes:
-        nodes: What each node had of the loop, by name: its steps, less what they called in others.
-        outputs: What lay between stamp and delivery of each output's events, by ``node.port``.
+        nodes: Time each node took of the loop, by name, without the calls of other nodes in it.
+        outputs: Times from stamp to delivery of each output's events, by ``node.port``.
         images: The newest image of each camera, by ``node.port: source``.
     """
 
     def __init__(self, clock: Clock) -> None:
-        self.nodes: dict[str, Sum] = {}
-        self.outputs: dict[str, Sum] = {}
+        self.nodes: dict[str, DurationSum] = {}
+        self.outputs: dict[str, DurationSum] = {}
         self.images: dict[str, Image] = {}
         self._clock = clock
         self._inner = [0]
@@ -55,7 +55,7 @@ class Meter(Instrument):
     def wrap_call(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
         """Return a function that calls `call` and adds up how long it takes."""
         inner, time_ns = self._inner, time.perf_counter_ns
-        steps = self.nodes.setdefault(node, Sum())
+        steps = self.nodes.setdefault(node, DurationSum())
 
         def metering(argument: Any) -> Any:
             outer = inner[0]
@@ -78,7 +78,7 @@ class Meter(Instrument):
         name = "run.announced" if sender is None else sender.name
         flow = self.outputs.get(name)
         if flow is None:
-            flow = self.outputs[name] = Sum()
+            flow = self.outputs[name] = DurationSum()
         now = self._clock.now()
         latency = now - event.stamp
         flow.count += 1

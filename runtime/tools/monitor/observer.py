@@ -1,4 +1,4 @@
-"""Making snapshots of a run, and doing what it is asked; all on the run's loop."""
+"""Makes snapshots of a run and carries commands out; all on the run's loop."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from runtime.tools.monitor.timekeeping import Timekeeper
 
 
 class Observer:
-    """Looks at one run.
+    """Observes and controls one run.
 
     Args:
         supervisor: Of the run.
@@ -53,27 +53,27 @@ class Observer:
         self._meter: Meter | None = None
         self._recent = RecentSamples(self._sample())
         self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}
-        """Of each node, and how they were shown: they seldom change."""
+        """Of each node, with their text, which seldom changes."""
         self._number = 0
 
     def begin(self) -> None:
-        """Begin to measure: somebody looks."""
+        """Begin to measure: somebody watches."""
         if self._meter is None:
             self._meter = Meter(self._state.clock)
             self._supervisor.instruments.attach(self._meter)
             self._recent = RecentSamples(self._sample())
 
     def end(self) -> None:
-        """Measure no more: nobody looks."""
+        """Stop measuring: nobody watches."""
         if self._meter is not None:
             self._supervisor.instruments.detach(self._meter)
             self._meter = None
             self._recent = RecentSamples(self._sample())
 
-    # Seeing.
+    # Snapshots.
 
     def take(self) -> Snapshot:
-        """Return what there is to see now, and of the last second or so."""
+        """Return a snapshot of now and of the last second or so."""
         state = self._state
         self._number += 1
         sample = self._sample()
@@ -89,7 +89,7 @@ class Observer:
                 now=now / SECOND,
                 duration=float(self._config.run.duration),
                 speed=self._recent.run / self._recent.real,
-                asked=self._keeper.asked,
+                target_speed=self._keeper.target_speed,
                 paused=self._keeper.paused,
                 fixed=self._keeper.fixed(),
             ),
@@ -128,7 +128,7 @@ class Observer:
         """Return the newest image of one of a snapshot's cameras.
 
         Raises:
-            CommandError: There is no such camera, or nobody looks.
+            CommandError: It has sent no image, or nobody watches.
         """
         images = self._meter.images if self._meter is not None else {}
         if camera not in images:
@@ -138,7 +138,7 @@ class Observer:
         return images[camera]
 
     def _sample(self) -> Sample:
-        """Return what has been added up since the last time."""
+        """Return the counters, with what was measured since the last sample."""
         sent: Counter[str] = Counter()
         for node in self._state.all_nodes:
             for sender in senders(node).values():
@@ -216,13 +216,13 @@ class Observer:
             for stream in streams(runner.node).values()
         ]
 
-    # Doing.
+    # Commands.
 
-    def do(self, command: Command) -> str:
-        """Do what was asked, and return what was done.
+    def execute(self, command: Command) -> str:
+        """Carry a command out, and return what was done.
 
         Raises:
-            VisnavError: It cannot be done; the message says why.
+            VisnavError: It cannot be carried out; the message says why.
         """
         keeper = self._keeper
         match command:
@@ -263,7 +263,7 @@ class Observer:
         return f"{name} restarts"
 
 
-def told(command: Command) -> str:
-    """Return a command in words, for the log."""
+def describe(command: Command) -> str:
+    """Return a command as text, for the log."""
     words = [str(v) for v in msgspec.structs.astuple(command) if v is not None]
     return " ".join([type(command).__name__.lower(), *words])

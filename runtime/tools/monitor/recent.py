@@ -1,4 +1,4 @@
-"""The last second or so: figures over a single snapshot's interval would jump about."""
+"""Figures of the last second or so, which are steadier than those of one interval."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import NamedTuple
 from runtime.schedule import SECOND
 
 KEPT = 5
-"""Intervals between snapshots that figures are taken over."""
+"""How many intervals between snapshots figures cover."""
 
 
 class Amount(NamedTuple):
-    """What was added up of one node or output.
+    """Durations of one node or output, added up.
 
     Attributes:
-        times: How often it was.
-        total: Nanoseconds of all.
-        longest: Nanoseconds of the longest.
+        times: How many they are.
+        total: Their sum, nanoseconds.
+        longest: The longest, nanoseconds.
     """
 
     times: int = 0
@@ -26,7 +26,7 @@ class Amount(NamedTuple):
     longest: int = 0
 
     def plus(self, other: Amount) -> Amount:
-        """Return both together."""
+        """Return both, added up."""
         return Amount(
             self.times + other.times,
             self.total + other.total,
@@ -35,14 +35,14 @@ class Amount(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What was known at one snapshot.
+    """Counters at one snapshot.
 
     Attributes:
         real: Seconds of `time.perf_counter`.
         run: Nanoseconds of the run's clock.
-        sent: Events sent since the beginning, by output.
-        nodes: What each node had of the loop since the sample before.
-        outputs: What lay between stamp and delivery since then.
+        sent: Events sent since the run began, by output.
+        nodes: Time that each node took of the loop since the sample before.
+        outputs: Times from stamp to delivery since then.
     """
 
     real: float
@@ -56,37 +56,37 @@ class RecentSamples:
     """The last samples.
 
     Args:
-        first: Of which but the time and what was sent by then counts.
+        first: Only its times and its count of sent events are used.
     """
 
     def __init__(self, first: Sample) -> None:
         self._samples = collections.deque([first], maxlen=KEPT + 1)
 
     def add(self, sample: Sample) -> None:
-        """Take another one."""
+        """Add a sample and forget the oldest."""
         self._samples.append(sample)
 
     @property
     def real(self) -> float:
-        """Real seconds that it spans."""
+        """Real seconds that the samples span."""
         return max(self._samples[-1].real - self._samples[0].real, 1e-9)
 
     @property
     def run(self) -> float:
-        """Seconds of the run's clock that it spans."""
+        """Seconds of the run's clock that the samples span."""
         return (self._samples[-1].run - self._samples[0].run) / SECOND
 
     def rate(self, output: str) -> float:
-        """Return how many events an output sent a second of the run's clock."""
+        """Return how many events an output sent per second of the run's clock."""
         sent = self._samples[-1].sent.get(output, 0) - self._samples[0].sent.get(output, 0)
         return sent / self.run if self.run > 0 else 0.0
 
     def node(self, name: str) -> Amount:
-        """Return what a node had of the loop."""
+        """Return how much of the loop's time a node took."""
         return self._sum([sample.nodes.get(name, Amount()) for sample in self._later()])
 
     def output(self, name: str) -> Amount:
-        """Return what lay between the stamps of an output's events and their delivery."""
+        """Return the times from the stamps of an output's events to their delivery."""
         return self._sum([sample.outputs.get(name, Amount()) for sample in self._later()])
 
     def _later(self) -> list[Sample]:

@@ -1,4 +1,4 @@
-"""The last records of a run's log, for those who look on."""
+"""The last records of a run's log, for snapshots."""
 
 from __future__ import annotations
 
@@ -32,5 +32,5 @@ class LastRecords(logging.Handler):
         )
 
     def lines(self) -> list[LogLine]:
-        """Return what is kept, the oldest first."""
+        """Return the records, the oldest first."""
         return list(self._lines)

@@ -1,4 +1,4 @@
-"""A snapshot as rows of text: the same words on every screen."""
+"""A snapshot as rows of text, the same in a terminal and on a page."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ COLUMNS: dict[str, tuple[str, ...]] = {
 """Titles of columns, by table."""
 
 LEFT, RIGHT = ("nodes", "ticks", "inputs", "links"), ("outputs", "settings")
-"""Where the tables stand."""
+"""Tables in the left and in the right column."""
 
 _WORDS = {"condition", "event", "value"}
-"""Columns of words; all others but the first are numbers."""
+"""Columns of text; all others but the first hold numbers."""
 
 
 def is_number(table: str, column: int) -> bool:
-    """Tell whether a column holds numbers, which stand to the right."""
+    """Tell whether a column holds numbers, which are aligned right."""
     return column > 0 and COLUMNS[table][column] not in _WORDS
 
 
@@ -36,30 +36,31 @@ def rows(table: str, snapshot: Snapshot) -> Rows:
 
 
 def headline(snapshot: Snapshot) -> str:
-    """Return what the run is doing, in a line."""
+    """Return time, speed and condition of the run, as a line."""
     clock = snapshot.clock
     limit = f" of {clock.duration:g}" if clock.duration else ""
     return f"{snapshot.run}   {clock.now:.3f}{limit} s   {pace(clock)}   {condition(snapshot)}"
 
 
 def condition(snapshot: Snapshot) -> str:
-    """Return whether the run goes on."""
+    """Return whether the run goes on, is paused or ends."""
     if snapshot.ended:
         return f"ends: {snapshot.ended}"
     return "paused" if snapshot.clock.paused else "runs"
 
 
 def pace(clock: ClockState) -> str:
-    """Return how fast time goes, and how fast it is to go."""
+    """Return the speed of time, and the speed that was asked for."""
     speed = f"{clock.speed:.2f} × real time"
     if clock.kind == "real":
         return f"{speed} (real)"
-    return f"{speed} ({'as fast as it can' if clock.asked is None else f'asked: {clock.asked:g}'})"
+    target = clock.target_speed
+    return f"{speed} ({'as fast as it can' if target is None else f'asked: {target:g}'})"
 
 
 def aim(clock: ClockState) -> float:
-    """Return the speed that faster and slower start from: what was asked for, or what there is."""
-    return clock.asked if clock.asked is not None else max(round(clock.speed, 1), 1.0)
+    """Return the speed that faster and slower start from: the one asked for, or the present one."""
+    return clock.target_speed if clock.target_speed is not None else max(round(clock.speed, 1), 1.0)
 
 
 def _nodes(snapshot: Snapshot) -> Rows:

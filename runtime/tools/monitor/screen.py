@@ -48,13 +48,13 @@ _COLOURS = {"WARNING": "yellow", "ERROR": "red", "CRITICAL": "red bold"}
 
 
 class Connection(Protocol):
-    """A `runtime.tools.monitor.client.Client`, or what stands for one in a test."""
+    """A `runtime.tools.monitor.client.Client`, or a fake of it in a test."""
 
     def snapshots(self) -> AsyncIterator[Snapshot]:
         """Yield snapshots until the run is over."""
 
     async def ask(self, command: Command) -> Answer:
-        """Ask the run to do something."""
+        """Send a command to the run."""
 
 
 class Screen(App[str]):
@@ -62,7 +62,7 @@ class Screen(App[str]):
 
     Args:
         connection: To the run.
-        leave: Whether to go when the run is over, instead of showing how it ended.
+        leave: Whether to exit when the run is over, instead of showing how it ended.
     """
 
     CSS = """
@@ -152,7 +152,7 @@ class Screen(App[str]):
                 log.write(_log_line(line), expand=True)
 
     def _fill(self, name: str, snapshot: Snapshot) -> None:
-        """Write a table's rows over those that stand there, so that the cursor stays."""
+        """Update a table's rows in place, so that the cursor stays."""
         table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
         found = rows(name, snapshot)
         table.set_class(not found, "none")
@@ -171,50 +171,50 @@ class Screen(App[str]):
     # Keys.
 
     def _ask(self, command: Command) -> None:
-        """Ask the run; keys work on while it has not answered."""
-        self.run_worker(self._tell(command))
+        """Send a command; keys go on working before it is answered."""
+        self.run_worker(self._send(command))
 
-    async def _tell(self, command: Command) -> None:
+    async def _send(self, command: Command) -> None:
         answer = await self._connection.ask(command)
         severity = "information" if answer.done else "error"
         self.notify(answer.text, severity=severity, markup=False)  # type: ignore[arg-type]
 
     def action_pause(self) -> None:
-        """Let time stand, or run again."""
+        """Pause or resume time."""
         if self.snapshot is not None:
             paused = self.snapshot.clock.paused
             self._ask(Resume() if paused else Pause())
             self._expect(paused=not paused)
 
     def action_step(self) -> None:
-        """Let the next thing happen."""
+        """Step to what is due next."""
         self._ask(Step())
 
     def action_step_far(self) -> None:
-        """Let a second go by."""
+        """Step one second."""
         self._ask(Step(seconds=1.0))
 
     def action_speed(self, factor: float) -> None:
-        """Let time run faster, or slower."""
+        """Multiply the speed of time."""
         if self.snapshot is not None:
             asked = min(max(aim(self.snapshot.clock) * factor, SLOWEST), QUICKEST)
             self._ask(Speed(factor=asked))
-            self._expect(asked=asked)
+            self._expect(target_speed=asked)
 
     def action_fastest(self) -> None:
         """Let time run as fast as it can."""
         self._ask(Speed(factor=None))
-        self._expect(asked=None)
+        self._expect(target_speed=None)
 
     def _expect(self, **changes: Any) -> None:
-        """Go by what was asked until the next snapshot, as the next key may come before it."""
+        """Assume that it was done until the next snapshot, as the next key may come before it."""
         if self.snapshot is not None and not self.snapshot.clock.fixed:
             clock = msgspec.structs.replace(self.snapshot.clock, **changes)
             self.snapshot = msgspec.structs.replace(self.snapshot, clock=clock)
 
     def action_restart(self) -> None:
-        """Start the node under the cursor anew."""
-        if (node := self._chosen()) is not None:
+        """Restart the node under the cursor."""
+        if (node := self._selected_node()) is not None:
             self._ask(Restart(node=node))
 
     def action_stop(self) -> None:
@@ -233,7 +233,7 @@ class Screen(App[str]):
         known = ["=".join(row) for row in rows("settings", self.snapshot)]
         prompt = self.query_one("#prompt", Input)
         prompt.suggester = SuggestFromList(known)
-        mine = [text for text in known if text.startswith(f"{self._chosen()}.")]
+        mine = [text for text in known if text.startswith(f"{self._selected_node()}.")]
         prompt.value = mine[0].partition("=")[0] + "=" if mine else ""
         prompt.cursor_position = len(prompt.value)
         prompt.placeholder = known[0] if known else "no node has a setting that can change"
@@ -241,17 +241,17 @@ class Screen(App[str]):
         prompt.focus()
 
     def action_leave_prompt(self) -> None:
-        """Set nothing."""
+        """Close the prompt."""
         self.query_one("#prompt").remove_class("asking")
         self.query_one("#nodes").focus()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Set what was asked for."""
+        """Set what was typed."""
         self.action_leave_prompt()
         if event.value.strip():
             self._ask(Set(text=event.value))
 
-    def _chosen(self) -> str | None:
+    def _selected_node(self) -> str | None:
         """Return the node under the cursor."""
         table: DataTable[Text] = self.query_one("#nodes", DataTable)
         if not table.row_count:

@@ -1,4 +1,4 @@
-"""The end of the monitor that is in the run: a Unix socket, served by a thread of its own.
+"""The server of a run's monitor: a Unix socket, served by a thread of its own.
 
 The run's loop does nothing but make a snapshot or carry a command out, when the thread asks it to;
 the thread encodes and sends, and keeps the rhythm, because time on the run's loop may be simulated.
@@ -23,16 +23,16 @@ from runtime.tools.monitor.command import (
     LONGEST_COMMAND,
     UNREADABLE,
     Answer,
-    Asked,
+    CommandRequest,
     EncodedImage,
     ImageRequest,
     Set,
-    Watch,
+    WatchRequest,
     decode_from_client,
     encode,
 )
 from runtime.tools.monitor.images import ImageEncoder
-from runtime.tools.monitor.observer import Observer, told
+from runtime.tools.monitor.observer import Observer, describe
 
 R = TypeVar("R")
 
@@ -41,21 +41,21 @@ log = logging.getLogger("visnav.runtime")
 PERIOD = 0.2
 """Real seconds between two snapshots."""
 
-PARTING = 1.0
-"""Real seconds within which those who watch must take the last snapshot."""
+CLOSING_TIMEOUT = 1.0
+"""Real seconds that clients have to receive the last snapshot."""
 
-_LISTENING = 5.0
-"""Real seconds within which the socket must be there."""
+_LISTEN_TIMEOUT = 5.0
+"""Real seconds within which the socket must be ready."""
 
-BEHIND = 1 << 20
-"""Bytes that may wait for one who watches; whoever is slower than that misses snapshots."""
+MAX_BACKLOG = 1 << 20
+"""Bytes that may wait for one client; a slower one misses snapshots."""
 
 
 class Server:
-    """Serves those who look at a run.
+    """Serves the clients that watch and control a run.
 
     Args:
-        observer: Looks at the run, and does what is asked.
+        observer: Makes snapshots of the run, and carries commands out.
         loop: The run's loop, on which the observer is called.
         path: Of the socket.
     """
@@ -74,17 +74,17 @@ class Server:
         self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
 
     def start(self) -> bool:
-        """Listen; tell whether that is possible."""
+        """Start to listen; tell whether that worked."""
         self._thread.start()
-        return self._ready.wait(_LISTENING) and self._thread.is_alive()
+        return self._ready.wait(_LISTEN_TIMEOUT) and self._thread.is_alive()
 
     def stop(self) -> None:
-        """Send those who watch how it ended, and listen no more; on the run's loop."""
+        """Send the last snapshot to all clients, and stop listening; called on the run's loop."""
         try:
             if self._watching:
                 self._last = encode(self._observer.take()) + b"\n"
             self._observer.end()
-        except Exception:  # who looks on must not spoil a run's end
+        except Exception:  # a monitor must not spoil a run's end
             log.exception("the monitor failed")
         with contextlib.suppress(RuntimeError):  # its loop is closed: it could not listen
             if self._loop is not None:
@@ -95,7 +95,9 @@ class Server:
         try:
             asyncio.run(self._serve())
         except OSError as error:
-            log.warning("nobody can look at this run: no socket at %s: %s", self._path, error)
+            log.warning(
+                "no monitor can connect to this run: no socket at %s: %s", self._path, error
+            )
         finally:
             self._ready.set()
 
@@ -116,7 +118,7 @@ class Server:
             writer.close()
         closing = asyncio.gather(*(w.wait_closed() for w in writers), return_exceptions=True)
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(closing, PARTING)  # what was written still goes out
+            await asyncio.wait_for(closing, CLOSING_TIMEOUT)  # what was written still goes out
         for writer in writers:
             writer.transport.abort()
         await asyncio.sleep(0)  # they let go of their sockets
@@ -124,9 +126,9 @@ class Server:
             self._path.unlink()
 
     def _listener(self) -> socket.socket:
-        """Return a socket that listens; until it does, it has not the name by which it is found.
+        """Return a socket that listens; it gets the name by which it is found only when it does.
 
-        Others would take it for one that a killed run has left, and remove it.
+        Before that, others would take it for one that a killed run has left, and remove it.
         """
         listener = socket.socket(socket.AF_UNIX)
         new = self._path.with_suffix(".new")
@@ -138,7 +140,7 @@ class Server:
         return listener
 
     async def _publish(self) -> None:
-        """Measure and send snapshots while there is somebody who watches."""
+        """Measure and send snapshots while somebody watches."""
         measuring = failed = False
         while True:
             await asyncio.sleep(PERIOD)
@@ -150,7 +152,7 @@ class Server:
                 elif measuring:
                     line = encode(await self._on_run_loop(self._observer.take)) + b"\n"
                     for writer in self._watching:
-                        if writer.transport.get_write_buffer_size() < BEHIND:
+                        if writer.transport.get_write_buffer_size() < MAX_BACKLOG:
                             writer.write(line)
             except Exception:
                 if not failed:
@@ -161,15 +163,17 @@ class Server:
         if self._end.is_set():
             writer.transport.abort()
             return
-        task = asyncio.create_task(self._attend(reader, writer))
-        self._clients[task] = writer  # at once: a task that has not begun ends without a word
+        task = asyncio.create_task(self._serve_client(reader, writer))
+        self._clients[task] = writer  # not in the task, which may be cancelled before it begins
         task.add_done_callback(self._clients.pop)
 
-    async def _attend(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_client(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         try:
             async for line in reader:
-                await self._hear(line, writer)
-                await writer.drain()  # whoever reads no answers is asked for no more
+                await self._handle_line(line, writer)
+                await writer.drain()  # a client that reads no answers has to wait
         except (OSError, ValueError):  # gone, or a line without an end
             pass
         except asyncio.CancelledError:  # the run is over
@@ -178,7 +182,7 @@ class Server:
             self._watching.discard(writer)
             writer.close()
 
-    async def _hear(self, line: bytes, writer: asyncio.StreamWriter) -> None:
+    async def _handle_line(self, line: bytes, writer: asyncio.StreamWriter) -> None:
         try:
             message = decode_from_client(line)
         except UNREADABLE as error:
@@ -186,32 +190,32 @@ class Server:
             writer.write(encode(answer) + b"\n")
             return
         match message:
-            case Watch():
+            case WatchRequest():
                 self._watching.add(writer)
-            case Asked() | ImageRequest():
+            case CommandRequest() | ImageRequest():
                 writer.write(encode(await self._answer(message)) + b"\n")
 
-    async def _answer(self, asked: Asked | ImageRequest) -> Answer | EncodedImage:
+    async def _answer(self, request: CommandRequest | ImageRequest) -> Answer | EncodedImage:
         try:
-            if isinstance(asked, ImageRequest):
-                return await self._image(asked)
-            text = await self._on_run_loop(lambda: self._observer.do(asked.command))
+            if isinstance(request, ImageRequest):
+                return await self._image(request)
+            text = await self._on_run_loop(lambda: self._observer.execute(request.command))
         except VisnavError as error:
-            return Answer(number=asked.number, done=False, text=str(error))
+            return Answer(number=request.number, done=False, text=str(error))
         except Exception:
             log.exception("the monitor failed")
             text = "the run could not do it, and its log says why"
-            return Answer(number=asked.number, done=False, text=text)
-        if not isinstance(asked.command, Set):  # which says so itself
-            log.info("asked by hand: %s", told(asked.command))
-        return Answer(number=asked.number, done=True, text=text)
+            return Answer(number=request.number, done=False, text=text)
+        if not isinstance(request.command, Set):  # which logs it itself
+            log.info("asked by hand: %s", describe(request.command))
+        return Answer(number=request.number, done=True, text=text)
 
-    async def _image(self, asked: ImageRequest) -> EncodedImage:
+    async def _image(self, request: ImageRequest) -> EncodedImage:
         jpeg = await self._encoder.encode(
-            asked.camera,
-            lambda: self._on_run_loop(lambda: self._observer.image(asked.camera)),
+            request.camera,
+            lambda: self._on_run_loop(lambda: self._observer.image(request.camera)),
         )
-        return EncodedImage(number=asked.number, jpeg=jpeg)
+        return EncodedImage(number=request.number, jpeg=jpeg)
 
     async def _on_run_loop(self, call: Callable[[], R]) -> R:
         """Have a function called on the run's loop, and return its result."""
@@ -231,7 +235,7 @@ class Server:
 
 @contextlib.contextmanager
 def serving(observer: Observer, run: str) -> Iterator[Path | None]:
-    """Let a run be looked at while the block lasts; called on its loop.
+    """Let a run be watched and controlled while the block lasts; called on its loop.
 
     Yields:
         The socket's path; `None` if there can be none.
@@ -239,7 +243,7 @@ def serving(observer: Observer, run: str) -> Iterator[Path | None]:
     try:
         path = socket_of(run)
     except (CommandError, OSError) as error:
-        log.warning("nobody can look at this run: %s", error)
+        log.warning("no monitor can connect to this run: %s", error)
         yield None
         return
     server = Server(observer, asyncio.get_running_loop(), path)

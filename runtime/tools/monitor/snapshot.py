@@ -1,4 +1,4 @@
-"""What there is to see of a run: plain data, the same for every kind of screen."""
+"""Snapshots of a run: plain data, the same for terminal and page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ NodeCondition = Literal["waiting", "starting", "ready", "running", "restarting",
 
 
 class _Data(msgspec.Struct, frozen=True, kw_only=True):
-    """Base of what a snapshot consists of."""
+    """Base of the parts of a snapshot."""
 
 
 class ClockState(_Data, frozen=True):
@@ -21,8 +21,8 @@ class ClockState(_Data, frozen=True):
         now: Seconds since the first update.
         duration: Seconds at which the run ends; 0 for no limit.
         speed: Seconds of the clock per real second over the last second or so.
-        asked: The speed that was asked for; `None`: as fast as it can.
-        paused: Whether it stands.
+        target_speed: The speed that was asked for; `None`: as fast as it can.
+        paused: Whether it is paused.
         fixed: Why it can be neither paused nor set; empty if it can.
     """
 
@@ -30,7 +30,7 @@ class ClockState(_Data, frozen=True):
     now: float
     duration: float
     speed: float
-    asked: float | None
+    target_speed: float | None
     paused: bool
     fixed: str
 
@@ -41,13 +41,13 @@ class NodeState(_Data, frozen=True):
     Attributes:
         name: Its name.
         type: ``module:Class``.
-        condition: Where it is in its life.
+        condition: Of starting, running and ending.
         failures: How often it was restarted.
-        share: Of the loop's time that was its own: 1 is all.
-        steps: How often the loop went into it, a second.
-        longest_ms: Its longest step, less what that called in others.
-        calls: Calls of its workers that wait for an answer.
-        settings: What can be changed, as ``key`` to TOML.
+        share: Share of the loop's time that it took, 0 to 1.
+        steps: How often the loop called it, per second.
+        longest_ms: Its longest step, without the calls of other nodes in it.
+        calls: Calls of its workers that are not answered yet.
+        settings: Those that can change: ``key`` to value in TOML.
     """
 
     name: str
@@ -62,17 +62,16 @@ class NodeState(_Data, frozen=True):
 
 
 class OutputState(_Data, frozen=True):
-    """One output; seconds are the run's clock's, over the last second or so (a real one).
+    """One output; rate and latency are on the run's clock, over the last real second or so.
 
     Attributes:
         name: ``node.port``.
         event: Its type of event.
-        count: Events sent since the beginning.
-        rate: Events a second.
-        age: Seconds since the last; `None` before the first that was seen.
-        latency_ms: Mean of what lay between an event's stamp and its delivery; `None` if there
-            was none.
-        latency_max_ms: The most.
+        count: Events sent since the run began.
+        rate: Events per second.
+        age: Seconds since the last event; `None` before the first that was seen.
+        latency_ms: Mean time from an event's stamp to its delivery; `None` without events.
+        latency_max_ms: The longest.
     """
 
     name: str
@@ -95,7 +94,7 @@ class InputState(_Data, frozen=True):
 
 
 class LinkState(_Data, frozen=True):
-    """What one link lost, and left out to keep to its rate."""
+    """How many events one link lost, and left out to keep to its rate."""
 
     name: str
     lost: int
@@ -103,7 +102,7 @@ class LinkState(_Data, frozen=True):
 
 
 class TickState(_Data, frozen=True):
-    """How punctual one ticker was since the beginning; microseconds of the run's clock."""
+    """How late one ticker was since the run began; microseconds of the run's clock."""
 
     name: str
     hz: float
@@ -117,11 +116,11 @@ class LogLine(_Data, frozen=True):
     """One record of the log.
 
     Attributes:
-        number: Counts the records of the run.
+        number: Counts the run's records, from 0.
         seconds: Of the run's clock.
         level: ``INFO``, ``WARNING``, …
         speaker: The node, or ``runtime``.
-        text: What it says.
+        text: The message.
     """
 
     number: int
@@ -137,7 +136,7 @@ class Snapshot(_Data, frozen=True, tag="snapshot"):
     Attributes:
         run: Its name.
         pid: Of its process.
-        number: Counts snapshots.
+        number: Counts snapshots, from 1.
         ended: Why the run ends or has ended; empty while it goes on.
         clock: The run's clock.
         nodes: In the order of the file.
@@ -145,7 +144,7 @@ class Snapshot(_Data, frozen=True, tag="snapshot"):
         inputs: Of all nodes.
         links: All there are.
         ticks: Of all nodes.
-        cameras: Whose images can be asked for: those that sent one since somebody looks.
+        cameras: ``node.port: source`` of those that sent an image since somebody watches.
         log: The last records.
     """
 

@@ -1,6 +1,6 @@
-"""Pausing, stepping and pacing simulated time.
+"""Pauses and steps simulated time, and sets its speed.
 
-In real time none of this is possible: sensors and vehicles do not wait.
+None of this is possible in real time: sensors and vehicles do not wait.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from runtime.schedule import SECOND
 
 
 class Timekeeper:
-    """Has the say over a run's clock; a `runtime.lockstep.Gate` while time is to stand.
+    """Controls a run's clock; it is the loop's `runtime.lockstep.Gate` while time is paused.
 
     Args:
         clock: The run's clock.
-        over: Tells whether the run is ending, which takes time and cannot stand.
+        over: Tells whether the run is ending, which takes simulated time and cannot be paused.
     """
 
     def __init__(self, clock: Clock, over: Callable[[], bool] = lambda: False) -> None:
         self._over = over
         self._loop = clock._loop if isinstance(clock, LockstepClock) else None
         self._limit = 0
-        """The time (ns) beyond which nothing happens while this is the loop's gate."""
+        """The time (ns) up to which the loop may go while this is its gate."""
 
     def fixed(self) -> str:
-        """Say why nothing here is possible; empty if it is."""
+        """Return why time cannot be controlled; empty if it can."""
         if self._loop is None:
             return "the run is in real time, which cannot be stopped: sensors do not wait"
         if self._loop.gate not in {None, self}:
@@ -37,48 +37,48 @@ class Timekeeper:
 
     @property
     def paused(self) -> bool:
-        """Whether time stands, or will when a step has been taken."""
+        """Whether time is paused, or will be after the current step."""
         return self._loop is not None and self._loop.gate is self
 
     @property
-    def asked(self) -> float | None:
+    def target_speed(self) -> float | None:
         """The speed that was asked for; `None`: as fast as it can, or real time."""
         if self._loop is None or not self._loop._pace:
             return None
         return round(1.0 / (self._loop._pace * SECOND), 9)
 
     def may_go(self, key: tuple[int, int, int]) -> bool:
-        """Tell whether to go on to what is due next; asked by the loop."""
+        """Tell whether the loop may go on to what is due next."""
         return key[0] <= self._limit or self._over()
 
     def pause(self) -> None:
-        """Let time stand.
+        """Pause time.
 
         Raises:
-            CommandError: It cannot.
+            CommandError: Time cannot be controlled.
         """
         loop = self._checked()
         self._limit = loop.now
         loop.gate = self
 
     def resume(self) -> None:
-        """Let time run.
+        """Resume time.
 
         Raises:
-            CommandError: It cannot be stopped, and so it runs.
+            CommandError: Time cannot be controlled.
         """
         loop = self._checked()
         loop.gate = None
-        loop._wall_origin = None  # or it would hurry to make good for the pause
+        loop._wall_origin = None  # else it would hurry to make up for the pause
 
     def step(self, seconds: float | None) -> None:
-        """Let time run a little, and then stand.
+        """Let time run a little, and then pause.
 
         Args:
-            seconds: How far; `None`: to the next thing due, and all that is due with it.
+            seconds: How far; `None`: to what is due next, all at the same time included.
 
         Raises:
-            CommandError: It cannot.
+            CommandError: Time cannot be controlled.
         """
         loop = self._checked()
         begin = max(loop.now, self._limit) if loop.gate is self else loop.now
@@ -90,13 +90,13 @@ class Timekeeper:
         loop._wall_origin = None
 
     def pace(self, factor: float | None) -> None:
-        """Let time run at a speed.
+        """Set the speed of time.
 
         Args:
             factor: Simulated seconds per real second; `None`: as fast as it can.
 
         Raises:
-            CommandError: It cannot.
+            CommandError: Time cannot be controlled.
         """
         loop = self._checked()
         loop._pace = 0.0 if factor is None else 1.0 / (factor * SECOND)
@@ -110,7 +110,7 @@ class Timekeeper:
 
 
 def _next_due(loop: LockstepLoop) -> int:
-    """Return when something is due next: of the schedule, a timer or work beside; 0 if nothing."""
+    """Return when the next entry, timer or work in a thread is due (ns); 0 if there is none."""
     entry = loop.schedule.next_due()
     due = [] if entry is None else [entry]
     due += [round(timer.when() * SECOND) for timer in loop._scheduled[:1]]  # type: ignore[attr-defined]

@@ -1,8 +1,8 @@
 """The monitor as a page: the same tables and commands as in a terminal, and a camera's images.
 
-Served on this machine only. Whoever has the address with its token may command the run: other
-users of the machine do not know it, and other pages in the browser can neither read it nor send
-the header that a command needs.
+Served on this machine only. The token in the address allows commands: other users of the machine
+do not know it, and other pages in the browser can neither read it nor send the header that a
+command needs.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from runtime.tools.monitor.http import (
 from runtime.tools.monitor.rows import COLUMNS, LEFT, RIGHT, aim, headline, is_number, rows
 from runtime.tools.monitor.snapshot import Snapshot
 
-TOKEN_HEADER = "x-token"  # noqa: S105  # its name, not itself
+TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
 _HOSTS = {"127.0.0.1", "localhost"}
-_STALE = 3
-"""Snapshots that a slow page may be behind."""
+_MAX_BACKLOG = 3
+"""Snapshots that may wait for a slow page."""
 
 
 class Page:
@@ -52,7 +52,7 @@ class Page:
 
     Args:
         client: The connection to the run.
-        token: What an address needs to be let in; made up if not given.
+        token: That an address must have; random if not given.
     """
 
     def __init__(self, client: Client, token: str | None = None) -> None:
@@ -65,10 +65,10 @@ class Page:
         self._end = "the run is over: it does not answer any more"
 
     async def listen(self) -> None:
-        """Hand the run's snapshots to all pages until it is over."""
+        """Send the run's snapshots to all pages until it is over."""
         try:
             async for snapshot in self._client.snapshots():
-                self._last = encode(shown(snapshot))
+                self._last = encode(page_data(snapshot))
                 self._offer(self._last)
                 if snapshot.ended:
                     self._end = f"the run is over: {snapshot.ended}"
@@ -98,7 +98,7 @@ class Page:
             writer.close()
 
     async def _respond(self, request: Request, writer: asyncio.StreamWriter) -> None:
-        self._let_in(request)
+        self._authorize(request)
         match request.method, request.path:
             case "GET", "/":
                 writer.write(self._page())
@@ -117,11 +117,11 @@ class Page:
             case _:
                 raise HttpError(404, f"there is no {request.path}")
 
-    def _let_in(self, request: Request) -> None:
-        """Refuse whoever has no token, and names that other pages gave to this address.
+    def _authorize(self, request: Request) -> None:
+        """Check a request's token, and that it names this machine as host, against DNS rebinding.
 
         Raises:
-            HttpError: They may not.
+            HttpError: It is not allowed.
         """
         host = host_of(request.headers)
         if host not in _HOSTS:
@@ -160,7 +160,7 @@ class Page:
         )
 
     async def _events(self) -> AsyncIterator[bytes]:
-        page: asyncio.Queue[bytes | None] = asyncio.Queue(_STALE)
+        page: asyncio.Queue[bytes | None] = asyncio.Queue(_MAX_BACKLOG)
         self._pages.add(page)
         try:
             if self._last is not None:
@@ -188,7 +188,7 @@ class Page:
         return await self._client.ask(command)
 
 
-def shown(snapshot: Snapshot) -> dict[str, Any]:
+def page_data(snapshot: Snapshot) -> dict[str, Any]:
     """Return what the page shows of a snapshot."""
     return {
         "headline": headline(snapshot),
@@ -224,7 +224,7 @@ async def serve(client: Client, port: int, token: str | None = None, leave: bool
     try:
         if leave:
             await listening
-            await asyncio.sleep(0.5)  # the pages are told
+            await asyncio.sleep(0.5)  # the pages receive the end
         else:
             await asyncio.get_running_loop().create_future()
     finally:

@@ -1,6 +1,6 @@
-"""Traces: what each node did when, in real time and in the run's own, for ui.perfetto.dev.
+"""Traces: what each node did when, in real time and on the run's clock, for ui.perfetto.dev.
 
-`record` is on the loop and does next to nothing; `spool` keeps what it notes in a file; `causes`
-says which event led to which; `write` makes the trace of it when the run is over; `paths` reads
-a trace and tells how long sensors take to become set-points.
+`record` notes steps and events on the loop, `spool` keeps the notes in a file, `causes` finds which
+event led to which, `write` makes the trace when the run is over, and `paths` reads a trace and says
+how long it took from sensors to set-points.
 """

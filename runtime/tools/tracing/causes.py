@@ -1,13 +1,13 @@
-"""Which event led to which: from a sensor's, over what nodes made of it, to a set-point.
+"""Finds which event led to which: from a sensor's measurement, through nodes, to a set-point.
 
-No node says so, but three things tell, in this order of trust:
+Nodes don't declare it, so it is inferred by three rules, the most reliable first:
 
-1. an event has the stamp of one that its node heard: an estimate bears that of its image;
-2. its node sent it while it was given another event;
-3. its node had heard another event: a controller that works at a rate of its own takes the newest.
+1. An event has the stamp of one that its node received: an estimate has that of its image.
+2. Its node sent it while it handled another event.
+3. Its node had received another event: a controller with a rate of its own uses the newest.
 
-The third is no proof, and is marked as *held*: the latency of such a path is the age of the
-newest that the node could know.
+The third rule is a guess, and is marked as *held*: the latency of such a path is the age of the
+newest event that the node could have used.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from typing import Literal
 
 import msgspec
 
-from runtime.tools.tracing.spool import Kind
+from runtime.tools.tracing.spool import EventKind
 
 REMEMBERED = 512
-"""Stamps that a node's past goes back."""
+"""How many stamps of received events are kept per node."""
 
 IDENTITIES = 8192
-"""Events that can be found again by their identity."""
+"""How many events are kept by identity."""
 
 How = Literal["begins", "follows", "holds"]
 
 
 class SentEvent(msgspec.Struct, eq=False):
-    """One event, and what it came from.
+    """One event, and the event that it follows from.
 
     Attributes:
         time: Of `time.perf_counter_ns`, when it was sent.
@@ -41,7 +41,7 @@ class SentEvent(msgspec.Struct, eq=False):
         stamp: Its stamp.
         seen: Whether its path begins with a camera.
         how: ``begins`` a path, ``follows`` from `cause`, or ``holds`` it at best.
-        cause: What it came from.
+        cause: The event that it follows from.
     """
 
     time: int
@@ -64,8 +64,8 @@ class SentEvent(msgspec.Struct, eq=False):
         return found[::-1]
 
 
-class _Past:
-    """What a node has heard that comes from a sensor."""
+class _HeardEvents:
+    """The events a node has received that come from a sensor."""
 
     def __init__(self) -> None:
         self.by_stamp: OrderedDict[int, list[SentEvent]] = OrderedDict()
@@ -79,28 +79,30 @@ class _Past:
             self.newest = sent
 
     def of_stamp(self, stamp: int) -> Iterator[SentEvent]:
-        """Yield what was heard with this stamp, the best to build on first."""
+        """Yield the events with this stamp, the most likely cause first."""
         yield from sorted(
             self.by_stamp.get(stamp, ()), key=lambda s: (s.seen, s.time), reverse=True
         )
 
 
 class Causes:
-    """Follows events through the nodes, one by one in the order of sending.
+    """Infers the cause of each event, one by one in the order of sending.
 
     Args:
         kinds: What is known of types of events.
-        hearers: Who hears events of a sender, type and source.
+        receivers: The nodes that receive events of a sender, type and source.
     """
 
     def __init__(
-        self, kinds: Mapping[str, Kind], hearers: Mapping[tuple[str, str, str], tuple[str, ...]]
+        self,
+        kinds: Mapping[str, EventKind],
+        receivers: Mapping[tuple[str, str, str], tuple[str, ...]],
     ) -> None:
         self._kinds = kinds
-        self._hearers = hearers
-        self._pasts: dict[str, _Past] = {}
+        self._receivers = receivers
+        self._heard: dict[str, _HeardEvents] = {}
         self._by_identity: OrderedDict[int, tuple[SentEvent, tuple[str, ...]]] = OrderedDict()
-        """Events, and who heard them."""
+        """Events, and the nodes that received them."""
 
     def add(
         self,
@@ -113,7 +115,7 @@ class Causes:
         identity: int,
         given: int,
     ) -> SentEvent:
-        """Take the next event and return it with what it came from.
+        """Add the next event and return it with its cause.
 
         Args:
             time: Of sending, real time (ns).
@@ -123,47 +125,47 @@ class Causes:
             source: Its source.
             stamp: Its stamp.
             identity: Its `id`.
-            given: The `id` of what the step that sent it had been given; 0 if nothing.
+            given: The `id` of the event that the step which sent it was handling; 0 if none.
         """
         node, kind = sender.partition(".")[0], self._kinds[event]
         sent = SentEvent(time, run, node, event, source, stamp)
         # Another event may lie where one lay that has come from elsewhere.
         found, heard = self._by_identity.get(given, (None, ()))
         self._trace_back(sent, kind, found if node in heard else None)
-        sent.seen = kind.seen if sent.cause is None else sent.cause.seen
-        hearers = self._hearers.get((sender, event, source), ())
-        self._by_identity[identity] = sent, hearers
+        sent.seen = kind.image if sent.cause is None else sent.cause.seen
+        receivers = self._receivers.get((sender, event, source), ())
+        self._by_identity[identity] = sent, receivers
         self._by_identity.move_to_end(identity)
         if len(self._by_identity) > IDENTITIES:
             self._by_identity.popitem(last=False)
-        if not kind.asked and (kind.sensed or sent.cause is not None):
-            for hearer in hearers:
-                if hearer != node:
-                    self._pasts.setdefault(hearer, _Past()).add(sent)
+        if not kind.setpoint and (kind.measured or sent.cause is not None):
+            for receiver in receivers:
+                if receiver != node:
+                    self._heard.setdefault(receiver, _HeardEvents()).add(sent)
         return sent
 
-    def _trace_back(self, sent: SentEvent, kind: Kind, given: SentEvent | None) -> None:
-        past = self._pasts.get(sent.node) or _Past()
+    def _trace_back(self, sent: SentEvent, kind: EventKind, given: SentEvent | None) -> None:
+        past = self._heard.get(sent.node) or _HeardEvents()
         if given is not None and (given.node == sent.node or not self._leads_anywhere(given)):
             given = None
         followed: list[SentEvent] = []
-        if not kind.asked:  # whose stamp is when it was sent, and tells nothing
+        if not kind.setpoint:  # whose stamp is when it was sent, and tells nothing
             if given is not None and given.stamp == sent.stamp:
                 followed.append(given)
             followed += past.of_stamp(sent.stamp)
-        if given is not None and not kind.sensed:
+        if given is not None and not kind.measured:
             followed.append(given)
         for cause in followed:
             if _passes(cause, sent.node):
                 sent.cause, sent.how = cause, "follows"
                 return
         newest = past.newest
-        if newest is not None and not kind.sensed and _passes(newest, sent.node):
+        if newest is not None and not kind.measured and _passes(newest, sent.node):
             sent.cause, sent.how = newest, "holds"
 
     def _leads_anywhere(self, sent: SentEvent) -> bool:
         kind = self._kinds[sent.event]
-        return not kind.asked and (kind.sensed or sent.cause is not None)
+        return not kind.setpoint and (kind.measured or sent.cause is not None)
 
 
 def _passes(sent: SentEvent, node: str) -> bool:

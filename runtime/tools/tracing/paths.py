@@ -1,6 +1,6 @@
-"""Reading a trace: how long paths from sensor to set-point take, and who has the loop.
+"""Reads a trace: how long paths from sensor to set-point take, and which nodes load the loop.
 
-Works on any trace that `runtime.tools.tracing.write` wrote; knows nothing of a run.
+Works on any trace that `runtime.tools.tracing.write` wrote, without the run.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Trace(msgspec.Struct, rename={"events": "traceEvents", "about": "otherData
     about: dict[str, str] = {}
 
 
-class Route(msgspec.Struct, frozen=True):
-    """How long one way from a sensor to a set-point took.
+class PathLatency(msgspec.Struct, frozen=True):
+    """How long one path from a sensor to a set-point took.
 
     Attributes:
         path: The events on it.
@@ -49,8 +49,8 @@ class Route(msgspec.Struct, frozen=True):
     real_ms: list[float]
 
 
-class Share(msgspec.Struct, frozen=True):
-    """What one node had of the loop.
+class NodeLoad(msgspec.Struct, frozen=True):
+    """How much of the loop's time one node took.
 
     Attributes:
         node: Its name.
@@ -92,45 +92,45 @@ def read_trace(path: Path) -> Trace:
     return trace
 
 
-def paths(trace: Trace) -> list[Route]:
-    """Return the latencies of all paths, the most trodden first."""
-    found: dict[str, Route] = {}
+def paths(trace: Trace) -> list[PathLatency]:
+    """Return the latencies of all paths, the most frequent first."""
+    found: dict[str, PathLatency] = {}
     for event in trace.events:
         if "path" in event.args:
             name = event.args["path"]
-            path = found.setdefault(name, Route(name, [], []))
+            path = found.setdefault(name, PathLatency(name, [], []))
             path.run_ms.append(event.args["run_ms"])
             path.real_ms.append(event.args["real_ms"])
     return sorted(found.values(), key=lambda path: -len(path.run_ms))
 
 
-def shares(trace: Trace) -> list[Share]:
-    """Return what each node had of the loop, the busiest first."""
+def node_loads(trace: Trace) -> list[NodeLoad]:
+    """Return how much of the loop's time each node took, the busiest first."""
     names = {e.tid: e.args["name"] for e in trace.events if e.ph == "M" and e.name == "thread_name"}
     slices = [
         e for e in trace.events if e.ph == "X" and e.pid == LOOP and not e.name.startswith("send ")
     ]
     slices.sort(key=lambda e: (e.ts, -e.dur))
-    alone = _alone(slices)
+    own_times = _own_times(slices)
     total = max((e.ts + e.dur for e in slices), default=0.0) - (slices[0].ts if slices else 0.0)
     by_node: dict[str, list[tuple[float, str]]] = {}
-    for each, own in zip(slices, alone, strict=True):
+    for each, own in zip(slices, own_times, strict=True):
         by_node.setdefault(names[each.tid], []).append((own, each.name))
     found = []
     for node, steps in by_node.items():
         busy, (longest, what) = sum(own for own, _ in steps), max(steps)
         share = busy / total if total else 0.0
-        found.append(Share(node, len(steps), busy / 1e3, share, longest / 1e3, what))
+        found.append(NodeLoad(node, len(steps), busy / 1e3, share, longest / 1e3, what))
     return sorted(found, key=lambda each: -each.busy_ms)
 
 
 def quantile(values: list[float], q: float) -> float:
-    """Return the value below or at which a share `q` of them lies."""
+    """Return the value that a share `q` of all values does not exceed."""
     ordered = sorted(values)
     return ordered[min(int(q * len(ordered)), len(ordered) - 1)]
 
 
-def _alone(slices: list[TraceEvent]) -> list[float]:
+def _own_times(slices: list[TraceEvent]) -> list[float]:
     """Return how long each slice took (µs) without those within it; sorted by beginning."""
     alone = [each.dur for each in slices]
     open_: list[int] = []

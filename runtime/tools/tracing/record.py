@@ -1,4 +1,4 @@
-"""Noting steps and events while the run runs: a tuple each, and nothing else on the loop."""
+"""An instrument that notes a run's steps and events: no more than a tuple each on the loop."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from runtime.instruments import Call, Instrument
 from runtime.real_clock import RealClock
 from runtime.sender import Sender, Tap
 from runtime.supervisor import Supervisor
-from runtime.tools.tracing.spool import CHUNK, Pace, Spool
+from runtime.tools.tracing.spool import CHUNK, ClockRate, Spool
 from runtime.tools.tracing.write import write_trace
 
 log = logging.getLogger("visnav.runtime")
 
 
-class Recorder(Instrument):
+class TraceInstrument(Instrument):
     """An instrument that notes what it sees, for a `Spool`.
 
     Each note is a tuple that begins with its kind::
@@ -36,7 +36,7 @@ class Recorder(Instrument):
         "worker", process, method, asked, answered
 
     Times are nanoseconds of `time.perf_counter_ns`; `run` and `stamp` are of the run's clock, but
-    for `run` in real time (see `Pace`).
+    for `run` in real time (see `ClockRate`).
     An identity is `id` of the event; a cause is the identity of the event that the innermost step
     was given, or 0.
 
@@ -127,7 +127,7 @@ class Recorder(Instrument):
         """Hand over what is left, while the run's clock still goes."""
         if isinstance(self._clock, RealClock):
             real, run, speed = time.perf_counter_ns(), self._clock.now(), self._clock.speed
-            self._spool.pace = Pace(round(real - run / speed), speed)
+            self._spool.rate = ClockRate(round(real - run / speed), speed)
         self._flush()
 
     def _flush(self) -> None:
@@ -155,7 +155,7 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
         raise ConfigError(
             f"{path}: expected a place for a trace, found: {error.strerror}"
         ) from None
-    recorder = Recorder(supervisor.state.clock, spool)
+    recorder = TraceInstrument(supervisor.state.clock, spool)
     supervisor.instruments.attach(recorder)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Keeping notes in a file while a run goes on, so that memory stays bounded.
+"""A file of notes, written while a run goes on, so that memory stays bounded.
 
 A thread encodes a list of notes at a time, which is short enough not to be felt on the loop. What
 the notes mean is in `runtime.tools.tracing.record`.
@@ -27,22 +27,22 @@ CHUNK = 1024
 _LENGTH_BYTES = 4
 
 
-class Kind(msgspec.Struct, frozen=True):
+class EventKind(msgspec.Struct, frozen=True):
     """What a trace must know of a type of event.
 
     Attributes:
-        sensed: A sensor's: a path may begin with it.
-        seen: A camera's: preferred to other sensors'.
-        asked: A set-point: a path ends with it.
+        measured: Whether it is a sensor's: a path may begin with it.
+        image: Whether it is a camera's, which is preferred to other sensors'.
+        setpoint: Whether it is a set-point: a path ends with it.
     """
 
-    sensed: bool
-    seen: bool
-    asked: bool
+    measured: bool
+    image: bool
+    setpoint: bool
 
 
-class Pace(NamedTuple):
-    """How the run's clock goes in real time; `run` of a note is then real time, too.
+class ClockRate(NamedTuple):
+    """How the run's clock follows real time; `run` of a note is then real time, too.
 
     Attributes:
         origin: When the run's clock showed 0.
@@ -65,18 +65,18 @@ class Spool:
 
     Attributes:
         beside: Notes of other threads than the loop's.
-        pace: Of the run's clock, if that is real; known at the end.
+        rate: Of the run's clock, if that is real; known at the end.
         kinds: What is known of each type of event, by name.
-        hearers: Nodes that hear events of a sender, type and source.
+        receivers: Nodes that hear events of a sender, type and source.
     """
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.beside: deque[tuple[Any, ...]] = deque()
-        self.pace: Pace | None = None
-        self.kinds: dict[str, Kind] = {}
-        self.hearers: dict[tuple[str, str, str], tuple[str, ...]] = {}
+        self.rate: ClockRate | None = None
+        self.kinds: dict[str, EventKind] = {}
+        self.receivers: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.origin = time.perf_counter_ns()
         """Before all that is noted."""
         self.failed: OSError | None = None
@@ -138,16 +138,16 @@ class Spool:
         _, time, run, sender, event, source, stamp, identity, cause, listeners = note
         name = "run.announced" if sender is None else sender.name
         key = (name, event.__name__, source)
-        if key not in self.hearers:
+        if key not in self.receivers:
             heard = (each.node for each in listeners or () if each.hears(event, source))
-            self.hearers[key] = tuple(dict.fromkeys(heard))
+            self.receivers[key] = tuple(dict.fromkeys(heard))
             self.kinds[event.__name__] = _kind(event)
         return ("event", time, run, *key, stamp, identity, cause)
 
 
-def _kind(event: type[Event]) -> Kind:
-    return Kind(
-        sensed=bool(event.category & (Category.SENSOR | Category.GEOMETRY)),
-        seen=issubclass(event, Image),
-        asked=issubclass(event, Setpoint),
+def _kind(event: type[Event]) -> EventKind:
+    return EventKind(
+        measured=bool(event.category & (Category.SENSOR | Category.GEOMETRY)),
+        image=issubclass(event, Image),
+        setpoint=issubclass(event, Setpoint),
     )

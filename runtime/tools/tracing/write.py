@@ -1,4 +1,4 @@
-"""Making a trace of notes: JSON trace events, which ui.perfetto.dev and chrome://tracing open.
+"""Makes a trace of notes: JSON trace events, which ui.perfetto.dev and chrome://tracing open.
 
 Format: "Trace Event Format", the Chromium project's document of 2016.
 Its time stamps are microseconds of real time; the run's clock stands in the arguments.
@@ -15,13 +15,13 @@ from typing import IO, Any
 import msgspec
 
 from runtime.tools.tracing.causes import Causes, SentEvent
-from runtime.tools.tracing.spool import Pace, Spool
+from runtime.tools.tracing.spool import ClockRate, Spool
 
 MADE_BY = "python -m runtime run --trace"
-"""Tells our traces from others."""
+"""Marks a trace as one of ours."""
 
 LOOP, THREADS, WORKERS, SENSORS = 1, 2, 3, 4
-"""Numbers of what the trace shows as processes."""
+"""Process numbers of the trace's groups of tracks."""
 
 _TITLES = {
     LOOP: "nodes on the event loop",
@@ -30,8 +30,8 @@ _TITLES = {
     SENSORS: "exposures",
 }
 _MOMENT = 0.1
-"""Microseconds that a moment is given, so that an arrow has something to begin at. What follows
-comes later: between reading the time and delivering an event lies the note itself."""
+"""Microseconds that the slice of an instant lasts, so that an arrow can begin there. It overlaps
+nothing: an event is delivered later than that, as the note itself is made in between."""
 
 
 def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Iterable[str]) -> None:
@@ -62,12 +62,12 @@ def _open(path: Path) -> IO[bytes]:
 
 
 class _Writer:
-    """Turns notes into trace events, one after the other."""
+    """Turns notes into trace events, one by one."""
 
     def __init__(self, spool: Spool, nodes: Iterable[str]) -> None:
         self._spool = spool
-        self._causes = Causes(spool.kinds, spool.hearers)
-        self._moments = _Moments(spool.pace)
+        self._causes = Causes(spool.kinds, spool.receivers)
+        self._moments = _Moments(spool.rate)
         self._tracks: dict[tuple[int, str], int] = {}
         self._answered: dict[str, int] = {}
         self._flows = 0
@@ -77,8 +77,8 @@ class _Writer:
     def events(self) -> Iterator[dict[str, Any]]:
         """Yield the trace's events."""
         for process, title in _TITLES.items():
-            yield _about("process_name", process, 0, name=title)
-            yield _about("process_sort_index", process, 0, sort_index=process)
+            yield _metadata("process_name", process, 0, name=title)
+            yield _metadata("process_sort_index", process, 0, sort_index=process)
         for node in self._nodes:
             yield from self._track(LOOP, node)
         for kind, *note in self._spool.read():
@@ -94,8 +94,8 @@ class _Writer:
     def _track(self, process: int, name: str) -> Iterator[dict[str, Any]]:
         if (process, name) not in self._tracks:
             number = self._tracks[process, name] = len(self._tracks) + 1
-            yield _about("thread_name", process, number, name=name)
-            yield _about("thread_sort_index", process, number, sort_index=number)
+            yield _metadata("thread_name", process, number, name=name)
+            yield _metadata("thread_sort_index", process, number, sort_index=number)
 
     def _slice(
         self, process: int, track: str, name: str, begin: int, end: float | None, **args: Any
@@ -129,7 +129,7 @@ class _Writer:
         given: int,
     ) -> Iterator[dict[str, Any]]:
         run = self._moments.add(time, run)
-        said = self._causes.add(time, run, sender, event, source, stamp, identity, given)
+        sent = self._causes.add(time, run, sender, event, source, stamp, identity, given)
         args: dict[str, Any] = {
             "port": sender,
             "source": source,
@@ -137,21 +137,21 @@ class _Writer:
             "stamp_s": stamp / 1e9,
         }
         path: list[SentEvent] = []
-        if self._spool.kinds[event].asked and said.cause is not None:
-            path = said.path()
+        if self._spool.kinds[event].setpoint and sent.cause is not None:
+            path = sent.path()
             begin = self._exposure(path[0])
             args |= {
                 "path": describe(path),
                 "run_ms": (run - path[0].stamp) / 1e6,
                 "real_ms": round((time - begin) / 1e6, 6),
             }
-        yield from self._slice(LOOP, said.node, f"send {event}", time, None, **args)
+        yield from self._slice(LOOP, sent.node, f"send {event}", time, None, **args)
         if path:
             yield from self._flow(path)
 
-    def _exposure(self, said: SentEvent) -> int:
+    def _exposure(self, sent: SentEvent) -> int:
         """Return when in real time a sensor's event was true."""
-        return min(self._moments.of(said.stamp, said.time), said.time)
+        return min(self._moments.of(sent.stamp, sent.time), sent.time)
 
     def _flow(self, path: list[SentEvent]) -> Iterator[dict[str, Any]]:
         """Draw arrows from an exposure over all that was sent to a set-point."""
@@ -198,19 +198,19 @@ class _Writer:
 
 
 class _Moments:
-    """When in real time the run's clock showed what."""
+    """The real times at which the run's clock showed its times."""
 
     KEPT = 100_000
 
-    def __init__(self, pace: Pace | None) -> None:
-        self._pace = pace
+    def __init__(self, rate: ClockRate | None) -> None:
+        self._rate = rate
         self._runs: list[int] = []
         self._times: list[int] = []
 
     def add(self, time: int, run: int) -> int:
         """Note that the clock showed `run` at `time`; return what it really showed then."""
-        if self._pace is not None:
-            return self._pace.run(run)
+        if self._rate is not None:
+            return self._rate.run(run)
         if not self._runs or run > self._runs[-1]:
             self._runs.append(run)
             self._times.append(time)
@@ -220,8 +220,8 @@ class _Moments:
 
     def of(self, stamp: int, latest: int) -> int:
         """Return when the clock showed `stamp`; `latest` if that is not known."""
-        if self._pace is not None:
-            return round(self._pace.origin + stamp / self._pace.speed)
+        if self._rate is not None:
+            return round(self._rate.origin + stamp / self._rate.speed)
         index = bisect.bisect_left(self._runs, stamp)
         return self._times[index] if index < len(self._times) else latest
 
@@ -234,5 +234,5 @@ def describe(path: list[SentEvent]) -> str:
     )
 
 
-def _about(what: str, process: int, track: int, **args: Any) -> dict[str, Any]:
+def _metadata(what: str, process: int, track: int, **args: Any) -> dict[str, Any]:
     return {"ph": "M", "name": what, "pid": process, "tid": track, "args": args}

@@ -1,4 +1,4 @@
-"""A snapshot, and a connection to a run that is none."""
+"""A snapshot, and a fake client."""
 
 from __future__ import annotations
 
@@ -25,7 +25,13 @@ from runtime.tools.monitor.snapshot import (
 def snapshot(**changes: Any) -> Snapshot:
     """Return a snapshot of a run with a drone and a pilot; `clock_…` changes its clock."""
     clock = ClockState(
-        kind="lockstep", now=1.5, duration=60.0, speed=2.0, asked=None, paused=False, fixed=""
+        kind="lockstep",
+        now=1.5,
+        duration=60.0,
+        speed=2.0,
+        target_speed=None,
+        paused=False,
+        fixed="",
     )
     of_clock = {k.removeprefix("clock_"): v for k, v in changes.items() if k.startswith("clock_")}
     common: dict[str, Any] = {"failures": 0, "share": 0.25, "steps": 400.0, "longest_ms": 1.25}
@@ -73,8 +79,8 @@ def snapshot(**changes: Any) -> Snapshot:
     return msgspec.structs.replace(found, **rest)
 
 
-class Stand:
-    """Stands for a `Client`: yields what it is given, and remembers what it was asked."""
+class FakeClient:
+    """Takes the place of a `Client`: yields the snapshots it is given, and keeps the commands."""
 
     def __init__(self, *snapshots: Snapshot | None) -> None:
         self.asked: list[Command] = []
@@ -90,7 +96,7 @@ class Stand:
     async def ask(self, command: Command) -> Answer:
         """Remember a command."""
         self.asked.append(command)
-        return Answer(number=0, done=True, text="so be it")
+        return Answer(number=0, done=True, text="done")
 
     async def image(self, camera: str) -> bytes:
         """Return something for the one camera there is."""

@@ -13,7 +13,7 @@ from runtime.errors import VisnavError
 from runtime.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.monitor.command import Pause, Restart, Set, Speed, Step, Stop
-from runtime.tools.monitor.observer import Observer, told
+from runtime.tools.monitor.observer import Observer, describe
 from runtime.tools.monitor.records import LastRecords
 from runtime.tools.monitor.snapshot import Snapshot
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
@@ -105,13 +105,13 @@ def test_looking_changes_nothing_of_what_is_said() -> None:
 def test_a_node_is_restarted_once_at_a_time() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         await supervisor.state.clock.sleep(0.1)
-        assert observer.do(Restart(node="vo")) == "vo restarts"
+        assert observer.execute(Restart(node="vo")) == "vo restarts"
         await supervisor.state.clock.sleep(0.1)
         assert node(observer.take(), "vo").condition == "restarting"
         with pytest.raises(VisnavError, match="expected a node that runs, and vo is restarting"):
-            observer.do(Restart(node="vo"))
+            observer.execute(Restart(node="vo"))
         with pytest.raises(VisnavError, match="found 'v0'"):
-            observer.do(Restart(node="v0"))
+            observer.execute(Restart(node="v0"))
         await supervisor.state.clock.sleep(0.5)
         found = node(observer.take(), "vo")
         assert (found.condition, found.failures) == ("running", 1)
@@ -122,13 +122,13 @@ def test_a_node_is_restarted_once_at_a_time() -> None:
 def test_commands_end_the_run_and_change_settings() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         await supervisor.state.clock.sleep(0.1)
-        assert observer.do(Set(text="pilot.gain=2")) == "gain = 2.0"
-        assert observer.do(Set(text="pilot.gain=2")) == "as it was"
-        assert observer.do(Stop()) == "ends"
+        assert observer.execute(Set(text="pilot.gain=2")) == "gain = 2.0"
+        assert observer.execute(Set(text="pilot.gain=2")) == "as it was"
+        assert observer.execute(Stop()) == "ends"
         assert observer.take().ended == "stopped by hand"
 
     assert observe(script).supervisor.state.reason == "stopped by hand"
-    assert told(Step(seconds=0.5)) == "step 0.5"
+    assert describe(Step(seconds=0.5)) == "step 0.5"
 
 
 def test_a_run_ends_in_order_though_time_stands() -> None:
@@ -146,8 +146,8 @@ def test_a_run_ends_in_order_though_time_stands() -> None:
         supervisor.state.config = config
         observer = Observer(supervisor, config, LastRecords())
         await supervisor.state.clock.sleep(0.1)
-        observer.do(Pause())
-        observer.do(Stop())
+        observer.execute(Pause())
+        observer.execute(Stop())
 
     assert (
         look([*NODES[:2], spec(Slow, "pilot")], body).supervisor.state.reason == "stopped by hand"
@@ -159,7 +159,7 @@ def test_a_run_ends_in_order_though_time_stands() -> None:
 def test_real_time_takes_no_orders(command: Any) -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         with pytest.raises(VisnavError, match="in real time, which cannot be stopped"):
-            observer.do(command)
+            observer.execute(command)
         assert "sensors do not wait" in observer.take().clock.fixed
 
     observe(script, clock="real", duration=0.02)

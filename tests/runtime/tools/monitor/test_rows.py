@@ -28,7 +28,9 @@ def test_the_headline_tells_time_pace_and_end() -> None:
     assert headline(snapshot()) == (
         "sample   1.500 of 60 s   2.00 × real time (as fast as it can)   runs"
     )
-    assert headline(snapshot(clock_asked=0.5, clock_paused=True)).endswith("(asked: 0.5)   paused")
+    assert headline(snapshot(clock_target_speed=0.5, clock_paused=True)).endswith(
+        "(asked: 0.5)   paused"
+    )
     assert headline(snapshot(clock_duration=0.0, clock_kind="real", ended="Ctrl-C")) == (
         "sample   1.500 s   2.00 × real time (real)   ends: Ctrl-C"
     )

@@ -26,11 +26,11 @@ from runtime.tools.monitor.command import (
 )
 from runtime.tools.monitor.screen import Screen
 from runtime.tools.monitor.snapshot import Snapshot
-from tests.runtime.tools.monitor.samples import Stand, snapshot
+from tests.runtime.tools.monitor.samples import FakeClient, snapshot
 
 
 @asynccontextmanager
-async def shown(stand: Stand, **options: Any) -> AsyncIterator[tuple[Screen, Pilot[Any]]]:
+async def shown(stand: FakeClient, **options: Any) -> AsyncIterator[tuple[Screen, Pilot[Any]]]:
     screen = Screen(stand, **options)
     async with screen.run_test(size=(140, 40)) as pilot:
         await pilot.pause()
@@ -42,7 +42,7 @@ def text(screen: Screen, name: str) -> str:
 
 
 async def test_it_shows_what_there_is_and_keeps_the_cursor() -> None:
-    stand = Stand(snapshot())
+    stand = FakeClient(snapshot())
     async with shown(stand) as (screen, pilot):
         assert text(screen, "head").startswith("sample   1.500 of 60 s")
         nodes: DataTable[Any] = screen.query_one("#nodes", DataTable)
@@ -63,7 +63,7 @@ async def test_it_shows_what_there_is_and_keeps_the_cursor() -> None:
 
 @pytest.mark.slow
 async def test_keys_ask_the_run() -> None:
-    stand = Stand(snapshot())
+    stand = FakeClient(snapshot())
     presses: list[tuple[list[str], list[Any]]] = [
         (["space"], [Pause()]),
         (["full_stop", "s"], [Step(), Step(seconds=1.0)]),
@@ -80,7 +80,7 @@ async def test_keys_ask_the_run() -> None:
             await pilot.pause()
             assert stand.asked == commands
         stand.asked.clear()
-        stand.coming.put_nowait(snapshot(clock_paused=True, clock_asked=SLOWEST))
+        stand.coming.put_nowait(snapshot(clock_paused=True, clock_target_speed=SLOWEST))
         await pilot.pause()
         await pilot.press("minus", "space", "space")
         await pilot.pause()
@@ -88,7 +88,7 @@ async def test_keys_ask_the_run() -> None:
 
 
 async def test_a_run_that_does_not_answer_does_not_hold_up_the_keys() -> None:
-    class Deaf(Stand):
+    class Deaf(FakeClient):
         async def ask(self, command: Command) -> Answer:
             await super().ask(command)
             return await asyncio.Event().wait()  # type: ignore[return-value]
@@ -102,7 +102,7 @@ async def test_a_run_that_does_not_answer_does_not_hold_up_the_keys() -> None:
 
 
 async def test_what_is_not_to_be_understood_is_told() -> None:
-    class Foreign(Stand):
+    class Foreign(FakeClient):
         async def snapshots(self) -> AsyncIterator[Snapshot]:
             raise CommandError("expected a run of this version")
             yield
@@ -113,7 +113,7 @@ async def test_what_is_not_to_be_understood_is_told() -> None:
 
 @pytest.mark.slow
 async def test_a_parameter_is_asked_for_below() -> None:
-    stand = Stand(snapshot())
+    stand = FakeClient(snapshot())
     async with shown(stand) as (screen, pilot):
         await pilot.press("down", "p")
         prompt = screen.query_one("#prompt", Input)
@@ -127,11 +127,11 @@ async def test_a_parameter_is_asked_for_below() -> None:
 
 
 async def test_it_says_when_the_run_is_over_and_leaves_if_it_should() -> None:
-    stand = Stand(snapshot(ended="duration"), None)
+    stand = FakeClient(snapshot(ended="duration"), None)
     async with shown(stand) as (screen, _):
         assert text(screen, "head") == "the run is over: duration"
         assert screen.is_running
-    stand = Stand(None)
+    stand = FakeClient(None)
     async with shown(stand, leave=True) as (screen, pilot):
         await pilot.pause()
         assert not screen.is_running

@@ -190,7 +190,7 @@ def test_a_monitor_that_fails_leaves_the_run_alone(monkeypatch: pytest.MonkeyPat
 def test_those_who_read_nothing_do_not_hold_up_the_end(
     monkeypatch: pytest.MonkeyPatch, sockets: Path
 ) -> None:
-    monkeypatch.setattr(server, "PARTING", 0.1)
+    monkeypatch.setattr(server, "CLOSING_TIMEOUT", 0.1)
     long = LogLine(number=0, seconds=0.0, level="INFO", speaker="x", text="x" * 400_000)
     monkeypatch.setattr(LastRecords, "lines", lambda _: [long])
     enough = threading.Event()
@@ -236,7 +236,7 @@ async def test_who_reads_no_answers_is_asked_for_no_more() -> None:
     reader, stuck = asyncio.StreamReader(), Stuck()
     reader.feed_data(b"nonsense\n" * 100)
     serving: Any = server.Server(None, asyncio.get_running_loop(), Path())  # type: ignore[arg-type]
-    task = asyncio.create_task(serving._attend(reader, stuck))
+    task = asyncio.create_task(serving._serve_client(reader, stuck))
     for _ in range(300):
         await asyncio.sleep(0)
     assert stuck.written == 1
@@ -271,8 +271,8 @@ async def test_measuring_begins_and_ends_with_those_who_watch(
     watch.feed_data(b'{"type":"watch"}\n')
     watch.feed_eof()
     publishing = asyncio.create_task(serving._publish())
-    await serving._attend(watch, one)  # and is gone
-    await serving._hear(b'{"type":"watch"}', other)
+    await serving._serve_client(watch, one)  # and is gone
+    await serving._handle_line(b'{"type":"watch"}', other)
     for _ in range(100):
         await asyncio.sleep(0)
     serving._watching.clear()
@@ -300,7 +300,7 @@ def test_an_error_of_the_monitors_own_is_an_answer(monkeypatch: pytest.MonkeyPat
     def fail(_: Observer, __: Command) -> str:
         raise RuntimeError("no hands")
 
-    monkeypatch.setattr(Observer, "do", fail)
+    monkeypatch.setattr(Observer, "execute", fail)
 
     def outside() -> None:
         with pytest.raises(VisnavError, match="could not do it, and its log says why"):
@@ -310,7 +310,7 @@ def test_an_error_of_the_monitors_own_is_an_answer(monkeypatch: pytest.MonkeyPat
 
 
 async def test_a_late_answer_and_the_end_disturb_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client, "PATIENCE", 0.0)
+    monkeypatch.setattr(client, "ANSWER_TIMEOUT", 0.0)
     reader = asyncio.StreamReader()
     connection = Client(reader, Mock())
     assert (await connection.ask(Stop())).text == "the run does not answer"
@@ -318,7 +318,7 @@ async def test_a_late_answer_and_the_end_disturb_nobody(monkeypatch: pytest.Monk
     reader.feed_data(encode(snapshot()) + b"\n")
     reader.feed_eof()
     assert [seen.run async for seen in connection.snapshots()] == ["sample"]
-    monkeypatch.setattr(client, "PATIENCE", 60.0)
+    monkeypatch.setattr(client, "ANSWER_TIMEOUT", 60.0)
     assert (await connection.ask(Stop())).text == "the run is over"
     with pytest.raises(VisnavError, match="the run is over"):
         await connection.image("drone.images: drone/front")

@@ -120,14 +120,14 @@ def test_a_speed_holds_from_now_on_and_can_be_taken_back() -> None:
     loop = LockstepLoop(speed=2.0)
     try:
         keeper = Timekeeper(LockstepClock(loop))
-        assert keeper.asked == 2.0
+        assert keeper.target_speed == 2.0
         loop.now = 1_000_000_000
         loop._wall_origin = 5.0
         keeper.pace(4.0)
-        assert keeper.asked == 4.0
+        assert keeper.target_speed == 4.0
         assert loop._wall_origin is None  # or it would hurry to where it was going
         keeper.pace(None)
-        assert keeper.asked is None
+        assert keeper.target_speed is None
     finally:
         loop.close()
 

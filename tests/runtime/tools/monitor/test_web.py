@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 from runtime.tools.monitor.command import Pause, Set
-from runtime.tools.monitor.web import Page, shown
-from tests.runtime.tools.monitor.samples import Stand, snapshot
+from runtime.tools.monitor.web import Page, page_data
+from tests.runtime.tools.monitor.samples import FakeClient, snapshot
 
 TOKEN = "abc"
 
 
 @asynccontextmanager
-async def serving(stand: Stand) -> AsyncIterator[int]:
+async def serving(stand: FakeClient) -> AsyncIterator[int]:
     page = Page(stand, TOKEN)  # type: ignore[arg-type]  # it stands for a client
     server = await asyncio.start_server(page.serve, "127.0.0.1", 0)
     listening = asyncio.create_task(page.listen())
@@ -51,7 +51,7 @@ def post(body: str, token: str = TOKEN) -> str:
 
 
 async def test_the_page_comes_with_the_token_and_runs_no_script_but_its_own() -> None:
-    async with serving(Stand()) as port:
+    async with serving(FakeClient()) as port:
         page = await say(port, get(f"/?token={TOKEN}"))
     head, _, content = page.partition("\r\n\r\n")
     assert head.startswith("HTTP/1.1 200")
@@ -84,12 +84,12 @@ async def test_the_page_comes_with_the_token_and_runs_no_script_but_its_own() ->
     ],
 )
 async def test_whoever_should_not_is_sent_away(request_: str, status: int) -> None:
-    async with serving(Stand()) as port:
+    async with serving(FakeClient()) as port:
         assert (await say(port, request_)).startswith(f"HTTP/1.1 {status} ")
 
 
 async def test_the_page_shows_at_once_what_is_known() -> None:
-    stand = Stand(snapshot())
+    stand = FakeClient(snapshot())
     async with serving(stand) as port:
         await say(port, get(f"/?token={TOKEN}"))
         page = await say(port, get(f"/?token={TOKEN}"))
@@ -101,7 +101,7 @@ async def test_the_page_shows_at_once_what_is_known() -> None:
 
 
 async def test_the_image_of_the_chosen_camera_is_served() -> None:
-    async with serving(Stand(snapshot())) as port:
+    async with serving(FakeClient(snapshot())) as port:
         camera = "drone.images:%20drone/front"
         head, _, jpeg = (await say(port, get(f"/image?token={TOKEN}&camera={camera}"))).partition(
             "\r\n\r\n"
@@ -113,11 +113,11 @@ async def test_the_image_of_the_chosen_camera_is_served() -> None:
 
 
 async def test_commands_go_to_the_run_if_they_bear_the_token() -> None:
-    stand = Stand()
+    stand = FakeClient()
     async with serving(stand) as port:
         for body in ('{"do":"pause"}', '{"do":"set","text":"pilot.gain=2"}'):
             answer = (await say(port, post(body), body)).partition("\r\n\r\n")[2]
-            assert json.loads(answer)["text"] == "so be it"
+            assert json.loads(answer)["text"] == "done"
         assert "403" in await say(port, post('{"do":"stop"}', token="x"), '{"do":"stop"}')
         refused = await say(port, post('{"do":"explode"}'), '{"do":"explode"}')
         assert refused.startswith("HTTP/1.1 400")
@@ -126,7 +126,7 @@ async def test_commands_go_to_the_run_if_they_bear_the_token() -> None:
 
 
 async def test_snapshots_come_as_events_and_so_does_the_end() -> None:
-    stand = Stand(snapshot())
+    stand = FakeClient(snapshot())
     async with serving(stand) as port:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(f"{get(f'/events?token={TOKEN}')}\r\n\r\n".replace("PORT", "1").encode())
@@ -152,7 +152,7 @@ async def test_snapshots_come_as_events_and_so_does_the_end() -> None:
 
 
 async def test_a_page_that_is_slow_still_sees_how_it_ended() -> None:
-    page = Page(Stand(*(snapshot() for _ in range(9)), snapshot(ended="duration"), None))  # type: ignore[arg-type]
+    page = Page(FakeClient(*(snapshot() for _ in range(9)), snapshot(ended="duration"), None))  # type: ignore[arg-type]
 
     async def look() -> list[bytes]:
         return [event async for event in page._events()]
@@ -167,5 +167,5 @@ async def test_a_page_that_is_slow_still_sees_how_it_ended() -> None:
 
 
 def test_faster_starts_from_a_speed_even_when_time_stands() -> None:
-    assert shown(snapshot(clock_paused=True, clock_speed=0.0))["speed"] == 1.0
-    assert shown(snapshot(clock_asked=0.5))["speed"] == 0.5
+    assert page_data(snapshot(clock_paused=True, clock_speed=0.0))["speed"] == 1.0
+    assert page_data(snapshot(clock_target_speed=0.5))["speed"] == 0.5

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from runtime.tools.tracing.causes import Causes, SentEvent
-from runtime.tools.tracing.spool import Kind
+from runtime.tools.tracing.spool import EventKind
 
 KINDS = {
-    "Image": Kind(sensed=True, seen=True, asked=False),
-    "Imu": Kind(sensed=True, seen=False, asked=False),
-    "Pose": Kind(sensed=False, seen=False, asked=False),
-    "Setpoint": Kind(sensed=False, seen=False, asked=True),
-    "Note": Kind(sensed=False, seen=False, asked=False),
+    "Image": EventKind(measured=True, image=True, setpoint=False),
+    "Imu": EventKind(measured=True, image=False, setpoint=False),
+    "Pose": EventKind(measured=False, image=False, setpoint=False),
+    "Setpoint": EventKind(measured=False, image=False, setpoint=True),
+    "Note": EventKind(measured=False, image=False, setpoint=False),
 }
 HEARERS = {
     ("drone.images", "Image", "drone"): ("vo", "pilot"),

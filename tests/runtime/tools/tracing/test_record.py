@@ -10,7 +10,7 @@ from typing import Any
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.schedule import Tick
 from runtime.sender import Sender
-from runtime.tools.tracing.record import Recorder
+from runtime.tools.tracing.record import TraceInstrument
 from runtime.tools.tracing.spool import CHUNK, Spool
 from tests.runtime.samples import Ping
 
@@ -20,7 +20,7 @@ def notes(path: Path, do: Any) -> list[Any]:
     loop = LockstepLoop()
     try:
         spool = Spool(path / "notes")
-        recorder = Recorder(LockstepClock(loop), spool)
+        recorder = TraceInstrument(LockstepClock(loop), spool)
         do(recorder)
         recorder.close()
         spool.close()
@@ -34,7 +34,7 @@ def test_what_is_sent_after_an_inner_step_is_the_outer_ones(tmp_path: Path) -> N
     sender = Sender("a.pings", Ping)
     given, reply = Ping(stamp=1, source="x"), Ping(stamp=2, source="a")
 
-    def do(recorder: Recorder) -> None:
+    def do(recorder: TraceInstrument) -> None:
         inner = recorder.wrap_call("b", "hear", lambda _: None)
 
         def outer(_: Any) -> None:
@@ -55,7 +55,7 @@ def test_what_is_sent_after_an_inner_step_is_the_outer_ones(tmp_path: Path) -> N
 def test_what_is_no_event_is_no_cause(tmp_path: Path) -> None:
     tick = Tick(stamp=1, index=0, late=0, missed=0)  # it may lie where an event lay
 
-    def do(recorder: Recorder) -> None:
+    def do(recorder: TraceInstrument) -> None:
         recorder.wrap_call(
             "a", "tick", lambda _: recorder.event_sent(None, Ping(stamp=1, source="a"))
         )(tick)
@@ -65,7 +65,7 @@ def test_what_is_no_event_is_no_cause(tmp_path: Path) -> None:
 
 
 def test_the_order_is_kept_however_many_there_are(tmp_path: Path) -> None:
-    def do(recorder: Recorder) -> None:
+    def do(recorder: TraceInstrument) -> None:
         for n in range(3 * CHUNK):
             recorder.wrap_call("a", str(n), lambda _: None)(None)
 
@@ -73,7 +73,7 @@ def test_the_order_is_kept_however_many_there_are(tmp_path: Path) -> None:
 
 
 def test_threads_are_noted_with_what_they_did(tmp_path: Path) -> None:
-    def do(recorder: Recorder) -> None:
+    def do(recorder: TraceInstrument) -> None:
         with ThreadPoolExecutor(1, thread_name_prefix="beside") as inner:
             for divisor, result in ((2, (3, 1)), (0, None)):
                 call = recorder.wrap_offload("a", functools.partial(divmod, 7, divisor), "divmod")

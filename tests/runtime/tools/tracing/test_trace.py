@@ -18,7 +18,7 @@ from runtime.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.cli.trace import tables
 from runtime.tools.tracing import spool, write
-from runtime.tools.tracing.paths import Trace, TraceEvent, paths, quantile, read_trace, shares
+from runtime.tools.tracing.paths import Trace, TraceEvent, node_loads, paths, quantile, read_trace
 from runtime.tools.tracing.record import tracing
 from runtime.tools.tracing.write import LOOP, SENSORS, THREADS
 from tests.runtime.samples_loop import (
@@ -90,7 +90,7 @@ def test_all_that_a_node_did_has_its_place(tmp_path: Path) -> None:
     assert names[SENSORS, "drone/front"] == {"Image exposed"}
     offloaded = [n for (pid, _), found in names.items() if pid == THREADS for n in found]
     assert set(offloaded) == {"vo: mean"}
-    assert [share.node for share in shares(trace)].count("vo") == 1
+    assert [share.node for share in node_loads(trace)].count("vo") == 1
 
 
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
@@ -176,7 +176,7 @@ def test_shares_leave_out_what_a_step_called_in_others() -> None:
         for n, name in enumerate(("a", "b"))
     ]
     slices = [slice_(1, "hear", 20, 30), slice_(0, "tick", 0, 60), slice_(0, "tick", 90, 10)]
-    first, second = shares(Trace(events=[*named, *slices]))
+    first, second = node_loads(Trace(events=[*named, *slices]))
     assert (first.node, first.steps, first.busy_ms, first.share) == ("a", 2, 0.04, 0.4)
     assert (second.node, second.longest_ms, second.longest) == ("b", 0.03, "hear")
 
