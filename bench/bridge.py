@@ -33,7 +33,7 @@ BLOCK = 50
 """Round trips of one side before it may be the other's turn."""
 
 WARM_UP = 50
-PICTURES = {"512×512 rgb8": (512, 512, 3), "1080×1080 rgb8": (1080, 1080, 3)}
+IMAGES = {"512×512 rgb8": (512, 512, 3), "1080×1080 rgb8": (1080, 1080, 3)}
 
 
 class BridgeRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -116,7 +116,7 @@ class Asker(Node):
         """Measure, and end the run."""
         cls = type(self)
         cls.rows = [await self._measure("small event", None)]
-        for case, shape in PICTURES.items():
+        for case, shape in IMAGES.items():
             cls.rows.append(await self._measure(case, shape))
         self.stop("measured")
 

@@ -133,7 +133,7 @@ def bridge(
     samples: Annotated[
         int, typer.Option(min=100, help="Round trips with small events; a quarter with images.")
     ] = 2000,
-    repeats: Annotated[int, typer.Option(min=30, help="Pictures encoded for ROS.")] = 300,
+    repeats: Annotated[int, typer.Option(min=30, help="Images encoded for ROS.")] = 300,
 ) -> None:
     """Measure what crosses between two processes beside raw Zenoh, and ROS images' encoding."""
     from bench.bridge import measure

@@ -23,11 +23,11 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.flooder import TWIST
-from events import Takeoff
+from bench.takeoff import TakeoffNode
 from nodes.ros2_bridge.keys import data_key
 from nodes.ros_messages.topics import Topic
 from nodes.ros_messages.typestore import TypeStore
-from runtime import Node, Output, Tick, every
+from runtime import NodeConfig, Tick, every
 from runtime.config.reading import parse
 from runtime.execute import execute
 
@@ -66,14 +66,8 @@ _late: list[tuple[int, int]] = []
 """When a tick came (monotonic clock) and how late, ns."""
 
 
-class Probe(Node):
+class Probe(TakeoffNode[NodeConfig]):
     """Measures how late a 400 Hz tick comes, and sends the vehicle up."""
-
-    orders = Output(Takeoff)
-
-    async def run(self) -> None:
-        """Take off."""
-        self.orders.send(Takeoff(stamp=self.clock.now(), source=self.name))
 
     @every(hz=400)
     def tick(self, tick: Tick) -> None:

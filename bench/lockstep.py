@@ -16,8 +16,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from bench.takeoff import TakeoffNode
 from events import Takeoff, VelocitySetpoint
-from runtime import Node, Output, Tick, every
+from runtime import NodeConfig, Output, Tick, every
 from runtime.config.reading import parse
 from runtime.execute import execute
 from sims.vehicle import (
@@ -47,15 +48,10 @@ class LockstepRow(msgspec.Struct, frozen=True, kw_only=True):
     share: float | None = None
 
 
-class Pilot(Node):
+class Pilot(TakeoffNode[NodeConfig]):
     """Takes off, then flies gentle curves."""
 
-    orders = Output(Takeoff)
     setpoints = Output(VelocitySetpoint)
-
-    async def run(self) -> None:
-        """Take off."""
-        self.orders.send(Takeoff(stamp=self.clock.now(), source=self.name))
 
     @every(hz=20)
     def steer(self, tick: Tick) -> None:

@@ -15,8 +15,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from events import Takeoff
-from runtime import Node, NodeConfig, Output, Tick, every
+from bench.takeoff import TakeoffNode
+from runtime import NodeConfig, Tick, every
 from runtime.config.reading import parse
 from runtime.execute import execute
 
@@ -65,14 +65,8 @@ class ProbeConfig(NodeConfig):
     warm_up: float = 1.5
 
 
-class Probe(Node[ProbeConfig]):
+class Probe(TakeoffNode[ProbeConfig]):
     """Measures how late a 400 Hz tick comes, and sends the vehicle up."""
-
-    orders = Output(Takeoff)
-
-    async def run(self) -> None:
-        """Take off."""
-        self.orders.send(Takeoff(stamp=self.clock.now(), source=self.name))
 
     @every(hz=400)
     def tick(self, tick: Tick) -> None:

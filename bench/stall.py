@@ -28,8 +28,9 @@ import msgspec
 import numpy as np
 
 from bench.slow_server import slow_server
-from events import Odometry, Takeoff
-from runtime import Input, Node, NodeConfig, Output, Tick, Worker, every
+from bench.takeoff import TakeoffNode
+from events import Odometry
+from runtime import Input, Node, NodeConfig, Tick, Worker, every
 from runtime.config.reading import parse
 from runtime.execute import execute
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
@@ -88,18 +89,12 @@ class ProbeConfig(NodeConfig):
     warm_up: float = 1.0
 
 
-class Probe(Node[ProbeConfig]):
+class Probe(TakeoffNode[ProbeConfig]):
     """Measures how late a 400 Hz tick comes, and sends the vehicle up."""
-
-    orders = Output(Takeoff)
 
     def __init__(self) -> None:
         self._samples = _collected.setdefault(self.config.mode, _Samples())
         self._last = 0
-
-    async def run(self) -> None:
-        """Take off."""
-        self.orders.send(Takeoff(stamp=self.clock.now(), source=self.name))
 
     @every(hz=400)
     def tick(self, tick: Tick) -> None:
