@@ -190,7 +190,7 @@ class _Run:
         if isinstance(error, NodeError):
             log_error(error, last=first)
         else:
-            log.error("%s", error, extra={"told": first})
+            log.error("%s", error, extra={"reported": first})
         if first:
             self.supervisor.state.error = error
 

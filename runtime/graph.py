@@ -68,7 +68,7 @@ def listeners(
     return found
 
 
-def nobody(_: str) -> Iterable[Listener]:
+def no_listeners(_: str) -> Iterable[Listener]:
     """Return the listeners of an output in other processes, where there are none."""
     return ()
 
@@ -80,7 +80,7 @@ def connect(
     taps: Iterable[Tap] = (),
     fault: Fault | None = None,
     last: Iterable[Listener] = (),
-    elsewhere: Callable[[str], Iterable[Listener]] = nobody,
+    elsewhere: Callable[[str], Iterable[Listener]] = no_listeners,
     wrap: Wrap = unwrapped,
 ) -> list[Listener]:
     """Freeze every output's listeners, and return all that are here.
@@ -97,19 +97,19 @@ def connect(
         elsewhere: Given ``node.port``, returns its listeners in other processes.
         wrap: Puts something round the nodes' handlers.
     """
-    heard = [
+    connected = [
         listener
         for node in nodes
         for listener in listeners(
             node, sources.get(node.name, {}), (links or {}).get(node.name, {}), fault, wrap
         )
     ]
-    heard += last
+    connected += last
     for node in nodes:
-        others = [listener for listener in heard if listener.node != node.name]
+        others = [listener for listener in connected if listener.node != node.name]
         for sender in senders(node).values():
             sender.connect([*elsewhere(sender.name), *others], taps, fault)
-    return heard
+    return connected
 
 
 def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str, str, str]]:
@@ -120,14 +120,14 @@ def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, 
             for receiver, receiving in nodes:
                 if receiver == sender:
                     continue
-                for port, events in heard_types(receiving).items():
+                for port, events in input_types(receiving).items():
                     listener = Listener(receiver, _nothing, events)
-                    if listener.may_hear(declared.event):
+                    if listener.may_receive(declared.event):
                         found.append((sender, output, declared.event.__name__, receiver, port))
     return found
 
 
-def heard_types(cls: type[Node[Any]]) -> dict[str, tuple[Any, ...]]:
+def input_types(cls: type[Node[Any]]) -> dict[str, tuple[Any, ...]]:
     """Return the event types of a class's inputs, fields of bundles and handlers."""
     found: dict[str, tuple[Any, ...]] = {}
     for name in cls.declared.listening:
@@ -150,7 +150,7 @@ def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str,
     return [
         (name, port, " or ".join(e.__name__ for e in events))
         for name, cls in nodes
-        for port, events in heard_types(cls).items()
+        for port, events in input_types(cls).items()
         if port not in cls.declared.handlers
         and (name, port) not in connected
         and port not in cls.declared.optional_fields()

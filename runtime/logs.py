@@ -111,7 +111,7 @@ def logging_to(
 
     def stamp(record: logging.LogRecord) -> bool:
         record.seconds = now() / 1e9
-        record.speaker = record.name.removeprefix("visnav.")
+        record.logger_name = record.name.removeprefix("visnav.")
         return True
 
     handler.addFilter(stamp)
@@ -137,15 +137,15 @@ def terminal_handler(console: Console | None = None) -> logging.Handler:
     A console may be given that other things are drawn on, too, such as a progress bar.
 
     It leaves out tracebacks, and what the command line says itself when the run is over (records
-    with `told`).
+    with `reported`).
     """
     from rich.console import Console
     from rich.logging import RichHandler
 
     console = console or Console(stderr=True)
     handler = RichHandler(console=console, show_path=False, show_time=False, markup=False)
-    handler.setFormatter(_OneLine("%(seconds)9.3f %(speaker)s: %(message)s"))
-    handler.addFilter(lambda record: not getattr(record, "told", False))
+    handler.setFormatter(_OneLine("%(seconds)9.3f %(logger_name)s: %(message)s"))
+    handler.addFilter(lambda record: not getattr(record, "reported", False))
     return handler
 
 
@@ -153,6 +153,6 @@ def file_handler(path: Path) -> logging.Handler:
     """Return a handler that writes everything to a file."""
     handler = _File(path, mode="w", encoding="utf-8", delay=False)
     handler.setFormatter(
-        logging.Formatter("%(seconds)12.6f %(levelname)-8s %(speaker)s: %(message)s")
+        logging.Formatter("%(seconds)12.6f %(levelname)-8s %(logger_name)s: %(message)s")
     )
     return handler

@@ -260,7 +260,7 @@ def log_error(error: NodeError, *, last: bool) -> None:
     """
     cause = error.__cause__
     ours = isinstance(code_location.leaf(error if cause is None else cause), VisnavError)
-    log.error("%s", with_place(error), exc_info=None if ours else cause, extra={"told": last})
+    log.error("%s", with_place(error), exc_info=None if ours else cause, extra={"reported": last})
 
 
 def with_place(error: Exception) -> str:

@@ -79,10 +79,10 @@ class Sender(Generic[T]):
         self, candidates: Iterable[Listener], taps: Iterable[Tap] = (), fault: Fault | None = None
     ) -> None:
         """Freeze who listens, in order, and pick the shortest way to deliver to them."""
-        self._candidates = tuple(c for c in candidates if c.may_hear(self.event))
+        self._candidates = tuple(c for c in candidates if c.may_receive(self.event))
         self._listeners = tuple(c.deliver for c in self._candidates)
         for route in self._known.values():
-            route.listeners = self._heard_by(*route.key)
+            route.listeners = self._listeners_of(*route.key)
         self._waiting = tuple(
             c.stream
             for c in self._candidates
@@ -92,7 +92,7 @@ class Sender(Generic[T]):
         self._fault = fault or _raise
         self._deliver = self._send_routed
         if not self.event.__subclasses__() and all(
-            c.hears_all(self.event) for c in self._candidates
+            c.receives_all(self.event) for c in self._candidates
         ):
             self._deliver = self._send_to_all
             streams = tuple(c.stream for c in self._candidates if c.stream and not c.stream.soon)
@@ -177,13 +177,13 @@ class Sender(Generic[T]):
         self._check(event)
         key = type(event), event.source
         if key not in self._known:
-            self._known[key] = Route(key, self._heard_by(*key))
+            self._known[key] = Route(key, self._listeners_of(*key))
         if not self._outside:
             self._routes[key] = self._known[key]
         return self._known[key]
 
-    def _heard_by(self, event: type[Event], source: str) -> tuple[Deliver, ...]:
-        return tuple(c.deliver for c in self._candidates if c.hears(event, source))
+    def _listeners_of(self, event: type[Event], source: str) -> tuple[Deliver, ...]:
+        return tuple(c.deliver for c in self._candidates if c.receives(event, source))
 
     def sent(self) -> Counter[type[Event]]:
         """Count what was sent, by type."""
@@ -239,15 +239,15 @@ class Listener:
         self.source = source
         self.stream = stream
 
-    def may_hear(self, event: type[Event]) -> bool:
+    def may_receive(self, event: type[Event]) -> bool:
         """Tell whether an output of this type can send what this listener hears."""
         return issubclass(event, self.events) or any(issubclass(e, event) for e in self.events)
 
-    def hears_all(self, event: type[Event]) -> bool:
+    def receives_all(self, event: type[Event]) -> bool:
         """Tell whether this listener hears whatever an output of this type sends."""
         return self.source is None and issubclass(event, self.events)
 
-    def hears(self, event: type[Event], source: str) -> bool:
+    def receives(self, event: type[Event], source: str) -> bool:
         """Tell whether this listener hears events of this very type from this source."""
         return issubclass(event, self.events) and (
             self.source is None or source == self.source or source.startswith(self.source + "/")

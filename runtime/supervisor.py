@@ -193,8 +193,8 @@ class Supervisor:
             links={runner.spec.name: runner.links for runner in runners},
             taps=taps,
             fault=self._listener_failed,
-            last=[Listener("run", self._hear_end, (Shutdown, WindowClosed))],
-            elsewhere=self.peers.listeners if self.peers is not None else graph.nobody,
+            last=[Listener("run", self._receive_end, (Shutdown, WindowClosed))],
+            elsewhere=self.peers.listeners if self.peers is not None else graph.no_listeners,
             wrap=self.instruments.listener,
         )
         if self.peers is not None:
@@ -209,7 +209,7 @@ class Supervisor:
         owner: Any = deliver.__self__  # type: ignore[attr-defined]  # a node, or a stream of one
         self.fault(owner.name.partition(".")[0], error)
 
-    def _hear_end(self, event: Event) -> None:
+    def _receive_end(self, event: Event) -> None:
         reason = getattr(event, "reason", "") or type(event).__name__
         self.stop(f"{event.source}: {reason}")
 
@@ -220,7 +220,7 @@ class Supervisor:
         try:
             announced = await self._start_nodes()
         except PeerError as error:
-            log.error("%s", error, extra={"told": True})
+            log.error("%s", error, extra={"reported": True})
             self.stop("the processes of the run did not come together", error)
             return
         except asyncio.CancelledError:  # the run is to end

@@ -32,7 +32,7 @@ WIDTH, HEIGHT = 1440, 900
 TOP = 32
 """Pixels of the viewer's own bar, which is left out."""
 
-PATIENCE = 240.0
+TIMEOUT = 240.0
 """Seconds until the image must be there."""
 
 STILL = 4
@@ -114,7 +114,7 @@ class Page:
         message = {"id": self._calls, "method": method, "params": parameters}
         self._connection.send(json.dumps(message))
         while True:
-            answer = json.loads(self._connection.recv(timeout=PATIENCE))
+            answer = json.loads(self._connection.recv(timeout=TIMEOUT))
             if answer.get("id") == self._calls:
                 if "error" in answer:
                     raise SystemExit(f"{method}: {answer['error']['message']}")
@@ -125,7 +125,7 @@ class Page:
         """Return the page as PNG once it no longer changes."""
         clip = {"x": 0, "y": TOP, "width": WIDTH, "height": HEIGHT - TOP, "scale": 1}
         self.call("Emulation.setDeviceMetricsOverride", **_SCREEN)
-        end, last, equal = time.monotonic() + PATIENCE, b"", 0
+        end, last, equal = time.monotonic() + TIMEOUT, b"", 0
         while equal < STILL:
             if time.monotonic() > end:
                 print("the image still changes; this is the last of it", file=sys.stderr)

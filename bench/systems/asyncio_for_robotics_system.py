@@ -18,7 +18,7 @@ import numpy as np
 import uvloop
 
 from bench.system import Case, Samples, System
-from bench.systems.children import ALL, PATIENCE, Job, PeerError, children, number_of, reply_to
+from bench.systems.children import ALL, TIMEOUT, Job, PeerError, children, number_of, reply_to
 from bench.systems.parts import needs, versions
 from bench.systems.zenoh_system import config, free_locator, header, pinger, publisher
 
@@ -96,8 +96,8 @@ async def _run(
 
 
 def _give_up(since: int, awaited: str) -> None:
-    if time.perf_counter_ns() - since > PATIENCE * 1e9:
-        raise PeerError(f"{awaited}: nothing came for {PATIENCE:g} s")
+    if time.perf_counter_ns() - since > TIMEOUT * 1e9:
+        raise PeerError(f"{awaited}: nothing came for {TIMEOUT:g} s")
 
 
 def serve(job: Job) -> None:

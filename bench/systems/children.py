@@ -40,7 +40,7 @@ PONG = struct.Struct("<qi")
 ALL = 0
 """As the receiver of a ping: a call of the roll, which each node answers with minus its number."""
 
-PATIENCE = 60.0
+TIMEOUT = 60.0
 """Seconds without an answer after which a measurement is given up."""
 
 GRACE = 2.0
@@ -96,8 +96,8 @@ class Crew:
                 output.seek(0)
                 text = output.read().decode(errors="replace").strip()[-2000:]
                 raise PeerError(f"node {node} ended with {process.returncode}: {text}")
-        if time.perf_counter_ns() - since > PATIENCE * 1e9:
-            raise PeerError(f"{awaited}: nothing came for {PATIENCE:g} s")
+        if time.perf_counter_ns() - since > TIMEOUT * 1e9:
+            raise PeerError(f"{awaited}: nothing came for {TIMEOUT:g} s")
 
     def exchange(self, case: Case, send: Send, receive: Receive) -> Samples:
         """Call the roll, then measure.
@@ -173,7 +173,7 @@ def number_of(pong: Any) -> int:
 
 def _end_if_stuck() -> None:
     # For a `send` that never returns, in a library that does not even let Python handle Ctrl-C.
-    faulthandler.dump_traceback_later(5 * PATIENCE, exit=True)
+    faulthandler.dump_traceback_later(5 * TIMEOUT, exit=True)
 
 
 def _end(nodes: dict[int, tuple[subprocess.Popen[bytes], IO[bytes]]]) -> None:

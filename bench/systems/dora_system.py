@@ -24,8 +24,8 @@ import msgspec
 
 from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
 from bench.systems.children import (
-    PATIENCE,
     PING,
+    TIMEOUT,
     Crew,
     Job,
     PeerError,
@@ -92,25 +92,25 @@ def _running(address: _Address, *arguments: str) -> Iterator[None]:
 
 
 def _wait_for_port(port: int) -> None:
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + TIMEOUT
     while time.monotonic() < until:
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
             return
         time.sleep(0.02)
-    raise PeerError(f"dora: nothing listens on port {port} after {PATIENCE:g} s")
+    raise PeerError(f"dora: nothing listens on port {port} after {TIMEOUT:g} s")
 
 
 def _start(address: _Address) -> None:
     """Start the dataflow, as soon as the coordinator knows of the daemon."""
     arguments = ("start", "flow.yml", "--detach", "--coordinator-port", str(address.coordinator))
-    until = time.monotonic() + PATIENCE / 2
+    until = time.monotonic() + TIMEOUT / 2
     while True:
         done = subprocess.run(
             [*_DORA, *arguments],
             cwd=address.directory,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            timeout=PATIENCE,
+            timeout=TIMEOUT,
             check=False,
         )
         if done.returncode == 0:

@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.messages import Ping, Pong
 from bench.system import Case, Samples, System
-from bench.systems.children import ALL, PATIENCE, PeerError
+from bench.systems.children import ALL, TIMEOUT, PeerError
 from bench.systems.parts import needs, payloads, versions
 
 _BUFFER = 1 << 23
@@ -96,7 +96,7 @@ def _units(ez: Any) -> tuple[Any, Any]:
         @task
         async def watch(self) -> None:
             before, since = self.exchange.progress, time.monotonic()
-            while time.monotonic() - since < PATIENCE:
+            while time.monotonic() - since < TIMEOUT:
                 await asyncio.sleep(1.0)
                 if self.exchange.progress != before:
                     before, since = self.exchange.progress, time.monotonic()

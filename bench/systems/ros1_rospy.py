@@ -24,7 +24,7 @@ EVERYBODY = 0
 HELLO = -1
 """Number of pings before the exchange."""
 
-PATIENCE = 10.0
+TIMEOUT = 10.0
 """Seconds for one pong."""
 
 FLOATS = 1080 * 1080
@@ -108,7 +108,7 @@ def be_pinger(
 
     pings = rospy.Publisher("ping", ping_type, tcp_nodelay=True)
     rospy.Subscriber("pong", pong_type, on_pong, tcp_nodelay=True)
-    deadline = now() + 2 * PATIENCE * 1e9
+    deadline = now() + 2 * TIMEOUT * 1e9
     while pings.get_num_connections() < receiver - 1 or ponged is None:
         if now() > deadline:
             raise RuntimeError(f"{pings.get_num_connections()} of {receiver - 1} subscribers came")
@@ -119,13 +119,13 @@ def be_pinger(
         begin = now()
         pings.publish(1, receiver, number, begin, array.copy() if copied else array)
         while ponged != number:
-            if not came.wait(PATIENCE):
+            if not came.wait(TIMEOUT):
                 raise RuntimeError(f"no pong for ping {number}")
             came.clear()
         taken[number] = arrived - begin
     taken[int(warm_up) :].tofile(out)
     pings.publish(1, EVERYBODY, len(taken), 0, array[:0])
-    deadline = now() + PATIENCE * 1e9
+    deadline = now() + TIMEOUT * 1e9
     while pings.get_num_connections() and now() < deadline:
         time.sleep(0.01)
 

@@ -25,7 +25,7 @@ from nodes.rerun_view.settings import RerunConfig
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.extras import install_command
 
-_PATIENCE = 15.0
+_TIMEOUT = 15.0
 """Real seconds until a server must listen."""
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
@@ -146,12 +146,12 @@ class Viewer:
             self._process.wait()
 
     def _wait(self, host: str, port: int) -> None:
-        end = time.monotonic() + _PATIENCE
+        end = time.monotonic() + _TIMEOUT
         while self._process.poll() is None and time.monotonic() < end:
             with contextlib.suppress(OSError), socket.create_connection((host, port), 1.0):
                 return
             time.sleep(0.05)
-        found = self.last_words() or f"nothing in {_PATIENCE:g} s"
+        found = self.last_words() or f"nothing in {_TIMEOUT:g} s"
         raise VisnavError(f"expected Rerun to listen on {host}:{port}, found: {found}")
 
 

@@ -58,7 +58,7 @@ def missing(present: Iterable[Hello], nodes: Sequence[str]) -> list[str]:
     return [node for node in nodes if node not in found]
 
 
-def say_missing(absent: Sequence[str], seconds: float, meet: str) -> str:
+def missing_message(absent: Sequence[str], seconds: float, meet: str) -> str:
     """Return what to tell those who wait in vain."""
     only = ",".join(absent)
     return (

@@ -22,7 +22,7 @@ from runtime.errors import PeerError, VisnavError, WireError
 from runtime.peers.authentication import NONCE, ForgedError, Sealing, hello_seal
 from runtime.peers.member import Member
 from runtime.peers.messages import Hello, decode, encode
-from runtime.peers.zenoh_session import Heard, Session
+from runtime.peers.zenoh_session import OnMessage, Session
 
 log = logging.getLogger("visnav.runtime")
 
@@ -56,10 +56,10 @@ class Meeting(Protocol):
     def soon(self, call: Callable[..., Any], *args: Any) -> None:
         """Have something called on the loop."""
 
-    def met(self, member: Member) -> None:
+    def joined(self, member: Member) -> None:
         """Take in that there is a session with a process."""
 
-    def went(self, member: Member, why: str = ...) -> None:
+    def left(self, member: Member, why: str = ...) -> None:
         """Take in that a session has ended."""
 
     def unsent(self, member: Member, error: VisnavError) -> None:
@@ -92,9 +92,9 @@ class Handshakes:
         self._complained: set[str] = set()
         self._enough = threading.Event()
 
-    def begin(self, heard: Heard) -> None:
+    def begin(self, on_message: OnMessage) -> None:
         """Show ourselves, and greet those who do not answer again and again."""
-        self._session.appear(heard, self.see)
+        self._session.appear(on_message, self.on_presence)
         threading.Thread(target=self._greet, name="greet", daemon=True).start()
 
     async def close(self) -> None:
@@ -114,7 +114,7 @@ class Handshakes:
         with self._lock:
             return [c.member for c in self._contacts.values() if c.member is not None]
 
-    def see(self, other: str, here: bool) -> None:
+    def on_presence(self, other: str, here: bool) -> None:
         """Take in that a process appears or disappears."""
         with self._lock:
             contact = self._contact(other) if here else self._contacts.pop(other, None)
@@ -125,9 +125,9 @@ class Handshakes:
         if here:
             self._membership.soon(self._greet_one, other, contact.nonce)
         elif contact.member is not None:
-            self._membership.soon(self._membership.went, contact.member)
+            self._membership.soon(self._membership.left, contact.member)
 
-    def hear(self, sender: str, sealed: bytes) -> None:
+    def receive(self, sender: str, sealed: bytes) -> None:
         """Take in a greeting; begin a session if it is a fresh one.
 
         Raises:
@@ -164,8 +164,8 @@ class Handshakes:
                 # Before anything that the loop seals for the session.
                 soon(self._greet_one, sender, sealing.nonce, sealing.seen, sealing.tag)
                 if before is not None:
-                    soon(self._membership.went, before, "their process had lost us")
-                soon(self._membership.met, member)
+                    soon(self._membership.left, before, "their process had lost us")
+                soon(self._membership.joined, member)
             elif before is None:
                 soon(self._greet_one, sender, contact.nonce, hello.nonce)
             elif hello.session == before.sealing.tag:
@@ -192,7 +192,7 @@ class Handshakes:
                 return
             contact.member = None
         self._membership.soon(
-            self._membership.went, member, f"their process is not understood: {error}"
+            self._membership.left, member, f"their process is not understood: {error}"
         )
 
     def greet_again(self) -> None:

@@ -39,26 +39,26 @@ class JointShutdown:
 
     Args:
         membership: Who is there.
-        went: Told that some are not waited for any more.
+        on_timeout: Told that some are not waited for any more.
 
     Attributes:
         ended_nodes: Nodes of other processes that have ended.
         at_work: Whether a node here is about to end.
-        heard_at: When the last word of another process came, on `time.monotonic`.
+        received_at: When the last word of another process came, on `time.monotonic`.
     """
 
-    def __init__(self, membership: Membership, went: Callable[[], None]) -> None:
+    def __init__(self, membership: Membership, on_timeout: Callable[[], None]) -> None:
         self.ended_nodes: set[str] = set()
         self.at_work = False
-        self.heard_at = 0.0
+        self.received_at = 0.0
         self._membership = membership
-        self._went = went
+        self._on_timeout = on_timeout
         self._timer: threading.Timer | None = None
         self._with_summary: dict[int, Member] = {}
 
     def begin(self) -> None:
         """Look from now on, in real time, whether the end goes on."""
-        self.heard_at = time.monotonic()
+        self.received_at = time.monotonic()
         self._watch()
 
     def close(self) -> None:
@@ -89,7 +89,7 @@ class JointShutdown:
     async def exchange_summaries(self, mine: Summary) -> Summary:
         """Exchange what each process has to say of the run; return all of it together."""
         membership = self._membership
-        membership.tell(FinalSummary(msgspec.json.encode(mine)))
+        membership.broadcast(FinalSummary(msgspec.json.encode(mine)))
         try:
             async with real_time_limit(PARTING):
                 await membership.until(
@@ -126,8 +126,8 @@ class JointShutdown:
         if self._timer is None:
             return
         if self.at_work:
-            self._membership.tell(StillWorking())
-        elif time.monotonic() - self.heard_at > SILENCE:
+            self._membership.broadcast(StillWorking())
+        elif time.monotonic() - self.received_at > SILENCE:
             self._give_up()
         self._watch()
 
@@ -138,8 +138,8 @@ class JointShutdown:
             names = "; ".join(name_of(m.nodes) for m in silent)
             log.error("%s: expected a word within %g s; the run ends without it", names, SILENCE)
             if membership.ended is not None:
-                membership.tell(membership.ended)
+                membership.broadcast(membership.ended)
             for member in silent:
                 membership.forget(member)
-            self._went()
+            self._on_timeout()
             membership.notify()

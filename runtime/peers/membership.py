@@ -23,7 +23,13 @@ from runtime.config.model import Config
 from runtime.errors import PeerError, VisnavError, WireError
 from runtime.peers.authentication import ForgedError, derive, is_hello
 from runtime.peers.clock_offsets import Exchange
-from runtime.peers.compatibility import check_fits, missing, name_of, say_missing, what_all_share
+from runtime.peers.compatibility import (
+    check_fits,
+    missing,
+    missing_message,
+    name_of,
+    what_all_share,
+)
 from runtime.peers.handshake import Handshakes
 from runtime.peers.member import Member
 from runtime.peers.messages import (
@@ -53,13 +59,13 @@ NAMED_EVERY = 5.0
 class Reactions(Protocol):
     """What is told, on the loop, what other processes do."""
 
-    def heard(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+    def receive(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         """Take in a message."""
 
     def lost(self, member: Member) -> None:
         """Deal with the loss of a process."""
 
-    def found_again(self, member: Member) -> None:
+    def reconnected(self, member: Member) -> None:
         """Go on with a process that the network had parted from us."""
 
     def unsent(self, member: Member, error: VisnavError) -> None:
@@ -123,14 +129,14 @@ class Membership:
         secret = b"known by certificate" if by_certificate else secret_of(network.secret)
         session = await asyncio.to_thread(Session, self._run, network, secret)
         self._handshakes = Handshakes(derive(secret, "run", self._run), session, self)
-        await asyncio.to_thread(self._handshakes.begin, self._hear)
+        await asyncio.to_thread(self._handshakes.begin, self._receive)
         if absent := self._missing():
             log.info("waiting for %s at %s", name_of(absent), network.meet)
         try:
             async with real_time_limit(float(network.wait)):
                 await self.until(lambda: not self._missing())
         except TimeoutError:
-            text = say_missing(self._missing(), float(network.wait), network.meet)
+            text = missing_message(self._missing(), float(network.wait), network.meet)
             raise PeerError(text) from None
         return self.number()
 
@@ -166,7 +172,7 @@ class Membership:
         assert self._handshakes is not None
         return self._handshakes.id
 
-    def tell(self, message: Message) -> None:
+    def broadcast(self, message: Message) -> None:
         """Send a message to all other processes of the run that are there."""
         for member in self.present():
             member.outbox.send(message)
@@ -245,14 +251,14 @@ class Membership:
 
     # In threads of Zenoh's and of lines.
 
-    def _hear(self, sender: str, sealed: bytes, payload: bytes) -> None:
+    def _receive(self, sender: str, sealed: bytes, payload: bytes) -> None:
         received = time.monotonic_ns()
         handshakes = self._handshakes
         assert handshakes is not None
         member = handshakes.member(sender)
         try:
             if member is None or is_hello(sealed):
-                handshakes.hear(sender, sealed)
+                handshakes.receive(sender, sealed)
                 return
             data = member.sealing.open(sealed, payload)
             message = decode(data)
@@ -313,7 +319,7 @@ class Membership:
             elif member.unfit or member.over:
                 log.debug("from %s, who is no part of this run: %s", member.place, message)
             else:
-                self._peers.heard(member, message, event)
+                self._peers.receive(member, message, event)
         except WireError as error:
             log.warning("from %s: %s", member.place, error)
         self.notify()
@@ -325,7 +331,7 @@ class Membership:
         else:
             self.fail(error)
 
-    def met(self, member: Member) -> None:
+    def joined(self, member: Member) -> None:
         """Take in who somebody is."""
         try:
             check_fits(self.hello, member.hello, self.nodes)
@@ -352,13 +358,13 @@ class Membership:
             self._numbered[number] = member
         member.unfit = False
         if member.number >= 0 and member.hello.running and self.hello.running:
-            self._peers.found_again(member)
+            self._peers.reconnected(member)
         held, member.held = member.held, None
         for message, event in held or ():
             self._take(member, message, event)
         self.notify()
 
-    def went(self, member: Member, why: str = "their process is gone") -> None:
+    def left(self, member: Member, why: str = "their process is gone") -> None:
         """Do without somebody with whom the session has ended."""
         if member.over:
             return
@@ -369,7 +375,7 @@ class Membership:
             self._peers.lost(member)
             for other in self._handshakes.members() if self._handshakes else ():
                 if other.held is not None and other.nodes == member.nodes:
-                    self.met(other)
+                    self.joined(other)
         self.notify()
 
     def _fitting(self) -> list[Member]:

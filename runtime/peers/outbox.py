@@ -135,7 +135,7 @@ class Outbox:
         except VisnavError as error:
             self._failed(error)
         except Exception as error:  # whatever a library does, the line goes on
-            self._failed(PeerError(f"a message could not be sent: {_say(error)}"))
+            self._failed(PeerError(f"a message could not be sent: {_describe(error)}"))
 
     def _wait(self, waiting: _Waiting) -> None:
         if waiting.packed is not None:
@@ -172,14 +172,14 @@ class Outbox:
                 assert parts is not None
             except Exception as error:  # the message goes without its event: others count it
                 parts = encode(waiting.message), b""
-                self._failed(PeerError(f"an event could not be sent: {_say(error)}"))
+                self._failed(PeerError(f"an event could not be sent: {_describe(error)}"))
             self._put_now(*parts)
             self._writing = False
             if self._closed:
                 self._wake.put(None)  # look again whether anything is left
 
 
-def _say(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 

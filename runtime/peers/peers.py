@@ -90,7 +90,7 @@ class Peers:
         self._decider: Member | None = None
         self._lost_early: list[Member] = []
         self._apart: set[int] = set()
-        self._retired_here: list[str] = []
+        self._ended_here: list[str] = []
         self._follower: ClockFollower | None = None
         self._followed = -1
 
@@ -119,19 +119,19 @@ class Peers:
             )
         return before
 
-    async def announce(self, said: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
+    async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Tell the others what the nodes here announce; return what all do, in file order."""
         self._announced = Announcements(
-            {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in said.items()}
+            {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in own.items()}
         )
-        self._membership.tell(self._announced)
+        self._membership.broadcast(self._announced)
         others = self._membership.present
         await self._membership.until(
             lambda: all(m.announced is not None for m in others()),
             whom=lambda m: m.announced is None,
             limit=self._start_up_limit(),
         )
-        everything = dict(said)
+        everything = dict(own)
         for member in others():
             if member.announced is not None:
                 for name, frames in member.announced.by_node.items():
@@ -153,7 +153,7 @@ class Peers:
         if reference is not None and self._token is None:
             await compare(reference, membership.until)
         self._ready = True
-        self._membership.tell(Ready())
+        self._membership.broadcast(Ready())
         if reference is None:
             await membership.until(
                 lambda: all(m.ready for m in membership.present()),
@@ -162,7 +162,7 @@ class Peers:
             )
             self._decided = True
             origin = time.monotonic_ns() + LEAD
-            self._membership.tell(FirstUpdate(origin))
+            self._membership.broadcast(FirstUpdate(origin))
         else:
             await membership.until(
                 lambda: reference.begin is not None,
@@ -199,7 +199,7 @@ class Peers:
             self._gather()
         early, self._early = self._early, []
         for item in early:
-            self.heard(*item)
+            self.receive(*item)
         for member in self._lost_early:
             self.lost(member)
 
@@ -230,23 +230,23 @@ class Peers:
         stop = Stop(reason, text, apart=not self._begun)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
         if not self._begun:  # also those who said so: they need not wait for our turn
-            self._membership.tell(stop)
+            self._membership.broadcast(stop)
             early, self._early = self._early, []
             for member, message, _ in early:
                 if isinstance(message, NodeEnded):
                     self._do(member.number, message, None)
         elif self._suspended:
-            self._membership.tell(stop)
+            self._membership.broadcast(stop)
             self._gather()
         elif not from_peer:
-            self._tell_in_order(stop)
+            self._broadcast_in_order(stop)
         self.shutdown.begin()
 
     def node_ended(self, node: str) -> None:
         """Tell the others that a node here has ended."""
         self.shutdown.at_work = False
-        self._retired_here.append(node)
-        self._tell_in_order(NodeEnded(node))
+        self._ended_here.append(node)
+        self._broadcast_in_order(NodeEnded(node))
 
     # After the run.
 
@@ -263,13 +263,13 @@ class Peers:
 
     # What the membership tells.
 
-    def heard(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+    def receive(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         """Take in a message of another process.
 
         Raises:
             WireError: It makes no sense.
         """
-        self.shutdown.heard_at = time.monotonic()
+        self.shutdown.received_at = time.monotonic()
         match message:
             case EventMessage() if (
                 self._begun and self._token is None
@@ -340,7 +340,7 @@ class Peers:
                 log.warning("%s: the run ends without it", gone)
                 if self._begun and self._token is not None and self._membership.ended is not None:
                     # Others may wait for its return, and not for their turn.
-                    self._membership.tell(
+                    self._membership.broadcast(
                         msgspec.structs.replace(self._membership.ended, apart=False)
                     )
             self._gather()
@@ -351,7 +351,7 @@ class Peers:
             self._remote.wants(member.number, ())
         rules = {spec.on_error for spec in self._config.nodes if spec.name in lost}
         if "stop" in rules:
-            log.error("%s", gone, extra={"told": True})
+            log.error("%s", gone, extra={"reported": True})
             self._gather()
             self._run.stop(f"{name} lost", gone)
         elif "restart" in rules:
@@ -366,7 +366,7 @@ class Peers:
             self._gather()
         self._run.connect()
 
-    def found_again(self, member: Member) -> None:
+    def reconnected(self, member: Member) -> None:
         """Go on with a process that the network had parted from us."""
         log.warning("%s: found again, at %s", name_of(member.nodes), member.place)
         self._take_back(member)
@@ -428,7 +428,7 @@ class Peers:
     def _go_on_without(self, member: Member) -> None:
         """Take a process out of the turns: it has not begun, or has given up."""
         self._apart.add(member.number)
-        for node in self._retired_here:  # what was to be said at our turn is lost
+        for node in self._ended_here:  # what was to be said at our turn is lost
             member.outbox.send(NodeEnded(node))
         self._gather()
 
@@ -441,7 +441,7 @@ class Peers:
 
     # Sending.
 
-    def _tell_in_order(self, message: Ordered) -> None:
+    def _broadcast_in_order(self, message: Ordered) -> None:
         """Send a message that others take in in its place among the events."""
         for member in self._membership.present():
             if self._token is not None and self._begun and member.number not in self._apart:

@@ -86,7 +86,7 @@ class RemoteEvents:
 class RemoteListener(Listener):
     """All inputs and handlers of another process, as one listener of an output here."""
 
-    __slots__ = ("_heard", "_leave", "_may_skip", "_output", "_process", "name")
+    __slots__ = ("_leave", "_listeners", "_may_skip", "_output", "_process", "name")
 
     def __init__(
         self, process: int, output: str, wanted: tuple[Subscription, ...], leave: Leave
@@ -96,30 +96,30 @@ class RemoteListener(Listener):
         self._process = process
         self._output = output
         self._leave = leave
-        self._heard = [
+        self._listeners = [
             (Listener("", _nothing, tuple(map(event_type, each.kinds)), each.source), each.latest)
             for each in wanted
         ]
         self._may_skip: dict[tuple[type[Event], str], bool] = {}
 
-    def may_hear(self, event: type[Event]) -> bool:
+    def may_receive(self, event: type[Event]) -> bool:
         """Tell whether anything there can hear an output of this type."""
-        return any(listener.may_hear(event) for listener, _ in self._heard)
+        return any(listener.may_receive(event) for listener, _ in self._listeners)
 
-    def hears_all(self, event: type[Event]) -> bool:
+    def receives_all(self, event: type[Event]) -> bool:
         """Tell whether something there hears whatever an output of this type sends."""
-        return any(listener.hears_all(event) for listener, _ in self._heard)
+        return any(listener.receives_all(event) for listener, _ in self._listeners)
 
-    def hears(self, event: type[Event], source: str) -> bool:
+    def receives(self, event: type[Event], source: str) -> bool:
         """Tell whether anything there hears events of this very type from this source."""
-        return any(listener.hears(event, source) for listener, _ in self._heard)
+        return any(listener.receives(event, source) for listener, _ in self._listeners)
 
     def offer(self, event: Event) -> None:
         """Send an event there."""
         key = (type(event), event.source)
         skip = self._may_skip.get(key)
         if skip is None:
-            skip = all(latest for listener, latest in self._heard if listener.hears(*key))
+            skip = all(latest for listener, latest in self._listeners if listener.receives(*key))
             self._may_skip[key] = skip
         self._leave(self._process, self._output, event, skip)
 

@@ -75,7 +75,7 @@ class TimeTokenHolder:
         self._inbox: list[tuple[int, Ordered, Event | None]] = []
         self._sent = [[0] * count for _ in range(count)]
         self._received = [0] * count
-        self._told: Key = NEVER
+        self._reported_key: Key = NEVER
         self._called = False
         self._others: Key = NEVER
         self._alive: frozenset[int] = frozenset()
@@ -120,7 +120,7 @@ class TimeTokenHolder:
         if self._report_due:
             self._report_state(key)
         if not self.holding:
-            if (self._outbox or key < self._told) and not self._called and self._epoch:
+            if (self._outbox or key < self._reported_key) and not self._called and self._epoch:
                 self._called = True
                 for other in self._alive - {self._me}:
                     self._send(other, TokenRequest(), None)
@@ -204,7 +204,7 @@ class TimeTokenHolder:
     def _pass(self, key: Key) -> None:
         """Give the turn to whoever must hear something, or else has the next thing due."""
         others = self._alive - {self._me}
-        self._told = self._keys[self._me] = key
+        self._reported_key = self._keys[self._me] = key
         if waiting := self._unread & others:
             to = min(waiting)
         else:
@@ -228,7 +228,7 @@ class TimeTokenHolder:
     def _report_state(self, key: Key) -> None:
         """Say where we stand to whoever makes the next turn."""
         self._report_due = False
-        self._told = key
+        self._reported_key = key
         standing = StateReport(
             processes=self._ids,
             epoch=self._epoch,

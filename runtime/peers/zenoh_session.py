@@ -24,10 +24,10 @@ from runtime.peers.authentication import derive
 
 log = logging.getLogger("visnav.runtime")
 
-Heard = Callable[[str, bytes, bytes], None]
+OnMessage = Callable[[str, bytes, bytes], None]
 """Called in Zenoh's thread with who sends, the message, and its payload."""
 
-Seen = Callable[[str, bool], None]
+OnPresence = Callable[[str, bool], None]
 """Called in Zenoh's thread when a process appears (True) or disappears."""
 
 CLOSING = 3.0
@@ -71,24 +71,24 @@ class Session:
         self._publishers: dict[str, Any] = {}
         self._kept: list[Any] = []
 
-    def appear(self, heard: Heard, seen: Seen) -> None:
+    def appear(self, on_message: OnMessage, on_presence: OnPresence) -> None:
         """Be seen by the others, and see them.
 
         Args:
-            heard: Told of messages.
-            seen: Told of processes that come and go, this one not included.
+            on_message: Told of messages.
+            on_presence: Told of processes that come and go, this one not included.
         """
 
         def take(sample: zenoh.Sample) -> None:
             head = sample.attachment
             if head is not None:
                 sender = str(sample.key_expr).rpartition("/")[2]
-                heard(sender, head.to_bytes(), sample.payload.to_bytes())
+                on_message(sender, head.to_bytes(), sample.payload.to_bytes())
 
         def notice(sample: zenoh.Sample) -> None:
             other = str(sample.key_expr).rpartition("/")[2]
             if other != self.id:
-                seen(other, sample.kind == zenoh.SampleKind.PUT)
+                on_presence(other, sample.kind == zenoh.SampleKind.PUT)
 
         self._kept = [
             self._session.declare_subscriber(

@@ -18,7 +18,7 @@ from msgspec import inspect as types
 
 from runtime.config.model import OnError
 from runtime.config.parameters import is_marked
-from runtime.graph import heard_types
+from runtime.graph import input_types
 from runtime.node import Node
 from runtime.units import Duration, Latency, plain
 
@@ -205,7 +205,7 @@ NODE_SETTINGS = (
 
 def _inputs(cls: type[Node[Any]], docs: dict[str, str]) -> Iterator[PortDescription]:
     declared = cls.declared
-    for name, events in heard_types(cls).items():
+    for name, events in input_types(cls).items():
         bundle, _, part = name.partition(".")
         kind: Literal["input", "bundle", "handler"]
         if name in declared.handlers:

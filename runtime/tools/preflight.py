@@ -30,7 +30,7 @@ from runtime.clock import Clock
 from runtime.config.model import Config, NodeSpec
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
 from runtime.execute import make_clock, make_loop
-from runtime.graph import heard_types, unconnected
+from runtime.graph import input_types, unconnected
 from runtime.node import Node
 from runtime.node_runner import NodeRunner
 from runtime.paths import written
@@ -299,7 +299,7 @@ def _types(cls: type[Node[Any]], port: str) -> tuple[Any, ...]:
     """Return the types of event that a port hears, or that a bundle's fields do."""
     return tuple(
         event
-        for name, events in heard_types(cls).items()
+        for name, events in input_types(cls).items()
         if name == port or name.startswith(f"{port}.")
         for event in events
     )
@@ -307,4 +307,4 @@ def _types(cls: type[Node[Any]], port: str) -> tuple[Any, ...]:
 
 def _may_send(cls: type[Node[Any]], events: tuple[Any, ...]) -> bool:
     listener = Listener("", lambda _: None, events)
-    return any(listener.may_hear(output.event) for output in cls.declared.outputs.values())
+    return any(listener.may_receive(output.event) for output in cls.declared.outputs.values())

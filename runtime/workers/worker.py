@@ -374,11 +374,11 @@ class _Process:
                     break
                 *lines, begun = (begun + read).split(b"\n")
                 for line in lines:
-                    self._hear(line)
+                    self._keep_line(line)
         if begun:
-            self._hear(begun)
+            self._keep_line(begun)
 
-    def _hear(self, line: bytes) -> None:
+    def _keep_line(self, line: bytes) -> None:
         text = line.decode(errors="replace").rstrip()
         self._tail.append(text)
         self._printed(text)

@@ -23,7 +23,7 @@ from runtime.digest import Digest
 from runtime.errors import ChannelTypeError, NodeError
 from runtime.execute import execute
 from runtime.testing import spec
-from tests.runtime.said import Said, Shouted, said
+from tests.runtime.small_events import Said, Shouted, said
 
 DTYPES = ["uint8", "int32", ">i4", "float32", "float64", "bool"]
 

@@ -9,7 +9,7 @@ from events import Event
 from runtime import Input, Node, Output, on
 from runtime.graph import connect, edges, unconnected
 from runtime.sender import Listener
-from tests.runtime.said import Said, Shouted, Sung, make, said, shouted
+from tests.runtime.small_events import Said, Shouted, Sung, make, said, shouted
 
 log: list[str] = []
 

@@ -50,7 +50,7 @@ def chat(tmp_path: Path, hz: float, level: str = "info", duration: float = 1.0) 
 
 def test_records_carry_the_runs_clock_and_the_node(tmp_path: Path) -> None:
     records = chat(tmp_path, 4).records
-    said = [(vars(r)["seconds"], vars(r)["speaker"], r.getMessage()) for r in records]
+    said = [(vars(r)["seconds"], vars(r)["logger_name"], r.getMessage()) for r in records]
     assert said == [(k / 4, "chatty", f"tick {k}") for k in range(4)]
 
 

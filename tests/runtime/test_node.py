@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from runtime import Input, Node, NodeConfig, Output
 from runtime.errors import ChannelClosedError
-from tests.runtime.said import Said, make, said
+from tests.runtime.small_events import Said, make, said
 
 C = TypeVar("C", bound=NodeConfig)
 

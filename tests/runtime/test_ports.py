@@ -11,7 +11,7 @@ from events import Event
 from runtime import Input, Node, Output, Tick, every, on
 from runtime.errors import DeclarationError
 from runtime.streams import Stream
-from tests.runtime.said import Said, Shouted, Sung, make
+from tests.runtime.small_events import Said, Shouted, Sung, make
 
 
 class Base(Node):

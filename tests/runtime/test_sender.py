@@ -14,7 +14,7 @@ from runtime.errors import ChannelClosedError
 from runtime.sender import Deliver, Listener, Sender
 from runtime.streams import Stream
 from tests.runtime.loops import Run, turns
-from tests.runtime.said import Said, Shouted, Sung, said, shouted
+from tests.runtime.small_events import Said, Shouted, Sung, said, shouted
 
 Ways = Callable[[Sender[Said], list[Listener]], None]
 

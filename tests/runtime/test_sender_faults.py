@@ -8,7 +8,7 @@ from events import Event
 from runtime.errors import ChannelFullError
 from runtime.sender import Deliver, Listener, Sender
 from runtime.streams import Stream
-from tests.runtime.said import Said, Shouted, shouted
+from tests.runtime.small_events import Said, Shouted, shouted
 
 # A source filter on one listener makes a sender take the longer of its two ways of delivery.
 SOURCES = pytest.mark.parametrize("source", [None, "drone"], ids=["to all", "routed"])

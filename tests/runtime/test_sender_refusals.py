@@ -17,7 +17,7 @@ from runtime.errors import ChannelThreadError, ChannelTypeError, NodeError
 from runtime.sender import Listener, Sender
 from runtime.streams import Stream
 from runtime.testing import run_nodes, spec
-from tests.runtime.said import Said, Shouted, Sung, said, shouted
+from tests.runtime.small_events import Said, Shouted, Sung, said, shouted
 
 WRONG: list[Any] = [Sung(stamp=0, source="drone"), "said", None, 3, Said]
 

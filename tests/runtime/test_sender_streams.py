@@ -13,7 +13,7 @@ from runtime.sender import Listener, Sender
 from runtime.streams import Stream
 from runtime.tasks import DEPTH_LIMIT
 from tests.runtime.loops import Run, turns
-from tests.runtime.said import Shouted, shouted
+from tests.runtime.small_events import Shouted, shouted
 
 Faults = list[tuple[object, str]]
 

@@ -10,7 +10,7 @@ from runtime.errors import ChannelFullError
 from runtime.sender import Listener, Sender
 from runtime.streams import Stream
 from tests.runtime.loops import Run, turns
-from tests.runtime.said import Said, Shouted, Sung, said, shouted
+from tests.runtime.small_events import Said, Shouted, Sung, said, shouted
 
 
 def a_stream(bound: int = 1, name: str = "n.s") -> Stream[Said]:

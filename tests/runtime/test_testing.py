@@ -12,7 +12,7 @@ from events import Announcement, Event
 from runtime import Input, Node, NodeConfig, Output, Tick, every, on
 from runtime.errors import ConfigError, NodeError, RefusedError
 from runtime.testing import run_in_lockstep, run_node, run_nodes, spec
-from tests.runtime.said import Said, Shouted, said
+from tests.runtime.small_events import Said, Shouted, said
 
 MS = 1_000_000
 

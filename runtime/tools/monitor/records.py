@@ -26,7 +26,7 @@ class LastRecords(logging.Handler):
                 number=next(self._numbers),
                 seconds=getattr(record, "seconds", 0.0),
                 level=record.levelname,
-                speaker=getattr(record, "speaker", record.name),
+                logger_name=getattr(record, "logger_name", record.name),
                 text=record.getMessage(),
             )
         )

@@ -268,5 +268,5 @@ def _cell(table: str, column: int, text: str) -> Text:
 
 
 def _log_line(line: LogLine) -> Text:
-    text = f"{line.seconds:10.3f} {line.level:8} {line.speaker}: {line.text}"
+    text = f"{line.seconds:10.3f} {line.level:8} {line.logger_name}: {line.text}"
     return Text(text, style=_COLOURS.get(line.level, ""))

@@ -119,14 +119,14 @@ class LogLine(_Data, frozen=True):
         number: Counts the run's records, from 0.
         seconds: Of the run's clock.
         level: ``INFO``, ``WARNING``, …
-        speaker: The node, or ``runtime``.
+        logger_name: The node, or ``runtime``.
         text: The message.
     """
 
     number: int
     seconds: float
     level: str
-    speaker: str
+    logger_name: str
     text: str
 
 

@@ -139,7 +139,7 @@ class Spool:
         name = "run.announced" if sender is None else sender.name
         key = (name, event.__name__, source)
         if key not in self.receivers:
-            heard = (each.node for each in listeners or () if each.hears(event, source))
+            heard = (each.node for each in listeners or () if each.receives(event, source))
             self.receivers[key] = tuple(dict.fromkeys(heard))
             self.kinds[event.__name__] = _kind(event)
         return ("event", time, run, *key, stamp, identity, cause)

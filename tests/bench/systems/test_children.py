@@ -32,7 +32,7 @@ def test_a_child_that_fails_says_why() -> None:
 
 @pytest.mark.slow
 def test_silence_ends_in_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(children, "PATIENCE", 1.5)
+    monkeypatch.setattr(children, "TIMEOUT", 1.5)
     with pytest.raises(children.PeerError, match=r"answers of nodes \[2\]: nothing came"):
         echo.measure(Case(nodes=2), "silent")
 

@@ -17,7 +17,7 @@ from typing import Any
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-PATIENCE = 10.0
+TIMEOUT = 10.0
 
 
 class Viewer:
@@ -34,7 +34,7 @@ class Viewer:
         self._open = contextlib.ExitStack()
         said = connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None)
         self.connection = self._open.enter_context(said)
-        self.info: dict[str, Any] = json.loads(self.connection.recv(PATIENCE))
+        self.info: dict[str, Any] = json.loads(self.connection.recv(TIMEOUT))
         self.channels: dict[str, dict[str, Any]] = {}
         self.messages: dict[str, list[tuple[int, bytes]]] = defaultdict(list)
         self.times: list[int] = []
@@ -50,7 +50,7 @@ class Viewer:
         """Say goodbye, if the connection still stands."""
         self._open.close()
 
-    def take(self, timeout: float = PATIENCE) -> None:
+    def take(self, timeout: float = TIMEOUT) -> None:
         """Take one message of any kind."""
         data = self.connection.recv(timeout)
         if isinstance(data, str):
@@ -76,7 +76,7 @@ class Viewer:
 
     def next(self, topic: str) -> bytes:
         """Return the oldest message of a topic that has not been returned."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not self.messages[topic]:
             self.take(max(end - time.monotonic(), 0.01))
         return self.messages[topic].pop(0)[1]

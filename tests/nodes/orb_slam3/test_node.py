@@ -16,7 +16,7 @@ from tests.nodes.estimation.test_estimator import camera
 def announced(mode: str) -> EstimatorAnnouncement:
     """Start a node that ends at once, for want of a vocabulary, and return what it announced."""
     from runtime.node import make_node
-    from tests.runtime.said import NoHost
+    from tests.runtime.small_events import NoHost
 
     node = make_node(OrbSlam3, "slam", spec(OrbSlam3, "slam", {"mode": mode}).config, NoHost())
     [announcement] = node.announce()

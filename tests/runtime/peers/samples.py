@@ -93,7 +93,7 @@ class Answerer(Node[AnswererConfig]):
         self.offers.append(f"{announcement.source}: {announcement}")
 
     @on(Asked, Answered, Image)
-    def hears(self, event: Event) -> bool:
+    def receives(self, event: Event) -> bool:
         self.heard.append(f"{type(event).__name__} {event.source} {event.stamp}")
         return self.config.handles
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from runtime.errors import PeerError
-from runtime.peers.compatibility import check_fits, missing, say_missing, what_all_share
+from runtime.peers.compatibility import check_fits, missing, missing_message, what_all_share
 from runtime.peers.messages import Hello
 from tests.runtime.peers.samples import Process, settings
 
@@ -28,7 +28,7 @@ def hello(*nodes: str, config: object = None, left_out: tuple[str, ...] = ()) ->
 def test_nodes_that_nobody_has_are_named_with_the_command() -> None:
     absent = missing([hello("tour")], NODES)
     assert absent == ["drone", "odometry"]
-    assert say_missing(absent, 2.0, "tcp/x:1").endswith("start them with --only drone,odometry")
+    assert missing_message(absent, 2.0, "tcp/x:1").endswith("start them with --only drone,odometry")
 
 
 @pytest.mark.parametrize(

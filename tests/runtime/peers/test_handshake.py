@@ -25,7 +25,7 @@ class Nobody:
     """In the place of `Peers`."""
 
     def __init__(self) -> None:
-        self.lost = self.found_again = self.heard = lambda *_: None
+        self.lost = self.reconnected = self.receive = lambda *_: None
 
     def now(self, ago: int = 0) -> int:
         return -ago
@@ -54,10 +54,10 @@ class Pair:
 
     def deliver(self, to: str) -> None:
         if self.under_way[to]:
-            self.ends[to]._hear(self.other(to), self.under_way[to].popleft(), b"")
+            self.ends[to]._receive(self.other(to), self.under_way[to].popleft(), b"")
 
     def show(self, to: str, here: bool) -> None:
-        self.greetings[to].see(self.other(to), here)
+        self.greetings[to].on_presence(self.other(to), here)
 
     def settle(self) -> None:
         """Let everything arrive; who is not known greets again and again."""
@@ -112,7 +112,7 @@ def run(pair: Pair, ops: list[tuple[str, Any]]) -> None:
                 pair.show(which, what == "meet")
             case "again" if pair.said:
                 to, message = pair.said[which % len(pair.said)]
-                pair.ends[to]._hear(pair.other(to), message, b"")
+                pair.ends[to]._receive(pair.other(to), message, b"")
 
 
 CROSSED: list[tuple[str, Any]] = [
@@ -132,7 +132,7 @@ def test_both_end_in_one_session_that_nothing_old_can_end(ops: list[tuple[str, A
         here, there = pair.tags()
         assert here == there != b""
         for to, message in list(pair.said):
-            pair.ends[to]._hear(pair.other(to), message, b"")
+            pair.ends[to]._receive(pair.other(to), message, b"")
             pair.settle()
         assert pair.tags() == [here, there]
 
@@ -173,8 +173,8 @@ def test_of_a_flood_of_strangers_few_are_remembered() -> None:
         greeting = pair.greetings["asker"]
         greeting._session.put = lambda *_: None  # type: ignore[method-assign]
         for number in range(10_000):
-            greeting.see(f"stranger{number}", True)
-            pair.ends["asker"]._hear(f"other{number}", b"\1" * 40, b"")
+            greeting.on_presence(f"stranger{number}", True)
+            pair.ends["asker"]._receive(f"other{number}", b"\1" * 40, b"")
         assert len(greeting._contacts) <= 256
         assert len(greeting._complained) <= 256
 

@@ -86,15 +86,15 @@ def test_one_that_never_hears_that_the_run_has_begun_ends_all(
     clock: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The others have begun, and go on without it in the turns until it has said why."""
-    heard = Peers.heard
+    receive = Peers.receive
 
     def deaf(peers: Peers, member: object, message: AnyMessage, event: None) -> None:
         if isinstance(message, FirstUpdate) and peers._membership.here == ("one",):
             peers._run.stop("Ctrl-C")
         else:
-            heard(peers, member, message, event)  # type: ignore[arg-type]
+            receive(peers, member, message, event)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Peers, "heard", deaf)
+    monkeypatch.setattr(Peers, "receive", deaf)
     config = settings(
         ("asker", "Asker", {}),
         ("one", "Answerer", {}),
@@ -111,14 +111,14 @@ def test_one_that_never_hears_that_the_run_has_begun_ends_all(
 @pytest.mark.slow
 def test_the_end_goes_on_without_one_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if its loop stood still, while Zenoh's threads go on."""
-    tell = Peers._tell_in_order
+    tell = Peers._broadcast_in_order
     monkeypatch.setattr("runtime.peers.joint_shutdown.SILENCE", 1.0)
 
     def mute(peers: Peers, message: Message) -> None:
         if peers._membership.here != ("one",):
             tell(peers, message)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Peers, "_tell_in_order", mute)
+    monkeypatch.setattr(Peers, "_broadcast_in_order", mute)
     config = settings(("asker", "Asker", {}), ("one", "Answerer", {}), clock="real", duration=0.2)
     both = [Process(config, only) for only in ("asker", "one")]
     for process in both:

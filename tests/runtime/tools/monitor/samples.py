@@ -73,7 +73,9 @@ def snapshot(**changes: Any) -> Snapshot:
             )
         ],
         cameras=["drone.images: drone/front"],
-        log=[LogLine(number=0, seconds=0.5, level="WARNING", speaker="pilot", text="[b]wind[/b]")],
+        log=[
+            LogLine(number=0, seconds=0.5, level="WARNING", logger_name="pilot", text="[b]wind[/b]")
+        ],
     )
     rest = {k: v for k, v in changes.items() if not k.startswith("clock_")}
     return msgspec.structs.replace(found, **rest)

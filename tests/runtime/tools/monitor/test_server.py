@@ -191,7 +191,7 @@ def test_those_who_read_nothing_do_not_hold_up_the_end(
     monkeypatch: pytest.MonkeyPatch, sockets: Path
 ) -> None:
     monkeypatch.setattr(server, "CLOSING_TIMEOUT", 0.1)
-    long = LogLine(number=0, seconds=0.0, level="INFO", speaker="x", text="x" * 400_000)
+    long = LogLine(number=0, seconds=0.0, level="INFO", logger_name="x", text="x" * 400_000)
     monkeypatch.setattr(LastRecords, "lines", lambda _: [long])
     enough = threading.Event()
     take = Observer.take
