@@ -1,4 +1,4 @@
-"""A simulator that takes its time: answers each request with a image pair, 80 ms later.
+"""A simulator that takes its time: answers each request with an image pair, 80 ms later.
 
 Stands for the image fetch over a socket that the thesis measured. Runs in a process of its own:
 ``python -m bench.slow_server DELAY BYTES`` prints its port, and ends with its standard input.

@@ -73,7 +73,7 @@ class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Image(Event, eq=False):
-    """A colour or grey picture, as ROS's ``sensor_msgs/Image``.
+    """A colour or grey image, as ROS's ``sensor_msgs/Image``.
 
     Attributes:
         frame_id: Optical frame.

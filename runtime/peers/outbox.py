@@ -2,7 +2,7 @@
 
 Zenoh waits where the network is slow, and the loop must not. A small message goes out on the spot
 as long as little is under way, by what the other process says has arrived; then Zenoh has room for
-it. So does a picture if the other process sees memory of ours, where it is put: its message is
+it. So does an image if the other process sees memory of ours, where it is put: its message is
 small. All others are written by a thread, in order.
 """
 

@@ -14,7 +14,7 @@ from bench import idle, lockstep, stall, throughput
 
 @pytest.mark.slow
 def test_an_inline_camera_delays_ticks_and_a_worker_fetches_as_much(tmp_path: Path) -> None:
-    """The command writes a row a mode; inline, a tick waits for a whole picture."""
+    """The command writes a row a mode; inline, a tick waits for a whole image."""
     out = tmp_path / "stall.json"
     command = [sys.executable, "-m", "runtime", "bench", "stall", "--seconds", "1.5"]
     subprocess.run([*command, "--repeats", "1", "--json", str(out)], check=True)
@@ -24,7 +24,7 @@ def test_an_inline_camera_delays_ticks_and_a_worker_fetches_as_much(tmp_path: Pa
     for mode in ("inline", "thread", "worker"):
         assert 10 <= rows[mode]["frames"] <= 16
         assert rows[mode]["fetch_ms_median"] > 1
-    # A picture takes several periods of the tick, so inline some ticks must be that late.
+    # An image takes several periods of the tick, so inline some ticks must be that late.
     assert rows["inline"]["late_max_us"] > 2_500
     assert rows["inline"]["missed"] > 0
     for mode in ("fetch inline", "fetch"):
@@ -65,7 +65,7 @@ def test_idling_is_measured_over_the_ticks() -> None:
 
 @pytest.mark.slow
 def test_throughput_covers_handlers_streams_and_workers() -> None:
-    """Each way through has a row; only pictures have bytes."""
+    """Each way through has a row; only images have bytes."""
     rows = throughput.measure(bursts=3)
     assert [row.case.split(",")[0] for row in rows] == [
         *("poses made", "poses made", "events", "events", "events", "images by reference"),

@@ -118,7 +118,7 @@ def test_the_plots_on_the_page_exist(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_each_plot_stands_once_under_its_own_case(tmp_path: Path) -> None:
-    """``large`` and ``large-shared`` begin alike, and yet do not share their pictures."""
+    """``large`` and ``large-shared`` begin alike, and yet do not share their images."""
     measured = results()
     cases = ("small", "large", "large-shared")
     rows = [msgspec.structs.replace(r, case=case) for r in measured.rows for case in cases]

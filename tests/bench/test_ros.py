@@ -8,7 +8,7 @@ from bench import flood, ros_images
 
 
 def test_both_encoders_are_measured_and_compared() -> None:
-    """A row for each kind of picture; that both make the same bytes is checked while warming up."""
+    """A row for each kind of image; that both make the same bytes is checked while warming up."""
     rows = ros_images.measure(repeats=5)
     assert [row.case for row in rows] == ["512×512 rgb8", "512×512 32FC1"]
     for row, size in zip(rows, (3, 4), strict=True):

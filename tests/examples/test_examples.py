@@ -64,7 +64,7 @@ def test_an_estimator_of_ones_own_is_judged_beside_ours(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
-    """`two_cameras` gives 15 coloured pairs and 70 grey pictures a second."""
+    """`two_cameras` gives 15 coloured pairs and 70 grey images a second."""
     summary = run("two_cameras", tmp_path, "run.duration=2s")
     assert summary["events"]["DepthImage"] == 30
     assert summary["events"]["Image"] == pytest.approx(30 + 140, abs=2)
@@ -95,7 +95,7 @@ def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(500)
 def test_a_single_camera_keeps_within_two_percent(tmp_path: Path) -> None:
-    """`monocular` at 30 instead of 70 pictures a second, for the sake of time."""
+    """`monocular` at 30 instead of 70 images a second, for the sake of time."""
     summary = run("monocular", tmp_path, "camera.rate=30", "report.figures=[]")
     figures = summary["verdict"]["estimators"]["odometry"]
     assert figures["alignment"] == "sim3"
@@ -103,8 +103,8 @@ def test_a_single_camera_keeps_within_two_percent(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_poor_pictures_over_a_poor_link_are_late_and_some_are_missing(tmp_path: Path) -> None:
-    """`imperfect` loses one picture in twenty; the estimates are as late as it asks for."""
+def test_poor_images_over_a_poor_link_are_late_and_some_are_missing(tmp_path: Path) -> None:
+    """`imperfect` loses one image in twenty; the estimates are as late as it asks for."""
     summary = run("imperfect", tmp_path, "run.duration=8s", "report.figures=[]")
     figures = summary["verdict"]["estimators"]["odometry"]
     link = summary["links"]["odometry.frames"]
@@ -123,7 +123,7 @@ def test_two_clouds_of_which_one_smears(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_data_sets_hold_equal_stamps(tmp_path: Path) -> None:
-    """`dataset` writes both layouts with the same pictures."""
+    """`dataset` writes both layouts with the same images."""
     run("dataset", tmp_path, "run.duration=2s")
     euroc = {int(p.stem) for p in (tmp_path / "euroc/mav0/cam0/data").glob("*.png")}
     tum = {int(p.stem.replace(".", "")) for p in (tmp_path / "tum_rgbd/rgb").glob("*.png")}

@@ -1,4 +1,4 @@
-"""What the flight log leaves: a trajectory that other tools read, and pictures."""
+"""What the flight log leaves: a trajectory that other tools read, and images."""
 
 from __future__ import annotations
 
@@ -69,16 +69,16 @@ def test_stamps_keep_their_nanoseconds(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pictures_are_drawn(tmp_path: Path) -> None:
+def test_images_are_drawn(tmp_path: Path) -> None:
     inputs: list[Event] = [odometry(500_000_000 * k, k) for k in range(20)]
     inputs += [image(500_000_000 * k, grey=k % 2 == 1) for k in range(20)]
     inputs.append(collision(9_000_000_000))
     log(tmp_path, sorted(inputs, key=lambda e: e.stamp), interval="500ms")
     for name in ("flight.png", "images.png"):
-        picture = cv2.imread(str(tmp_path / name))
-        assert picture is not None
-        assert min(picture.shape[:2]) > 300
-        assert picture.std() > 5
+        image = cv2.imread(str(tmp_path / name))
+        assert image is not None
+        assert min(image.shape[:2]) > 300
+        assert image.std() > 5
 
 
 @pytest.mark.parametrize(("east", "seconds"), [(0.0, 20), (1.0, 20), (0.0, 1)])
@@ -87,11 +87,11 @@ def test_a_straight_flight_and_one_on_the_spot_are_drawn_as_large(
 ) -> None:
     """Axes without breadth would be a line: half of the plot's height is the view from above."""
     log(tmp_path, [odometry(500_000_000 * k, east * k) for k in range(2 * seconds)])
-    picture = cv2.imread(str(tmp_path / "flight.png"), cv2.IMREAD_GRAYSCALE)
-    assert picture is not None
-    left = picture[:, : picture.shape[1] * 2 // 5]
+    image = cv2.imread(str(tmp_path / "flight.png"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    left = image[:, : image.shape[1] * 2 // 5]
     rows = np.flatnonzero((left < 200).any(axis=1))
-    assert rows[-1] - rows[0] > picture.shape[0] // 3
+    assert rows[-1] - rows[0] > image.shape[0] // 3
 
 
 def test_the_sheet_never_holds_more_than_it_should() -> None:
@@ -110,7 +110,7 @@ def test_the_sheet_never_holds_more_than_it_should() -> None:
     assert kept[-1] >= 8_000_000_000
 
 
-def test_a_flight_without_pictures_or_movement_leaves_what_there_is(tmp_path: Path) -> None:
+def test_a_flight_without_images_or_movement_leaves_what_there_is(tmp_path: Path) -> None:
     log(tmp_path, [odometry(0)])
     assert {p.name for p in tmp_path.iterdir()} == {"trajectory.tum", "flight.png"}
     other = tmp_path / "other"
@@ -158,7 +158,7 @@ class Failing(FlightLog):
 
 @pytest.mark.slow
 def test_a_restart_keeps_what_was_written_before(tmp_path: Path) -> None:
-    """The trajectory goes on, whatever was said while it was down; pictures are drawn by part."""
+    """The trajectory goes on, whatever was said while it was down; images are drawn by part."""
     inputs: list[Event] = [odometry(100_000_000 * k, 0.1 * k) for k in range(60)]
     inputs += [image(500_000_000 * k) for k in range(12)]
     node = spec(Failing, "log", on_error="restart")

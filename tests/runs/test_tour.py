@@ -68,7 +68,7 @@ def test_a_short_flight_leaves_everything(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pictures_depth_pose_and_truth_share_their_stamps() -> None:
+def test_images_depth_pose_and_truth_share_their_stamps() -> None:
     """At equal intervals, beside an IMU that keeps its own."""
     config = load(CONFIG, [*SHORT, "run.duration=1s"])
     nodes = (*config.nodes[:1], spec(Witness, "witness"))
@@ -125,7 +125,7 @@ def test_the_tour_flies_round_the_hall_and_lands(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_whole_tour_with_pictures(tmp_path: Path) -> None:
+def test_the_whole_tour_with_images(tmp_path: Path) -> None:
     fly(tmp_path, "out", *SMALL)
     found = summary(tmp_path / "out")
     assert found["reason"] == "pilot: flight completed"

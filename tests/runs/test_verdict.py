@@ -39,7 +39,7 @@ def test_odometry_keeps_within_a_third_of_a_percent(world: str, tmp_path: Path) 
 
 
 def test_a_scene_too_heavy_for_the_machine_gives_the_same_estimates(tmp_path: Path) -> None:
-    """Two real seconds a picture, or as fast as it goes: the same events, to the byte."""
+    """Two real seconds an image, or as fast as it goes: the same events, to the byte."""
     short = ["run.duration=5s", "camera.rate=5", "camera.width=256", "camera.height=256"]
     short.append("report.figures=[]")
     found = []

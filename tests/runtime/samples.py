@@ -175,7 +175,7 @@ class Lively(Speaker):
 
 
 class Painter(Node):
-    """Sends one small picture."""
+    """Sends one small image."""
 
     images = Output(Image)
 

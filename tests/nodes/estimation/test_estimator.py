@@ -38,7 +38,7 @@ INFO = CameraInfo.from_fov(8, 6, math.pi / 2)
 
 
 class Scripted(Estimator):
-    """Moves a metre along its optical axis with each picture; a dark picture is not enough."""
+    """Moves a metre along its optical axis with each image; a dark image is not enough."""
 
     needs = frozenset({"grey", "depth"})
     method = "scripted"
@@ -91,9 +91,7 @@ def vehicle(source: str = "drone", control_rate: float = 400) -> Event:
     )
 
 
-def picture(
-    stamp: int, source: str = "drone/front", dark: bool = False, grey: int = 9
-) -> list[Event]:
+def rgbd(stamp: int, source: str = "drone/front", dark: bool = False, grey: int = 9) -> list[Event]:
     data = np.full((6, 8), 0 if dark else grey, np.uint8)
     depth = np.ones((6, 8), np.float32)
     frame = f"{source}_optical"
@@ -115,7 +113,7 @@ def begin(*events: Event, control_rate: float = 400) -> list[str]:
 
 
 def test_the_bodys_pose_is_in_map_from_where_the_vehicle_said_it_stands() -> None:
-    frames = [*picture(1), *picture(2)]
+    frames = [*rgbd(1), *rgbd(2)]
     result = track(vehicle(), camera("drone/front", "rgb", "depth"), *frames)
     first, second = result.of(PoseEstimate)
     assert (first.frame_id, first.child_frame_id) == ("map", "base_link")
@@ -128,7 +126,7 @@ def test_without_a_vehicle_or_if_asked_it_is_in_odom() -> None:
     cases: list[tuple[list[Event], dict[str, Any]]] = [([], {}), ([vehicle()], {"origin": "start"})]
     for said, config in cases:
         seen = camera("drone/front", "rgb", "depth")
-        result = track(*said, seen, *picture(1), *picture(2), **config)
+        result = track(*said, seen, *rgbd(1), *rgbd(2), **config)
         first, second = result.of(PoseEstimate)
         assert first.frame_id == "odom"
         np.testing.assert_allclose(first.position, (0.0, 0.0, 0.0), atol=1e-12)
@@ -141,42 +139,48 @@ def armed(stamp: int, source: str = "drone") -> Event:
 
 def test_a_vehicle_that_takes_commands_stands_where_it_said_until_it_is_armed() -> None:
     late = 500 * MS
-    assert begin(*picture(late)) == ["map"]
-    assert begin(armed(late), *picture(late)) == ["map"]
-    assert begin(armed(late - 1), *picture(late)) == ["odom"]
-    assert begin(TakenOff(stamp=late - 1, source="drone"), *picture(late)) == ["odom"]
-    assert begin(armed(late - 1, "another"), *picture(late)) == ["map"]
+    assert begin(*rgbd(late)) == ["map"]
+    assert begin(armed(late), *rgbd(late)) == ["map"]
+    assert begin(armed(late - 1), *rgbd(late)) == ["odom"]
+    assert begin(TakenOff(stamp=late - 1, source="drone"), *rgbd(late)) == ["odom"]
+    assert begin(armed(late - 1, "another"), *rgbd(late)) == ["map"]
 
 
-def test_a_picture_that_shows_too_little_is_no_beginning() -> None:
+def test_an_image_that_shows_too_little_is_no_beginning() -> None:
     """The tracker's poses begin later, when the vehicle is elsewhere."""
-    found = begin(*picture(0, dark=True), armed(100 * MS), *picture(300 * MS), *picture(400 * MS))
+    found = begin(*rgbd(0, dark=True), armed(100 * MS), *rgbd(300 * MS), *rgbd(400 * MS))
     assert found == ["odom", "odom"]
 
 
 def test_a_frame_once_chosen_stays() -> None:
-    assert begin(*picture(0), armed(1), *picture(300 * MS), *picture(400 * MS)) == ["map"] * 3
+    assert begin(*rgbd(0), armed(1), *rgbd(300 * MS), *rgbd(400 * MS)) == ["map"] * 3
 
 
 @pytest.mark.parametrize(("late", "frame"), [(0, "map"), (140 * MS, "map"), (141 * MS, "odom")])
 def test_of_a_recorded_vehicle_the_first_exposure_is_known_only(late: int, frame: str) -> None:
     """A period of the camera's 10 Hz, and its latency: it may move from the start on."""
-    assert begin(*picture(late), control_rate=0.0) == [frame]
+    assert begin(*rgbd(late), control_rate=0.0) == [frame]
 
 
 def test_who_does_not_know_the_metre_is_not_in_map() -> None:
     seen = camera("drone/front", "rgb", "depth")
-    result = run_nodes([spec(ScaleFree, "est")], inputs=[vehicle(), seen, *picture(1)])
+    result = run_nodes([spec(ScaleFree, "est")], inputs=[vehicle(), seen, *rgbd(1)])
     assert [each.frame_id for each in result.of(PoseEstimate)] == ["odom"]
 
 
 def test_after_a_restart_it_is_in_a_frame_of_its_own_and_says_so() -> None:
     """Brought up in mid-flight, it would say that the vehicle stands at the start."""
-    dazzling = [picture(at * MS, grey=255) for at in (100, 1500)]
-    frames = [*picture(0), *dazzling[0], *picture(900 * MS), *dazzling[1], *picture(3000 * MS)]
+    dazzling = [rgbd(at * MS, grey=255) for at in (100, 1500)]
+    frames = [
+        *rgbd(0),
+        *dazzling[0],
+        *rgbd(900 * MS),
+        *dazzling[1],
+        *rgbd(3000 * MS),
+    ]
     result = run_nodes(
         [spec(Scripted, "est", on_error="restart")],
-        inputs=[vehicle(), camera("drone/front", "rgb", "depth"), *frames, *picture(3100 * MS)],
+        inputs=[vehicle(), camera("drone/front", "rgb", "depth"), *frames, *rgbd(3100 * MS)],
         duration=4.0,
     )
     assert [(e.stamp // MS, e.frame_id) for e in result.of(PoseEstimate)] == [
@@ -192,7 +196,7 @@ def test_after_a_restart_it_is_in_a_frame_of_its_own_and_says_so() -> None:
 
 def test_another_vehicles_place_is_not_taken_for_its_own() -> None:
     seen = camera("other/front", "rgb", "depth")
-    result = track(vehicle("drone"), seen, *picture(1, "other/front"))
+    result = track(vehicle("drone"), seen, *rgbd(1, "other/front"))
     assert result.of(PoseEstimate)[0].frame_id == "odom"
 
 
@@ -200,9 +204,9 @@ def test_the_first_camera_that_gives_what_is_needed_is_read() -> None:
     result = track(
         *(camera("drone/down", "grey"), camera("drone/front", "rgb", "depth")),
         *(camera("drone/rear", "grey", "depth"),),
-        *picture(1),
-        *picture(1, "drone/rear"),
-        *picture(1, "drone/down")[:1],
+        *rgbd(1),
+        *rgbd(1, "drone/rear"),
+        *rgbd(1, "drone/down")[:1],
     )
     assert {event.frame_id for event in result.of(TrackedFeatures)} == {"drone/front_optical"}
     assert len(result.of(PoseEstimate)) == 1
@@ -211,8 +215,8 @@ def test_the_first_camera_that_gives_what_is_needed_is_read() -> None:
 def test_the_file_may_name_another_camera() -> None:
     result = track(
         *(camera("drone/front", "rgb", "depth"), camera("drone/rear", "grey", "depth")),
-        *picture(1),
-        *picture(1, "drone/rear"),
+        *rgbd(1),
+        *rgbd(1, "drone/rear"),
         inputs={"frames": "drone/rear"},
     )
     assert {event.frame_id for event in result.of(TrackedFeatures)} == {"drone/rear_optical"}
@@ -231,8 +235,8 @@ def test_no_camera_at_all_is_an_error_that_says_so() -> None:
 
 
 def test_lost_and_regained_are_told_once_and_no_pose_meanwhile() -> None:
-    dark = [*picture(2, dark=True), *picture(3, dark=True)]
-    result = track(camera("drone/front", "grey", "depth"), *picture(1), *dark, *picture(4))
+    dark = [*rgbd(2, dark=True), *rgbd(3, dark=True)]
+    result = track(camera("drone/front", "grey", "depth"), *rgbd(1), *dark, *rgbd(4))
     assert [(e.stamp, e.reason) for e in result.of(TrackingLost)] == [(2, "dark")]
     assert [e.stamp for e in result.of(TrackingRegained)] == [4]
     assert [e.stamp for e in result.of(PoseEstimate)] == [1, 4]
@@ -262,7 +266,7 @@ def test_whatever_happens_an_estimate_in_map_is_true(
         at += gap
         flown[at * MS] = max(at - (moves if control_rate else 0), 0) / 1000
         grey = {"lit": 9, "dark": 0, "dazzling": 255}[kind]
-        events += picture(at * MS, grey=grey)
+        events += rgbd(at * MS, grey=grey)
     events.sort(key=lambda event: event.stamp)
 
     class Ideal(Scripted):

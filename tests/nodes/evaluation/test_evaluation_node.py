@@ -177,7 +177,7 @@ def test_files_hold_what_was_said(tmp_path: Path) -> None:
     assert len(ticks.stamps) == 4001
 
 
-def test_of_many_pictures_a_few_are_kept_with_their_features(tmp_path: Path) -> None:
+def test_of_many_images_a_few_are_kept_with_their_features(tmp_path: Path) -> None:
     events: list[Event] = []
     for stamp in FRAMES:
         data = np.full((60, 80), 128, np.uint8)

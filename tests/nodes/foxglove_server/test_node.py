@@ -72,7 +72,7 @@ def test_who_connects_and_says_nothing_does_not_hold_up_the_end(
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_a_viewer_comes_and_goes_while_the_example_flies(tmp_path: Path) -> None:
-    """Pictures and poses come at their rates; a viewer that is cut off leaves the run alone."""
+    """Images and poses come at their rates; a viewer that is cut off leaves the run alone."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

@@ -24,13 +24,13 @@ from tests.nodes.viewing.samples import (
     ESTIMATOR,
     MS,
     VEHICLE,
+    decoded,
     depth,
     estimate,
     features,
     image,
     imu,
     odometry,
-    picture,
     score,
 )
 
@@ -155,20 +155,20 @@ def test_estimates_in_a_frame_of_their_own_begin_at_the_truth(
     assert fields(viewer.next("/mapping/cloud"))[2] == [b"vo/odom"]
 
 
-def test_pictures_are_what_the_camera_saw(server: Server, viewer: Viewer) -> None:
+def test_images_are_what_the_camera_saw(server: Server, viewer: Viewer) -> None:
     stage = Stage(server)
     stage.look(viewer, "/drone/camera/image", "/drone/camera/depth")
     stage.publishing.image(image(STAMP))
     stage.publishing.depth(depth(STAMP, 2.5))
     found = fields(viewer.next("/drone/camera/image"))
-    assert picture(found[2][0], cv2.IMREAD_COLOR_RGB)[3, 4] == pytest.approx([200, 100, 50], abs=4)
+    assert decoded(found[2][0], cv2.IMREAD_COLOR_RGB)[3, 4] == pytest.approx([200, 100, 50], abs=4)
     assert (found[3], found[4]) == ([b"jpeg"], [b"drone/camera_optical"])
     raw = fields(viewer.next("/drone/camera/depth"))
     assert (raw[2], raw[3], raw[4], raw[5]) == ([8], [6], [b"16UC1"], [16])
     assert set(np.frombuffer(raw[6][0], "<u2").tolist()) == {2500}
 
 
-def test_pictures_that_nobody_announced_have_a_topic_too(server: Server, viewer: Viewer) -> None:
+def test_images_that_nobody_announced_have_a_topic_too(server: Server, viewer: Viewer) -> None:
     stage = Stage(server)
     stray = msgspec.structs.replace(image(0), source="web/cam", frame_id="web_optical")
     stage.publishing.image(stray)
@@ -186,7 +186,7 @@ def test_a_camera_with_both_has_a_topic_for_the_grey_ones(server: Server, viewer
     stage.publishing.image(
         msgspec.structs.replace(image(0), source="drone/eye/grey", encoding="mono8", data=data)
     )
-    grey = picture(fields(viewer.next("/drone/eye/grey"))[2][0], cv2.IMREAD_GRAYSCALE)
+    grey = decoded(fields(viewer.next("/drone/eye/grey"))[2][0], cv2.IMREAD_GRAYSCALE)
     assert grey[3, 4] == pytest.approx(90, abs=3)
 
 
@@ -241,7 +241,7 @@ def test_a_viewer_that_vanishes_is_survived(server: Server, viewer: Viewer) -> N
     assert fields(viewer.next("/drone/odometry"))[2] == [b"map"]
 
 
-def test_where_nobody_looks_no_picture_is_made(
+def test_where_nobody_looks_no_image_is_made(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(server)

@@ -78,7 +78,7 @@ def announcements() -> list[Event]:
 
 
 def image(stamp: int, source: str = CAMERA, *, grey: bool = False) -> Image:
-    """Return a picture that is another at every stamp."""
+    """Return an image that is another at every stamp."""
     shape = (4, 5) if grey else (4, 5, 3)
     data = np.random.default_rng(stamp).integers(0, 255, shape, np.uint8)
     encoding = "mono8" if grey else "rgb8"

@@ -65,7 +65,7 @@ def test_wait_keeps_everything_and_says_that_it_is_full() -> None:
 
 
 def test_drop_images_keeps_what_is_small() -> None:
-    """Pictures beyond the limit are left out; measurements are not."""
+    """Images beyond the limit are left out; measurements are not."""
     queue = backlog("drop_images")
     for stamp in range(10):
         queue.put(stamp, large(stamp) if stamp % 2 else imu(stamp))

@@ -66,7 +66,7 @@ def test_all_events_come_back_as_they_were(tmp_path: Path, settings: dict[str, A
 
 
 def test_ros_reads_the_topics_that_the_bridge_has(tmp_path: Path) -> None:
-    """All messages can be read; pictures, poses and transforms are in ROS's names and axes."""
+    """All messages can be read; images, poses and transforms are in ROS's names and axes."""
     path = tmp_path / "a.mcap"
     record(path, [*announcements(), *said(SECOND)])
     found = messages(path)
@@ -76,9 +76,9 @@ def test_ros_reads_the_topics_that_the_bridge_has(tmp_path: Path) -> None:
         "/odometry/pose", "/drone/down/range", "/scores/odometry/ate", "/tf", "/tf_static",
         "/map/points",
     } <= {*found}  # fmt: skip
-    picture = found["/drone/front/image_raw"][0]
-    assert picture.data.tobytes() == image(SECOND).data.tobytes()
-    assert (picture.encoding, picture.header.stamp.sec) == ("rgb8", 1)
+    received = found["/drone/front/image_raw"][0]
+    assert received.data.tobytes() == image(SECOND).data.tobytes()
+    assert (received.encoding, received.header.stamp.sec) == ("rgb8", 1)
     x, y, z = odometry(SECOND).position
     place = found["/drone/odom"][0].pose.pose.position
     assert (place.x, place.y, place.z) == (y, x, -z)
@@ -108,12 +108,12 @@ def test_times_are_those_of_publication(tmp_path: Path) -> None:
 
 
 def test_jpeg_and_millimetres_lose_what_they_must(tmp_path: Path) -> None:
-    """A picture comes back about as it was, and depth to the millimetre; all else is the same."""
+    """An image comes back about as it was, and depth to the millimetre; all else is the same."""
     path = tmp_path / "a.mcap"
     column = np.arange(0, 250, 2).astype(np.uint8)[:, None, None]
     smooth = np.broadcast_to(column, (125, 40, 3)).copy()
-    picture = Image(stamp=1, source="drone/front", frame_id="f", data=smooth)
-    record(path, [*announcements(), picture, depth(2)], image_format="jpeg", depth_format="png")
+    sent = Image(stamp=1, source="drone/front", frame_id="f", data=smooth)
+    record(path, [*announcements(), sent, depth(2)], image_format="jpeg", depth_format="png")
     *_, found, far = replayed(path)
     assert isinstance(found, Image)
     assert found.frame_id == "f"

@@ -60,7 +60,7 @@ def test_a_run_is_recorded_to_its_end(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_simulated_time_waits_for_a_slow_disk(tmp_path: Path) -> None:
-    """With next to no memory nothing is lost: pictures come no faster than they are written."""
+    """With next to no memory nothing is lost: images come no faster than they are written."""
     events: list[Event] = [big(n * 10_000_000) for n in range(12)]
     result = record(events, tmp_path, memory=1 << 19, image_format="png")
     assert result.drops["recorder.events"].dropped == 0

@@ -22,7 +22,7 @@ from tests.nodes.monocular_odometry.world import (
 
 
 def begin(path: list[Floats], tiles: tuple[Tile, ...]) -> tuple[InitialMap, int]:
-    """Return the first map and the number of its second picture."""
+    """Return the first map and the number of its second image."""
     initialization = Initialization(MATRIX, MonocularSettings())
     for number, place in enumerate(path):
         found = initialization.add(look(place, tiles))
@@ -69,7 +69,7 @@ def test_it_waits_for_the_motion_that_is_asked_for() -> None:
     assert numbers[0] < numbers[1]
 
 
-def test_too_few_corners_begin_anew_with_the_next_picture() -> None:
+def test_too_few_corners_begin_anew_with_the_next_image() -> None:
     dark: Grey = np.zeros((192, 256), np.uint8)
     initialization = Initialization(MATRIX, MonocularSettings())
     assert initialization.add(look(WAY[0])) is None

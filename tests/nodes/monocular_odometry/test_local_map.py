@@ -1,4 +1,4 @@
-"""The map between pictures: what a new key frame adds to it, corrects and forgets."""
+"""The map between images: what a new key frame adds to it, corrects and forgets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Monocular odometry as a node, on pictures of a small world."""
+"""Monocular odometry as a node, on images of a small world."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def camera() -> Event:
     )
 
 
-def picture(number: int, data: Grey) -> Event:
+def image_event(number: int, data: Grey) -> Event:
     return Image(
         stamp=(number + 1) * FRAME,
         source="drone/down",
@@ -52,7 +52,7 @@ def picture(number: int, data: Grey) -> Event:
 @pytest.mark.slow
 def test_it_says_that_its_scale_is_free_and_nothing_before_it_has_a_map() -> None:
     images = [look(pose(x=0.06 * i)) for i in range(18)] + [np.zeros_like(look(pose()))]
-    events = [picture(i, image) for i, image in enumerate(images)]
+    events = [image_event(i, image) for i, image in enumerate(images)]
     result = run_node(MonocularOdometry, inputs=[camera(), *events], duration=1.2, name="mono")
     (said,) = result.of(EstimatorAnnouncement)
     assert said.scale_free
@@ -64,7 +64,7 @@ def test_it_says_that_its_scale_is_free_and_nothing_before_it_has_a_map() -> Non
     assert [each.stamp for each in result.of(TrackingLost)] == [last]
     assert estimates[0].frame_id == "odom"  # no vehicle said where it stands
     x, y, z = estimates[-1].position
-    assert y > 0.2  # to the right of the picture, which is to the body's right
+    assert y > 0.2  # to the right of the image, which is to the body's right
     assert math.hypot(x, z) < 0.02 * y
 
 

@@ -21,7 +21,7 @@ INFO = CameraInfo.from_fov(256, 192, math.radians(80))
 MATRIX = INFO.matrix()
 FLAT: tuple[Tile, ...] = ((2.0, -9.0, 9.0, -9.0, 9.0),)
 STEPPED: tuple[Tile, ...] = ((3.0, -9.0, 9.0, -9.0, 9.0), (1.8, -9.0, 9.0, -9.0, 0.0))
-"""Two planes, each half of the picture."""
+"""Two planes, each half of the image."""
 RELIEF: tuple[Tile, ...] = (
     (2.0, -9.0, 9.0, -9.0, 9.0),
     *((1.5 + 0.1 * i, -1.4 + 1.2 * i, -0.8 + 1.2 * i, -0.9, -0.2) for i in range(3)),
@@ -67,7 +67,7 @@ def look(camera: Floats, tiles: tuple[Tile, ...] = RELIEF) -> Grey:
         hit = (tile_u > left) & (tile_u < end) & (tile_v > top) & (tile_v < bottom)
         hit &= (reach / ahead > 0) & (reach < nearest)
         np.copyto(nearest, reach, where=hit)
-        # Another piece of texture at each distance, and as fine in the picture.
+        # Another piece of texture at each distance, and as fine in the image.
         np.copyto(u, 2.0 * tile_u / distance + distance, where=hit)
         np.copyto(v, 2.0 * tile_v / distance, where=hit)
     drawn = cv2.remap(

@@ -1,6 +1,6 @@
-"""A tilted wall with a random picture on it, and a camera that moves in front of it.
+"""A tilted wall with a random image on it, and a camera that moves in front of it.
 
-What the camera sees is exact: the picture and its view are related by a homography, and depth is
+What the camera sees is exact: the image and its view are related by a homography, and depth is
 where the ray meets the plane.
 """
 
@@ -61,23 +61,23 @@ class View(NamedTuple):
 
 
 def views(count: int, blank: range = range(0)) -> list[View]:
-    """Return a flight in front of the wall, to the right and nearer, with blank pictures in it."""
+    """Return a flight in front of the wall, to the right and nearer, with blank images in it."""
     wall = _wall()
     return [_view(wall, k, blank=k in blank) for k in range(count)]
 
 
 @cache
 def _wall() -> npt.NDArray[np.uint8]:
-    """Return a picture with corners of all sizes."""
+    """Return an image with corners of all sizes."""
     rng = np.random.default_rng(5)
     height, width = INFO.height + 2 * _MARGIN, INFO.width + 2 * _MARGIN
-    picture = np.full((height, width, 3), 128, np.uint8)
+    image = np.full((height, width, 3), 128, np.uint8)
     for _ in range(9000):
         x, y = rng.integers(width), rng.integers(height)
         w, h = rng.integers(3, 22, size=2)
         colour = tuple(int(c) for c in rng.integers(20, 235, size=3))
-        cv2.rectangle(picture, (int(x), int(y)), (int(x + w), int(y + h)), colour, -1)
-    return picture
+        cv2.rectangle(image, (int(x), int(y)), (int(x + w), int(y + h)), colour, -1)
+    return image
 
 
 def _view(wall: npt.NDArray[np.uint8], k: int, *, blank: bool) -> View:

@@ -1,4 +1,4 @@
-"""A node with a camera that sees one picture, again and again."""
+"""A node with a camera that sees one image, again and again."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from tests.nodes.orb_slam3.scene import views
 
 
 class Still(Node):
-    """Sends the same picture ten times a second."""
+    """Sends the same image ten times a second."""
 
     images = Output(Image)
 
     def __init__(self) -> None:
-        self._picture = views(1)[0].rgb
+        self._image = views(1)[0].rgb
 
     @every(hz=10)
     def show(self, tick: Tick) -> None:
         """Send it."""
         self.images.send(
-            Image(stamp=tick.stamp, source="drone/front", frame_id="f", data=self._picture)
+            Image(stamp=tick.stamp, source="drone/front", frame_id="f", data=self._image)
         )

@@ -40,7 +40,7 @@ def vocabulary(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Flight:
-    """What ORB-SLAM3 said of some pictures, what it knew at the end, and what it printed."""
+    """What ORB-SLAM3 said of some images, what it knew at the end, and what it printed."""
 
     def __init__(self, mode: Mode, vocabulary: Path, seen: Sequence[View]) -> None:
         self.tracked: list[OrbSlam3Result] = []
@@ -98,7 +98,7 @@ def test_the_pose_is_the_camera_in_its_first_frame_in_metres(flight: Flight) -> 
     assert degrees[:30].max() < 0.3
 
 
-def test_a_blank_picture_is_lost_and_the_last_pose_stays(flight: Flight) -> None:
+def test_a_blank_image_is_lost_and_the_last_pose_stays(flight: Flight) -> None:
     before, blank = flight.tracked[29], flight.tracked[30:36]
     assert all(t.lost and t.reason and t.state != "OK" for t in blank)
     assert all(t.pose.tobytes() == before.pose.tobytes() for t in blank)
@@ -117,7 +117,7 @@ def test_it_goes_on_when_it_sees_again(flight: Flight) -> None:
         assert np.linalg.norm(after.pose[:3, 3] - expected[:3, 3]) < 0.03
 
 
-def test_points_are_corners_in_the_picture_and_most_agree_with_the_map(flight: Flight) -> None:
+def test_points_are_corners_in_the_image_and_most_agree_with_the_map(flight: Flight) -> None:
     for said in flight.tracked[1:30]:
         assert said.points.dtype == np.float32
         assert said.points.shape == (len(said.inliers), 2)

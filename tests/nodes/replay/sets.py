@@ -118,8 +118,8 @@ def euroc_as_published(folder: Path) -> Path:
     rows = "#timestamp [ns],filename\r\n"
     for stamp in (first, first + 50_000_000):
         rows += f"{stamp},{stamp}.png\r\n"
-        picture = np.full((480, 752), stamp % 251, np.uint8)
-        cv2.imwrite(str(root / "cam0" / "data" / f"{stamp}.png"), picture)
+        image = np.full((480, 752), stamp % 251, np.uint8)
+        cv2.imwrite(str(root / "cam0" / "data" / f"{stamp}.png"), image)
     (root / "cam0" / "data.csv").write_text(rows)
     (root / "imu0" / "sensor.yaml").write_text(
         "#Default imu sensor yaml file\nsensor_type: imu\ncomment: VI-Sensor IMU (ADIS16448)\n\n"
@@ -158,14 +158,14 @@ def tum_as_published(folder: Path) -> Path:
         (root / kind).mkdir(parents=True)
     head = "# {}\n# file: 'rgbd_dataset_freiburg1_xyz.bag'\n# timestamp filename\n"
     colours = ["1305031102.175304", "1305031102.211214", "1305031102.243211"]
-    colours += ["1305031102.850000"]  # 50 ms before the last depth picture
+    colours += ["1305031102.850000"]  # 50 ms before the last depth image
     depths = ["1305031102.160407", "1305031102.226738", "1305031102.262886", "1305031102.900000"]
-    picture = np.zeros((480, 640, 3), np.uint8)
-    picture[:] = (10, 20, 30)  # blue, green, red
+    image = np.zeros((480, 640, 3), np.uint8)
+    image[:] = (10, 20, 30)  # blue, green, red
     steps = np.full((480, 640), 5000, np.uint16)
     steps[0, 0] = 0
     for name in colours:
-        cv2.imwrite(str(root / "rgb" / f"{name}.png"), picture)
+        cv2.imwrite(str(root / "rgb" / f"{name}.png"), image)
     for name in depths:
         cv2.imwrite(str(root / "depth" / f"{name}.png"), steps)
     for kind, title, names in (

@@ -16,7 +16,7 @@ from tests.nodes.mcap_recorder.samples import image, imu
 PIXELS = 1 << 20
 
 
-def pictures(count: int, made: list[int]) -> Iterator[Timed]:
+def timed_images(count: int, made: list[int]) -> Iterator[Timed]:
     for stamp in range(count):
         made.append(stamp)
         data = np.zeros((1024, 1024), np.uint8)
@@ -46,7 +46,7 @@ def test_all_comes_in_order_and_batches_are_the_same_every_time() -> None:
 def test_memory_is_bounded() -> None:
     """No more is read than may wait, and a batch."""
     made: list[int] = []
-    ahead = ReadAhead(pictures(60, made), 8 * PIXELS)
+    ahead = ReadAhead(timed_images(60, made), 8 * PIXELS)
     ahead._thread.join(0.3)  # in which it would read everything, if it could
     assert ahead._thread.is_alive()
     assert len(made) <= 13
@@ -60,7 +60,7 @@ def test_closing_stops_the_reading() -> None:
 
     def events() -> Iterator[Timed]:
         try:
-            yield from pictures(1000, [])
+            yield from timed_images(1000, [])
         finally:
             closed.set()
 

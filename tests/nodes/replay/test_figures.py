@@ -148,7 +148,7 @@ def test_tums_truth_is_in_ned(tum: Reader) -> None:
 
 
 def test_our_own_euroc_comes_back(tmp_path: Path) -> None:
-    """Truth to the nanometre, pictures in grey, depth to its step."""
+    """Truth to the nanometre, images in grey, depth to its step."""
     found = sets.reader(sets.euroc(tmp_path))
     stamp = 2 * sets.STEP
     truth, expected = of(found, Odometry)[2], odometry(stamp)
@@ -198,7 +198,7 @@ def test_a_bag_comes_back(bag: Path) -> None:
 
 
 @pytest.mark.slow
-def test_compressed_pictures_of_a_bag_come_back(tmp_path: Path) -> None:
+def test_compressed_images_of_a_bag_come_back(tmp_path: Path) -> None:
     """PNG to the bit, and depth to the millimetre."""
     found = sets.reader(sets.compressed_bag(tmp_path))
     assert (of(found, Image)[2].data == image(2 * sets.STEP).data).all()
@@ -268,11 +268,11 @@ def test_a_damaged_orientation_of_the_truth_is_an_error_of_its_line(tmp_path: Pa
         sets.reader(folder)
 
 
-def test_a_missing_picture_is_an_error_when_its_turn_comes(tmp_path: Path) -> None:
+def test_a_missing_image_is_an_error_when_its_turn_comes(tmp_path: Path) -> None:
     """It names the file."""
     folder = sets.euroc_as_published(tmp_path)
     last = sorted((folder / "mav0" / "cam0" / "data").iterdir())[-1]
-    last.write_bytes(b"no picture")
+    last.write_bytes(b"no image")
     found = sets.reader(folder)
     with pytest.raises(ReplayError, match=rf"{last.name}: expected an image"):
         of(found, Image)

@@ -58,7 +58,7 @@ def test_an_estimator_says_of_a_recording_what_it_said_in_flight(tmp_path: Path)
 
 
 def said(path: Path) -> list[tuple[int, bytes]]:
-    """Return all events of a recording with their times; of pictures, a fingerprint."""
+    """Return all events of a recording with their times; of images, a fingerprint."""
     reader = Recorded(path)
     events = [Timed(0, a) for a in reader.announcements()]
     events += reader.events(0, None, lambda _, __: True)

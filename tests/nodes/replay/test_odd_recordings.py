@@ -129,7 +129,7 @@ def test_whatever_a_library_raises_is_an_error_of_one_line(
         sets.reader(path)
 
 
-def test_pictures_of_one_moment_have_a_rate(tmp_path: Path) -> None:
+def test_images_of_one_moment_have_a_rate(tmp_path: Path) -> None:
     """In TUM's layout it is told by the stamps."""
     path = sets.tum_as_published(tmp_path)
     rows = (path / "rgb.txt").read_text().splitlines()[3:]
@@ -138,7 +138,7 @@ def test_pictures_of_one_moment_have_a_rate(tmp_path: Path) -> None:
     assert camera.rate == 30.0
 
 
-def test_a_file_without_content_is_no_picture(tmp_path: Path) -> None:
+def test_a_file_without_content_is_no_image(tmp_path: Path) -> None:
     """And the message is ours, not OpenCV's."""
     path = sets.tum_as_published(tmp_path)
     (path / "rgb" / "1305031102.175304.png").write_bytes(b"")

@@ -84,7 +84,7 @@ def test_only_what_is_wanted_is_read(path: Path) -> None:
     assert read(path, choice=Choice(("nobody",))) == []
 
 
-def test_pictures_are_of_announced_cameras(path: Path) -> None:
+def test_images_are_of_announced_cameras(path: Path) -> None:
     """Of their size, kinds and frame, so that an estimator works unchanged."""
     opened = reader(path)
     cameras = {a.source: a for a in opened.announcements() if isinstance(a, CameraAnnouncement)}
@@ -104,7 +104,7 @@ def test_pictures_are_of_announced_cameras(path: Path) -> None:
 
 
 def test_truth_and_vehicle_agree(path: Path) -> None:
-    """The vehicle stands, at first, where the truth has it about the first picture."""
+    """The vehicle stands, at first, where the truth has it about the first image."""
     opened = reader(path)
     vehicle, *_ = opened.announcements()
     opened.close()

@@ -92,13 +92,13 @@ def test_a_loop_of_one_moment_is_an_error(path: Path) -> None:
 
 
 def test_a_recording_that_does_not_say_its_end_lingers(tmp_path: Path) -> None:
-    """For those who have something to say of the last picture."""
+    """For those who have something to say of the last image."""
     result = replay(sets.euroc(tmp_path), linger="250ms")
     assert result.seconds == pytest.approx(2 * sets.STEP / 1e9 + 0.25)
 
 
 def test_a_choice_narrows_it(path: Path) -> None:
-    """The camera's pictures alone; announcements stay."""
+    """The camera's images alone; announcements stay."""
     result = replay(path, only=["Image"])
     assert len(result.of(Image)) == sets.FRAMES == len(result.sent) - len(result.of(Announcement))
 

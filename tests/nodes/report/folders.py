@@ -1,4 +1,4 @@
-"""Folders as runs leave them: a random walk, noisy estimates of it, small pictures and clouds."""
+"""Folders as runs leave them: a random walk, noisy estimates of it, small images and clouds."""
 
 from __future__ import annotations
 
@@ -175,6 +175,6 @@ def ply(path: Path, points: np.ndarray, colors: np.ndarray | None = None) -> Non
 
 
 def frame(path: Path, seed: int = 0) -> None:
-    """Write a small picture."""
+    """Write a small image."""
     noise = np.random.default_rng(seed).integers(0, 255, (24, 32, 3), np.uint8)
     cv2.imwrite(str(path), noise)

@@ -72,19 +72,19 @@ def test_of_points_on_one_pixel_the_nearest_is_seen() -> None:
     view = View("", np.eye(3), np.zeros(2), np.ones(2))
     points = np.array([[0.5, 0.5, z] for z in (0.1, 0.9, 0.5)], np.float32)
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
-    picture, _ = paint(Shown("", points, colors, 3), view, 11.0, 1)
-    assert picture.shape == (11, 11, 3)
-    assert picture[5, 5].tolist() == [0, 255, 0]
-    assert (picture.reshape(-1, 3) != picture[0, 0]).any(axis=1).sum() == 1
+    image, _ = paint(Shown("", points, colors, 3), view, 11.0, 1)
+    assert image.shape == (11, 11, 3)
+    assert image[5, 5].tolist() == [0, 255, 0]
+    assert (image.reshape(-1, 3) != image[0, 0]).any(axis=1).sum() == 1
 
 
 def test_where_dots_overlap_the_nearer_is_seen() -> None:
     view = View("", np.eye(3), np.zeros(2), np.ones(2))
     points = np.array([[0.5, 0.5, 0.9], [0.6, 0.5, 0.1]], np.float32)
     colors = np.array([[255, 0, 0], [0, 255, 0]], np.uint8)
-    picture, _ = paint(Shown("", points, colors, 2), view, 11.0, 3)
-    assert (picture == [255, 0, 0]).all(axis=2).sum() == 9
-    assert (picture == [0, 255, 0]).all(axis=2).sum() == 3
+    image, _ = paint(Shown("", points, colors, 2), view, 11.0, 3)
+    assert (image == [255, 0, 0]).all(axis=2).sum() == 9
+    assert (image == [0, 255, 0]).all(axis=2).sum() == 3
 
 
 def test_a_name_that_matplotlib_would_hide_is_shown() -> None:
@@ -93,11 +93,11 @@ def test_a_name_that_matplotlib_would_hide_is_shown() -> None:
     assert len(label("long" * 20)) == 40
 
 
-def test_up_on_the_picture_is_north_and_right_is_east() -> None:
+def test_up_on_the_image_is_north_and_right_is_east() -> None:
     view = View("", np.eye(3), np.zeros(2), np.ones(2))
     points = np.array([[0.95, 0.95, 0.0]], np.float32)
-    picture, _ = paint(Shown("", points, np.zeros((1, 3), np.uint8), 1), view, 10.0, 1)
-    assert picture[0, 9].tolist() == [0, 0, 0]
+    image, _ = paint(Shown("", points, np.zeros((1, 3), np.uint8), 1), view, 10.0, 1)
+    assert image[0, 9].tolist() == [0, 0, 0]
 
 
 def test_clouds_are_read_whole_and_sampled(tmp_path: Path) -> None:

@@ -150,9 +150,9 @@ def test_the_page_needs_nothing_beside_it(page: Page) -> None:
     assert "@import" not in page.markup
 
 
-def test_every_picture_is_one_and_shows_something(run: Path, page: Page) -> None:
-    pictures = sorted((run / "plots").glob("*.png"))
-    assert [p.name for p in pictures] == [
+def test_every_image_is_one_and_shows_something(run: Path, page: Page) -> None:
+    images = sorted((run / "plots").glob("*.png"))
+    assert [p.name for p in images] == [
         "axes.png",
         "clouds_1.png",
         "distributions.png",
@@ -162,12 +162,12 @@ def test_every_picture_is_one_and_shows_something(run: Path, page: Page) -> None
         "relative.png",
         "trajectories.png",
     ]
-    for path in pictures:
-        picture = cv2.imread(str(path))
-        assert picture is not None
-        assert 600 < picture.shape[1] <= 1110
-        assert picture.std() > 5
-    assert page.markup.count("<img") == len(pictures) + 1  # and flight.png
+    for path in images:
+        image = cv2.imread(str(path))
+        assert image is not None
+        assert 600 < image.shape[1] <= 1110
+        assert image.std() > 5
+    assert page.markup.count("<img") == len(images) + 1  # and flight.png
 
 
 @pytest.mark.slow

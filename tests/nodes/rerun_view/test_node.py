@@ -38,7 +38,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def flight(seconds: float) -> list[Event]:
-    """Return what a flight says: 100 poses and 20 sets of pictures a second."""
+    """Return what a flight says: 100 poses and 20 sets of images a second."""
     events: list[Event] = []
     for i in range(round(seconds * 100)):
         events.append(odometry(i * 10 * MS, (0.02 * i, 0.0, -1.0)))
@@ -49,7 +49,7 @@ def flight(seconds: float) -> list[Event]:
 
 
 @pytest.mark.slow
-def test_in_lockstep_all_is_recorded_and_as_many_pictures_as_asked_for(tmp_path: Path) -> None:
+def test_in_lockstep_all_is_recorded_and_as_many_images_as_asked_for(tmp_path: Path) -> None:
     inputs = [VEHICLE, CAMERA, ESTIMATOR, *flight(1.9)]
     run_node(RerunView, inputs=inputs, config={"image_rate": 4}, duration=1.9, out=tmp_path)
     found = Recorded(tmp_path / "flight.rrd")

@@ -19,13 +19,13 @@ from tests.nodes.viewing.samples import (
     VEHICLE,
     Recorded,
     camera_pose,
+    decoded,
     depth,
     estimate,
     features,
     image,
     imu,
     odometry,
-    picture,
     score,
 )
 
@@ -124,20 +124,20 @@ def test_estimates_in_a_frame_of_their_own_begin_at_the_truth(tmp_path: Path) ->
     assert turned == pytest.approx([0.1, 0.7, 0.5, 0.5])
 
 
-def test_pictures_and_features_are_below_their_camera(tmp_path: Path) -> None:
+def test_images_and_features_are_below_their_camera(tmp_path: Path) -> None:
     events: list[Event] = [camera_pose(0), depth(0), image(0), features(0)]
     found = record(tmp_path, events, points_max_height=9.0)
     entity = "map/drone/camera"
     ((_, _, (blob,)),) = found.of(f"{entity}/rgb", "EncodedImage:blob")
-    assert picture(blob, cv2.IMREAD_COLOR_RGB)[3, 4] == pytest.approx([200, 100, 50], abs=4)
+    assert decoded(blob, cv2.IMREAD_COLOR_RGB)[3, 4] == pytest.approx([200, 100, 50], abs=4)
     ((_, _, (blob,)),) = found.of(f"{entity}/depth", "EncodedDepthImage:blob")
-    assert picture(blob, cv2.IMREAD_UNCHANGED).tolist() == [[200] * 4] * 3
+    assert decoded(blob, cv2.IMREAD_UNCHANGED).tolist() == [[200] * 4] * 3
     points = found.values(f"{entity}/rgb/features/vo", "Points2D:positions")
     assert points[0] == pytest.approx(np.array([[1.5, 2.5], [3.5, 4.5]]))
     assert len(found.values("map/points/drone/camera", "Points3D:positions")[0]) == 2
 
 
-def test_pictures_that_nobody_announced_are_shown_by_themselves(tmp_path: Path) -> None:
+def test_images_that_nobody_announced_are_shown_by_themselves(tmp_path: Path) -> None:
     stray = msgspec.structs.replace(image(0), source="web/cam", frame_id="web_optical")
     points = msgspec.structs.replace(features(0), frame_id="web_optical")
     found = record(tmp_path, [stray, points])
@@ -145,7 +145,7 @@ def test_pictures_that_nobody_announced_are_shown_by_themselves(tmp_path: Path) 
     assert len(found.of("images/web/cam/rgb/features/vo", "Points2D:positions")) == 1
 
 
-def test_quality_nought_leaves_pictures_as_they_are(tmp_path: Path) -> None:
+def test_quality_nought_leaves_images_as_they_are(tmp_path: Path) -> None:
     found = record(tmp_path, [image(0)], jpeg_quality=0)
     assert len(found.of("map/drone/camera/rgb", "Image:buffer")) == 1
     assert found.of("map/drone/camera/rgb", "EncodedImage:blob") == []

@@ -75,10 +75,10 @@ def test_the_client_decodes_every_topic(seen: tuple[Any, Any, str]) -> None:
     assert set(heard) == set(TOPICS) - {"/cmd_vel", "/slam/pose"}
     assert heard["/drone/imu"]["linear_acceleration"] == {"x": 0.0, "y": 0.0, "z": 9.81}
     assert heard["/drone/odom"]["pose"]["pose"]["position"] == {"x": 2.5, "y": 1.0, "z": 3.0}
-    picture = heard["/drone/camera/image_raw"]
+    message = heard["/drone/camera/image_raw"]
     first = samples.image().data.ravel()[:4].tolist()
-    assert picture["data"] == {"size": 48 * 64 * 3, "first": first}
-    assert (picture["encoding"], picture["step"]) == ("rgb8", 192)
+    assert message["data"] == {"size": 48 * 64 * 3, "first": first}
+    assert (message["encoding"], message["step"]) == ("rgb8", 192)
     assert heard["/drone/camera/depth/image_raw"]["encoding"] == "32FC1"
     assert heard["/drone/camera/camera_info"]["header"]["frame_id"] == "camera_optical_frame"
     assert heard["/mapper/points"]["width"] == 3

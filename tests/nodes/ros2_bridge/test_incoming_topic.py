@@ -82,7 +82,7 @@ ALL = sorted(READERS)
 @pytest.mark.parametrize(("type_", "use"), ALL)
 def test_every_reader_reads_a_message_that_is_sane(type_: str, use: str) -> None:
     ear = Ear(type_, use)
-    if use == "depth":  # an rgb8 picture is none
+    if use == "depth":  # an rgb8 image is none
         assert ear.hear(valid(type_)) is None
         assert ear.said[0].startswith("/t: message refused: encoding: expected 32FC1")
     else:

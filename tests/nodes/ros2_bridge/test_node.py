@@ -201,7 +201,7 @@ def test_a_camera_of_ros_is_waited_for_and_announced(
     assert "/eye/camera_info: calibration refused: " in caplog.text
 
 
-def test_pictures_are_read_in_order_beside_the_loop(
+def test_images_are_read_in_order_beside_the_loop(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Turning the colours of a large one takes longer than a controller can wait."""
@@ -214,8 +214,8 @@ def test_pictures_are_read_in_order_beside_the_loop(
 
     writer = ImageWriter(samples.store(), "eye", "bgr8")
     pixels = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
-    pictures = [bytes(writer.write((0, n), pixels)) for n in range(1, 6)]
-    session = TakingSession([*pictures, b"nonsense"])
+    images = [bytes(writer.write((0, n), pixels)) for n in range(1, 6)]
+    session = TakingSession([*images, b"nonsense"])
     monkeypatch.setattr("nodes.ros2_bridge.node.Session", lambda *_, **__: session)
     monkeypatch.setattr("nodes.ros_messages.incoming.read_image", read)
     table = {"topic": "/eye", "type": "sensor_msgs/msg/Image", "as": "image"}

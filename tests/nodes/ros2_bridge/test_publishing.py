@@ -40,15 +40,15 @@ def stamps(messages: list[Any]) -> list[int]:
     return [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in messages]
 
 
-def test_in_lockstep_every_picture_is_published_in_order(bridge: Bridge) -> None:
-    pictures = [samples.image(10_000_000 * (i + 1)) for i in range(20)]
-    session = bridge([*ANNOUNCED, *pictures])
+def test_in_lockstep_every_image_is_published_in_order(bridge: Bridge) -> None:
+    sent = [samples.image(10_000_000 * (i + 1)) for i in range(20)]
+    session = bridge([*ANNOUNCED, *sent])
     (images,), (info,), (clock,) = map(
         session.on, ("/drone/camera/image_raw", "/drone/camera/camera_info", "/clock")
     )
     found = images.read()
-    assert stamps(found) == stamps(info.read()) == [each.stamp for each in pictures]
-    assert found[0].data.tobytes() == pictures[0].data.tobytes()
+    assert stamps(found) == stamps(info.read()) == [each.stamp for each in sent]
+    assert found[0].data.tobytes() == sent[0].data.tobytes()
     assert clock.sent >= 39
 
 
@@ -76,7 +76,7 @@ def test_sensors_are_best_effort_and_fixed_frames_are_kept(bridge: Bridge) -> No
     assert imu.topic.qos.text() == "::,5:,:,:,,"
 
 
-def test_a_source_may_change_what_its_pictures_are(bridge: Bridge) -> None:
+def test_a_source_may_change_what_its_images_are(bridge: Bridge) -> None:
     """A message says what is in it, and not what was in the first."""
     grey = Image(
         stamp=20_000_000,

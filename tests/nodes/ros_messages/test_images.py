@@ -1,4 +1,4 @@
-"""Pictures and clouds: the bytes are rosbags' own, and come back as they were."""
+"""Images and clouds: the bytes are rosbags' own, and come back as they were."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_a_sweep_has_no_colours() -> None:
 
 
 @pytest.mark.parametrize("shape", [(48, 64, 3), (48, 64)])
-def test_a_png_holds_the_picture_and_names_it_as_image_transport_does(
+def test_a_png_holds_the_image_and_names_it_as_image_transport_does(
     shape: tuple[int, ...],
 ) -> None:
     data = RANDOM.integers(0, 256, shape, np.uint8)

@@ -181,7 +181,7 @@ def part(width: int, height: int) -> Any:
     return make("sensor_msgs/msg/RegionOfInterest", **names)
 
 
-def test_a_calibration_may_name_the_whole_picture() -> None:
+def test_a_calibration_may_name_the_whole_image() -> None:
     data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera().info, "eye")
     message = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
     message.roi, message.binning_x, message.binning_y = part(64, 48), 1, 1

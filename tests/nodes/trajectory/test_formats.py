@@ -171,9 +171,9 @@ def test_errors_name_the_file_the_line_and_what_is_there(
 def test_files_that_cannot_be_read_are_named(read: Callable[[Path], Any], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"missing: expected a text file .* No such file"):
         read(tmp_path / "missing")
-    (tmp_path / "picture.png").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(ValueError, match=r"picture\.png: expected a text file"):
-        read(tmp_path / "picture.png")
+    (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(ValueError, match=r"image\.png: expected a text file"):
+        read(tmp_path / "image.png")
 
 
 def test_a_long_line_is_shown_in_part(tmp_path: Path) -> None:

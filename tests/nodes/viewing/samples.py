@@ -112,7 +112,7 @@ def features(stamp: int) -> TrackedFeatures:
     )
 
 
-def picture(coded: bytes | list[int], mode: int) -> npt.NDArray[Any]:
+def decoded(coded: bytes | list[int], mode: int) -> npt.NDArray[Any]:
     """Read a JPEG or PNG."""
     data = np.frombuffer(coded, np.uint8) if isinstance(coded, bytes) else np.array(coded, np.uint8)
     found = cv2.imdecode(data, mode)

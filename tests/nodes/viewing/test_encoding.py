@@ -6,19 +6,19 @@ import cv2
 import numpy as np
 
 from nodes.viewing.encoding import depth_in_steps, encode_depth, encode_image
-from tests.nodes.viewing.samples import picture
+from tests.nodes.viewing.samples import decoded
 
 
 def test_red_stays_red() -> None:
     data = np.zeros((16, 16, 3), np.uint8)
     data[..., 0] = 220
-    back = picture(encode_image(data, "jpeg").tobytes(), cv2.IMREAD_COLOR_RGB)
+    back = decoded(encode_image(data, "jpeg").tobytes(), cv2.IMREAD_COLOR_RGB)
     assert np.abs(back.astype(int) - data).max() < 8
 
 
 def test_depth_is_kept_to_the_centimetre_and_nothing_is_nought() -> None:
     data = np.array([[1.234, np.inf], [0.0, 700.0]], np.float32)
-    back = picture(encode_depth(depth_in_steps(data, 100.0)), cv2.IMREAD_UNCHANGED)
+    back = decoded(encode_depth(depth_in_steps(data, 100.0)), cv2.IMREAD_UNCHANGED)
     assert back.tolist() == [[123, 0], [0, 0]]
 
 

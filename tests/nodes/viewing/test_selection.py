@@ -6,7 +6,7 @@ from events import PlannedPose, PositionSetpoint
 from nodes.viewing.selection import ImageSelection, PlanSelection
 
 
-def test_of_thirty_pictures_a_second_five_are_kept_and_of_one_exposure_all() -> None:
+def test_of_thirty_images_a_second_five_are_kept_and_of_one_exposure_all() -> None:
     selection = ImageSelection(5.0)
     stamps = [i * 1_000_000_000 // 30 for i in range(60)]
     kept = {
@@ -19,7 +19,7 @@ def test_of_thirty_pictures_a_second_five_are_kept_and_of_one_exposure_all() -> 
     assert not selection.selected("another", stamps[0])
 
 
-def test_without_a_rate_there_are_no_pictures() -> None:
+def test_without_a_rate_there_are_no_images() -> None:
     assert not ImageSelection(0.0).select("Image", "a", "a", 0)
 
 

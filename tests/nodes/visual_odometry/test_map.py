@@ -20,7 +20,7 @@ SIZE = INFO.width, INFO.height
 
 
 def mapped(number: int = 0, seen_from: Floats | None = None) -> Landmarks:
-    """Return a map of what one picture shows."""
+    """Return a map of what one image shows."""
     where = pose() if seen_from is None else seen_from
     image, depth = look(where)
     corners = find_corners(image, 28, np.empty((0, 2)))
@@ -179,7 +179,7 @@ def test_few_key_frames_remembered_do_for_a_path() -> None:
     assert np.linalg.norm(said.pose[:3, 3] - there[:3, 3]) < 0.01
 
 
-def test_pictures_without_depth_are_followed_on_the_map_there_is() -> None:
+def test_images_without_depth_are_followed_on_the_map_there_is() -> None:
     tracker = FeatureTracker(INFO)
     for index in range(12):
         image, depth = look(there := pose(x=0.02 * index))
@@ -195,9 +195,9 @@ def test_a_lost_camera_finds_a_key_frame_that_optical_flow_does_not_reach() -> N
     dark = np.zeros((240, 320), np.uint8), np.full((240, 320), np.inf, np.float32)
     assert tracker.track(28 * 33_000_000, *dark).lost
     there = pose(x=0.1, yaw=-2.0)
-    picture = look(there)
+    image = look(there)
     for index in range(29, 45):
-        said = tracker.track(index * 33_000_000, *picture)
+        said = tracker.track(index * 33_000_000, *image)
         if not said.lost:
             break
     assert not said.lost

@@ -61,7 +61,7 @@ def test_a_camera_at_rest_stays(make: Make) -> None:
 
 @pytest.mark.slow
 @METHODS
-def test_equal_pictures_give_equal_bits(make: Make) -> None:
+def test_equal_images_give_equal_bits(make: Make) -> None:
     first, second = (follow(make(INFO), MOTIONS["all at once"]) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert a.pose.tobytes() == b.pose.tobytes()
@@ -94,7 +94,7 @@ def test_a_dark_moment_is_lost_and_regained_at_the_same_place(make: Make) -> Non
 
 
 @METHODS
-def test_a_picture_of_another_size_is_refused(make: Make) -> None:
+def test_an_image_of_another_size_is_refused(make: Make) -> None:
     image, depth = look(pose())
     with pytest.raises(ValueError, match="image: expected 320×240 pixels"):
         make(INFO).track(0, image[:90], depth)

@@ -42,10 +42,10 @@ class Offer(Announcement):
 
 
 class Asker(Node):
-    """Asks at a rate, tells whose answers it heard, and shows pictures."""
+    """Asks at a rate, tells whose answers it heard, and shows images."""
 
     questions = Output(Asked)
-    pictures = Output(Image)
+    images = Output(Image)
     answers = Input(Answered)
 
     async def on_startup(self) -> None:
@@ -59,7 +59,7 @@ class Asker(Node):
         self.questions.send(Asked(stamp=tick.stamp, source=self.name, count=tick.index))
         if tick.index % 10 == 0:
             data = self.rng.integers(0, 255, (40, 60, 3), np.uint8)
-            self.pictures.send(Image(stamp=tick.stamp, source=self.name, frame_id="f", data=data))
+            self.images.send(Image(stamp=tick.stamp, source=self.name, frame_id="f", data=data))
 
     async def run(self) -> None:
         async for answer in self.answers:

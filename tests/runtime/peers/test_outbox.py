@@ -12,10 +12,10 @@ from runtime.errors import VisnavError
 from runtime.peers.messages import EventMessage, Message, Ready, decode
 from runtime.peers.outbox import Outbox
 from runtime.peers.shared_memory import Outgoing
-from tests.runtime.peers.test_shared_memory import picture
+from tests.runtime.peers.test_shared_memory import sample_image
 
 LARGE = 1000
-"""Side of a picture that a line's thread writes."""
+"""Side of an image that a line's thread writes."""
 
 
 def line_of(put: Any) -> tuple[Outbox, list[VisnavError]]:
@@ -33,7 +33,7 @@ def test_it_goes_on_though_a_library_fails() -> None:
         said.append(decode(head))
 
     line, wrong = line_of(put)
-    large: Image = picture(1, side=LARGE)
+    large: Image = sample_image(1, side=LARGE)
     line.send(EventMessage("a.b"), large)
     line.send(EventMessage("c.d"), large)
     line.close()
@@ -53,7 +53,7 @@ def test_what_cannot_be_put_into_memory_is_counted_all_the_same(
     monkeypatch.setattr(Outgoing, "put", full)
     line, wrong = line_of(lambda head, payload: said.append((decode(head), payload)))
     line.memory = Outgoing()
-    line.send(EventMessage("a.b", 7), picture(1, side=LARGE))
+    line.send(EventMessage("a.b", 7), sample_image(1, side=LARGE))
     line.send(Ready())
     line.close()
     assert said == [(EventMessage("a.b", 7), b""), (Ready(), b"")]

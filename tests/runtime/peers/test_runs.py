@@ -49,7 +49,7 @@ def test_in_real_time_everything_crosses_too() -> None:
     config = settings(*THREE, clock="real", duration=0.6)
     one, other = apart(config, "asker", "one,other")
     assert one.outputs == other.outputs
-    for output in ("asker.questions", "asker.pictures", "one.answers", "other.answers"):
+    for output in ("asker.questions", "asker.images", "one.answers", "other.answers"):
         assert one.outputs[output] > 0  # how many is up to the machine
     for summary in (one, other):
         trips = [each.round_trip_ms for each in summary.processes]

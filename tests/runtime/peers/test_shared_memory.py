@@ -23,7 +23,7 @@ from tests.runtime.peers.samples import apart, settings
 from tests.runtime.peers.test_runs import THREE
 
 
-def picture(value: int = 0, side: int = 100) -> Image:
+def sample_image(value: int = 0, side: int = 100) -> Image:
     data = np.full((side, side, 3), value, np.uint8)
     return Image(stamp=value, source="camera", frame_id="f", data=data)
 
@@ -43,7 +43,7 @@ def put(outgoing: Outgoing, event: Image) -> tuple[int, int]:
 
 def test_an_event_arrives_as_it_was() -> None:
     outgoing, incoming = both()
-    sent = picture(7)
+    sent = sample_image(7)
     got = unpack(incoming.frame(*put(outgoing, sent)))
     assert pack(got).frame() == pack(sent).frame()
     assert isinstance(got, Image)
@@ -52,26 +52,26 @@ def test_an_event_arrives_as_it_was() -> None:
 
 def test_a_frame_stays_until_its_last_array_is_gone_and_then_its_place_is_used_again() -> None:
     outgoing, incoming = both()
-    place = put(outgoing, picture(1))
+    place = put(outgoing, sample_image(1))
     got = unpack(incoming.frame(*place))
     assert isinstance(got, Image)
     part = got.data[5]
     del got
     assert incoming.unread == 0
-    others = {put(outgoing, picture(n)) for n in range(2, 5)}
+    others = {put(outgoing, sample_image(n)) for n in range(2, 5)}
     assert place not in others
     assert (part == 1).all()
     del part
     assert incoming.unread == 1
     outgoing.freed(incoming.freed())
     assert incoming.unread == 0
-    assert put(outgoing, picture(9)) == place
+    assert put(outgoing, sample_image(9)) == place
 
 
 def test_there_is_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shared_memory, "LIMIT", 100_000)
     outgoing, _ = both()
-    packed = pack(picture())
+    packed = pack(sample_image())
     assert [outgoing.put(packed) is None for _ in range(4)] == [False, False, True, True]
 
 
@@ -103,7 +103,7 @@ def test_no_descriptor_is_left() -> None:
     gc.collect()
     before = opened()
     outgoing, incoming = both()
-    got = unpack(incoming.frame(*put(outgoing, picture(3))))
+    got = unpack(incoming.frame(*put(outgoing, sample_image(3))))
     del outgoing, incoming
     assert isinstance(got, Image)
     assert (got.data == 3).all()
@@ -114,7 +114,7 @@ def test_no_descriptor_is_left() -> None:
 @pytest.mark.parametrize("place", [(1 << 30, 10), (0, 1 << 30), (-1, 10), (0, -5), (0, 10)])
 def test_a_wrong_place_is_an_error_of_the_wire(place: tuple[int, int]) -> None:
     outgoing, incoming = both()
-    put(outgoing, picture())
+    put(outgoing, sample_image())
     with pytest.raises(WireError):
         unpack(incoming.frame(*place))
 
@@ -134,14 +134,14 @@ def lined(outgoing: Outgoing | None) -> tuple[Outbox, list[tuple[Any, bytes]]]:
     return line, said
 
 
-def test_a_line_puts_a_picture_there_at_once_and_a_larger_one_in_its_thread() -> None:
+def test_a_line_puts_a_image_there_at_once_and_a_larger_one_in_its_thread() -> None:
     outgoing, incoming = both()
     line, said = lined(outgoing)
-    line.send(EventMessage("a.b"), picture(1))
+    line.send(EventMessage("a.b"), sample_image(1))
     ((first, payload),) = said  # already
     assert payload == b""
     got = unpack(incoming.frame(*first.place))
-    line.send(EventMessage("a.b"), picture(2, side=1000))
+    line.send(EventMessage("a.b"), sample_image(2, side=1000))
     line.send(MemoryMapped())
     line.close()
     second = unpack(incoming.frame(*said[1][0].place))
@@ -152,15 +152,15 @@ def test_a_line_puts_a_picture_there_at_once_and_a_larger_one_in_its_thread() ->
 def test_a_line_without_room_there_sends_the_frame_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Outgoing, "put", lambda self, packed: None)
     line, said = lined(Outgoing())
-    packed = pack(picture(1))
+    packed = pack(sample_image(1))
     assert packed.size > SMALL
-    line.send(EventMessage("a.b"), picture(1))
+    line.send(EventMessage("a.b"), sample_image(1))
     line.close()
     assert said == [(EventMessage("a.b"), packed.frame())]
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_pictures_pass_through_it_if_the_file_says_so(
+def test_images_pass_through_it_if_the_file_says_so(
     shared: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     placed: list[int] = []
@@ -171,9 +171,9 @@ def test_pictures_pass_through_it_if_the_file_says_so(
         return put(outgoing, packed)
 
     monkeypatch.setattr(Outgoing, "put", noted)
-    monkeypatch.setattr("runtime.peers.outbox.SMALL", 4096)  # less than a picture of the sample
+    monkeypatch.setattr("runtime.peers.outbox.SMALL", 4096)  # less than an image of the sample
     config = settings(*THREE, shared=shared)
     one, other = apart(config, "asker", "one,other")
     assert one.outputs == other.outputs
-    assert one.outputs["asker.pictures"] == 5
+    assert one.outputs["asker.images"] == 5
     assert len(placed) == (5 if shared else 0)

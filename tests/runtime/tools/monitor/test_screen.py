@@ -52,9 +52,9 @@ async def test_it_shows_what_there_is_and_keeps_the_cursor() -> None:
         await pilot.pause()
         assert "2.000" in text(screen, "head")
         assert nodes.cursor_row == 1
-        picture = screen.export_screenshot()
+        image = screen.export_screenshot()
         for words in ("drone.images", "vo.images", "drone.control", "[b]wind[/b]", "quit"):
-            assert words in picture.replace("&#160;", " ")
+            assert words in image.replace("&#160;", " ")
         stand.coming.put_nowait(snapshot(links=[]))
         await pilot.pause()
         assert not screen.query_one("#links").display

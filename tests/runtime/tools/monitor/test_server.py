@@ -174,7 +174,7 @@ def test_a_run_that_is_over_cannot_be_asked(sockets: Path) -> None:
 
 def test_a_monitor_that_fails_leaves_the_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(_: Observer) -> Snapshot:
-        raise RuntimeError("no picture")
+        raise RuntimeError("no image")
 
     monkeypatch.setattr(Observer, "take", fail)
 

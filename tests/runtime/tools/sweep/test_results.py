@@ -119,9 +119,9 @@ def test_a_plot_for_each_parameter(tmp_path: Path) -> None:
     drawn = draw_plots(plan, rows)
     assert [path.name for path in drawn] == ["judge.latency.png", "judge.method.png"]
     for path in drawn:
-        picture = imread(path)
-        assert picture.shape[0] > 300
-        assert picture.std() > 0.05
+        image = imread(path)
+        assert image.shape[0] > 300
+        assert image.std() > 0.05
 
 
 def test_nothing_is_drawn_of_runs_without_figures(tmp_path: Path) -> None:
