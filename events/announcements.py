@@ -1,4 +1,4 @@
-"""What a node will provide, said once before the first event.
+"""What a node will provide, sent once before the first event.
 
 Bridges build publishers from these, estimators their calibration, reports their tables.
 """

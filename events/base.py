@@ -1,4 +1,4 @@
-"""What every event is: frozen data with a time, a speaker and a category."""
+"""What every event is: frozen data with a time, a source and a category."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class EventMeta(msgspec.StructMeta):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(msgspec.field,))
 class Event(msgspec.Struct, metaclass=EventMeta, frozen=True, kw_only=True):
-    """Something that a node says to whoever listens.
+    """Something that a node sends to all that listen.
 
     Subclass it to add fields; every subclass is frozen and takes keyword arguments only.
 
     Attributes:
         stamp: Nanoseconds on the run's clock at which what the event describes was true
             (the exposure of an image, not its arrival). An `int`: no bool, float or numpy number.
-        source: Who says it, as a path: ``drone``, ``drone/front_center``.
+        source: Who sends it, as a path: ``drone``, ``drone/front_center``.
     """
 
     category: ClassVar[Category] = Category.USER

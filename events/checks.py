@@ -2,7 +2,7 @@
 
 A stamp is an `int`; vectors, angles and the like are finite; an orientation is a unit quaternion.
 What is not raises in the node that makes the event, and names the field; it never reaches those
-who would have heard it.
+who would have received it.
 """
 
 from __future__ import annotations

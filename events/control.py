@@ -59,7 +59,7 @@ class Hover(Command):
 
 
 class PositionSetpoint(Setpoint):
-    """Be at a place; velocity and acceleration are feed-forward for those who follow a path.
+    """Be at a place; velocity and acceleration are feed-forward for one that follows a path.
 
     Attributes:
         position: Metres in ``map``.

@@ -20,7 +20,7 @@ class Shutdown(Event):
 
 
 class ParameterChanged(Event):
-    """Says that a setting of a node changed while the run went on.
+    """A setting of a node has changed during the run.
 
     Its source is the node, its stamp the moment from which on the new value holds.
 

@@ -1,6 +1,6 @@
 """What sensors measure.
 
-Arrays are checked and made read-only when the event is made: what has been said stays said,
+Arrays are checked and made read-only when the event is made: what has been sent does not change,
 and an image passes from node to node by reference.
 """
 
@@ -17,7 +17,7 @@ from events.checks import check, check_pose
 
 
 def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
-    """Make `array` read-only, or say how it differs from what the field holds."""
+    """Make `array` read-only, or report how it differs from what the field holds."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype or array.ndim not in ndim:
         found = (
             f"{array.dtype} of shape {array.shape}"

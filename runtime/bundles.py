@@ -167,7 +167,7 @@ class Matcher(Generic[B]):
         self.stream.close()
 
     def statistics(self) -> StreamStatistics:
-        """Tell how full the stream of sets is and was, and what it dropped."""
+        """Return how full the stream of sets is and was, and what it dropped."""
         return self.stream.statistics()
 
     def match(self) -> None:
@@ -246,7 +246,7 @@ class Slot:
         return event
 
     def _changes_to(self, source: str) -> bool:
-        """Hear another source from now on, if it is the first or above the one heard so far."""
+        """Listen to another source from now on, if it is the first or above the current one."""
         before = self._source
         if before is not None and source.startswith(f"{before}/"):
             return False

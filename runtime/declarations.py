@@ -21,7 +21,7 @@ class Declared(msgspec.Struct):
     handlers: dict[str, Handles]
     ticks: dict[str, Ticks]
     listening: list[str]
-    """Inputs, bundles and handlers, in the order in which they hear an event."""
+    """Inputs, bundles and handlers, in the order in which they receive an event."""
 
     def bundle_fields(self) -> list[str]:
         """Return ``bundle.field`` for all fields of all bundles."""

@@ -1,4 +1,4 @@
-"""A fingerprint of all that was said in a run: equal digests mean equal events, to the byte."""
+"""A fingerprint of all events of a run: equal digests mean equal events, to the byte."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@
     │   ├── ChannelBusyError   two coroutines wait on one input
     │   ├── ChannelTypeError   something else was sent than the output declares
     │   ├── ChannelThreadError `send` was called in another thread than the loop's
-    │   └── AmbiguousSourceError  an input that matches stamps hears two sources
+    │   └── AmbiguousSourceError  an input that matches stamps receives two sources
     ├── CommandError           a run cannot do what its monitor asked it to
     ├── ResultsError           a run's folder is not ours, or cannot be written
     ├── UncheckableError       what a node will announce is known in a run only, not to `check`
@@ -125,11 +125,11 @@ class CommandError(VisnavError):
 
 
 class ResultsError(VisnavError):
-    """A run's folder is somebody else's, or results cannot be written into it."""
+    """A run's folder belongs to something else, or results cannot be written into it."""
 
 
 class UncheckableError(VisnavError):
-    """While a file is only checked, a node cannot tell what it will announce."""
+    """While a file is only checked, a node does not know what it will announce."""
 
 
 class PeerError(VisnavError):

@@ -34,7 +34,7 @@ def run_to_end(
     Args:
         loop: Not running yet.
         main: What to run.
-        escaped: Told what came out of the loop while `main` is not done; the loop then goes on,
+        escaped: Called with errors of the loop while `main` is not done; the loop then goes on,
             unless this raises.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Who hears whom: a pure function of the nodes, made before the first event.
+"""Which listener receives which output: a pure function of the nodes, made before the first event.
 
 Every output of a node is connected to the inputs and handlers of all *other* nodes that know its
 type of event, in the order of the nodes in the file and of the declarations in each node.
@@ -88,11 +88,11 @@ def connect(
     May be called again when nodes come or go.
 
     Args:
-        nodes: In the order in which they hear events.
+        nodes: In the order in which they receive events.
         sources: Ports narrowed by the file.
         links: Ports whose events come late or not at all.
         taps: See every event first.
-        fault: Told of listeners that raise; without it, `send` raises what they do.
+        fault: Called with listeners that raise; without it, `send` raises what they do.
         last: Listeners after all nodes.
         elsewhere: Given ``node.port``, returns its listeners in other processes.
         wrap: Puts something round the nodes' handlers.

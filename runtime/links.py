@@ -76,7 +76,7 @@ class Link:
     def to(
         self, deliver: Callable[[Any], Any], fault: Callable[[BaseException], None] | None = None
     ) -> Callable[[Any], Any]:
-        """Say what is at the far end; return what to call at this one."""
+        """Set what is at the far end; return what to call at this one."""
         self._deliver = deliver
         self._fault = fault or _raise
         return self.offer

@@ -54,7 +54,7 @@ class _JumpingSelector(selectors.DefaultSelector):
 
 
 class Gate(Protocol):
-    """Says when time may go on: other processes may have to, first."""
+    """Decides when time may go on: other processes may have to, first."""
 
     def may_go(self, key: tuple[int, int, int]) -> bool:
         """Tell whether to go on to what is due next: at a time (ns), of a kind, with an order."""

@@ -1,4 +1,4 @@
-"""Logging: the standard library's, through a queue, so that a slow terminal delays nobody.
+"""Logging: the standard library's, through a queue, so that a slow terminal delays no node.
 
 Levels: trace (5), debug, info, warning, error, and fatal, which also stops the run. Each node has
 a logger, ``visnav.<node>``; lines carry the time of the run's clock.
@@ -40,11 +40,11 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
         self.node = node
 
     def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, Any]:
-        """Add nothing to the message; the logger's name says who speaks."""
+        """Add nothing to the message; the logger's name is the sender's."""
         return msg, kwargs
 
     def trace(self, msg: str, *args: object) -> None:
-        """Log what only somebody hunting a bug wants to read."""
+        """Log what helps only to find a bug."""
         self.log(TRACE, msg, *args)
 
     def fatal(self, msg: str, *args: object) -> NoReturn:
@@ -61,7 +61,7 @@ class _Queued(logging.handlers.QueueHandler):
     """Queues records; their tracebacks stay apart from their messages."""
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Make message and traceback while what they tell of is as it is."""
+        """Make message and traceback while what they describe is as it is."""
         record = copy.copy(record)
         record.msg, record.args = record.getMessage(), None
         if record.exc_info:
@@ -83,7 +83,7 @@ class _File(logging.FileHandler):
     """Writes records to a file as long as that is possible."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802, ARG002
-        """Say once why it is not possible (any more)."""
+        """Report once why it is not possible (any more)."""
         error = sys.exc_info()[1]
         self.setLevel(logging.CRITICAL + 1)
         stream, self.stream = self.stream, None

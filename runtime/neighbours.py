@@ -31,4 +31,4 @@ def check_events() -> None:
         )
 
 
-check_events()  # whoever imports the runtime is to hear of it before anything else fails
+check_events()  # an import of the runtime reports it before anything else fails

@@ -157,14 +157,14 @@ class Node(Generic[C]):
         return ()
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Hear what a node (any node) will provide; called before the first event.
+        """Receive what a node (any node) will provide; called before the first event.
 
         Raises:
             ValueError: This node cannot work with it; the message says why, and the run ends.
         """
 
     def check(self) -> Iterable[str]:
-        """Return what this node lacks, a sentence each; called when all announcements are heard.
+        """Return what this node lacks, a sentence each; called when all announcements are received.
 
         With any, the run does not begin. What may be meant is for `log.warning`.
         """
@@ -173,12 +173,12 @@ class Node(Generic[C]):
     async def on_ready(self) -> None:
         """Get ready with what was announced, such as a worker that needs a camera's calibration.
 
-        Called once all announcements are heard. The first event waits for every node's, so that
+        Called once all announcements are received. The first event waits for every node's, so that
         in real time, too, none is missed meanwhile. Nothing may be sent yet.
         """
 
     def narrow(self, port: str, source: str) -> None:
-        """Hear only one source on a port (or on a bundle, or on ``bundle.field``).
+        """Receive only one source on a port (or on a bundle, or on ``bundle.field``).
 
         For nodes that choose among what is announced: call it in `on_announcement`. What the file
         says of the port holds nevertheless.
@@ -186,7 +186,7 @@ class Node(Generic[C]):
         self.sources.setdefault(port, source)
 
     def on_change(self, before: C) -> None:
-        """Hear that `config` is a new one: somebody changed a setting while the run goes on.
+        """React to a new `config`: a setting was changed during the run.
 
         Called between two steps. Only settings marked as `runtime.Changeable` change.
 
@@ -201,7 +201,7 @@ class Node(Generic[C]):
         """Do what the node does; returning is allowed. Cancelled when the run ends."""
 
     async def on_shutdown(self) -> None:
-        """Finish: flush and close. May send; nodes before this one in the file still hear it."""
+        """Finish: flush and close. May send; nodes before this one in the file still receive it."""
 
     # What a node can ask for.
 
@@ -327,7 +327,7 @@ def make_node(
 class _Call(functools.partial[R]):
     """A call whose `StopIteration` becomes a `RuntimeError`, as in a coroutine.
 
-    No future takes one, and whoever awaited it would wait for ever.
+    No future takes one, and a task that awaited it would wait for ever.
     """
 
     def __call__(self, /, *args: Any, **kwargs: Any) -> R:

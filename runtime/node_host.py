@@ -39,7 +39,7 @@ class NodeHost:
         parameters: Changes settings of nodes.
         create: Makes a task that the run owns.
         stop: Ends the run, for a reason.
-        fault: Told which node raised what.
+        fault: Called with the node and what it raised.
     """
 
     checking = False
@@ -173,7 +173,7 @@ class NodeHost:
                 self._fault(node.name, error)
 
     def _has_run(self, node: Node[Any]) -> None:
-        """Say so if a node has stopped reading its inputs: it looks alive, and is not."""
+        """Log it if a node has stopped reading its inputs."""
         runner = self.state.runners[node.name]
         ports = [*node.declared.inputs, *node.declared.bundles]
         over = self.state.stopped is not None or runner.shutting_down or runner.restarting

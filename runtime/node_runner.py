@@ -36,7 +36,7 @@ class NodeRunner:
     """What belongs to one node while it runs.
 
     Args:
-        spec: What the file says of it.
+        spec: Its table in the file.
         create: Makes a task that the run owns.
 
     Attributes:
@@ -120,7 +120,7 @@ class NodeRunner:
             raise wrap(name, error) from error
 
     def receive_announcements(self, announcements: Iterable[Announcement]) -> None:
-        """Let the node hear all announcements, and ask what it lacks then.
+        """Hand the node all announcements, then ask what it lacks.
 
         Raises:
             NodeError: Something went wrong in it; a `RefusedError` if it cannot work with one, or
@@ -144,7 +144,7 @@ class NodeRunner:
             raise RefusedError(name, "; ".join(lacks))
 
     async def get_ready(self, limit: float) -> None:
-        """Let the node get ready with what it has heard.
+        """Let the node get ready with what was announced.
 
         Args:
             limit: Real seconds that `on_ready` may take.

@@ -25,7 +25,7 @@ class ParameterServer:
 
     Args:
         state: Of the run.
-        fault: Told which node raised what.
+        fault: Called with the node and what it raised.
     """
 
     def __init__(self, state: RunState, fault: Callable[[str, BaseException], None]) -> None:
@@ -34,7 +34,7 @@ class ParameterServer:
         self._sender = Sender("run.parameters", ParameterChanged)
 
     def connect(self, listeners: Iterable[Listener], taps: Iterable[Tap], fault: Fault) -> None:
-        """Connect those who hear of changes: all that can, those of the changed node too."""
+        """Connect the listeners to changes: all that can, those of the changed node too."""
         self._sender.connect(listeners, taps, fault)
 
     def set(self, text: str) -> dict[str, str]:

@@ -122,14 +122,14 @@ class Output(_Port, Generic[T]):
 
 
 class Handles(msgspec.Struct, frozen=True):
-    """What `@on` says of a method."""
+    """What `@on` declares of a method."""
 
     events: tuple[type[Event], ...]
     source: str | None
 
 
 class Ticks(msgspec.Struct, frozen=True):
-    """What `@every` says of a method."""
+    """What `@every` declares of a method."""
 
     hz: float | str
 
@@ -138,7 +138,7 @@ def on(*events: type[Event], source: str | None = None) -> Callable[[F], F]:
     """Make a method the handler of some types of event.
 
     It runs inside `send`, in the order of the nodes in the file. It may return True: handled,
-    and nobody after this node gets the event. It must be quick, and cannot wait.
+    and no node after this one gets the event. It must be quick, and cannot wait.
 
     Args:
         events: Types of event; their subclasses come too.

@@ -1,4 +1,4 @@
-"""What is known of a run while it goes on: written by its supervisor, read by whoever looks on."""
+"""What is known of a run while it goes on: written by its supervisor, read by observers."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class RunState:
         several_processes: Whether other nodes of the file run in other processes.
         running: Whether the first update has been, and nodes may send.
         first_update: When that was, on `time.monotonic`; `None` before.
-        stop_requested: Why somebody asked for the end of the run, which the loop may not have
-            heard yet; such as a signal.
+        stop_requested: Why the end of the run was requested, such as by a signal; the loop may
+            not know of it yet.
         stopped: When the end of the run was asked for, on `time.monotonic`; `None` before.
         stopped_at: The same on the run's clock (ns).
         reason: Why the run ends; "" before.

@@ -116,7 +116,7 @@ class Ticker:
         name: ``node.method``, for statistics.
         hz: Rate; due times are exact multiples of its period, rounded down to nanoseconds.
         call: Takes a `Tick`.
-        fault: Told what `call` raises.
+        fault: Called with what `call` raises.
         before: The ticker that this one replaces, whose statistics it carries on.
     """
 

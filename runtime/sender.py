@@ -173,7 +173,7 @@ class Sender(Generic[T]):
         return self._deliver(event)
 
     def _route(self, event: T) -> Route:
-        """Check an event, and remember who hears those of its type and source."""
+        """Check an event, and remember the listeners to its type and source."""
         self._check(event)
         key = type(event), event.source
         if key not in self._known:
@@ -213,12 +213,12 @@ class Sender(Generic[T]):
 
 
 class Listener:
-    """One handler or stream, and which events it hears.
+    """One handler or stream, and which events it receives.
 
     Args:
         node: Name of the node it belongs to.
         deliver: What to call with an event.
-        events: The types that it hears, with their subclasses.
+        events: The types that it receives, with their subclasses.
         source: Only this source and those below it; `None` for all.
         stream: The stream, if it is one.
     """
@@ -240,22 +240,22 @@ class Listener:
         self.stream = stream
 
     def may_receive(self, event: type[Event]) -> bool:
-        """Tell whether an output of this type can send what this listener hears."""
+        """Return whether an output of this type can send what this listener receives."""
         return issubclass(event, self.events) or any(issubclass(e, event) for e in self.events)
 
     def receives_all(self, event: type[Event]) -> bool:
-        """Tell whether this listener hears whatever an output of this type sends."""
+        """Return whether this listener receives all that an output of this type sends."""
         return self.source is None and issubclass(event, self.events)
 
     def receives(self, event: type[Event], source: str) -> bool:
-        """Tell whether this listener hears events of this very type from this source."""
+        """Return whether this listener receives events of this very type from this source."""
         return issubclass(event, self.events) and (
             self.source is None or source == self.source or source.startswith(self.source + "/")
         )
 
 
 class Route:
-    """Who hears one type of event from one source, and how often it was sent."""
+    """The listeners to one type of event from one source, and how often it was sent."""
 
     __slots__ = ("key", "listeners", "sent")
 

@@ -2,7 +2,7 @@
 
 A stream has one reader. An event that finds the reader waiting goes straight to it; any other
 is kept up to a bound, beyond which the input's declared policy decides. A reader in a task of
-ours is resumed inside `offer` (`runtime.tasks`); a reader in anybody else's task is woken
+ours is resumed inside `offer` (`runtime.tasks`); a reader in any other task is woken
 through the loop, for which a stream looks enough like a future.
 """
 
@@ -96,7 +96,7 @@ class Stream(Generic[T]):
         self._buffer: deque[T] = deque()
         self.merge: Callable[[T, T], T] | None = None
         """Given what is dropped and what follows it, returns what is kept in place of both."""
-        self.waiter: Waiter | None = None  # set by whoever a reader yielded this stream to
+        self.waiter: Waiter | None = None  # set by the task that a reader yielded this stream to
         self._taken = 0
         self._seen: T | None = None
         self._room: asyncio.Event | None = None
@@ -189,7 +189,7 @@ class Stream(Generic[T]):
     def peek(self) -> T | None:
         """Return the newest event without taking it, or `None` if none waits.
 
-        With ``keep="latest"`` and nobody reading, this is the newest there has been.
+        With ``keep="latest"`` and no reader, this is the newest there has been.
         """
         if not self._buffer:
             return None
@@ -244,7 +244,7 @@ class Stream(Generic[T]):
             self.peak = len(buffer)
 
     def has_room(self) -> bool:
-        """Tell whether an event would fit (or the stream is closed, and takes no more)."""
+        """Return whether an event would fit (or the stream is closed, and takes no more)."""
         return len(self._buffer) < self.bound or self._closed
 
     async def wait_for_room(self) -> None:
@@ -263,7 +263,7 @@ class Stream(Generic[T]):
         self._wake()
 
     def statistics(self) -> StreamStatistics:
-        """Tell how full the stream is and was, and what it dropped."""
+        """Return how full the stream is and was, and what it dropped."""
         return StreamStatistics(len(self._buffer), self.peak, self.dropped)
 
     def _wake(self) -> None:
@@ -325,7 +325,7 @@ class _ForeignTask:
         self.resume_soon()
 
     def result(self) -> None:
-        """Tell the task how its wait ended; called by the task."""
+        """Notify the task how its wait ended; called by the task."""
         if self._cancelled is not None:
             raise self._cancelled
 

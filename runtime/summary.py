@@ -1,4 +1,4 @@
-"""What a run leaves to say about itself: ``summary.json`` and the table at its end."""
+"""What a run reports of itself: ``summary.json`` and the table at its end."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         ticks: Punctuality, by ticker.
         stalls: Times the loop did not turn, by node.
         longest_stalls: The worst of them, by node.
-        announcements: What nodes said they provide.
+        announcements: What nodes announced.
         environment: Machine and versions; the command line, and the commit of the current folder.
         processes: Where which nodes ran, if not all in one process.
         workers: What workers cost, by ``node.Factory``.
@@ -304,7 +304,7 @@ def overall(passed: Iterable[bool | None]) -> bool | None:
 
 
 def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
-    """Put together what the processes of one run say of it; where it runs together, once."""
+    """Put together the summaries of one run's processes; where it runs together, once."""
     first = parts[0]
     digests = {name: each for part in parts for name, each in part.digests.items()}
     verdicts = [part.verdict for part in parts if part.verdict is not None]

@@ -1,7 +1,7 @@
 """The life of a run's nodes: started in order, watched over, ended in reverse order.
 
     construct → on_startup, in file order
-    announce, heard by all; check; on_ready, in file order
+    announce, received by all; check; on_ready, in file order
     connect; ticks and run() begin: the first update
     …
     cancel run(), on_shutdown: in reverse order, always, each with a time limit
@@ -122,7 +122,7 @@ class Supervisor:
         Args:
             reason: For the summary.
             error: What went wrong, if anything did.
-            from_peer: Whether another process says so, and need not be told.
+            from_peer: Whether another process reported it, and need not be notified.
         """
         if self._ended.is_set():
             return
@@ -172,7 +172,7 @@ class Supervisor:
 
         Args:
             name: Of the node.
-            anyway: Bring one up whatever that says: somebody asked for it.
+            anyway: Bring one up whatever that says: it was requested.
         """
         runner = self.state.runners[name]
         runner.restarting = True
@@ -183,7 +183,7 @@ class Supervisor:
         task.add_done_callback(lambda task: self._restarts.pop(task, None))
 
     def connect(self) -> None:
-        """Freeze who hears whom; anew whenever a node or another process comes or goes."""
+        """Freeze each output's listeners; anew whenever a node or another process comes or goes."""
         runners = self.state.runners.values()
         nodes = [runner.node for runner in runners if runner.node and runner.started]
         taps = (*self._taps, *self.instruments.taps)
@@ -272,7 +272,7 @@ class Supervisor:
                 runner.starts = before
         await start_up(runners, start=start, exchange=exchange, ready=ready, failed=_give_up)
         if self.peers is not None:
-            self.connect()  # so that each knows what the others hear
+            self.connect()  # so that each knows what the others receive
             await self.peers.begin()
         return mine
 
@@ -347,7 +347,7 @@ class Supervisor:
             self.state.note_error(error)
 
     async def _shut_down(self, runner: NodeRunner) -> None:
-        """End one node, unless that is done: it hears nothing afterwards."""
+        """End one node, unless that is done: it receives nothing afterwards."""
         async with runner.shutdown_lock:
             for error in await runner.shut_down(self.state.shutdown_limit()):
                 self.state.note_error(error)

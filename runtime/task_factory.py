@@ -93,12 +93,12 @@ async def _exercise(factory: Factory | None, loop: asyncio.AbstractEventLoop) ->
 class _Task(asyncio.Task[Any]):
     """A task whose place in a set does not depend on its address.
 
-    Whoever goes through a set of tasks (a `TaskGroup` that cancels them, a caller of
+    Code that goes through a set of tasks (a `TaskGroup` that cancels them, a caller of
     `asyncio.wait`) does so in the same order in equal runs.
     """
 
     tasks = 0
-    """How many this one has made: its own count, so that nobody who looks on changes it."""
+    """How many this one has made: its own count, so that no observer changes it."""
 
     def __init__(self, number: int, coro: Coroutine[Any, Any, Any], **options: Any) -> None:
         self._number = number

@@ -27,7 +27,7 @@ DEPTH_LIMIT = 32
 stack, nor keep the loop to itself."""
 
 Fault = Callable[[Callable[[Any], Any], BaseException], None]
-"""Told which listener raised what; the delivery then goes on."""
+"""Called with the listener and what it raised; the delivery then goes on."""
 
 _NOTHING: Any = object()
 
@@ -211,7 +211,7 @@ class FanOut:
 
     Args:
         streams: None of them declared with ``wake="soon"``.
-        fault: Told which stream could not take an event; without it, that is raised.
+        fault: Called with the stream that could not take an event; without it, that is raised.
         check: Called with an event of another type than `expected`; may raise.
 
     Attributes:

@@ -169,7 +169,7 @@ def spec(
 
 
 def _script(inputs: list[Event]) -> type[Node[Any]]:
-    """Return a class of node that says what the script says."""
+    """Return a class of node that sends what the script lists."""
 
     class Script(Node):
         script = Output(Event)

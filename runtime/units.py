@@ -36,7 +36,7 @@ class Latency(Duration):
     """A duration that is short by nature: a latency, delay, jitter, exposure.
 
     ``latency = 40`` is rarely meant as 40 s: a number without a unit is taken up to `LONGEST_BARE`
-    only. Whoever means 40 s writes ``"40s"``.
+    only. For 40 s write ``"40s"``.
     """
 
     @classmethod

@@ -29,11 +29,11 @@ _LONG = 4096
 
 
 class ForgedError(WireError):
-    """A seal is not what it should be: somebody else wrote the message, or it is an old one."""
+    """A seal is not what it should be: another process wrote the message, or it is an old one."""
 
 
 def derive(secret: bytes, *about: str | bytes) -> bytes:
-    """Return a key (32 bytes) that only who knows the secret can tell, for one purpose."""
+    """Return a key (32 bytes) for one purpose, which only holders of the secret can derive."""
     mac = hashlib.blake2b(key=hashlib.sha256(secret).digest(), digest_size=32)
     for each in about:
         part = each.encode() if isinstance(each, str) else each
@@ -123,5 +123,5 @@ def hello_seal(key: bytes, sender: str, receiver: str) -> Seal:
 
 
 def is_hello(sealed: bytes) -> bool:
-    """Tell whether a message says that it is a hello."""
+    """Return whether a message claims to be a hello."""
     return sealed[1:9] == bytes(8)

@@ -14,7 +14,7 @@ KEPT = 20
 
 
 class Exchange(NamedTuple):
-    """What one question and its answer said, in nanoseconds.
+    """The result of one question and its answer, in nanoseconds.
 
     Attributes:
         round_trip: What they took; half of it is how far off the others may be.

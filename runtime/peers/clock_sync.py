@@ -21,7 +21,7 @@ PERIOD = 0.1
 """Seconds between two exchanges."""
 
 EXCHANGES = 10
-"""Of which the quickest says how late our clock is."""
+"""Exchanges of which the quickest gives how late our clock is."""
 
 LIMIT = 500e-6
 """How much quicker or slower our clock may run, as NTP has it; quartzes differ by a tenth of it."""

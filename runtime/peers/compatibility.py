@@ -1,4 +1,4 @@
-"""Whether the processes that have met make up the run: all nodes once, and equal files."""
+"""Whether the processes present make up the run: all nodes once, and equal files."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def missing(present: Iterable[Hello], nodes: Sequence[str]) -> list[str]:
 
 
 def missing_message(absent: Sequence[str], seconds: float, meet: str) -> str:
-    """Return what to tell those who wait in vain."""
+    """Return the message for a process that waits in vain."""
     only = ",".join(absent)
     return (
         f"expected all nodes to be there within {seconds:g} s, found none of {', '.join(absent)} "

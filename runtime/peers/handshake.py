@@ -1,9 +1,9 @@
 """Greetings: how two processes that see each other come to a session.
 
-Each greets the other with a nonce; who answers ours with the seal of the run is there now, and
-knows the secret: then a session begins, and only what it seals is heard. A greeting that answers
-nothing may be an old one, and changes nothing. A new session ends the one before: the other
-process had lost us.
+Each greets the other with a nonce; a process that answers ours with the seal of the run is
+present and knows the secret: then a session begins, and only what it seals is received. A
+greeting that answers nothing may be an old one, and changes nothing. A new session ends the one
+before: the other process had lost us.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STRANGERS = 256
 
 
 class Contact:
-    """A process that shows itself, whoever it may be.
+    """A process that is visible, known or not.
 
     Attributes:
         nonce: In our greetings, until one is answered.
@@ -49,7 +49,7 @@ class Contact:
 
 
 class Meeting(Protocol):
-    """What is told whom we meet, on the loop, and says who we are."""
+    """What is notified of sessions, on the loop, and describes this process."""
 
     hello: Hello
 
@@ -74,11 +74,11 @@ class Handshakes:
     Args:
         key: Of the run.
         session: With Zenoh.
-        membership: Says who we are, and is told whom we meet.
+        membership: Describes this process, and is notified of sessions.
 
     Attributes:
         id: By which the others know us.
-        refused: Messages that were left out, since nobody of the run wrote them.
+        refused: Messages that were left out, since no process of the run wrote them.
     """
 
     def __init__(self, key: bytes, session: Session, membership: Meeting) -> None:
@@ -93,12 +93,12 @@ class Handshakes:
         self._enough = threading.Event()
 
     def begin(self, on_message: OnMessage) -> None:
-        """Show ourselves, and greet those who do not answer again and again."""
+        """Become visible, and greet processes that do not answer again and again."""
         self._session.appear(on_message, self.on_presence)
         threading.Thread(target=self._greet, name="greet", daemon=True).start()
 
     async def close(self) -> None:
-        """Say the last words, and leave."""
+        """Send what still waits, and leave."""
         self._enough.set()
         for member in self.members():
             await asyncio.to_thread(member.outbox.close)
@@ -177,7 +177,7 @@ class Handshakes:
                 contact.doubt = hello.nonce
 
     def refuse(self, sender: str, error: VisnavError) -> None:
-        """Say, once of each of so many, who is not heard."""
+        """Log a process whose messages are refused: once each, for so many."""
         self.refused += 1
         if sender not in self._complained and len(self._complained) < STRANGERS:
             self._complained.add(sender)
@@ -196,7 +196,7 @@ class Handshakes:
         )
 
     def greet_again(self) -> None:
-        """Greet those who have not answered, and those who may be in another session than we."""
+        """Greet processes that have not answered, or may be in another session than this one."""
         due = []
         with self._lock:
             for other, contact in self._contacts.items():

@@ -1,7 +1,7 @@
 """The end of a run in several processes: in order, and not for ever.
 
-Nodes end in reverse order of the file, wherever they are, and nobody leaves before all know what
-each has to say. Those who say nothing for long are not waited for.
+Nodes end in reverse order of the file, wherever they are, and no process leaves before all
+summaries are exchanged. Processes that are silent for long are not waited for.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from runtime.time_limits import real_time_limit
 log = logging.getLogger("visnav.runtime")
 
 BUSY_EVERY = 2.0
-"""Seconds after which those who wait for us in the end are told that we are still at it."""
+"""Seconds between two messages that this process is still ending its nodes."""
 
 SILENCE = 8.0
-"""Seconds without a word in the end, after which it goes on without those who are silent."""
+"""Seconds without a message, after which the end goes on without the silent processes."""
 
 PARTING = 5.0
-"""Seconds that a process has, in the end, to tell what there was."""
+"""Seconds that the processes have to exchange their summaries."""
 
 
 class JointShutdown:
@@ -39,12 +39,12 @@ class JointShutdown:
 
     Args:
         membership: Who is there.
-        on_timeout: Told that some are not waited for any more.
+        on_timeout: Called when some are not waited for any more.
 
     Attributes:
         ended_nodes: Nodes of other processes that have ended.
         at_work: Whether a node here is about to end.
-        received_at: When the last word of another process came, on `time.monotonic`.
+        received_at: When the last message of another process came, on `time.monotonic`.
     """
 
     def __init__(self, membership: Membership, on_timeout: Callable[[], None]) -> None:
@@ -81,13 +81,13 @@ class JointShutdown:
         self.at_work = bool(node)
 
     def take_summary(self, member: Member, part: Summary) -> None:
-        """Take in what another process has to say of the run."""
+        """Take in another process's part of the summary."""
         member.final_summary = part
         self._with_summary[member.number] = member
         member.outbox.send(SummaryReceived())
 
     async def exchange_summaries(self, mine: Summary) -> Summary:
-        """Exchange what each process has to say of the run; return all of it together."""
+        """Exchange each process's part of the summary; return all of it together."""
         membership = self._membership
         membership.broadcast(FinalSummary(msgspec.json.encode(mine)))
         try:
@@ -132,7 +132,7 @@ class JointShutdown:
         self._watch()
 
     def _give_up(self) -> None:
-        """End without those who say nothing."""
+        """End without the silent processes."""
         membership = self._membership
         if silent := [m for m in membership.present() if not m.has_our_summary]:
             names = "; ".join(name_of(m.nodes) for m in silent)

@@ -23,10 +23,10 @@ from runtime.summary import ProcessSummary, Summary
 from runtime.wire import unpack
 
 ACK_EVERY = 8192
-"""Bytes after which the other end is told that they have arrived."""
+"""Bytes after which the other end is notified that they have arrived."""
 
 FREE_EVERY = 4
-"""Frames in its memory that are read no more after which it is told so."""
+"""Frames in its memory, read no more, after which it is notified."""
 
 
 class Member:
@@ -34,26 +34,26 @@ class Member:
 
     Args:
         id_: By which it is known.
-        hello: Who it says it is.
+        hello: How it describes itself.
         sealing: What proves that a message is its own.
         put: Writes a message to it; may wait.
-        failed: Told what could not be written.
+        failed: Called with what could not be written.
 
     Attributes:
         number: Its number among the processes of the run, or -1 if it is none of them.
         over: Why the session has ended, if it has.
         unfit: Whether it is no part of the run: it runs another file, or nodes that run elsewhere.
-        held: What it has said, while another process with its nodes is still in the run.
+        held: Messages it has sent, while another process with its nodes is still in the run.
         exchanges: Of the time.
         drift_ppm: How much quicker that clock is than ours, in millionths, if we follow it.
         announced: What its nodes announced.
         ready: Whether its nodes can begin.
-        begin: When the first update is, if it has said so.
+        begin: When the first update is, if it has sent that.
         subscriptions: Of nodes here, as it was sent them.
-        final_summary: What it had to say of the run.
+        final_summary: Its part of the run's summary.
         outgoing: Memory that was offered to it.
         incoming: Memory of its own that we see.
-        has_our_summary: Whether it has what we had to say of the run.
+        has_our_summary: Whether it has our part of the run's summary.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Member:
         )
 
     def event(self, message: EventMessage, payload: bytes) -> Event:
-        """Return the event that it said.
+        """Return the event that it sent.
 
         Raises:
             WireError: There is none that is known here.
@@ -99,7 +99,7 @@ class Member:
         return unpack(self.incoming.frame(*message.place))
 
     def acknowledge(self, count: int) -> None:
-        """Take in that so many bytes came, and tell it once in a while."""
+        """Take in that so many bytes came, and notify it once in a while."""
         self._arrived += count
         unread = 0 if self.incoming is None else self.incoming.unread
         if self._arrived >= ACK_EVERY or unread >= FREE_EVERY:
@@ -124,7 +124,7 @@ class Member:
         return self.hello.place
 
     def summary(self) -> ProcessSummary:
-        """Return what the run's summary says of it."""
+        """Return its entry in the run's summary."""
         best = self.exchanges.best()
         return ProcessSummary(
             nodes=list(self.nodes),

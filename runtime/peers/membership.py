@@ -1,7 +1,7 @@
-"""Who is there: the processes that have met, those that come, and those that go.
+"""Which processes are present: those that have met, that join, and that leave.
 
-What Zenoh's threads bring is handed to the loop here; of the rest of this room only greetings and
-lines know of threads.
+What Zenoh's threads bring is handed to the loop here; of the rest of this package only handshakes
+and outboxes know of threads.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ from runtime.time_limits import real_time_limit
 log = logging.getLogger("visnav.runtime")
 
 NAMED_EVERY = 5.0
-"""Real seconds after which those who are waited for are named, again and again."""
+"""Real seconds between two log lines that name the processes waited for."""
 
 
 class Reactions(Protocol):
-    """What is told, on the loop, what other processes do."""
+    """What is notified, on the loop, of what other processes do."""
 
     def receive(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         """Take in a message."""
@@ -66,10 +66,10 @@ class Reactions(Protocol):
         """Deal with the loss of a process."""
 
     def reconnected(self, member: Member) -> None:
-        """Go on with a process that the network had parted from us."""
+        """Go on with a process that was disconnected."""
 
     def unsent(self, member: Member, error: VisnavError) -> None:
-        """Say what could not be sent."""
+        """Log what could not be sent."""
 
     def now(self, ago: int = 0) -> int:
         """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
@@ -81,7 +81,7 @@ class Membership:
     Args:
         config: The whole file.
         only: Nodes that run here.
-        peers: Told, on the loop, of messages and losses.
+        peers: Notified, on the loop, of messages and losses.
 
     Attributes:
         nodes: Of the whole file, in order.
@@ -89,7 +89,7 @@ class Membership:
         me: Number of this process. They are numbered by their first nodes, once all have met.
         count: How many processes there are in all.
         hello: Who we are.
-        ended: Once the run ends, what those are told who come anew.
+        ended: Once the run ends, what is sent to processes that join.
     """
 
     def __init__(self, config: Config, only: Iterable[str], peers: Reactions) -> None:
@@ -122,7 +122,7 @@ class Membership:
             How often a process with our nodes was in this run before.
 
         Raises:
-            PeerError: They are not within the limit, or somebody runs another file or our nodes.
+            PeerError: They are not within the limit, or one runs another file or our nodes.
         """
         network = self._network
         by_certificate = not network.secret and certified(network)
@@ -183,16 +183,16 @@ class Membership:
         self._numbered.pop(member.number, None)
 
     def settle(self, *, lost: Iterable[str] = (), left_out: Iterable[str] = ()) -> None:
-        """Say from now on that the run goes on, that these are lost, and that it left these out."""
+        """State from now on that the run goes on, which nodes are lost, and which left out."""
         lost, left_out = (*self.hello.lost, *lost), (*self.hello.left_out, *left_out)
         self.hello = msgspec.structs.replace(self.hello, running=True, lost=lost, left_out=left_out)
 
     async def close(self) -> None:
-        """Say the last words, and leave."""
+        """Send what still waits, and leave."""
         if self._handshakes is not None:
             await self._handshakes.close()
 
-    # Waiting for what others say.
+    # Waiting for other processes.
 
     async def until(
         self,
@@ -325,14 +325,14 @@ class Membership:
         self.notify()
 
     def _misfit(self, error: PeerError) -> None:
-        """Deal with somebody with whom there can be no run."""
+        """Deal with a process with which there can be no run."""
         if self.hello.running:
             log.warning("left alone: %s", error)
         else:
             self.fail(error)
 
     def joined(self, member: Member) -> None:
-        """Take in who somebody is."""
+        """Take in a process with which a session began."""
         try:
             check_fits(self.hello, member.hello, self.nodes)
         except PeerError as error:
@@ -365,7 +365,7 @@ class Membership:
         self.notify()
 
     def left(self, member: Member, why: str = "their process is gone") -> None:
-        """Do without somebody with whom the session has ended."""
+        """Go on without a process whose session has ended."""
         if member.over:
             return
         member.over = why

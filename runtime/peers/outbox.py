@@ -1,7 +1,7 @@
 """The way to one other process: a message goes at once if it is sure to, else by a thread.
 
 Zenoh waits where the network is slow, and the loop must not. A small message goes out on the spot
-as long as little is under way, by what the other process says has arrived; then Zenoh has room for
+as long as little is under way, by what the other process has confirmed; then Zenoh has room for
 it. So does an image if the other process sees memory of ours, where it is put: its message is
 small. All others are written by a thread, in order.
 """
@@ -42,12 +42,12 @@ class Outbox:
     Args:
         name: Of the process, for messages to people.
         put: Writes one; may wait.
-        failed: Told, in the line's thread, why something could not be sent.
+        failed: Called, in the outbox's thread, with why something could not be sent.
 
     Attributes:
         replaced: Events that a newer one of the same output took the place of.
         peak: Most messages that ever waited.
-        memory: That the other process sees, once it has said so.
+        memory: That the other process sees, once it has confirmed it.
     """
 
     def __init__(self, name: str, put: Put, failed: Callable[[VisnavError], None]) -> None:
@@ -71,7 +71,7 @@ class Outbox:
         """Send a message, or put it at the end of those that wait.
 
         Args:
-            message: What to say.
+            message: What to send.
             event: Goes with it.
             skip: If given, the event takes the place of one with the same word that still waits.
 
@@ -106,7 +106,7 @@ class Outbox:
             self._thread.join(timeout)
 
     def abandon(self) -> None:
-        """Write no more: there is nobody."""
+        """Write no more: the process has gone."""
         with self._lock:
             self._queue.clear()
             self._closed = True
@@ -134,7 +134,7 @@ class Outbox:
             self._put(head, frame)
         except VisnavError as error:
             self._failed(error)
-        except Exception as error:  # whatever a library does, the line goes on
+        except Exception as error:  # whatever a library does, the outbox goes on
             self._failed(PeerError(f"a message could not be sent: {_describe(error)}"))
 
     def _wait(self, waiting: _Waiting) -> None:
@@ -184,7 +184,7 @@ def _describe(error: Exception) -> str:
 
 
 class _Waiting:
-    """One message in the line."""
+    """One message in the outbox."""
 
     __slots__ = ("message", "packed", "skip")
 

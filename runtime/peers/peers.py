@@ -49,17 +49,17 @@ from runtime.wire import pack, unpack
 log = logging.getLogger("visnav.runtime")
 
 LEAD = 50_000_000
-"""Nanoseconds between the word to begin and the first update: it must reach everybody before."""
+"""Nanoseconds between the message to begin and the first update: it must reach all before."""
 
 
 class Run(Protocol):
     """What the other processes can bring about here."""
 
     def stop(self, reason: str, error: Exception | None = None, *, from_peer: bool = False) -> None:
-        """End the run; `from_peer` if another process says so."""
+        """End the run; `from_peer` if another process reported it."""
 
     def connect(self) -> None:
-        """Freeze anew who hears whom."""
+        """Freeze anew which listener receives which output."""
 
 
 class Peers:
@@ -103,7 +103,7 @@ class Peers:
             How often the nodes here were in this run before, in a process that was lost.
 
         Raises:
-            PeerError: They are not within the limit, or somebody runs another file or our nodes.
+            PeerError: They are not within the limit, or one runs another file or our nodes.
         """
         membership = self._membership
         before = await membership.meet()
@@ -120,7 +120,7 @@ class Peers:
         return before
 
     async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
-        """Tell the others what the nodes here announce; return what all do, in file order."""
+        """Send the others what the nodes here announce; return what all do, in file order."""
         self._announced = Announcements(
             {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in own.items()}
         )
@@ -145,8 +145,9 @@ class Peers:
         """Agree on when the first update is, and wait for it.
 
         One process decides that the run has begun, once all are ready. A loss before that ends
-        the run; one after it is dealt with as in the run, also by those who hear of it before they
-        hear that the run has begun. Who comes back to a run that goes on joins it where it is.
+        the run; one after it is dealt with as in the run, also by a process that learns of it
+        before it learns that the run has begun. A process that comes back to a run
+        that goes on joins it where it is.
         """
         membership = self._membership
         reference = self._decider = self._reference()
@@ -191,7 +192,7 @@ class Peers:
             self._follower = ClockFollower(self._clock, member)
 
     def nodes_run(self) -> None:
-        """Let what the others say arrive: the nodes here have begun."""
+        """Deliver messages from now on: the nodes here have begun."""
         self._begun = True
         self._membership.settle()
         if self._loop is not None:
@@ -206,11 +207,11 @@ class Peers:
     # During the run.
 
     def listeners(self, output: str) -> list[Listener]:
-        """Return who hears an output in other processes."""
+        """Return an output's listeners in other processes."""
         return self._remote.listeners(output) if self._remote else []
 
     def connect(self, listeners: list[Listener], fault: Fault) -> None:
-        """Say who hears here what is said elsewhere, and tell the others."""
+        """Connect the listeners here to outputs elsewhere, and notify the others."""
         if self._remote is None:
             return
         self._remote.connect(listeners, fault)
@@ -221,15 +222,15 @@ class Peers:
                 member.outbox.send(Subscriptions(wanted))
 
     def stopping(self, reason: str, error: Exception | None, *, from_peer: bool) -> None:
-        """Tell the others that the run ends, and why; also where the word is `from_peer`.
+        """Notify the others that the run ends, and why; also where the reason is `from_peer`.
 
-        They may hear it from us first.
+        They may receive it from us first.
         """
         self._ends = True
         text = None if error is None else str(error)
         stop = Stop(reason, text, apart=not self._begun)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
-        if not self._begun:  # also those who said so: they need not wait for our turn
+        if not self._begun:  # also its senders: they need not wait for our turn
             self._membership.broadcast(stop)
             early, self._early = self._early, []
             for member, message, _ in early:
@@ -243,7 +244,7 @@ class Peers:
         self.shutdown.begin()
 
     def node_ended(self, node: str) -> None:
-        """Tell the others that a node here has ended."""
+        """Notify the others that a node here has ended."""
         self.shutdown.at_work = False
         self._ended_here.append(node)
         self._broadcast_in_order(NodeEnded(node))
@@ -251,7 +252,7 @@ class Peers:
     # After the run.
 
     async def close(self) -> None:
-        """Say the last words, and leave."""
+        """Send what still waits, and leave."""
         self._ends = True
         self.shutdown.close()
         if self._follower is not None:
@@ -261,7 +262,7 @@ class Peers:
             self._loop.gate = None
         await self._membership.close()
 
-    # What the membership tells.
+    # What the membership notifies of.
 
     def receive(self, member: Member, message: OfTheRun, event: Event | None) -> None:
         """Take in a message of another process.
@@ -304,7 +305,7 @@ class Peers:
             case Stop() if not self._begun or message.serial < 0:
                 if message.apart:
                     self._go_on_without(member)
-                elif self._suspended:  # it is no use to wait for anybody's return
+                elif self._suspended:  # it is no use to wait for a return
                     self._gather()
                 self._do(member.number, message, None)
             case NodeEnded() if message.node not in member.nodes:
@@ -367,7 +368,7 @@ class Peers:
         self._run.connect()
 
     def reconnected(self, member: Member) -> None:
-        """Go on with a process that the network had parted from us."""
+        """Go on with a process that was disconnected."""
         log.warning("%s: found again, at %s", name_of(member.nodes), member.place)
         self._take_back(member)
         if member.number == self._followed:
@@ -379,12 +380,12 @@ class Peers:
         return self._clock.now() - round(ago * speed)
 
     def unsent(self, member: Member, error: VisnavError) -> None:
-        """Say what could not be sent; that a process has gone is noticed elsewhere."""
+        """Log what could not be sent; that a process has gone is noticed elsewhere."""
         if not self._ends:
             log.warning("to %s: %s", name_of(member.nodes), error)
 
     def _do(self, number: int, message: Ordered, event: Event | None) -> None:
-        """Do what another process says; in lockstep, at our turn."""
+        """Do what another process's message asks; in lockstep, at our turn."""
         try:
             match message:
                 case EventMessage() if self._remote is not None and event is not None:
@@ -415,7 +416,7 @@ class Peers:
         self._run.connect()
 
     def _gather(self, new: tuple[int, ...] = ()) -> None:
-        """In lockstep, share the turns among those who are there."""
+        """In lockstep, share the turns among the processes present."""
         if self._token is None or self._loop is None or not self._begun:
             return
         self._suspended = False
@@ -428,7 +429,7 @@ class Peers:
     def _go_on_without(self, member: Member) -> None:
         """Take a process out of the turns: it has not begun, or has given up."""
         self._apart.add(member.number)
-        for node in self._ended_here:  # what was to be said at our turn is lost
+        for node in self._ended_here:  # what was to be sent at our turn is lost
             member.outbox.send(NodeEnded(node))
         self._gather()
 

@@ -1,4 +1,4 @@
-"""Outputs here that are heard in other processes, and outputs there that are heard here."""
+"""Outputs here with listeners in other processes, and outputs there with listeners here."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class RemoteEvents:
                     self._arrivals[name] = (owners[spec.name], Sender(name, output.event))
 
     def wants(self, process: int, wanted: tuple[Subscription, ...]) -> None:
-        """Note what a process hears; nothing, if it is gone.
+        """Note what a process receives; nothing, if it is gone.
 
         Raises:
-            WireError: It hears a kind of event that is not known here.
+            WireError: It listens to a kind of event that is not known here.
         """
         for each in wanted:
             for kind in each.kinds:
@@ -62,7 +62,7 @@ class RemoteEvents:
         ]
 
     def connect(self, listeners: Iterable[Listener], fault: Fault) -> None:
-        """Say who hears here what is said elsewhere."""
+        """Connect the listeners here to outputs elsewhere."""
         listeners = list(listeners)
         for _, sender in self._arrivals.values():
             sender.connect(listeners, fault=fault)
@@ -103,15 +103,15 @@ class RemoteListener(Listener):
         self._may_skip: dict[tuple[type[Event], str], bool] = {}
 
     def may_receive(self, event: type[Event]) -> bool:
-        """Tell whether anything there can hear an output of this type."""
+        """Return whether anything there can receive from an output of this type."""
         return any(listener.may_receive(event) for listener, _ in self._listeners)
 
     def receives_all(self, event: type[Event]) -> bool:
-        """Tell whether something there hears whatever an output of this type sends."""
+        """Return whether something there receives all that an output of this type sends."""
         return any(listener.receives_all(event) for listener, _ in self._listeners)
 
     def receives(self, event: type[Event], source: str) -> bool:
-        """Tell whether anything there hears events of this very type from this source."""
+        """Return whether anything there receives events of this very type from this source."""
         return any(listener.receives(event, source) for listener, _ in self._listeners)
 
     def offer(self, event: Event) -> None:
@@ -125,7 +125,7 @@ class RemoteListener(Listener):
 
 
 def subscriptions(listeners: Iterable[Listener]) -> tuple[Subscription, ...]:
-    """Return what these listeners hear, for other processes."""
+    """Return what these listeners receive, for other processes."""
     found = {
         Subscription(
             kinds=tuple(kind_of(event) for event in listener.events),

@@ -1,4 +1,4 @@
-"""The secret of a run: who has it may take part, and nobody else is heard.
+"""The secret of a run: a process that has it may take part, and no other.
 
 On one machine it is a random key in a file that only its user can read, made when it is first
 needed; so nobody has to think of it. Processes on several machines, or of several users, are given

@@ -37,8 +37,8 @@ KEY = 32
 class Outgoing:
     """Memory into which this process puts what is large for another one.
 
-    `put` is called by one thread at a time, `freed` by any. The file is closed when nobody uses
-    this object any more.
+    `put` is called by one thread at a time, `freed` by any. The file is closed when this
+    object is used no more.
     """
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class Outgoing:
 class Incoming:
     """Memory into which another process puts what is large for this one.
 
-    The file is closed when nobody uses this object any more; arrays that stand in it stay valid.
+    The file is closed when this object is used no more; arrays that stand in it stay valid.
     """
 
     def __init__(self, fd: int) -> None:
@@ -124,11 +124,11 @@ class Incoming:
 
     @property
     def unread(self) -> int:
-        """How many frames nobody here reads any more, but for those that `freed` returned."""
+        """How many frames are read no more here, but for those that `freed` returned."""
         return len(self._window.freed)
 
     def freed(self) -> tuple[int, ...]:
-        """Return which frames nobody here reads any more, each once."""
+        """Return which frames are read no more here, each once."""
         freed = self._window.freed
         return tuple(freed.popleft() for _ in range(len(freed)))
 

@@ -1,12 +1,12 @@
 """Lockstep in several processes: one at a time goes on, the one with the next thing due.
 
-Each process has a loop on simulated time. Whoever has the turn runs on until somebody else has
-something due before its own next thing, or until it has said something that others must hear
+Each process has a loop on simulated time. The one that has the turn runs on until another has
+something due before its own next thing, or until it has sent something that others must receive
 first; then it passes the turn on, with the time, and with the counters that order what is due at
 one time. So everything happens in the order in which one process would have done it, and workers
 and threads go on beside in all processes at once.
 
-Here are no sockets: what is said goes out through `send`, what is heard comes in by `take`.
+Here are no sockets: messages go out through `send`, and come in by `take`.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ class TimeTokenHolder:
 
         Args:
             alive: Who is there, this process included.
-            ids: Their ids; all must speak of the same before there is a turn again.
-            new: Those who were not there before, or not as they are now.
+            ids: Their ids; all must report the same before there is a turn again.
+            new: Those that were not there before, or not as they are now.
         """
         self._alive = frozenset(alive)
         self._ids = tuple(sorted(ids))
@@ -116,7 +116,7 @@ class TimeTokenHolder:
     # What the loop asks, whenever nothing is ready.
 
     def may_go(self, key: Key) -> bool:
-        """Tell whether time may go on to what is due here next."""
+        """Return whether time may go on to what is due here next."""
         if self._report_due:
             self._report_state(key)
         if not self.holding:
@@ -172,7 +172,7 @@ class TimeTokenHolder:
         self._begin()
 
     def _begin(self) -> None:
-        """Take the turn that was passed to us once all that was said before is here."""
+        """Take the turn that was passed to us once all that was sent before is here."""
         turn = self._next
         if turn is None or any(
             self._received[other] < turn.sent[other][self._me] for other in self._alive - {self._me}
@@ -202,7 +202,7 @@ class TimeTokenHolder:
         self._timeline.move(self._timeline.now, (schedule, order + len(outbox)))
 
     def _pass(self, key: Key) -> None:
-        """Give the turn to whoever must hear something, or else has the next thing due."""
+        """Give the turn to a process with something to receive, or else with the next thing due."""
         others = self._alive - {self._me}
         self._reported_key = self._keys[self._me] = key
         if waiting := self._unread & others:
@@ -223,10 +223,10 @@ class TimeTokenHolder:
             None,
         )
 
-    # After somebody went or came.
+    # After a process left or joined.
 
     def _report_state(self, key: Key) -> None:
-        """Say where we stand to whoever makes the next turn."""
+        """Report our state to the process that makes the next turn."""
         self._report_due = False
         self._reported_key = key
         standing = StateReport(
@@ -245,7 +245,7 @@ class TimeTokenHolder:
             self._send(maker, standing, None)
 
     def _resume(self) -> None:
-        """Make a turn, if it is ours to make and all have said where they stand."""
+        """Make a turn, if it is ours to make and all have reported their state."""
         found = [self._reports.get(n) for n in sorted(self._alive)]
         if min(self._alive, default=-1) != self._me or any(
             s is None or s.processes != self._ids for s in found

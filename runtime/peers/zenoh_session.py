@@ -1,4 +1,4 @@
-"""A Zenoh session between the processes of one run: the only module of this room with zenoh.
+"""A Zenoh session between the processes of one run: the only module with zenoh.
 
 Zenoh has threads of its own and no asyncio: what it calls runs there, and must not wait.
 """
@@ -25,7 +25,7 @@ from runtime.peers.authentication import derive
 log = logging.getLogger("visnav.runtime")
 
 OnMessage = Callable[[str, bytes, bytes], None]
-"""Called in Zenoh's thread with who sends, the message, and its payload."""
+"""Called in Zenoh's thread with the sender's id, the message, and its payload."""
 
 OnPresence = Callable[[str, bool], None]
 """Called in Zenoh's thread when a process appears (True) or disappears."""
@@ -43,7 +43,7 @@ class Session:
     Args:
         run: The run's name; processes of other runs are not seen.
         network: Where processes meet, and how they talk.
-        secret: That they share. Without a Zenoh file, nobody else can connect.
+        secret: That they share. Without a Zenoh file, no other process can connect.
 
     Raises:
         PeerError: The session cannot be opened.
@@ -75,8 +75,8 @@ class Session:
         """Be seen by the others, and see them.
 
         Args:
-            on_message: Told of messages.
-            on_presence: Told of processes that come and go, this one not included.
+            on_message: Called with each message.
+            on_presence: Called for processes that come and go, this one not included.
         """
 
         def take(sample: zenoh.Sample) -> None:
@@ -138,7 +138,7 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
     settings: dict[str, Any] = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
-        # Of two that hear of each other only one connects: with passwords, both may fail else.
+        # Of two that discover each other only one connects: with passwords, both may fail else.
         "scouting/gossip/autoconnect_strategy": {
             "peer": {"to_router": "always", "to_peer": "greater-zid"}
         },
@@ -166,7 +166,7 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
 
 
 def certified(network: NetworkConfig) -> bool:
-    """Tell whether a Zenoh file lets only those connect who have a certificate."""
+    """Return whether a Zenoh file lets only processes with a certificate connect."""
     configuration = _configuration(network)
     ends = [*_endpoints(configuration, "listen"), *_endpoints(configuration, "connect")]
     mutual = json.loads(configuration.get_json("transport/link/tls/enable_mtls"))
@@ -179,7 +179,7 @@ def _endpoints(configuration: zenoh.Config, way: str) -> list[str]:
 
 
 def _warn_if_open(configuration: zenoh.Config) -> None:
-    """Warn of an endpoint at which what is said can be read on the way."""
+    """Warn of an endpoint at which messages can be read on the way."""
     bare = [
         endpoint
         for endpoint in _endpoints(configuration, "listen")
@@ -210,7 +210,7 @@ def _beside(meet: str) -> list[str]:
 
 
 def _is_here(endpoint: str) -> bool:
-    """Tell whether only processes of this machine reach an endpoint."""
+    """Return whether only processes of this machine reach an endpoint."""
     parts = _ENDPOINT.fullmatch(endpoint)
     host = parts[2] if parts else ""
     try:

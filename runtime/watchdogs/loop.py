@@ -1,4 +1,4 @@
-"""Notices a loop that does not turn, and says which node stands on which line.
+"""Notices a loop that does not turn, and reports which node stands on which line.
 
 A thread looks at the loop's thread a few times per limit. Only where it finds the loop busy does
 it ask it to sign a note; a note that stays unsigned for the limit is a stall. An idle loop is
@@ -52,7 +52,7 @@ class LoopWatchdog:
     Args:
         loop: The loop.
         limit: Real seconds without a turn that are a stall; 0 watches nothing.
-        report: Told of each stall once it is over; from the watchdog's thread.
+        report: Called with each stall once it is over; from the watchdog's thread.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class LoopWatchdog:
 
 
 def idle(frame: FrameType | None) -> bool:
-    """Tell whether a loop whose thread has this frame has nothing to do."""
+    """Return whether a loop whose thread has this frame has nothing to do."""
     while frame is not None and frame.f_code.co_filename in _WAITING:
         frame = frame.f_back
     return frame is None or frame.f_code.co_filename in _LOOPS

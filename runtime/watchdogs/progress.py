@@ -1,4 +1,4 @@
-"""Says what a run waits for when nothing goes on: which node, which line, which wait.
+"""Reports what a run waits for when nothing goes on: which node, which line, which wait.
 
 A thread looks at the run a few times per limit. When it finds that neither the run's time nor its
 phase has changed for half of it, it asks the loop to explain. A loop that runs without time
@@ -40,7 +40,7 @@ class ProgressWatchdog:
     Args:
         state: Of the run.
         loop: Its loop.
-        limit: Real seconds without progress after which there is something to say; 0 for never.
+        limit: Real seconds without progress after which this is reported; 0 for never.
     """
 
     def __init__(self, state: RunState, loop: asyncio.AbstractEventLoop, limit: float) -> None:
@@ -128,7 +128,7 @@ class ProgressWatchdog:
         return answers[-1][0] if known else None
 
     def _explain(self) -> str:
-        """Say who is waited for; ``""`` if all is well, ``"busy"`` if nobody is; on the loop."""
+        """Return who is waited for; ``""`` if all is well, ``"busy"`` if nobody is; on the loop."""
         run, loop = self._state, self._loop
         waiting = [runner for runner in run.runners.values() if runner.phase]
         if waiting:
@@ -174,7 +174,7 @@ class ProgressWatchdog:
 
 
 def _explain_time(loop: LockstepLoop, run: RunState) -> str:
-    """Say what simulated time waits for."""
+    """Describe what simulated time waits for."""
     if loop.gate is not None:
         paused = getattr(loop.gate, "paused", False)
         return "" if paused else "the other processes of the run"

@@ -137,7 +137,7 @@ class MappedFile:
         self._fd = fd
         self._map: mmap.mmap | None = None
         self.freed: collections.deque[int] = collections.deque()
-        """Offsets of blocks that nobody reads any more; appended to from any thread."""
+        """Offsets of blocks that are read no more; appended to from any thread."""
 
     def view(self, offset: int, size: int) -> Any:
         """Return the bytes of a block; when the last array on them is gone, it is freed."""
@@ -230,7 +230,7 @@ class SharedPipe:
                     self._writer.start()
 
     def _send_rest(self) -> None:
-        with contextlib.suppress(OSError):  # whoever receives is told, too
+        with contextlib.suppress(OSError):  # the receiver is notified, too
             while True:
                 self._connection.sendall(self._unsent[0])
                 with self._sending:
@@ -265,11 +265,11 @@ class SharedPipe:
         return pickle.loads(body, buffers=[self._window.view(*span) for span in spans])  # noqa: S301
 
     def poll(self, timeout: float) -> bool:
-        """Wait up to `timeout` seconds for a message, and tell whether there is one."""
+        """Wait up to `timeout` seconds for a message, and return whether there is one."""
         return bool(self._readable.poll(timeout * 1e3))
 
     def shut_down(self) -> None:
-        """End the connection for both sides; a thread that waits in `receive` is told."""
+        """End the connection for both sides; a thread that waits in `receive` is notified."""
         with contextlib.suppress(OSError):  # it has ended already
             self._connection.shutdown(socket.SHUT_RDWR)
 

@@ -38,16 +38,16 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 Called = Callable[[str, str, concurrent.futures.Future[Any]], None]
-"""Told which process is asked to run which method, and the answer to come."""
+"""Called with the process, the method that it is to run, and the answer to come."""
 
 _GRACE = 2.0
 """Seconds a process gets to end by itself once its connection is closed."""
 
 _LOOK = 0.25
-"""Seconds after which a thread that hears nothing from a process looks whether there is one."""
+"""Seconds after which a thread that receives nothing from a process looks whether there is one."""
 
 _LONGEST = 1e8
-"""Seconds that no limit exceeds which the kernel is told."""
+"""Seconds of the longest limit that the kernel is given."""
 
 
 class Worker(Generic[W]):
@@ -66,8 +66,8 @@ class Worker(Generic[W]):
         env: Environment variables for the processes, added to ours.
         niceness: How much the processes stand back for others, 0 to 19. In real time they also
             keep off one core, so that a tick need not wait for a core to come free.
-        printed: Told each line that a process prints.
-        died: Told when a process ends on its own or is killed for hanging; from any thread.
+        printed: Called with each line that a process prints.
+        died: Called when a process ends on its own or is killed for hanging; from any thread.
         costs: Where to note what the calls cost.
 
     Raises:
@@ -99,7 +99,7 @@ class Worker(Generic[W]):
         self.costs.latency = latency
         self.costs.processes = processes
         self.called: Called | None = None
-        """Told of every call, if anybody wants to know."""
+        """Called with every call, if it is set."""
         self._clock = clock
         self._latency = latency
         self._processes: list[_Process] = []
@@ -125,7 +125,7 @@ class Worker(Generic[W]):
 
     def _start(self) -> list[concurrent.futures.Future[Any]]:
         with self._changing:
-            if self._closed:  # whoever wanted it has gone before this thread came to it
+            if self._closed:  # its caller has gone before this thread came to it
                 raise WorkerError(f"worker {self.name}: closed before it was ready")
             started = []
             for make in self._make[len(self._processes) :]:
@@ -253,7 +253,7 @@ class _Process:
         self._reader = threading.Thread(target=self._read_answers, name=name, daemon=True)
 
     def start(self, to_make: Any) -> concurrent.futures.Future[Any]:
-        """Have the object made; the future tells whether that went well."""
+        """Have the object made; the future has whether that went well."""
         self._output.start()
         with contextlib.suppress(OSError):  # if it is gone already, the request below says so
             self._pipe.send(sys.path)
@@ -270,7 +270,7 @@ class _Process:
         It never waits for the process to take it.
         """
         work: concurrent.futures.Future[Any] = concurrent.futures.Future()
-        work.set_running_or_notify_cancel()  # whoever stops waiting does not cancel it
+        work.set_running_or_notify_cancel()  # a caller that stops waiting does not cancel it
         try:
             packed = self._pipe.pack(message)
         except Exception as error:  # it cannot be pickled: the caller's mistake
