@@ -179,6 +179,7 @@ def test_a_recording_takes_the_simulators_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(180)
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 @pytest.mark.parametrize("first", [0, 1])
 def test_two_machines_start_in_either_order(tmp_path: Path, clock: str, first: int) -> None:
@@ -195,7 +196,7 @@ def test_two_machines_start_in_either_order(tmp_path: Path, clock: str, first: i
         )
         started.append(process)
     for process in started:
-        _, said = process.communicate(timeout=50)
+        _, said = process.communicate(timeout=150)
         assert process.returncode == 0, said
     one, other = (json.loads((tmp_path / only / "summary.json").read_text()) for only in groups)
     assert one["digest"] == other["digest"]

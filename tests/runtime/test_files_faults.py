@@ -145,7 +145,7 @@ def test_a_full_disk_for_the_log_alone_loses_the_log_alone(tmp_path: Path) -> No
     results = tmp_path / "runs" / "sample"
     claim(results)
     (results / "log.txt").symlink_to("/dev/full")
-    done = run_limited(tmp_path)
+    done = run_limited(tmp_path, "--out", "runs/sample")
     fails_in_one_line(done, "failing: RuntimeError: out of order")
     assert "log.txt: cannot be written: No space left on device" in done.stderr
     assert summary(results)["error"] == "failing: RuntimeError: out of order"

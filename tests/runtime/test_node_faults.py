@@ -50,8 +50,10 @@ def run_batch(folder: Path, modes: list[tuple[str, str, str, str]]) -> None:
     for number, (place, way, clock, rule) in enumerate(modes):
         here = folder / f"{number}"
         here.mkdir()
+        duration = 3.0 if rule == "stop" else 0.5  # those end sooner, if the machine is idle
         (here / "a.toml").write_text(
-            f"[run]\nname = 'a'\nclock = '{clock}'\nduration = 0.5\nshutdown_limit = 2\nstall = 0\n"
+            f"[run]\nname = 'a'\nclock = '{clock}'\nduration = {duration}\n"
+            "shutdown_limit = 2\nstall = 0\n"
             "[[nodes]]\nname = 'first'\ntype = 'tests.runtime.samples_faults:Witness'\n"
             f"[[nodes]]\nname = 'faulty'\ntype = 'tests.runtime.samples_faults:Faulty'\n"
             f"place = '{place}'\nway = '{way}'\non_error = '{rule}'\n"
