@@ -73,7 +73,7 @@ async def _look(folder: Path, browser: str) -> None:
     assert web.stdout is not None
     url = (await web.stdout.readline()).decode().split()[-1]
     await asyncio.sleep(2.0)  # there should be something to show at once
-    await asyncio.to_thread(_draw, browser, url, DOCS / "web.png", 1280, 640)
+    await asyncio.to_thread(_draw, browser, url, DOCS / "web.png", 1360, 1080)
     web.terminate()
     await web.wait()
 
