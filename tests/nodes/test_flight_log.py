@@ -75,10 +75,10 @@ def test_images_are_drawn(tmp_path: Path) -> None:
     inputs.append(collision(9_000_000_000))
     log(tmp_path, sorted(inputs, key=lambda e: e.stamp), interval="500ms")
     for name in ("flight.png", "images.png"):
-        image = cv2.imread(str(tmp_path / name))
-        assert image is not None
-        assert min(image.shape[:2]) > 300
-        assert image.std() > 5
+        drawn = cv2.imread(str(tmp_path / name))
+        assert drawn is not None
+        assert min(drawn.shape[:2]) > 300
+        assert drawn.std() > 5
 
 
 @pytest.mark.parametrize(("east", "seconds"), [(0.0, 20), (1.0, 20), (0.0, 1)])
