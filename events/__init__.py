@@ -7,13 +7,22 @@ are made (`events.checks`): integer stamps, finite numbers, unit quaternions.
 
 from events.announcements import (
     Announcement,
+    BarometerAnnouncement,
+    BodyAnnouncement,
     CameraAnnouncement,
     EstimatorAnnouncement,
     ImuAnnouncement,
+    LidarAnnouncement,
+    MagnetometerAnnouncement,
+    NavSatAnnouncement,
     PathAnnouncement,
+    PilotAnnouncement,
+    RangeAnnouncement,
+    SensorAnnouncement,
     VehicleAnnouncement,
 )
 from events.base import Category, Event, Quaternion, Vector3
+from events.camera_info import CameraInfo
 from events.control import (
     Arm,
     AttitudeSetpoint,
@@ -36,17 +45,16 @@ from events.estimates import (
     TrackingLost,
     TrackingRegained,
 )
-from events.geometry import Odometry, PoseStamped, TransformStamped
+from events.geometry import Odometry, PoseStamped, TransformStamped, Wind
 from events.lifecycle import ParameterChanged, Shutdown
 from events.maps import PointCloud
 from events.scores import Score
 from events.sensors import (
-    CameraInfo,
     DepthImage,
     FluidPressure,
     Image,
     Imu,
-    LaserScan3D,
+    LidarScan,
     MagneticField,
     NavSatFix,
     Range,
@@ -60,6 +68,8 @@ __all__ = [
     "Arm",
     "Armed",
     "AttitudeSetpoint",
+    "BarometerAnnouncement",
+    "BodyAnnouncement",
     "BodyRateSetpoint",
     "CameraAnnouncement",
     "CameraInfo",
@@ -80,12 +90,16 @@ __all__ = [
     "KeyReleased",
     "Land",
     "Landed",
-    "LaserScan3D",
+    "LidarAnnouncement",
+    "LidarScan",
     "MagneticField",
+    "MagnetometerAnnouncement",
+    "NavSatAnnouncement",
     "NavSatFix",
     "Odometry",
     "ParameterChanged",
     "PathAnnouncement",
+    "PilotAnnouncement",
     "PlannedPose",
     "PointCloud",
     "PoseEstimate",
@@ -94,8 +108,10 @@ __all__ = [
     "PositionSetpoint",
     "Quaternion",
     "Range",
+    "RangeAnnouncement",
     "Score",
     "SegmentationImage",
+    "SensorAnnouncement",
     "Setpoint",
     "Shutdown",
     "TakenOff",
@@ -109,6 +125,7 @@ __all__ = [
     "VehicleAnnouncement",
     "VehicleEvent",
     "VelocitySetpoint",
+    "Wind",
     "WindowClosed",
     "WindowResized",
 ]

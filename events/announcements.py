@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from events.base import Category, Event, Quaternion, Vector3
+from events.camera_info import CameraInfo
 from events.checks import check, check_pose
-from events.sensors import CameraInfo
 
 
 class Announcement(Event):
@@ -51,6 +51,20 @@ class CameraAnnouncement(Announcement):
         info: Intrinsics; the same for all its images.
         rate: Frames per second.
         latency: Seconds from exposure to delivery.
+        exposure: Seconds that the shutter is open, half of them before the stamp; the longest, if
+            the camera chooses it.
+        readout: Seconds from the first row's exposure to the last row's; 0 is a global shutter.
+            `stamp` is that of the middle row: row v of an image with h rows is exposed at
+            ``stamp + readout · (v / (h - 1) - 1/2)``.
+        time_offset: Seconds by which the images' stamps are late on the clock of the IMU and the
+            ground truth: what is stamped t was exposed at ``t - time_offset``. (Kalibr's
+            ``timeshift_cam_imu`` is its negative.)
+        time_jitter: Greatest random error of the stamps besides, seconds, either way.
+        noise: Standard deviation of the images' noise at middle grey, grey levels.
+        baseline: Of the right camera of a stereo rig, metres to the left one; 0 of all others.
+        stereo: Source of the left camera of that rig; empty of all others.
+        undistorted: Source of the camera whose images these are, without distortion; empty if
+            these are a camera's own.
         frame_id: Optical frame, as in its images.
         parent_frame_id: Frame it is mounted on; ``map`` for a free camera.
         position: The camera in the parent frame, metres.
@@ -61,6 +75,14 @@ class CameraAnnouncement(Announcement):
     info: CameraInfo
     rate: float
     latency: float
+    exposure: float = 0.0
+    readout: float = 0.0
+    time_offset: float = 0.0
+    time_jitter: float = 0.0
+    noise: float = 0.0
+    baseline: float = 0.0
+    stereo: str = ""
+    undistorted: str = ""
     frame_id: str
     parent_frame_id: str
     position: Vector3
@@ -68,7 +90,9 @@ class CameraAnnouncement(Announcement):
 
     def __post_init__(self) -> None:
         check_pose(self, self.position, self.orientation)
-        check(self, (self.rate, self.latency, 0.0))
+        check(self, (self.rate, self.latency, self.exposure))
+        check(self, (self.readout, self.time_offset, self.time_jitter))
+        check(self, (self.noise, self.baseline, 0.0))
 
 
 class ImuAnnouncement(Announcement):
@@ -91,14 +115,151 @@ class ImuAnnouncement(Announcement):
     accelerometer_random_walk: float
 
 
+class SensorAnnouncement(Announcement):
+    """Base of the other sensors' announcements.
+
+    Attributes:
+        rate: Hertz.
+        latency: Seconds from the measurement to its delivery.
+        frame_id: Frame of the measurements.
+        parent_frame_id: Frame that it is mounted on.
+        position: The sensor in the parent frame, metres.
+        orientation: Rotation from the sensor's frame to the parent frame.
+    """
+
+    rate: float
+    latency: float = 0.0
+    frame_id: str = "base_link"
+    parent_frame_id: str = "base_link"
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
+        check(self, (self.rate, self.latency, 0.0))
+
+
+class BarometerAnnouncement(SensorAnnouncement):
+    """A barometer, which sends `FluidPressure`.
+
+    Attributes:
+        noise: Standard deviation of the white noise, pascal.
+        altitude: Altitude of the origin of ``map`` above sea level, metres.
+    """
+
+    noise: float
+    altitude: float
+
+
+class NavSatAnnouncement(SensorAnnouncement):
+    """A satellite receiver, which sends `NavSatFix`.
+
+    Attributes:
+        latitude: Degrees north, of the origin of ``map``.
+        longitude: Degrees east, of the origin of ``map``.
+        altitude: Metres above the WGS 84 ellipsoid, of the origin of ``map``.
+        horizontal_noise: Standard deviation of the white noise, north and east, metres.
+        vertical_noise: Standard deviation of the white noise, down, metres.
+    """
+
+    latitude: float
+    longitude: float
+    altitude: float
+    horizontal_noise: float
+    vertical_noise: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, (self.latitude, self.longitude, self.altitude))
+
+
+class MagnetometerAnnouncement(SensorAnnouncement):
+    """A magnetometer, which sends `MagneticField`.
+
+    Attributes:
+        noise: Standard deviation of the white noise of each axis, tesla.
+        field: Of the earth at the origin of ``map``, tesla in ``map``.
+    """
+
+    noise: float
+    field: Vector3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, self.field)
+
+
+class RangeAnnouncement(SensorAnnouncement):
+    """A range finder along its frame's x axis, which sends `Range`.
+
+    Attributes:
+        noise: Standard deviation of the white noise, metres.
+        min_range: Metres.
+        max_range: Metres.
+        field_of_view: Radians; 0 of a single ray.
+    """
+
+    noise: float
+    min_range: float
+    max_range: float
+    field_of_view: float = 0.0
+
+
+class LidarAnnouncement(SensorAnnouncement):
+    """A lidar, which sends a `LidarScan` for each turn.
+
+    Attributes:
+        channels: Number of its rings, or of the rays of one column.
+        columns: Directions of each ring in a turn.
+        horizontal_fov: Radians.
+        elevations: Lowest and highest ray above the sensor's x-y plane, radians.
+        noise: Standard deviation of the white noise along the ray, metres.
+        min_range: Metres.
+        max_range: Metres.
+    """
+
+    channels: int
+    columns: int
+    horizontal_fov: float
+    elevations: tuple[float, float]
+    noise: float
+    min_range: float
+    max_range: float
+
+
+class BodyAnnouncement(Announcement):
+    """A body that moves in the world by itself; its true pose is sent as `PoseStamped`.
+
+    Attributes:
+        kind: What it is, in a word: ``person``, ``car``, ``door``.
+        object_ids: Its numbers in a `SegmentationImage`: its mask is where one of these is.
+    """
+
+    kind: str
+    object_ids: tuple[int, ...]
+
+
+class PilotAnnouncement(Announcement):
+    """A node that sends commands or set-points; `source` is theirs.
+
+    Attributes:
+        vehicle: Name of the vehicle that it flies; empty if it does not say, which is refused
+            where there are several.
+    """
+
+    vehicle: str = ""
+
+
 class PathAnnouncement(Announcement):
     """Where a pilot is about to fly; a simulator refuses what is not free.
 
     Attributes:
         waypoints: Places to pass in this order, metres in ``map``; at first the vehicle climbs from
             where it stands to the height of the first one.
+        vehicle: Name of the vehicle that it is for; empty for the only one.
     """
 
+    vehicle: str = ""
     waypoints: tuple[Vector3, ...]
 
 

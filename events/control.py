@@ -12,18 +12,30 @@ from events.checks import check, check_pose
 
 
 class Command(Event):
-    """Base of the orders that are given once."""
+    """Base of the orders that are given once.
+
+    Attributes:
+        vehicle: Name of the vehicle that it is for; empty for the only one.
+    """
 
     category: ClassVar[Category] = Category.CONTROL
+
+    vehicle: str = ""
 
     def __post_init__(self) -> None:
         check(self)
 
 
 class Setpoint(Event):
-    """Base of what is sent again and again, and where only the newest counts."""
+    """Base of what is sent again and again, and where only the newest counts.
+
+    Attributes:
+        vehicle: Name of the vehicle that it is for; empty for the only one.
+    """
 
     category: ClassVar[Category] = Category.CONTROL
+
+    vehicle: str = ""
 
     def __post_init__(self) -> None:
         check(self)
@@ -146,6 +158,7 @@ class PlannedPose(Event):
     """Where a pilot means the vehicle to be at `stamp`; for the record, not an order.
 
     Attributes:
+        vehicle: Name of the vehicle; empty for the only one.
         frame_id: Parent frame.
         position: Metres in the parent frame.
         yaw: Heading in radians, clockwise from north seen from above.
@@ -153,6 +166,7 @@ class PlannedPose(Event):
 
     category: ClassVar[Category] = Category.CONTROL
 
+    vehicle: str = ""
     frame_id: str = "map"
     position: Vector3
     yaw: float

@@ -88,3 +88,18 @@ class Odometry(Event):
     def __post_init__(self) -> None:
         check_pose(self, self.position, self.orientation)
         check(self, self.linear_velocity, self.angular_velocity)
+
+
+class Wind(Event):
+    """True velocity of the air, for the record: what a vehicle feels at its place.
+
+    Attributes:
+        velocity: Metres per second in ``map``: (1, 0, 0) blows towards the north.
+    """
+
+    category: ClassVar[Category] = Category.GEOMETRY
+
+    velocity: Vector3
+
+    def __post_init__(self) -> None:
+        check(self, self.velocity)

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events.base import Category, Event, Quaternion, Vector3
-from events.checks import check, check_pose
+from events.base import Category, Event, Vector3
+from events.checks import check
 
 
 def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
@@ -31,53 +30,14 @@ def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> N
     array.setflags(write=False)
 
 
-class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """Pinhole intrinsics in OpenCV's convention: pixel *centres* have whole coordinates.
-
-    A point (x, y, z) in the optical frame falls on column ``fx·x/z + cx``, row ``fy·y/z + cy``.
-
-    Attributes:
-        width: Pixels.
-        height: Pixels.
-        fx: Focal length in pixels along the columns.
-        fy: Focal length in pixels along the rows.
-        cx: Principal point, column; ``(width - 1) / 2`` for an ideal camera.
-        cy: Principal point, row.
-        distortion: plumb_bob coefficients (k1, k2, p1, p2, k3); zeros for an ideal camera.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-
-    @classmethod
-    def from_fov(cls, width: int, height: int, horizontal_fov: float) -> CameraInfo:
-        """Make an ideal camera with square pixels from its horizontal field of view (radians)."""
-        focal = width / (2.0 * np.tan(horizontal_fov / 2.0))
-        return cls(
-            width=width,
-            height=height,
-            fx=float(focal),
-            fy=float(focal),
-            cx=(width - 1) / 2,
-            cy=(height - 1) / 2,
-        )
-
-    def matrix(self) -> npt.NDArray[np.float64]:
-        """Return K, shape (3, 3), as OpenCV takes it."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-
-
 class Image(Event, eq=False):
     """A colour or grey image, as ROS's ``sensor_msgs/Image``.
 
     Attributes:
         frame_id: Optical frame.
         encoding: ``rgb8`` or ``mono8``.
+        exposure_time: Seconds that the shutter was open; 0 if that is unknown or no time.
+        gain: Factor of the amplifier; 1 if unknown.
         data: uint8, shape (height, width, 3) for ``rgb8``, (height, width) for ``mono8``.
     """
 
@@ -85,6 +45,8 @@ class Image(Event, eq=False):
 
     frame_id: str
     encoding: str = "rgb8"
+    exposure_time: float = 0.0
+    gain: float = 1.0
     data: npt.NDArray[np.uint8]
 
     def __post_init__(self) -> None:
@@ -169,11 +131,13 @@ class MagneticField(Event):
     """Magnetometer, as ROS's ``sensor_msgs/MagneticField``.
 
     Attributes:
-        magnetic_field: Tesla in the body frame.
+        frame_id: Frame of the measurement.
+        magnetic_field: Tesla in that frame.
     """
 
     category: ClassVar[Category] = Category.SENSOR
 
+    frame_id: str = "base_link"
     magnetic_field: Vector3
 
     def __post_init__(self) -> None:
@@ -187,6 +151,8 @@ class NavSatFix(Event):
         latitude: Degrees north.
         longitude: Degrees east.
         altitude: Metres above the WGS 84 ellipsoid.
+        position_covariance: Of (north, east, down), m²: 9 numbers, row by row; empty if unknown.
+        velocity: Metres per second in ``map``, as receivers measure it by Doppler shift.
     """
 
     category: ClassVar[Category] = Category.SENSOR
@@ -194,23 +160,29 @@ class NavSatFix(Event):
     latitude: float
     longitude: float
     altitude: float
+    position_covariance: tuple[float, ...] = ()
+    velocity: Vector3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check(self, (self.latitude, self.longitude, self.altitude))
+        check(self, (self.latitude, self.longitude, self.altitude), self.velocity)
 
 
 class Range(Event):
     """Distance sensor, as ROS's ``sensor_msgs/Range``.
 
     Attributes:
+        frame_id: Frame of the sensor, which looks along its x axis.
         range: Metres; ``inf`` if nothing is in reach.
+        field_of_view: Radians; 0 of a single ray.
         min_range: Metres.
         max_range: Metres.
     """
 
     category: ClassVar[Category] = Category.SENSOR
 
+    frame_id: str = "base_link"
     range: float
+    field_of_view: float = 0.0
     min_range: float
     max_range: float
 
@@ -218,21 +190,38 @@ class Range(Event):
         check(self)
 
 
-class LaserScan3D(Event, eq=False):
-    """One sweep of a lidar.
+class LidarScan(Event, eq=False):
+    """One turn of a lidar, as ROS's ``sensor_msgs/PointCloud2`` of a lidar's driver.
+
+    `stamp` is the time of the first ray. Each point is in the sensor's frame at the time of its own
+    ray, `stamp` + its `times`: a moving sensor's cloud is skewed, as a real one's is. Rays that hit
+    nothing give no point.
 
     Attributes:
-        frame_id: Frame of the points.
+        frame_id: Frame of the sensor: x forward, y right, z down.
         points: float32 metres, shape (n, 3).
-        orientation: Rotation from the sensor to ``map`` when it was taken.
+        intensities: float32, 0 to 1, shape (n,).
+        times: float32 seconds after `stamp`, shape (n,), not falling.
+        rings: uint16 number of the ray's channel, 0 the uppermost, shape (n,).
     """
 
     category: ClassVar[Category] = Category.SENSOR
 
     frame_id: str
     points: npt.NDArray[np.float32]
-    orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    intensities: npt.NDArray[np.float32]
+    times: npt.NDArray[np.float32]
+    rings: npt.NDArray[np.uint16]
 
     def __post_init__(self) -> None:
-        check_pose(self, (0.0, 0.0, 0.0), self.orientation)
-        publish("LaserScan3D", "points", self.points, np.float32, {2})
+        check(self)
+        publish("LidarScan", "points", self.points, np.float32, {2})
+        publish("LidarScan", "intensities", self.intensities, np.float32, {1})
+        publish("LidarScan", "times", self.times, np.float32, {1})
+        publish("LidarScan", "rings", self.rings, np.uint16, {1})
+        count = len(self.times)
+        if self.points.shape != (count, 3) or {len(self.intensities), len(self.rings)} != {count}:
+            raise TypeError(
+                f"LidarScan: expected points, intensities and rings of {count} times, found "
+                f"shapes {self.points.shape}, {self.intensities.shape}, {self.rings.shape}"
+            )

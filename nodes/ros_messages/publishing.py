@@ -21,7 +21,7 @@ from events import (
     Image,
     Imu,
     ImuAnnouncement,
-    LaserScan3D,
+    LidarScan,
     MagneticField,
     NavSatFix,
     Odometry,
@@ -60,7 +60,7 @@ LARGE: tuple[type[Event], ...] = (
     DepthImage,
     SegmentationImage,
     PointCloud,
-    LaserScan3D,
+    LidarScan,
 )
 """Events whose messages take long to make: `Publishing.large` has a function for each."""
 
@@ -134,7 +134,7 @@ class Publishing(Generic[P]):
             DepthImage: self._depth,
             SegmentationImage: self._segmentation,
             PointCloud: self._cloud,
-            LaserScan3D: self._lidar,
+            LidarScan: self._lidar,
         }
         """What puts the messages of images and point clouds, by type of event."""
         messages = self._messages
@@ -276,10 +276,10 @@ class Publishing(Generic[P]):
     def _cloud(self, event: PointCloud) -> None:
         self._points("cloud", event, event.colors)
 
-    def _lidar(self, event: LaserScan3D) -> None:
+    def _lidar(self, event: LidarScan) -> None:
         self._points("lidar", event)
 
-    def _points(self, kind: TopicKind, event: PointCloud | LaserScan3D, colors: Any = None) -> None:
+    def _points(self, kind: TopicKind, event: PointCloud | LidarScan, colors: Any = None) -> None:
         if publisher := self._publisher(kind, event.source):
             frame = self._names.name(event.frame_id, event.source)
             points = convert_points(self._names.axes(event.frame_id), event.points)

@@ -35,12 +35,17 @@ VALID: dict[Any, Any] = {
     Quaternion: (0.5, -0.5, 0.5, 0.5),
     tuple[str, ...]: ("rgb",),
     tuple[float, ...]: (),
+    tuple[float, float]: (-0.3, 0.3),
+    tuple[int, ...]: (3, 4),
     events.CameraInfo: INFO,
 }
 ARRAYS: dict[str, Any] = {
     "points": np.zeros((2, 3), np.float32),
     "colors": np.zeros((2, 3), np.uint8),
     "inliers": np.zeros(2, np.bool_),
+    "intensities": np.zeros(2, np.float32),
+    "times": np.zeros(2, np.float32),
+    "rings": np.zeros(2, np.uint16),
 }
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=32)
 

@@ -10,16 +10,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from events import CameraInfo, DepthImage, Event, Image, LaserScan3D, PointCloud, SegmentationImage
+from events import CameraInfo, DepthImage, Event, Image, LidarScan, PointCloud, SegmentationImage
 
 COLOURS = np.zeros((2, 3), np.uint8)
+TURN = {
+    "frame_id": "l",
+    "points": np.zeros((2, 3), np.float32),
+    "intensities": np.zeros(2, np.float32),
+    "times": np.zeros(2, np.float32),
+    "rings": np.zeros(2, np.uint16),
+}
 
 GOOD: list[tuple[type[Event], dict[str, Any], str]] = [
     (Image, {"frame_id": "c", "data": np.zeros((4, 5, 3), np.uint8)}, "data"),
     (Image, {"frame_id": "c", "encoding": "mono8", "data": np.zeros((4, 5), np.uint8)}, "data"),
     (DepthImage, {"frame_id": "c", "data": np.zeros((4, 5), np.float32)}, "data"),
     (SegmentationImage, {"frame_id": "c", "data": np.zeros((4, 5), np.int32)}, "data"),
-    (LaserScan3D, {"frame_id": "l", "points": np.zeros((2, 3), np.float32)}, "points"),
+    (LidarScan, TURN, "points"),
     (PointCloud, {"points": np.zeros((2, 3), np.float32), "colors": COLOURS}, "points"),
 ]
 

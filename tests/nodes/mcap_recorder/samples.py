@@ -14,7 +14,7 @@ from events import (
     Image,
     Imu,
     ImuAnnouncement,
-    LaserScan3D,
+    LidarScan,
     Odometry,
     PointCloud,
     PoseEstimate,
@@ -133,8 +133,14 @@ def said(stamp: int) -> list[Event]:
         cloud(stamp, "map", 7, colours=True),
         cloud(stamp, "map/plain", 3, colours=False),
         cloud(stamp, "map/none", 0, colours=True),
-        LaserScan3D(
-            stamp=stamp, source="drone/lidar", frame_id="l", points=np.ones((2, 3), np.float32)
+        LidarScan(
+            stamp=stamp,
+            source="drone/lidar",
+            frame_id="l",
+            points=np.ones((2, 3), np.float32),
+            intensities=np.array([0.25, 0.75], np.float32),
+            times=np.array([0.0, 0.05], np.float32),
+            rings=np.array([0, 15], np.uint16),
         ),
         TrackedFeatures(
             stamp=stamp,
