@@ -11,7 +11,7 @@ import numpy.typing as npt
 from events.frames import Axes, convert_points
 from nodes.mcap.native import Shape
 from nodes.ros_messages.depth import decode_compressed
-from nodes.ros_messages.images import COMPRESSED, POINT
+from nodes.ros_messages.images import COMPRESSED, LIDAR_POINT, POINT
 from nodes.ros_messages.typestore import TypeStore
 
 Array = npt.NDArray[Any]
@@ -54,8 +54,14 @@ def arrays(
 
 
 def _cloud(message: Any, shapes: list[Shape], axes: Axes) -> list[Array]:
-    """Return points, and colours if there is room for them: all are white where there were none."""
-    rows = np.frombuffer(message.data, POINT, shapes[0].shape[0])
+    """Return the arrays of a cloud, or of a lidar's turn, in the order of the event's fields.
+
+    A cloud's colours are there if there is room for them: all are white where there were none.
+    """
+    scan = message.point_step == LIDAR_POINT.itemsize
+    rows = np.frombuffer(message.data, LIDAR_POINT if scan else POINT, shapes[0].shape[0])
     points = convert_points(axes, np.ascontiguousarray(rows["xyz"]))
+    if scan:
+        return [points, *(np.ascontiguousarray(rows[n]) for n in ("intensity", "time", "ring"))]
     counts = [colors.shape[0] for colors in shapes[1:]]
     return [points, *(np.ascontiguousarray(rows["bgr"][:count, ::-1]) for count in counts)]

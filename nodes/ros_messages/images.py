@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from events import DepthImage, Image
+from events import DepthImage, Image, LidarScan
 from nodes.ros_messages.stamps import Time
 from nodes.ros_messages.typestore import TypeStore
 from nodes.viewing.encoding import encode_image
@@ -29,7 +29,18 @@ _LENGTH = struct.Struct("<I")
 _NONE = np.zeros(0, np.uint8)
 
 POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
-"""A point of a PointCloud2 as `CloudWriter` writes it."""
+"""A point of a cloud's PointCloud2: its colour is one field, ``rgb``, as PCL packs it."""
+
+LIDAR_POINT = np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
+"""A point of a lidar's PointCloud2, with the fields that Velodyne's driver writes, and that LIO-SAM
+and FAST-LIO read: ``time`` is seconds after the message's stamp, which is that of the first ray."""
+
+_FLOAT32, _UINT16 = 7, 4
+"""Of sensor_msgs/msg/PointField."""
+
+_XYZ = [("x", 0, _FLOAT32), ("y", 4, _FLOAT32), ("z", 8, _FLOAT32)]
+_COLOURED = [*_XYZ, ("rgb", 12, _FLOAT32)]
+_MEASURED = [*_XYZ, ("intensity", 12, _FLOAT32), ("ring", 16, _UINT16), ("time", 18, _FLOAT32)]
 
 _PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
 _TURNS = {
@@ -127,62 +138,75 @@ class CompressedWriter:
 
 
 class CloudWriter:
-    """Writes ``sensor_msgs/msg/PointCloud2`` with the fields x, y, z and, if wanted, rgb.
+    """Writes ``sensor_msgs/msg/PointCloud2``.
 
     Args:
         store: Of the types.
         frame_id: Of the points.
-        fields: ``xyz`` leaves out rgb, and its four bytes of each point empty.
     """
 
-    def __init__(
-        self, store: TypeStore, frame_id: str, fields: Literal["xyz", "xyzrgb"] = "xyzrgb"
-    ) -> None:
+    def __init__(self, store: TypeStore, frame_id: str) -> None:
         self._store = store
-        self._header = frame_id
-        self._names = ("x", "y", "z", "rgb") if fields == "xyzrgb" else ("x", "y", "z")
+        self._frame_id = frame_id
 
-    def write(
-        self,
-        time: Time,
-        points: npt.NDArray[np.float32],
-        colors: npt.NDArray[np.uint8] | None = None,
+    def cloud(
+        self, time: Time, points: npt.NDArray[np.float32], colors: npt.NDArray[np.uint8]
     ) -> bytearray:
-        """Return the message.
+        """Return the message of a cloud, with the fields x, y, z and rgb.
 
         Args:
             time: Seconds and nanoseconds.
             points: Metres in ROS's axes, shape (n, 3).
             colors: Red, green, blue, shape (n, 3), or (0, 3) for none: then all are white.
-                Not for ``xyz``.
         """
+        frame, rows = self._rows(time, points, POINT, _COLOURED)
+        rows["bgr"] = colors[:, ::-1] if len(colors) else 255
+        return frame
+
+    def scan(self, time: Time, points: npt.NDArray[np.float32], scan: LidarScan) -> bytearray:
+        """Return the message of a lidar's turn, with the fields of `LIDAR_POINT`.
+
+        Args:
+            time: Seconds and nanoseconds.
+            points: Metres in ROS's axes, shape (n, 3).
+            scan: Whose points they are.
+        """
+        frame, rows = self._rows(time, points, LIDAR_POINT, _MEASURED)
+        rows["intensity"], rows["ring"], rows["time"] = scan.intensities, scan.rings, scan.times
+        return frame
+
+    def _rows(
+        self,
+        time: Time,
+        points: npt.NDArray[np.float32],
+        kind: np.dtype[np.void],
+        fields: list[tuple[str, int, int]],
+    ) -> tuple[bytearray, npt.NDArray[np.void]]:
+        """Return a message with its points, and a view of its rows for the rest."""
         count = len(points)
         message = self._store.message("sensor_msgs/msg/PointCloud2")
         field = self._store.message("sensor_msgs/msg/PointField")
-        names = enumerate(self._names)
         frame = self._store.serialize(
             message(
-                header=self._store.header(time, self._header),
+                header=self._store.header(time, self._frame_id),
                 height=1,
                 width=count,
-                fields=[field(name=n, offset=4 * i, datatype=7, count=1) for i, n in names],
+                fields=[field(name=n, offset=at, datatype=t, count=1) for n, at, t in fields],
                 is_bigendian=False,
-                point_step=POINT.itemsize,
-                row_step=POINT.itemsize * count,
+                point_step=kind.itemsize,
+                row_step=kind.itemsize * count,
                 data=_NONE,
                 is_dense=bool(np.isfinite(points).all()),
             )
         )
         dense = frame.pop()  # follows the data
-        begin, size = len(frame), count * POINT.itemsize
+        begin, size = len(frame), count * kind.itemsize
         _LENGTH.pack_into(frame, begin - 4, size)
         frame += bytearray(size + 1)
         frame[-1] = dense
-        rows = np.frombuffer(frame, POINT, count, begin)
+        rows = np.frombuffer(frame, kind, count, begin)
         rows["xyz"] = points
-        if colors is not None:
-            rows["bgr"] = colors[:, ::-1] if len(colors) else 255
-        return frame
+        return frame, rows
 
 
 def read_image(message: Any, source: str, stamp: int, frame_id: str) -> Image:

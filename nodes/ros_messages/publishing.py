@@ -274,17 +274,19 @@ class Publishing(Generic[P]):
             publisher.put(writer.write(self._time(event.stamp), event.data))
 
     def _cloud(self, event: PointCloud) -> None:
-        self._points("cloud", event, event.colors)
+        self._points("cloud", event, lambda cloud, *to: cloud.cloud(*to, event.colors))
 
     def _lidar(self, event: LidarScan) -> None:
-        self._points("lidar", event)
+        self._points("lidar", event, lambda cloud, *to: cloud.scan(*to, event))
 
-    def _points(self, kind: TopicKind, event: PointCloud | LidarScan, colors: Any = None) -> None:
+    def _points(
+        self, kind: TopicKind, event: PointCloud | LidarScan, write: Callable[..., bytearray]
+    ) -> None:
         if publisher := self._publisher(kind, event.source):
             frame = self._names.name(event.frame_id, event.source)
             points = convert_points(self._names.axes(event.frame_id), event.points)
-            writer = CloudWriter(self._store, frame, "xyz" if colors is None else "xyzrgb")
-            publisher.put(writer.write(self._time(event.stamp), points, colors))
+            writer = CloudWriter(self._store, frame)
+            publisher.put(write(writer, self._time(event.stamp), points))
 
     def _info(self, kind: TopicKind, event: Image | DepthImage) -> None:
         camera = self._cameras.get(event.source)

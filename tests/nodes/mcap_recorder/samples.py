@@ -6,25 +6,36 @@ import numpy as np
 
 from events import (
     Armed,
+    BarometerAnnouncement,
+    BodyAnnouncement,
     CameraAnnouncement,
     CameraInfo,
     DepthImage,
     EstimatorAnnouncement,
     Event,
+    FluidPressure,
     Image,
     Imu,
     ImuAnnouncement,
+    LidarAnnouncement,
     LidarScan,
+    MagneticField,
+    MagnetometerAnnouncement,
+    NavSatAnnouncement,
+    NavSatFix,
     Odometry,
+    PilotAnnouncement,
     PointCloud,
     PoseEstimate,
     PoseStamped,
     Range,
+    RangeAnnouncement,
     Score,
     SegmentationImage,
     TrackedFeatures,
     TransformStamped,
     VehicleAnnouncement,
+    Wind,
 )
 from runtime.wire import pack
 
@@ -74,6 +85,40 @@ def announcements() -> list[Event]:
             accelerometer_random_walk=3e-3,
         ),
         EstimatorAnnouncement(stamp=0, source="odometry", method="test"),
+        BarometerAnnouncement(
+            stamp=0, source="drone/barometer", rate=50.0, noise=3.0, altitude=122.0
+        ),
+        NavSatAnnouncement(
+            stamp=0,
+            source="drone/gps",
+            rate=5.0,
+            latency=0.2,
+            latitude=47.641468,
+            longitude=-122.140165,
+            altitude=122.0,
+            horizontal_noise=0.3,
+            vertical_noise=0.4,
+        ),
+        MagnetometerAnnouncement(
+            stamp=0, source="drone/magnetometer", rate=50.0, noise=1e-7, field=(2e-5, 5e-6, 4e-5)
+        ),
+        RangeAnnouncement(
+            stamp=0, source="drone/down", rate=20.0, noise=0.01, min_range=0.1, max_range=9.0
+        ),
+        LidarAnnouncement(
+            stamp=0,
+            source="drone/lidar",
+            rate=10.0,
+            channels=16,
+            columns=1024,
+            horizontal_fov=6.283,
+            elevations=(-0.26, 0.26),
+            noise=0.02,
+            min_range=0.2,
+            max_range=50.0,
+        ),
+        BodyAnnouncement(stamp=0, source="world/person", kind="person", object_ids=(7, 8)),
+        PilotAnnouncement(stamp=0, source="pilot", vehicle="drone"),
     ]
 
 
@@ -82,7 +127,15 @@ def image(stamp: int, source: str = CAMERA, *, grey: bool = False) -> Image:
     shape = (4, 5) if grey else (4, 5, 3)
     data = np.random.default_rng(stamp).integers(0, 255, shape, np.uint8)
     encoding = "mono8" if grey else "rgb8"
-    return Image(stamp=stamp, source=source, frame_id=OPTICAL, encoding=encoding, data=data)
+    return Image(
+        stamp=stamp,
+        source=source,
+        frame_id=OPTICAL,
+        encoding=encoding,
+        exposure_time=0.008,
+        gain=1.5,
+        data=data,
+    )
 
 
 def depth(stamp: int) -> DepthImage:
@@ -166,6 +219,21 @@ def said(stamp: int) -> list[Event]:
             static=True,
         ),
         Range(stamp=stamp, source="drone/down", range=1.0, min_range=0.1, max_range=9.0),
+        FluidPressure(stamp=stamp, source="drone/barometer", fluid_pressure=99_871.5, variance=9.0),
+        MagneticField(stamp=stamp, source="drone/magnetometer", magnetic_field=(2e-5, -1e-6, 4e-5)),
+        NavSatFix(
+            stamp=stamp,
+            source="drone/gps",
+            latitude=47.6415,
+            longitude=-122.1402,
+            altitude=123.5,
+            position_covariance=(0.09, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.16),
+            velocity=(1.0, -0.5, 0.25),
+        ),
+        Wind(stamp=stamp, source="drone", velocity=(3.0, -1.0, 0.5)),
+        PoseStamped(
+            stamp=stamp, source="world/person", position=(4.0, 5.0, -0.9), orientation=TURNED
+        ),
         Score(stamp=stamp, source="judge", subject="odometry", metric="ate", value=0.5, unit="m"),
         Armed(stamp=stamp, source="drone"),
         Found(stamp=stamp, source="test", number=2**60, where={"x": 0.1}),

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from events import LidarScan
 from nodes.ros_messages.images import (
     CloudWriter,
     CompressedWriter,
@@ -65,7 +66,7 @@ def test_a_writer_follows_a_new_size_and_takes_views() -> None:
 def test_a_cloud_has_the_bytes_that_rosbags_makes(count: int) -> None:
     points = RANDOM.random((count, 3), np.float32)
     colours = RANDOM.integers(0, 256, (count, 3), np.uint8)
-    data = CloudWriter(samples.store(), "map").write((1, 2), points, colours)
+    data = CloudWriter(samples.store(), "map").cloud((1, 2), points, colours)
     message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
     assert bytes(samples.store().serialize(message)) == bytes(data)
     assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
@@ -81,21 +82,39 @@ def test_a_cloud_has_the_bytes_that_rosbags_makes(count: int) -> None:
 
 def test_a_cloud_with_points_that_are_nowhere_is_not_dense() -> None:
     points = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]], np.float32)
-    for fields in ("xyz", "xyzrgb"):
-        data = CloudWriter(samples.store(), "map", fields).write((1, 2), points)
-        message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
-        assert not message.is_dense
+    data = CloudWriter(samples.store(), "map").cloud((1, 2), points, np.empty((0, 3), np.uint8))
+    message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
+    assert not message.is_dense
 
 
-def test_a_sweep_has_no_colours() -> None:
-    points = RANDOM.random((5, 3), np.float32)
-    data = CloudWriter(samples.store(), "lidar", "xyz").write((1, 2), points)
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_a_turn_of_a_lidar_has_the_fields_of_velodynes_driver(count: int) -> None:
+    """FAST-LIO reads them with ``lidar_type: 2`` and ``timestamp_unit: 0`` (seconds)."""
+    scan = LidarScan(
+        stamp=1,
+        source="drone/lidar",
+        frame_id="lidar",
+        points=RANDOM.random((count, 3), np.float32),
+        intensities=RANDOM.random(count, np.float32),
+        times=np.sort(RANDOM.random(count, np.float32)),
+        rings=RANDOM.integers(0, 16, count, np.uint16),
+    )
+    data = CloudWriter(samples.store(), "lidar").scan((1, 2), scan.points, scan)
     message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
     assert bytes(samples.store().serialize(message)) == bytes(data)
-    assert [(f.name, f.offset) for f in message.fields] == [("x", 0), ("y", 4), ("z", 8)]
-    rows = message.data.reshape(5, message.point_step)
-    np.testing.assert_array_equal(rows[:, :12].copy().view(np.float32), points)
-    assert not rows[:, 12:].any()
+    assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
+        ("x", 0, 7), ("y", 4, 7), ("z", 8, 7),
+        ("intensity", 12, 7), ("ring", 16, 4), ("time", 18, 7),
+    ]  # fmt: skip
+    rows = message.data.reshape(count, message.point_step)
+
+    def column(begin: int, end: int, kind: type) -> np.ndarray:
+        return rows[:, begin:end].copy().view(kind) if count else np.empty((0, 1), kind)
+
+    np.testing.assert_array_equal(column(0, 12, np.float32).reshape(-1, 3), scan.points)
+    np.testing.assert_array_equal(column(12, 16, np.float32).ravel(), scan.intensities)
+    np.testing.assert_array_equal(column(16, 18, np.uint16).ravel(), scan.rings)
+    np.testing.assert_array_equal(column(18, 22, np.float32).ravel(), scan.times)
 
 
 @pytest.mark.parametrize("shape", [(48, 64, 3), (48, 64)])
