@@ -60,7 +60,19 @@ class CameraAnnouncement(Announcement):
             ground truth: what is stamped t was exposed at ``t - time_offset``. (Kalibr's
             ``timeshift_cam_imu`` is its negative.)
         time_jitter: Greatest random error of the stamps besides, seconds, either way.
-        noise: Standard deviation of the images' noise at middle grey, grey levels.
+        noise: Standard deviation of the images' noise at middle grey (128), grey levels.
+        full_well: Electrons of a white pixel at gain 1, whose number has a Poisson distribution
+            (shot noise); 0 if the noise is the same at all grey levels.
+        reference_exposure: Exposure time, seconds, at which an image of gain 1 is as bright as its
+            scene is drawn; 0 if brightness does not depend on the exposure time.
+        response: Light of each of the 256 grey levels, as a ``pcalib.txt`` of TUM's monoVO data
+            set has it: rising, of any scale. Empty: that of sRGB (`events.photometry`).
+        vignette: Coefficients a1, a2, … of the share of light ``1 + a1 r² + a2 r⁴ + …`` at the
+            distance r from the principal point, in halves of the image's diagonal.
+        depth_noise: k in ``sigma = k z²``, the standard deviation of depth z, 1/m.
+        depth_step: k in ``step = k z²``, the distance between two values that depth can have, 1/m.
+        min_depth: Metres; what is nearer has no depth.
+        max_depth: Metres; what is farther has no depth. 0: no limit.
         baseline: Of the right camera of a stereo rig, metres to the left one; 0 of all others.
         stereo: Source of the left camera of that rig; empty of all others.
         undistorted: Source of the camera whose images these are, without distortion; empty if
@@ -80,6 +92,14 @@ class CameraAnnouncement(Announcement):
     time_offset: float = 0.0
     time_jitter: float = 0.0
     noise: float = 0.0
+    full_well: float = 0.0
+    reference_exposure: float = 0.0
+    response: tuple[float, ...] = ()
+    vignette: tuple[float, ...] = ()
+    depth_noise: float = 0.0
+    depth_step: float = 0.0
+    min_depth: float = 0.0
+    max_depth: float = 0.0
     baseline: float = 0.0
     stereo: str = ""
     undistorted: str = ""
@@ -93,6 +113,9 @@ class CameraAnnouncement(Announcement):
         check(self, (self.rate, self.latency, self.exposure))
         check(self, (self.readout, self.time_offset, self.time_jitter))
         check(self, (self.noise, self.baseline, 0.0))
+        check(self, (self.full_well, self.reference_exposure, 0.0))
+        check(self, (self.depth_noise, self.depth_step, 0.0))
+        check(self, (self.min_depth, self.max_depth, 0.0))
 
 
 class ImuAnnouncement(Announcement):

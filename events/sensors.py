@@ -59,7 +59,8 @@ class DepthImage(Event, eq=False):
 
     Attributes:
         frame_id: Optical frame.
-        data: float32 metres, shape (height, width); ``inf`` where nothing was hit.
+        data: float32 metres, shape (height, width); ``inf`` where nothing was hit, or the sensor
+            found no depth.
     """
 
     category: ClassVar[Category] = Category.SENSOR
