@@ -20,8 +20,9 @@ from sims.vehicle.model import (
     attach_vehicle,
     read_parameters,
 )
-from sims.vehicle.physics import Contact, Physics, PhysicsDivergedError, State
+from sims.vehicle.physics import Contact, Physics, State
 from sims.vehicle.setpoints import Setpoint
+from sims.vehicle.simulation import PhysicsDivergedError, Simulation
 
 __all__ = [
     "STANDING_HEIGHT",
@@ -40,6 +41,7 @@ __all__ = [
     "Physics",
     "PhysicsDivergedError",
     "Setpoint",
+    "Simulation",
     "State",
     "VehicleParameters",
     "attach_vehicle",

@@ -1,7 +1,7 @@
-"""The physics of one world with one vehicle: stepping, and reading what is true at an instant.
+"""What is true of one vehicle in a simulated world at an instant.
 
-No sensor noise (see `imu`), no control (see `control`), no images. Everything that comes out is
-in our frames: world NED, body FRD.
+Stepping is in `simulation`. No sensor noise (see `imu`), no control (see `control`), no images.
+Everything that comes out is in our frames: world NED, body FRD.
 """
 
 from __future__ import annotations
@@ -14,13 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Quaternion, Vector3
-from sims.vehicle.model import TIMESTEP_NS, VehicleParameters, read_parameters
+from sims.vehicle.model import VehicleParameters, read_parameters
+from sims.vehicle.simulation import Simulation
 
 Floats = npt.NDArray[np.float64]
-
-
-class PhysicsDivergedError(Exception):
-    """The state is no longer finite: the world's model or what was written into it is at fault."""
 
 
 class State(msgspec.Struct, frozen=True, gc=False):
@@ -56,32 +53,26 @@ class Contact(msgspec.Struct, frozen=True, gc=False):
 
 
 class Physics:
-    """A world with a vehicle in it, stepped by whole milliseconds.
-
-    What is read is exactly that of `time_ns`: the accelerometer too. MuJoCo's ``mj_step`` leaves
-    sensors and contacts of *before* its last integration behind, so the forward pass for the
-    present instant is made when they are first asked for, and the next advance starts from it
-    with ``mj_step2`` instead of computing it again. The motors' thrust is a state of its own
-    (their lag), so a new command changes nothing at the instant at which it is given.
+    """A vehicle's view of a simulation: its motors, its state, and what it feels.
 
     Whoever writes a state into `data` does it before anything is read at that instant.
 
     Args:
-        model: A compiled world, with the vehicle attached by `model.attach_vehicle`.
+        world: The simulation, which several vehicles may share; or a compiled world with the
+            vehicle, attached by `model.attach_vehicle`, for a simulation of its own.
         name: The vehicle's name in it.
 
     Raises:
         ValueError: The world has no such vehicle, or another time step.
     """
 
-    def __init__(self, model: mujoco.MjModel, name: str) -> None:
+    def __init__(self, world: Simulation | mujoco.MjModel, name: str) -> None:
+        model = world.model if isinstance(world, Simulation) else world
         self.parameters: VehicleParameters = read_parameters(model, name)
-        if abs(model.opt.timestep * 1e9 - TIMESTEP_NS) > 1e-3:
-            raise ValueError(
-                f"expected a world with a time step of 0.001 s, found {model.opt.timestep} s"
-            )
+        self.simulation = world if isinstance(world, Simulation) else Simulation(world)
         self.model = model
-        self.data: Any = mujoco.MjData(model)
+        self.data: Any = self.simulation.data
+        self.history = self.simulation.history
         self._body = model.body(f"{name}/base_link").id
         joint = model.joint(f"{name}/free")
         pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
@@ -93,39 +84,15 @@ class Physics:
         self._twist = self.data.qvel[self._of_twist]
         self._motors = self.data.ctrl[motor : motor + 4]
         self._imu = self.data.sensordata[sensor : sensor + 6]
-        self._steps = 0
-        self._fresh = False
 
     @property
     def time_ns(self) -> int:
         """Nanoseconds simulated since the start or the last `reset`; whole milliseconds."""
-        return self._steps * TIMESTEP_NS
+        return self.simulation.time_ns
 
     def advance_to(self, stamp_ns: int) -> None:
-        """Step with the present motor commands to the last whole millisecond ≤ `stamp_ns`.
-
-        Does nothing if it is there already, or later.
-
-        Raises:
-            PhysicsDivergedError: The state is no longer finite.
-        """
-        steps = stamp_ns // TIMESTEP_NS - self._steps
-        if steps <= 0:
-            return
-        data = self.data
-        self._steps += steps
-        if self._fresh:
-            self._fresh = False
-            mujoco.mj_step2(self.model, data)
-            steps -= 1
-        if steps:
-            mujoco.mj_step(self.model, data, steps)
-        # MuJoCo starts again at time 0 when it finds a number that is not finite.
-        if data.time < (self._steps - 0.5) * 1e-9 * TIMESTEP_NS:
-            raise PhysicsDivergedError(
-                f"the simulation diverged before {self.time_ns / 1e9:.3f} s: "
-                "its state was no longer finite"
-            )
+        """Step the simulation; see `Simulation.advance_to`."""
+        self.simulation.advance_to(stamp_ns)
 
     def set_motors(self, m0: float, m1: float, m2: float, m3: float) -> None:
         """Set the motor commands, each 0 to 1 of its full thrust; clamped beyond."""
@@ -142,10 +109,6 @@ class Physics:
     def state_at(self, stamp_ns: int) -> tuple[State, Floats, Floats]:
         """Return the state at a time at or after `time_ns`, less than or just one step later.
 
-        Between two steps the world is carried on as the next step will carry it: a whole step
-        later this is what `advance_to` gives. (Damped joints of other bodies, which MuJoCo steps
-        implicitly, may differ slightly.)
-
         Returns:
             The vehicle's state; copies of the world's generalised positions, shape (nq,), and
             velocities, shape (nv,), for a renderer.
@@ -153,40 +116,30 @@ class Physics:
         Raises:
             ValueError: The time is before `time_ns`, or more than a step later.
         """
-        ahead = stamp_ns - self.time_ns
-        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
-        if not 0 <= ahead <= TIMESTEP_NS:
-            expected = f"{self.time_ns} to {self.time_ns + TIMESTEP_NS} ns"
-            raise ValueError(f"state_at: expected a time of {expected}, found {stamp_ns} ns")
-        if ahead:
-            if not self._fresh:
-                self._refresh()
-            # As semi-implicit Euler does it: first the velocity, and with that the position.
-            next_qvel = qvel + self.data.qacc * (TIMESTEP_NS * 1e-9)
-            mujoco.mj_integratePos(self.model, qpos, next_qvel, ahead * 1e-9)
-            qvel += self.data.qacc * (ahead * 1e-9)
-        return _state(qpos[self._of_pose], qvel[self._of_twist]), qpos, qvel
+        qpos, qvel = self.simulation.state_at(stamp_ns)
+        return self.state_in(qpos, qvel), qpos, qvel
+
+    def state_in(self, qpos: Floats, qvel: Floats) -> State:
+        """Return the vehicle's state in one of the world, such as one of `history`."""
+        return _state(qpos[self._of_pose], qvel[self._of_twist])
 
     def imu(self) -> tuple[Vector3, Vector3]:
         """Return the true angular velocity (rad/s, FRD) and specific force (m/s², FRD).
 
         Measured at the centre of mass. At rest the specific force is (0, 0, -9.81).
         """
-        if not self._fresh:
-            self._refresh()
+        self.simulation.refresh()
         wx, wy, wz, ax, ay, az = self._imu.tolist()
         return (wx, -wy, -wz), (ax, -ay, -az)
 
     def touching(self) -> bool:
         """Return whether the vehicle touches anything; cheaper than `contacts`."""
-        if not self._fresh:
-            self._refresh()
+        self.simulation.refresh()
         return bool(self.data.ncon) and bool(self._own_contacts())
 
     def contacts(self) -> list[Contact]:
         """Return every point at which the vehicle touches something."""
-        if not self._fresh:
-            self._refresh()
+        self.simulation.refresh()
         if not self.data.ncon:
             return []
         return [self._contact(index, own) for index, own in self._own_contacts()]
@@ -198,22 +151,15 @@ class Physics:
         free fall of 0.1 mm. A vehicle that does not come to rest within 1 cm and half a second
         stays where it is; so does all else in the world. Call it before the first step.
         """
-        trial = mujoco.MjData(self.model)
-        mujoco.mj_step(self.model, trial, 500_000_000 // TIMESTEP_NS)
+        trial = self.simulation.trial(0.5)
         pose, twist = trial.qpos[self._of_pose], trial.qvel[self._of_twist]
         if np.abs(twist).max() < 1e-3 and np.linalg.norm(pose[:3] - self._pose[:3]) < 0.01:
             self._pose[:] = pose
-            self._fresh = False
+            self.simulation.changed()
 
     def reset(self) -> None:
-        """Go back to the start: time 0, the world as compiled, motors off."""
-        mujoco.mj_resetData(self.model, self.data)
-        self._steps = 0
-        self._fresh = False
-
-    def _refresh(self) -> None:
-        mujoco.mj_forward(self.model, self.data)
-        self._fresh = True
+        """Go back to the start; see `Simulation.reset`."""
+        self.simulation.reset()
 
     def _own_contacts(self) -> list[tuple[int, int]]:
         """Return (contact, which of its two geoms is the vehicle's) for each that pushes."""

@@ -1,0 +1,140 @@
+"""The physics of one world, with all vehicles that are in it: stepping, and its present state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from sims.vehicle.history import History
+from sims.vehicle.model import TIMESTEP_NS
+
+Floats = npt.NDArray[np.float64]
+
+
+class PhysicsDivergedError(Exception):
+    """The state is no longer finite: the world's model or what was written into it is at fault."""
+
+
+class Simulation:
+    """A world, stepped by whole milliseconds.
+
+    What is read is exactly that of `time_ns`: the accelerometer too. MuJoCo's ``mj_step`` leaves
+    sensors and contacts of *before* its last integration behind, so the forward pass for the
+    present instant is made when they are first asked for, and the next advance starts from it
+    with ``mj_step2`` instead of computing it again. The motors' thrust is a state of its own
+    (their lag), so a new command changes nothing at the instant at which it is given: of several
+    vehicles it does not matter which is controlled first.
+
+    Args:
+        model: A compiled world.
+
+    Attributes:
+        model: The compiled world.
+        data: MuJoCo's data. Whoever writes a state into it does so before anything is read at
+            that instant, or calls `changed`.
+        history: The states of the past.
+
+    Raises:
+        ValueError: The world has another time step.
+    """
+
+    def __init__(self, model: Any) -> None:
+        if abs(model.opt.timestep * 1e9 - TIMESTEP_NS) > 1e-3:
+            raise ValueError(
+                f"expected a world with a time step of 0.001 s, found {model.opt.timestep} s"
+            )
+        self.model = model
+        self.data: Any = mujoco.MjData(model)
+        self.history = History(self)
+        self._steps = 0
+        self._fresh = False
+
+    @property
+    def time_ns(self) -> int:
+        """Nanoseconds simulated since the start or the last `reset`; whole milliseconds."""
+        return self._steps * TIMESTEP_NS
+
+    def advance_to(self, stamp_ns: int) -> None:
+        """Step with the present motor commands to the last whole millisecond ≤ `stamp_ns`.
+
+        Does nothing if it is there already, or later.
+
+        Raises:
+            PhysicsDivergedError: The state is no longer finite.
+        """
+        steps = stamp_ns // TIMESTEP_NS - self._steps
+        if steps <= 0:
+            return
+        if self.history.kept:
+            for _ in range(steps):
+                self.history.add()
+                self._step(1)
+        else:
+            self._step(steps)
+        # MuJoCo starts again at time 0 when it finds a number that is not finite.
+        if self.data.time < (self._steps - 0.5) * 1e-9 * TIMESTEP_NS:
+            raise PhysicsDivergedError(
+                f"the simulation diverged before {self.time_ns / 1e9:.3f} s: "
+                "its state was no longer finite"
+            )
+
+    def state_at(self, stamp_ns: int) -> tuple[Floats, Floats]:
+        """Return the state at a time at or after `time_ns`, less than or just one step later.
+
+        Between two steps the world is carried on as the next step will carry it: a whole step
+        later this is what `advance_to` gives. (Damped joints of other bodies, which MuJoCo steps
+        implicitly, may differ slightly.)
+
+        Returns:
+            Copies of the generalised positions, shape (nq,), and velocities, shape (nv,).
+
+        Raises:
+            ValueError: The time is before `time_ns`, or more than a step later.
+        """
+        ahead = stamp_ns - self.time_ns
+        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        if not 0 <= ahead <= TIMESTEP_NS:
+            expected = f"{self.time_ns} to {self.time_ns + TIMESTEP_NS} ns"
+            raise ValueError(f"state_at: expected a time of {expected}, found {stamp_ns} ns")
+        if ahead:
+            self.refresh()
+            # As semi-implicit Euler does it: first the velocity, and with that the position.
+            next_qvel = qvel + self.data.qacc * (TIMESTEP_NS * 1e-9)
+            mujoco.mj_integratePos(self.model, qpos, next_qvel, ahead * 1e-9)
+            qvel += self.data.qacc * (ahead * 1e-9)
+        return qpos, qvel
+
+    def refresh(self) -> None:
+        """Have sensors, contacts and accelerations be those of the present instant."""
+        if not self._fresh:
+            mujoco.mj_forward(self.model, self.data)
+            self._fresh = True
+
+    def changed(self) -> None:
+        """Take note that somebody has written a state into `data`."""
+        self._fresh = False
+
+    def trial(self, seconds: float) -> Any:
+        """Return MuJoCo's data of some seconds after the start, if nothing is done meanwhile."""
+        trial = mujoco.MjData(self.model)
+        mujoco.mj_step(self.model, trial, round(seconds * 1e9) // TIMESTEP_NS)
+        return trial
+
+    def reset(self) -> None:
+        """Go back to the start: time 0, the world as compiled, motors off."""
+        mujoco.mj_resetData(self.model, self.data)
+        self._steps = 0
+        self._fresh = False
+        self.history.clear()
+
+    def _step(self, steps: int) -> None:
+        self._steps += steps
+        if self._fresh:
+            self._fresh = False
+            mujoco.mj_step2(self.model, self.data)
+            steps -= 1
+        if steps:
+            mujoco.mj_step(self.model, self.data, steps)
