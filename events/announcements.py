@@ -279,11 +279,14 @@ class PathAnnouncement(Announcement):
     Attributes:
         waypoints: Places to pass in this order, metres in ``map``; at first the vehicle climbs from
             where it stands to the height of the first one.
+        margin: Distance along each axis that the vehicle may move to and fro before it sets off,
+            metres.
         vehicle: Name of the vehicle that it is for; empty for the only one.
     """
 
     vehicle: str = ""
     waypoints: tuple[Vector3, ...]
+    margin: float = 0.0
 
 
 class EstimatorAnnouncement(Announcement):

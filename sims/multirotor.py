@@ -192,7 +192,9 @@ class Multirotor(Simulator[MultirotorConfig]):
             return
         if trouble_at_start(self._clearance, self._start):  # which `check` reports
             return
-        if trouble := trouble_on_path(self._clearance, self._start, announcement.waypoints):
+        if trouble := trouble_on_path(
+            self._clearance, self._start, announcement.waypoints, announcement.margin
+        ):
             raise ValueError(trouble)
 
     def check(self) -> Iterable[str]:

@@ -4,12 +4,15 @@
 an estimator gives, and `Teleop` by the keys of a keyboard.
 """
 
+from nodes.pilots.manoeuvres import Excitation, FigureEight
 from nodes.pilots.pilot import Pilot, PilotConfig
 from nodes.pilots.teleop import Keys, Teleop, TeleopConfig
 from nodes.pilots.visual_pilot import VisualPilot, VisualPilotConfig
 from nodes.pilots.waypoint_follower import WaypointFollower
 
 __all__ = [
+    "Excitation",
+    "FigureEight",
     "Keys",
     "Pilot",
     "PilotConfig",

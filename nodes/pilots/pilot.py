@@ -7,6 +7,7 @@ vehicle's true one, `nodes.pilots.visual_pilot` an estimator's.
 from __future__ import annotations
 
 import asyncio
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
@@ -33,6 +34,7 @@ from events import (
     VehicleEvent,
 )
 from events.rotations import yaw_of
+from nodes.pilots.manoeuvres import Excitation, FigureEight, Heading, excited, headed, joined
 from nodes.pilots.waypoint_path import WaypointPath, plan
 from runtime import Duration, Node, NodeConfig, Output, on
 
@@ -44,24 +46,46 @@ class PilotConfig(NodeConfig):
 
     Attributes:
         waypoints: Places to pass, metres in ``map`` (x north, y east, z down: heights are
-            negative). The path begins above the place where the vehicle stands.
+            negative). The path begins above the place where the vehicle stands. May be left out
+            where there is a `figure_eight`.
         speed: Highest speed along the path, metres per second.
         acceleration: Highest acceleration along the path and across it, metres per second squared.
         corner_radius: Distance from a waypoint at which the rounding of its corner begins, metres.
         turn_time: Seconds over which changes of heading are smoothed.
+        heading: ``path``: the nose is in the direction of flight. ``fixed``: it keeps the heading
+            of the start. ``sweep``: it swings to both sides of the direction of flight, by 40° and
+            every 6 s.
+        excitation: Movement on the spot about all axes between take-off and the path, which
+            initializes a visual-inertial system; none unless it is given.
+        figure_eight: A figure eight that is flown after the waypoints.
         rate: Set-points per second.
-        start_delay: Time from the first known pose to take-off, seconds.
+        start_delay: Time from the first known pose to take-off, seconds: the vehicle stands still.
         end_run: Whether the run ends once the vehicle has landed.
     """
 
-    waypoints: Annotated[tuple[Vector3, ...], msgspec.Meta(min_length=1)]
+    waypoints: tuple[Vector3, ...] = ()
     speed: Positive = 1.3
     acceleration: Positive = 1.0
     corner_radius: Positive = 0.8
     turn_time: Duration = Duration(0.5)  # immutable
+    heading: Heading = "path"
+    excitation: Excitation | None = None
+    figure_eight: FigureEight | None = None
     rate: Positive = 50
     start_delay: Duration = Duration(0.5)
     end_run: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.waypoints and self.figure_eight is None:
+            raise ValueError("waypoints: expected at least one, or a figure_eight, found neither")
+
+    def places(self, laps: int = 1) -> list[Vector3]:
+        """Return the places to pass: the waypoints, then the figure eight some times."""
+        places = list(self.waypoints)
+        if self.figure_eight is not None:
+            for x, y, z in self.figure_eight.places().tolist() * laps:
+                places.append((x, y, z))
+        return places
 
 
 C = TypeVar("C", bound=PilotConfig, default=PilotConfig)
@@ -80,8 +104,14 @@ class Pilot(Node[C], ABC):
     """Why the run ends, once the vehicle has landed."""
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the waypoints."""
-        yield PathAnnouncement(stamp=0, source=self.name, waypoints=self.config.waypoints)
+        """Announce the places to pass, and the room that the excitation needs."""
+        excitation = self.config.excitation
+        yield PathAnnouncement(
+            stamp=0,
+            source=self.name,
+            waypoints=tuple(self.config.places()),
+            margin=0.0 if excitation is None else excitation.reach,
+        )
 
     def __init__(self) -> None:
         self.pose: Odometry | PoseEstimate | None = None
@@ -129,7 +159,7 @@ class Pilot(Node[C], ABC):
         await self._pose_known.wait()
         await clock.sleep(self.config.start_delay)
         assert self.pose is not None
-        height = self.pose.position[2] - self.config.waypoints[0][2]
+        height = self.pose.position[2] - self.config.places()[0][2]
         self.commands.send(Takeoff(stamp=clock.now(), source=name, altitude=max(height, 0.5)))
         await self._taken_off.wait()
         path = await self.offload(self._plan, self.pose)
@@ -145,20 +175,25 @@ class Pilot(Node[C], ABC):
             self.shutdowns.send(Shutdown(stamp=clock.now(), source=name, reason=self.outcome))
 
     def _plan(self, start: Odometry | PoseEstimate) -> WaypointPath | None:
-        """Return the path from here; `None` if the only waypoint is where the vehicle is."""
+        """Return the path from here; `None` if it has no length and no excitation."""
         config = self.config
+        yaw, step = yaw_of(start.orientation), 1 / config.rate
+        parts = []
+        if config.excitation is not None:
+            parts.append(excited(config.excitation, start.position, yaw, step))
         points = [start.position]
-        for waypoint in config.waypoints:
-            if math.dist(points[-1], waypoint) > 0.05:
-                points.append(waypoint)
-        if len(points) == 1:
-            return None
-        return plan(
-            np.array(points),
-            speed=config.speed,
-            acceleration=config.acceleration,
-            radius=config.corner_radius,
-            yaw=yaw_of(start.orientation),
-            turn_time=config.turn_time,
-            step=1 / config.rate,
-        )
+        for place in config.places(config.figure_eight.laps if config.figure_eight else 1):
+            if math.dist(points[-1], place) > 0.05:
+                points.append(place)
+        if len(points) > 1:
+            path = plan(
+                np.array(points),
+                speed=config.speed,
+                acceleration=config.acceleration,
+                radius=config.corner_radius,
+                yaw=yaw,
+                turn_time=config.turn_time,
+                step=step,
+            )
+            parts.append(headed(path, config.heading, yaw))
+        return functools.reduce(joined, parts) if parts else None

@@ -85,14 +85,19 @@ def plan(
     position = np.apply_along_axis(_smooth, 0, position, round(0.3 / step))
     velocity = np.gradient(position, step, axis=0)
     heading = _headings(velocity, yaw)
-    heading = _smooth(heading, round(turn_time / step))
+    return timed(position, _smooth(heading, round(turn_time / step)), step)
+
+
+def timed(position: Floats, yaw: Floats, step: float) -> WaypointPath:
+    """Return the path of positions and headings at regular steps, with their derivatives."""
+    velocity = np.gradient(position, step, axis=0)
     return WaypointPath(
         step=step,
         position=position,
         velocity=velocity,
         acceleration=np.gradient(velocity, step, axis=0),
-        yaw=heading,
-        yaw_rate=np.gradient(heading, step),
+        yaw=yaw,
+        yaw_rate=np.gradient(yaw, step),
     )
 
 

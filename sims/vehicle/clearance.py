@@ -112,18 +112,23 @@ def trouble_at_start(world: Clearance, place: Vector3) -> str:
     return ""
 
 
-def trouble_on_path(world: Clearance, start: Vector3, waypoints: Iterable[Vector3]) -> str:
+def trouble_on_path(
+    world: Clearance, start: Vector3, waypoints: Iterable[Vector3], margin: float = 0.0
+) -> str:
     """Return why a vehicle cannot fly from point to point; empty if it can.
 
     Args:
         world: Solids of the world.
         start: Position of the vehicle, which first climbs to the height of the first waypoint.
         waypoints: The waypoints, connected by straight lines with rounded corners.
+        margin: Metres that it moves to and fro along each axis before it sets off.
     """
-    return next(_troubles(world, start, tuple(waypoints)), "")
+    return next(_troubles(world, start, tuple(waypoints), margin), "")
 
 
-def _troubles(world: Clearance, start: Vector3, waypoints: Sequence[Vector3]) -> Iterator[str]:
+def _troubles(
+    world: Clearance, start: Vector3, waypoints: Sequence[Vector3], margin: float
+) -> Iterator[str]:
     for number, place in enumerate(waypoints):
         if found := world.at(place):
             down = ": heights are negative, z is down" if found.startswith("the ground") else ""
@@ -132,6 +137,14 @@ def _troubles(world: Clearance, start: Vector3, waypoints: Sequence[Vector3]) ->
     if not waypoints:
         return
     above = (start[0], start[1], waypoints[0][2])
+    for axis in range(3) if margin else ():
+        for side in (-margin, margin):
+            x, y, z = (value + side * (k == axis) for k, value in enumerate(above))
+            if found := world.at((x, y, z)):
+                yield (
+                    f"excitation: expected {margin:g} m of free room about {show(above)}, found "
+                    f"{found} at {show((x, y, z))}"
+                )
     for number, (before, place) in enumerate(pairwise([start, above, *waypoints])):
         if found := world.between(before, place):
             yield (

@@ -142,8 +142,19 @@ def test_it_waits_as_long_as_it_is_told() -> None:
     assert fly(SQUARE, start_delay="2s").of(Takeoff)[0].stamp == 2_000_000_000
 
 
+def test_it_moves_about_before_it_sets_off_and_flies_an_eight_at_last() -> None:
+    eight = {"centre": [1, 0, -1.5], "laps": 2}
+    flown = fly([[1, 0, -1.5]], excitation={}, figure_eight=eight).of(PositionSetpoint)
+    east = [s.position[1] for s in flown[:300]]
+    assert max(east) == pytest.approx(0.25, abs=0.03)
+    assert min(east) == pytest.approx(-0.25, abs=0.03)
+    north = [s.position[0] for s in flown[300:]]
+    assert (max(north), min(north)) == pytest.approx((3, -1), abs=0.1)
+    assert sum(a < 2.9 <= b for a, b in itertools.pairwise(north)) == 2
+
+
 def test_no_waypoints_are_a_mistake_in_the_file() -> None:
-    with pytest.raises(ConfigError, match="waypoints: expected a list of length >= 1"):
+    with pytest.raises(ConfigError, match="waypoints: expected at least one, or a figure_eight"):
         fly([])
 
 
