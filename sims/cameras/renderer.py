@@ -1,7 +1,8 @@
 """Rendering: what a camera sees, and the effects of its lens, shutter and sensor.
 
 Made for a worker process (a GL context belongs to the thread that made it), but works in-process.
-The drawing is in `sims.cameras.stage`, effects on images are in `sims.cameras.optics` and
+An exposure is *captured* (drawn, at each of its moments) and then *developed* (made the images of a
+sensor). The drawing is in `sims.cameras.stage`, effects on images are in `sims.cameras.optics` and
 `sims.cameras.noise`.
 """
 
@@ -9,15 +10,17 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from events.base import Quaternion, Vector3
 from sims.cameras.frame import Frame
 from sims.cameras.noise import generator, grey_of, noisy_depth, noisy_image
 from sims.cameras.optics import defocused, mean, moments
+from sims.cameras.shot import Shot
 from sims.cameras.spec import CameraSpec, camera_info
 from sims.cameras.stage import NEAR, RANGE, Colours, Depths, Floats, Stage
 
@@ -36,6 +39,23 @@ def model_from_bytes(data: bytes) -> Any:
         ValueError: The bytes are none, or were written by another version of MuJoCo.
     """
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": data})
+
+
+class Captured(NamedTuple):
+    """What falls on a camera's sensor in one exposure, before its own errors.
+
+    Attributes:
+        colours: uint8 images, shape (height, width, 3), of the moments that make up the exposure,
+            in order; empty if no colour is wanted.
+        depth: float32 metres, shape (height, width), if wanted.
+        numbers: int32 object numbers, shape (height, width), if wanted.
+        pose: The optical frame's position and orientation in ``map`` at the stamp.
+    """
+
+    colours: list[Colours]
+    depth: Depths | None
+    numbers: npt.NDArray[np.int32] | None
+    pose: tuple[Vector3, Quaternion]
 
 
 class CameraRenderer:
@@ -78,121 +98,98 @@ class CameraRenderer:
         names: tuple[str, ...],
         qvel: Floats | None = None,
     ) -> dict[str, Frame]:
-        """Expose some cameras at one state.
+        """Expose some cameras at one state: `expose`, with a frame for each name."""
+        frames = self.expose(tuple(Shot(name, stamp_ns, qpos, qvel) for name in names))
+        return dict(zip(names, frames, strict=True))
 
-        Args:
-            stamp_ns: Nanoseconds on the run's clock; goes into the frames and into the noise.
-            qpos: The model's generalised positions, shape (nq,).
-            names: Names of the cameras, as in their settings.
-            qvel: Its generalised velocities, shape (nv,), for motion blur; None: at rest.
-
-        Returns:
-            A frame for each name. The same arguments give the same bits.
+    def expose(self, shots: tuple[Shot, ...]) -> tuple[Frame, ...]:
+        """Return the frames of some exposures. The same arguments give the same bits.
 
         Raises:
             RuntimeError: After `close`.
-            KeyError: A name that no spec has.
-            ValueError: `qpos` or `qvel` has another length than the model's.
+            KeyError: A camera that no spec has.
+            ValueError: A state or velocity has another length than the model's.
         """
         if self._stage.closed:
             raise RuntimeError("render: expected an open renderer, found a closed one")
-        _check("qpos", qpos, self._model.nq)
-        if qvel is not None:
-            _check("qvel", qvel, self._model.nv)
         self._stage.enter()
-        frames: dict[str, Frame] = {}
-        for name in names:
-            spec, number = self._cameras[name]
+        frames = []
+        for shot in shots:
+            _check("qpos", shot.qpos, self._model.nq)
+            if shot.qvel is not None:
+                _check("qvel", shot.qvel, self._model.nv)
+            spec, number = self._cameras[shot.camera]
             due = time.monotonic() + spec.render_time
-            frames[name] = self._expose(stamp_ns, spec, number, qpos, qvel)
+            frames.append(self._develop(shot, spec, self._capture(shot, spec, number)))
             # In real time, and not on the run's clock: it stands for a slow renderer.
             time.sleep(max(due - time.monotonic(), 0.0))
-        return frames
+        return tuple(frames)
 
     def close(self) -> None:
         """Give the GL context back. Further calls do nothing."""
         self._stage.close()
 
-    def _expose(
-        self, stamp_ns: int, spec: CameraSpec, number: int, qpos: Floats, qvel: Floats | None
-    ) -> Frame:
+    def _capture(self, shot: Shot, spec: CameraSpec, number: int) -> Captured:
+        """Draw what falls on the sensor, at each of the moments that make up the exposure."""
         kinds, stage, size = set(spec.images), self._stage, (spec.height, spec.width)
         coloured = not kinds.isdisjoint({"rgb", "grey"})
-        motion = qvel if coloured and spec.exposure > 0.0 else None
-        stage.look(number, qpos, spec.light)
-        position, orientation = stage.pose(number)
-        rgb, depth = stage.colour_and_depth(size, coloured, "depth" in kinds or motion is not None)
+        blurred = coloured and spec.exposure > 0.0 and shot.moves()
+        self._look(shot, spec, number, 0.0)
+        pose = stage.pose(number)
+        middle, depth = stage.colour_and_depth(size, coloured, "depth" in kinds or blurred)
         numbers = stage.segmentation(size) if "segmentation" in kinds else None
-        if rgb is not None:
-            if motion is not None and depth is not None:
-                rgb = self._smeared(spec, number, qpos, motion, rgb, depth)
-            rgb = defocused(rgb, spec.blur)
-        random = generator(self._seed, spec.name, stamp_ns)
-        grey = None
-        if rgb is not None and "grey" in kinds:
-            grey = noisy_image(grey_of(rgb), spec.noise, random)
-        if rgb is not None and "rgb" in kinds:
-            rgb = noisy_image(rgb, spec.noise, random)
-        if depth is not None and "depth" in kinds:
+        colours = [] if middle is None else [middle]
+        if blurred and middle is not None and depth is not None:
+            shift = self._shift(shot, spec, number, depth)
+            colours = []
+            for moment in moments(spec.exposure, shift):
+                if moment == 0.0:
+                    colours.append(middle)
+                    continue
+                self._look(shot, spec, number, moment)
+                image, _ = stage.colour_and_depth(size, True, False)
+                assert image is not None
+                colours.append(image)
+        return Captured(colours, depth if "depth" in kinds else None, numbers, pose)
+
+    def _develop(self, shot: Shot, spec: CameraSpec, captured: Captured) -> Frame:
+        """Make of what was drawn the images that the sensor gives."""
+        random = generator(self._seed, spec.name, shot.stamp)
+        rgb = grey = None
+        if captured.colours:
+            rgb = defocused(mean(captured.colours), spec.blur)
+            if "grey" in spec.images:
+                grey = noisy_image(grey_of(rgb), spec.noise, random)
+            rgb = noisy_image(rgb, spec.noise, random) if "rgb" in spec.images else None
+        depth = captured.depth
+        if depth is not None:
             depth = noisy_depth(depth, spec.depth_noise, random)
+        position, orientation = captured.pose
         return Frame(
-            stamp=stamp_ns,
+            stamp=shot.stamp,
             position=position,
             orientation=orientation,
-            rgb=rgb if "rgb" in kinds else None,
+            rgb=rgb,
             grey=grey,
-            depth=depth if "depth" in kinds else None,
-            segmentation=numbers,
+            depth=depth,
+            segmentation=captured.numbers,
         )
 
-    def _smeared(
-        self,
-        spec: CameraSpec,
-        number: int,
-        qpos: Floats,
-        qvel: Floats,
-        middle: Colours,
-        depth: Depths,
-    ) -> Colours:
-        """Return the mean of what a camera sees while its shutter is open.
+    def _look(self, shot: Shot, spec: CameraSpec, number: int, seconds: float) -> None:
+        """Set the scene up as a camera sees it some seconds after an exposure's stamp."""
+        state = shot.state(self._model, seconds)
+        self._stage.look(number, state, shot.stamp * 1e-9 + seconds, spec.light)
 
-        Args:
-            spec: The camera.
-            number: Number of the camera in the model.
-            qpos: The state in the middle of the exposure.
-            qvel: Its velocity, taken to be constant meanwhile.
-            middle: The image in the middle of the exposure.
-            depth: Its depth.
-        """
-        images = []
-        for moment in moments(spec.exposure, self._shift(spec, number, qpos, qvel, depth)):
-            if moment == 0.0:
-                images.append(middle)
-                continue
-            self._stage.look(number, self._later(qpos, qvel, moment), spec.light)
-            image, _ = self._stage.colour_and_depth((spec.height, spec.width), True, False)
-            assert image is not None
-            images.append(image)
-        return mean(images)
-
-    def _shift(
-        self, spec: CameraSpec, number: int, qpos: Floats, qvel: Floats, depth: Depths
-    ) -> float:
+    def _shift(self, shot: Shot, spec: CameraSpec, number: int, depth: Depths) -> float:
         """Return the approximate motion of the image while the shutter is open, pixels."""
         poses = []
         for moment in (-0.5 * spec.exposure, 0.5 * spec.exposure):
-            self._stage.look(number, self._later(qpos, qvel, moment))
+            self._look(shot, spec, number, moment)
             poses.append(self._stage.pose(number))
         (here, turn), (there, other) = poses
         angle = 2.0 * math.acos(min(abs(sum(a * b for a, b in zip(turn, other, strict=True))), 1.0))
         nearest = float(np.quantile(np.minimum(depth[::8, ::8], RANGE), 0.05))
         return camera_info(spec).fx * (angle + math.dist(here, there) / max(nearest, NEAR))
-
-    def _later(self, qpos: Floats, qvel: Floats, seconds: float) -> Floats:
-        """Return the state some seconds later (or earlier) at constant velocity."""
-        moved: Floats = qpos.copy()
-        mujoco.mj_integratePos(self._model, moved, qvel, seconds)
-        return moved
 
 
 def _number(model: Any, name: str) -> int:

@@ -27,6 +27,7 @@ from runtime.sender import Sender
 from sims.cameras.delivery import delay_of
 from sims.cameras.frame import Frame
 from sims.cameras.renderer import CameraRenderer, model_to_bytes
+from sims.cameras.shot import Shot
 from sims.cameras.spec import CameraSpec, announcement, optical_frame, optical_in_body
 
 
@@ -188,13 +189,12 @@ class CameraRig:
         spec, stamp, due, qpos, qvel = exposure
         wait = max(due - self._node.clock.now(), 0) / 1e9
         try:
-            frames = await self._renderer.call_for(
-                wait, CameraRenderer.render, stamp, qpos, (spec.name,), qvel
-            )
+            shot = Shot(spec.name, stamp, qpos, qvel)
+            (frame,) = await self._renderer.call_for(wait, CameraRenderer.expose, (shot,))
             # Of two processes, or of two delays, the later may be through first: keep the order.
             if before is not None and not before.done():
                 await asyncio.wait([before])
-            self._send(spec, frames[spec.name])
+            self._send(spec, frame)
         finally:
             self._in_flight[spec.name] -= 1
             done.set_result(None)

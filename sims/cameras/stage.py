@@ -78,12 +78,19 @@ class Stage:
         """Make this stage's context the thread's."""
         self._gl.make_current()
 
-    def look(self, camera_id: int, qpos: Floats, light: float = 1.0) -> None:
+    def look(
+        self,
+        camera_id: int,
+        qpos: Floats,
+        seconds: float = 0.0,  # noqa: ARG002  # of what moves by itself
+        light: float = 1.0,
+    ) -> None:
         """Set the scene up as a camera sees it.
 
         Args:
             camera_id: Its number in the model.
             qpos: The model's generalised positions, shape (nq,).
+            seconds: Simulated time, on which depends what moves by itself.
             light: Factor on all lights.
         """
         model, data = self.model, self._data
