@@ -20,6 +20,7 @@ from events.announcements import (
     RangeAnnouncement,
     SensorAnnouncement,
     VehicleAnnouncement,
+    WindAnnouncement,
 )
 from events.base import Category, Event, Quaternion, Vector3
 from events.camera_info import CameraInfo
@@ -126,6 +127,7 @@ __all__ = [
     "VehicleEvent",
     "VelocitySetpoint",
     "Wind",
+    "WindAnnouncement",
     "WindowClosed",
     "WindowResized",
 ]

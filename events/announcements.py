@@ -250,6 +250,23 @@ class LidarAnnouncement(SensorAnnouncement):
     max_range: float
 
 
+class WindAnnouncement(Announcement):
+    """Wind that a vehicle feels, which is sent as `Wind`; `source` is the vehicle's name.
+
+    Attributes:
+        rate: Hertz at which it is sent.
+        velocity: Mean of the wind without gusts and turbulence, m/s in ``map``.
+        turbulence: Wind at a height of 20 feet by which its strength is given, m/s; 0 for none.
+    """
+
+    rate: float
+    velocity: Vector3
+    turbulence: float = 0.0
+
+    def __post_init__(self) -> None:
+        check(self, self.velocity, (self.rate, self.turbulence, 0.0))
+
+
 class BodyAnnouncement(Announcement):
     """A body that moves in the world by itself; its true pose is sent as `PoseStamped`.
 

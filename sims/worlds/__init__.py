@@ -4,7 +4,19 @@ A built-in world costs physics little (primitives, all in the world body) and is
 textures are drawn from a seed, and nothing repeats for long.
 """
 
-from sims.worlds.loading import WORLDS, WorldError, load_world
+from sims.worlds.dynamics import Dynamics, Motion, Scene
+from sims.worlds.loading import WORLDS, WorldError, load_scene, load_world
 from sims.worlds.tours import CLEARANCE, TOURS, tour_length
 
-__all__ = ["CLEARANCE", "TOURS", "WORLDS", "WorldError", "load_world", "tour_length"]
+__all__ = [
+    "CLEARANCE",
+    "TOURS",
+    "WORLDS",
+    "Dynamics",
+    "Motion",
+    "Scene",
+    "WorldError",
+    "load_scene",
+    "load_world",
+    "tour_length",
+]

@@ -11,11 +11,13 @@ from typing import Any
 import mujoco
 
 from runtime import VisnavError
+from sims.worlds.dynamics import Scene
 from sims.worlds.hall import hall
 from sims.worlds.yard import yard
 
-WORLDS: dict[str, Callable[[int, bool], Any]] = {"hall": hall, "yard": yard}
-"""The worlds that are built in: name to the function that makes one from a seed, bare or not."""
+WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {"hall": hall, "yard": yard}
+"""The worlds that are built in: name to the function that makes one from a seed, bare or not. One
+in which something moves by itself is a `Scene`."""
 
 
 class WorldError(VisnavError, ValueError):
@@ -23,6 +25,11 @@ class WorldError(VisnavError, ValueError):
 
 
 def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> mujoco.MjSpec:
+    """Return a world without what moves in it by itself; see `load_scene`."""
+    return load_scene(name_or_path, seed, bare=bare).spec
+
+
+def load_scene(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> Scene:
     """Return a world, ready for vehicles and cameras to be added.
 
     What MuJoCo warns of from then on goes to the log.
@@ -43,7 +50,7 @@ def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.lower().endswith(".xml")
     if is_path:
-        return _from_file(Path(name_or_path))
+        return Scene(_from_file(Path(name_or_path)))
     if text not in WORLDS:
         known = ", ".join(sorted(WORLDS))
         near = difflib.get_close_matches(text, WORLDS, n=2, cutoff=0.5)
@@ -51,7 +58,8 @@ def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
         raise WorldError(
             f'world: expected one of {known}, or a path to an .xml file, found "{text}"{hint}'
         )
-    return WORLDS[text](seed, bare)
+    built = WORLDS[text](seed, bare)
+    return built if isinstance(built, Scene) else Scene(built)
 
 
 def _from_file(path: Path) -> Any:
