@@ -21,11 +21,10 @@ from events import Takeoff, VelocitySetpoint
 from runtime import NodeConfig, Output, Tick, every
 from runtime.config.reading import parse
 from runtime.execute import execute
+from sims.sensors import ImuNoise, ImuParameters
 from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,
-    ImuNoise,
-    ImuParameters,
     Physics,
     attach_vehicle,
 )

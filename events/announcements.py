@@ -11,6 +11,9 @@ from events.base import Category, Event, Quaternion, Vector3
 from events.camera_info import CameraInfo
 from events.checks import check, check_pose
 
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+"""The matrix of a sensor without errors of scale and alignment, row by row."""
+
 
 class Announcement(Event):
     """Base of all announcements; `source` names what is announced."""
@@ -121,6 +124,9 @@ class CameraAnnouncement(Announcement):
 class ImuAnnouncement(Announcement):
     """An IMU and its noise model (continuous-time densities, as in Kalibr's files).
 
+    A measurement is matrix · truth + bias + white noise (and what `vibration` says), cut off at its
+    range, in steps of its resolution.
+
     Attributes:
         rate: Hertz.
         frame_id: Frame of the measurements.
@@ -128,6 +134,21 @@ class ImuAnnouncement(Announcement):
         gyroscope_random_walk: rad/s²/√Hz.
         accelerometer_noise_density: m/s²/√Hz.
         accelerometer_random_walk: m/s³/√Hz.
+        gyroscope_turn_on_bias: Standard deviation of the bias at the start, rad/s.
+        accelerometer_turn_on_bias: Standard deviation of the bias at the start, m/s².
+        gyroscope_matrix: Scale and misalignment, 9 numbers, row by row.
+        accelerometer_matrix: Scale and misalignment, 9 numbers, row by row.
+        g_sensitivity: Angular velocity that an acceleration feigns, rad/s per m/s².
+        gyroscope_range: Greatest angular velocity, rad/s; 0 is no limit.
+        accelerometer_range: Greatest acceleration, m/s²; 0 is no limit.
+        gyroscope_resolution: Step, rad/s; 0 is none.
+        accelerometer_resolution: Step, m/s²; 0 is none.
+        vibration: Amplitude of the rotors' vibration at full thrust, m/s²; 0 is none.
+        averaged: True if a measurement is the mean since the one before, as of delta angles and
+            delta velocities; False if it is that of its stamp.
+        parent_frame_id: Frame that it is mounted on.
+        position: The IMU in the parent frame, metres.
+        orientation: Rotation from its frame to the parent frame.
     """
 
     rate: float
@@ -136,6 +157,25 @@ class ImuAnnouncement(Announcement):
     gyroscope_random_walk: float
     accelerometer_noise_density: float
     accelerometer_random_walk: float
+    gyroscope_turn_on_bias: float = 0.0
+    accelerometer_turn_on_bias: float = 0.0
+    gyroscope_matrix: tuple[float, ...] = IDENTITY
+    accelerometer_matrix: tuple[float, ...] = IDENTITY
+    g_sensitivity: float = 0.0
+    gyroscope_range: float = 0.0
+    accelerometer_range: float = 0.0
+    gyroscope_resolution: float = 0.0
+    accelerometer_resolution: float = 0.0
+    vibration: float = 0.0
+    averaged: bool = False
+    parent_frame_id: str = "base_link"
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
+        for matrix in (self.gyroscope_matrix, self.accelerometer_matrix):
+            check(self, matrix[:3], matrix[3:6], matrix[6:])
 
 
 class SensorAnnouncement(Announcement):

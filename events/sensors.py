@@ -154,6 +154,7 @@ class NavSatFix(Event):
         altitude: Metres above the WGS 84 ellipsoid.
         position_covariance: Of (north, east, down), m²: 9 numbers, row by row; empty if unknown.
         velocity: Metres per second in ``map``, as receivers measure it by Doppler shift.
+        status: As ROS's ``sensor_msgs/NavSatStatus``: 0 is a fix, -1 none yet.
     """
 
     category: ClassVar[Category] = Category.SENSOR
@@ -163,6 +164,7 @@ class NavSatFix(Event):
     altitude: float
     position_covariance: tuple[float, ...] = ()
     velocity: Vector3 = (0.0, 0.0, 0.0)
+    status: int = 0
 
     def __post_init__(self) -> None:
         check(self, (self.latitude, self.longitude, self.altitude), self.velocity)

@@ -16,6 +16,7 @@ from events import (
     Announcement,
     Collision,
     Command,
+    FluidPressure,
     Imu,
     ImuAnnouncement,
     Odometry,
@@ -27,13 +28,12 @@ from events import (
 from events.rotations import rotate_inverse
 from runtime import Output, Tick, every, on
 from sims.cameras import add_camera, check_cameras
-from sims.simulator import Rate, Simulator, SimulatorConfig
+from sims.sensors import ImuNoise, SensorOutputs, SensorsConfig, SensorSuite, Truth
+from sims.simulator import Rate, Simulator
 from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,
     Gains,
-    ImuNoise,
-    ImuParameters,
     Limits,
     Phase,
     Physics,
@@ -48,17 +48,14 @@ FRAME = "base_link"
 """Frame of the vehicle's body."""
 
 
-class MultirotorConfig(SimulatorConfig):
-    """Settings of a multirotor, besides those of every simulator.
+class MultirotorConfig(SensorsConfig):
+    """Settings of a multirotor, besides those of every simulator and of its sensors.
 
     Attributes:
         position: Position on the ground at the start: x north and y east, metres.
         height: Height of the ground there, metres above the world's zero.
         yaw: Heading at the start, degrees clockwise from north.
         control_rate: Rate of the controller, Hz.
-        imu_rate: Rate of the IMU and of the ground truth (`odometry`), Hz. The ground truth is also
-            sent at each exposure.
-        imu: Noise of the IMU.
         trigger: ``free``: each camera exposes at its own rate, at equal intervals. ``imu``: the
             next IMU sample after that triggers the exposure, so that image, depth, pose and IMU
             share their stamps; the intervals are equal only if the camera's rate divides the
@@ -71,8 +68,6 @@ class MultirotorConfig(SimulatorConfig):
     height: float = 0.0
     yaw: float = 0.0
     control_rate: Rate = 400
-    imu_rate: Rate = 200
-    imu: ImuParameters = ImuParameters()
     trigger: Literal["free", "imu"] = "free"
     gains: Gains = Gains()
     limits: Limits = Limits()
@@ -96,6 +91,7 @@ class Multirotor(Simulator[MultirotorConfig]):
     """
 
     imu = Output(Imu)
+    pressures = Output(FluidPressure)
     vehicle_events = Output(VehicleEvent)
 
     frame_id = FRAME
@@ -117,6 +113,7 @@ class Multirotor(Simulator[MultirotorConfig]):
             setpoint_timeout=config.setpoint_timeout,
         )
         self._noise = ImuNoise(config.imu, config.imu_rate, self.rng)
+        self._suite = SensorSuite(self, config, SensorOutputs(self.pressures), FRAME, self._truth)
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
         self._odometry_stamp = -1
@@ -130,6 +127,13 @@ class Multirotor(Simulator[MultirotorConfig]):
             self.every(camera.rate, functools.partial(call, camera.name), camera.name)
         if not free:
             self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
+        self._suite.start()
+
+    async def run(self) -> None:
+        """Send the poses of cameras and sensors on the body, once."""
+        await super().run()
+        for mounting in self._suite.transforms():
+            self.transforms.send(mounting)
 
     def _build(self) -> Any:
         config = self.config
@@ -158,6 +162,7 @@ class Multirotor(Simulator[MultirotorConfig]):
             frame_id=FRAME,
             **msgspec.structs.asdict(self.config.imu),
         )
+        yield from self._suite.announcements()
         yield from super().announce()
         if self.config.trigger == "imu":
             for camera in self.config.cameras:
@@ -260,6 +265,11 @@ class Multirotor(Simulator[MultirotorConfig]):
         state, qpos, qvel = self._physics.state_at(stamp)
         self._send_odometry(stamp, state)
         self.rig.expose(camera, stamp, qpos, qvel)
+
+    def _truth(self, tick: Tick) -> Truth:
+        stamp = self._advance(tick)
+        state, qpos, _ = self._physics.state_at(stamp)
+        return Truth(stamp, state.position, state.orientation, state.velocity, qpos)
 
     def _advance(self, tick: Tick) -> int:
         """Step the physics up to a tick, and return the stamp of the state then.

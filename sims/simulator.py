@@ -24,6 +24,8 @@ from sims.cameras import CameraSpec
 from sims.cameras.rig import CameraOutputs, CameraRig
 
 Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
+Longitude = Annotated[float, msgspec.Meta(ge=-180, le=180)]
 Count = Annotated[int, msgspec.Meta(ge=1, le=16)]
 
 
@@ -34,6 +36,8 @@ class SimulatorConfig(NodeConfig):
         world: Name of a built-in world (``hall``, ``yard``), or path of an MJCF file. In an MJCF
             file x is north, y is west and z is up; in all settings and events x is north, y is
             east and z is down (NED). So a geom with ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
+        origin: Where the origin of ``map`` is on the earth: latitude and longitude, degrees north
+            and east, and altitude, metres above the WGS 84 ellipsoid, which here is sea level too.
         cameras: The cameras that are carried.
         camera_processes: Number of processes that render.
         render_threads: Threads of the software renderer in each of them.
@@ -42,6 +46,7 @@ class SimulatorConfig(NodeConfig):
     """
 
     world: NameOrPath = "hall"
+    origin: tuple[Latitude, Longitude, float] = (47.641468, -122.140165, 122.0)
     cameras: tuple[CameraSpec, ...] = ()
     camera_processes: Count = 2
     render_threads: Count = 1

@@ -1,4 +1,4 @@
-"""A quadrotor: its MuJoCo model, physics, IMU noise, control cascade and autopilot.
+"""A quadrotor: its MuJoCo model, physics, control cascade and autopilot.
 
 Everything here is pure: time is an argument, nothing waits, nothing is sent. One step of a run is
 
@@ -10,7 +10,6 @@ Everything here is pure: time is an argument, nothing waits, nothing is sent. On
 from sims.vehicle.autopilot import Autopilot, Phase
 from sims.vehicle.control import Controller, Motors
 from sims.vehicle.gains import Gains, Limits
-from sims.vehicle.imu import ImuNoise, ImuParameters
 from sims.vehicle.mixer import Mixer
 from sims.vehicle.model import (
     STANDING_HEIGHT,
@@ -31,8 +30,6 @@ __all__ = [
     "Contact",
     "Controller",
     "Gains",
-    "ImuNoise",
-    "ImuParameters",
     "Limits",
     "Mixer",
     "Motor",

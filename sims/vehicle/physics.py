@@ -1,7 +1,7 @@
 """What is true of one vehicle in a simulated world at an instant.
 
-Stepping is in `simulation`. No sensor noise (see `imu`), no control (see `control`), no images.
-Everything that comes out is in our frames: world NED, body FRD.
+Stepping is in `simulation`. No sensor noise (see `sims.sensors`), no control (see `control`), no
+images. Everything that comes out is in our frames: world NED, body FRD.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from sims.vehicle import ImuNoise, ImuParameters
+from sims.sensors import ImuNoise, ImuParameters
 
 REST = ((0.0, 0.0, 0.0), (0.0, 0.0, -9.81))
 RATE = 200.0

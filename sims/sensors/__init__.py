@@ -1,0 +1,25 @@
+"""Sensors other than cameras: pure models, and what runs them for a vehicle's node.
+
+A model is told the truth and returns what its sensor measures; it knows no clock and sends
+nothing. `SensorSuite` runs all of a vehicle's models at their rates, and sends what they measure
+when it is due.
+"""
+
+from sims.sensors.barometer import Barometer, BarometerSpec
+from sims.sensors.imu import ImuNoise, ImuParameters
+from sims.sensors.sensor import Sensor, SensorSpec, Truth
+from sims.sensors.settings import SensorsConfig
+from sims.sensors.suite import SensorOutputs, SensorSuite
+
+__all__ = [
+    "Barometer",
+    "BarometerSpec",
+    "ImuNoise",
+    "ImuParameters",
+    "Sensor",
+    "SensorOutputs",
+    "SensorSpec",
+    "SensorSuite",
+    "SensorsConfig",
+    "Truth",
+]

@@ -1,0 +1,142 @@
+"""What all sensors but cameras and the IMU have in common: settings, place, source, truth."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+
+from events import Event, Quaternion, SensorAnnouncement, Vector3
+from events.rotations import from_rpy
+from runtime.units import Latency
+
+NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Name = Annotated[str, msgspec.Meta(min_length=1, pattern="^[A-Za-z0-9_]+$")]
+
+
+class SensorSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of every sensor.
+
+    Attributes:
+        rate: Measurements per second (AirSim: ``UpdateFrequency``).
+        latency: Time from a measurement to its delivery (AirSim: ``UpdateLatency``).
+        startup_delay: Time from the start to the first measurement (AirSim: ``StartupDelay``).
+        position: Position on the body, metres forward, right, down (FRD).
+        orientation: Roll, pitch, yaw of the sensor in the body's frame, degrees, applied yaw first
+            (Z-Y-X). Positive pitch is upwards: -90 looks straight down.
+    """
+
+    rate: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 50.0
+    latency: Latency = Latency(0)  # immutable
+    startup_delay: Latency = Latency(0)
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Vector3 = (0.0, 0.0, 0.0)
+
+    @property
+    def rotation(self) -> Quaternion:
+        """Rotation from the sensor's frame to the body."""
+        roll, pitch, yaw = (math.radians(angle) for angle in self.orientation)
+        return from_rpy(roll, pitch, yaw)
+
+
+class Truth(NamedTuple):
+    """What is true of the body that carries a sensor, at one instant."""
+
+    stamp: int
+    """Nanoseconds."""
+    position: Vector3
+    """Metres NED."""
+    orientation: Quaternion
+    """Rotation FRD → NED."""
+    velocity: Vector3
+    """Metres per second NED."""
+    qpos: Any
+    """The world's generalised positions, shape (nq,), for sensors that see it."""
+
+
+class Place(NamedTuple):
+    """Where a sensor is, and what its measurements are called."""
+
+    source: str
+    """Of its measurements: ``drone/barometer``."""
+    parent_frame_id: str
+    """Frame of the body."""
+    origin: tuple[float, float, float]
+    """Latitude and longitude (degrees) and altitude (metres) of the origin of ``map``."""
+
+
+S = TypeVar("S", bound=SensorSpec)
+
+
+class Sensor(ABC, Generic[S]):
+    """Model of one sensor: told the truth at its rate, it returns what it measures.
+
+    Args:
+        spec: Its settings.
+        place: Where it is.
+        random: Source of its random numbers; equal seeds give equal measurements.
+    """
+
+    port: ClassVar[str]
+    """Output of the vehicle's node that its measurements are sent on."""
+
+    def __init__(self, spec: S, place: Place, random: np.random.Generator) -> None:
+        self.spec = spec
+        self.place = place
+        self.random = random
+
+    @property
+    def source(self) -> str:
+        """Source of the measurements, and name of their frame."""
+        return self.place.source
+
+    @abstractmethod
+    def measure(self, truth: Truth) -> Event:
+        """Return the next measurement."""
+
+    @abstractmethod
+    def announcement(self) -> SensorAnnouncement:
+        """Return what the sensor will provide."""
+
+    def mounting(self) -> dict[str, Any]:
+        """Return the fields that all announcements have."""
+        return {
+            "stamp": 0,
+            "source": self.source,
+            "rate": self.spec.rate,
+            "latency": float(self.spec.latency),
+            "frame_id": self.source,
+            "parent_frame_id": self.place.parent_frame_id,
+            "position": self.spec.position,
+            "orientation": self.spec.rotation,
+        }
+
+
+class GaussMarkov:
+    """A first-order Gauss-Markov process, sampled at equal intervals, from zero at the start.
+
+    Args:
+        sigma: Standard deviation that it tends to; of AirSim's, the factor of its input.
+        tau: Time constant, seconds; 0 is a process that stays zero.
+        dt: Interval, seconds.
+        size: Number of independent components.
+        airsim: Take AirSim's recursion, whose input is weighted with 1 - e^(-dt/τ) instead of
+            √(1 - e^(-2 dt/τ)): its deviation tends to σ √(dt / 2τ) only.
+    """
+
+    def __init__(
+        self, sigma: float, tau: float, dt: float, size: int = 1, *, airsim: bool = False
+    ) -> None:
+        self._keep = math.exp(-dt / tau) if tau > 0.0 else 0.0
+        self._input = 1.0 - self._keep if airsim else math.sqrt(1.0 - self._keep**2)
+        self._input *= sigma if tau > 0.0 else 0.0
+        self.value = np.zeros(size)
+
+    def step(self, random: np.random.Generator) -> Any:
+        """Return the next values, shape (size,)."""
+        self.value = self._keep * self.value + self._input * random.standard_normal(len(self.value))
+        return self.value
