@@ -1,0 +1,175 @@
+"""What was announced of a rig, as the calibration files of other programs.
+
+Each file is a template beside this module, ``<format>.<file>.jinja``, and reads like the file.
+
+Every file speaks of the IMU's frame, in which the exported IMU data is, and of optical frames
+(x right, y down, z forward); pixel centres have whole coordinates in all of them. A rig without an
+IMU has the body's frame (FRD) in its place. Noise is that of ``ImuAnnouncement``, continuous
+densities as Kalibr's, or what a template says beside it. What a format has no word for is refused
+if the projection depends on it, and otherwise said in a comment.
+
+Sources: github.com/ethz-asl/kalibr/wiki/yaml-formats; docs.openvins.com/gs-calibration.html and
+open_vins/config; VINS-Fusion/config and camodocal; basalt-headers' ``calibration.hpp``;
+ORB-SLAM3's "Calibration_Tutorial.pdf", section 5; VSLAM-LAB's ``Datasets/DatasetVSLAMLAB.py``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import msgspec
+import numpy as np
+
+from events import CameraAnnouncement
+from events.poses import inverse, pose_tuples
+from nodes.calibration.mounting import camera_in_imu, pair
+from nodes.dataset.recording import real
+from nodes.dataset.rig import Rig
+
+DEPTH_FACTOR = 5000.0
+"""Steps of an exported depth image per metre, as TUM's."""
+
+GRAVITY = 9.81
+"""Metres per second squared, as an `Imu` at rest has it."""
+
+
+class Format(msgspec.Struct, frozen=True):
+    """What a format consists of, and what it can say.
+
+    Attributes:
+        files: Names of its files.
+        radtan: How many coefficients its radial-tangential lens has: 4 (k1, k2, p1, p2), 5 (and
+            k3) or 8 (and k4, k5, k6 in the denominator).
+        pair_only: Whether it is for one camera or one stereo pair.
+        needs_imu: Whether there is none of it without an IMU.
+        camera_file: A file of each camera, with ``{}`` for its number; empty for none.
+    """
+
+    files: tuple[str, ...]
+    radtan: int
+    pair_only: bool = False
+    needs_imu: bool = False
+    camera_file: str = ""
+
+
+FORMATS = {
+    "kalibr": Format(("camchain-imucam.yaml", "imu.yaml"), 4),
+    "openvins": Format(
+        ("estimator_config.yaml", "kalibr_imu_chain.yaml", "kalibr_imucam_chain.yaml"),
+        4,
+        needs_imu=True,
+    ),
+    "vins": Format(("vins.yaml",), 4, pair_only=True, camera_file="cam{}.yaml"),
+    "basalt": Format(("calibration.json",), 8),
+    "orbslam3": Format(("orbslam3.yaml",), 5, pair_only=True),
+    "vslamlab": Format(("calibration.yaml",), 5),
+}
+"""The formats of calibrations, by the names that ``export`` knows."""
+
+
+def write_files(rig: Rig, name: str) -> dict[str, str]:
+    """Return the files of a format, by name, with their texts.
+
+    Args:
+        rig: Sensors of one body.
+        name: One of `FORMATS`.
+
+    Raises:
+        ValueError: The format has no word for something that the projection depends on.
+    """
+    form = FORMATS[name]
+    if form.needs_imu and rig.imu is None:
+        raise ValueError(f"{name}: expected an IMU on {rig.body}, found none")
+    chosen = pair(rig) if form.pair_only else rig.cameras
+    cameras = [_camera(rig, each, name) for each in chosen]
+    for what in ("fisheye",) if name == "orbslam3" else ("time_offset",) * (name != "kalibr"):
+        if len({camera[what] for camera in cameras}) > 1:
+            raise ValueError(f"{name} has one {what} for all cameras, found several")
+    common: dict[str, Any] = {
+        "cameras": cameras,
+        "imu": rig.imu,
+        "stereo": len(pair(rig)) == 2,
+        "gravity": GRAVITY,
+        "depth_factor": DEPTH_FACTOR,
+    }
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=False,  # noqa: S701  # neither YAML nor JSON is HTML
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {"real": real, "row": _row}
+    found = {
+        file: environment.get_template(f"{name}.{file}.jinja").render(common)
+        for file in form.files
+        if rig.imu is not None or file != "imu.yaml"
+    }
+    for number, camera in enumerate(cameras if form.camera_file else []):
+        template = environment.get_template(f"{name}.{form.camera_file.format('')}.jinja")
+        found[form.camera_file.format(number)] = template.render(camera=camera)
+    return found
+
+
+def _camera(rig: Rig, camera: CameraAnnouncement, name: str) -> dict[str, Any]:
+    """Return what templates ask of a camera, besides what is announced."""
+    info, in_imu = camera.info, camera_in_imu(rig, camera)
+    fisheye = info.distortion_model == "equidistant"
+    k = _coefficients(camera, name)
+    names = (
+        ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    )
+    lens = dict(zip(names, k, strict=False))
+    if name == "basalt" and not fisheye:  # the radius at which the model turns back
+        lens["rpmax"] = float(np.tan(min(info.widest_angle(), 1.55)))
+    (x, y, z), (qw, qx, qy, qz) = pose_tuples(in_imu)
+    rolling = (
+        f"rolling shutter: {real(camera.readout)} s from the first row to the last; "
+        "stamps are those of the middle row"
+    )
+    late = f"stamps are {real(camera.time_offset)} s late on the clock of the IMU"
+    remarks = [rolling] if camera.readout else []
+    return {field: getattr(camera, field) for field in camera.__struct_fields__} | {
+        "fisheye": fisheye,
+        "k": k,
+        "lens": lens,
+        "middle": {"fx": info.fx, "fy": info.fy, "cx": info.cx, "cy": info.cy},
+        "in_imu": in_imu,
+        "from_imu": inverse(in_imu),
+        "pose": {"px": x, "py": y, "pz": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw},
+        "eyes": [
+            number
+            for number, other in enumerate(rig.cameras)
+            if camera.stereo == other.source or other.stereo == camera.source
+        ],
+        "remarks": remarks,
+        "all_remarks": [*remarks, *([late] if camera.time_offset else [])],
+    }
+
+
+def _coefficients(camera: CameraAnnouncement, name: str) -> tuple[float, ...]:
+    """Return a lens's coefficients in a format's order.
+
+    Raises:
+        ValueError: It has no word for the lens.
+    """
+    info, most = camera.info, FORMATS[name].radtan
+    if info.distortion_model == "equidistant":
+        return info.distortion
+    k = (0.0,) * 8 if info.is_pinhole else (*info.distortion, 0.0, 0.0, 0.0)[:8]
+    if any(k[most:]):
+        knows = ", ".join(("k1", "k2", "p1", "p2", "k3")[:most])
+        found = info.distortion_model + (" with k3" if len(info.distortion) == 5 else "")
+        raise ValueError(
+            f"{camera.source}: {name} has no word for its lens: expected radtan ({knows}) or "
+            f"equidistant, found {found}; the format basalt has one"
+        )
+    return k[:most]
+
+
+def _row(values: Iterable[float]) -> str:
+    return f"[{', '.join(real(float(value)) for value in values)}]"

@@ -1,0 +1,175 @@
+"""Each calibration file, read back by itself, projects as the announced camera does."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from events import CameraInfo
+from events.poses import pose_matrix
+from nodes.calibration.formats import FORMATS, write_files
+from nodes.calibration.readers import READERS, ReadCamera, read
+from nodes.dataset.rig import Rig
+from tests.nodes.calibration.samples import IMU, LENSES, camera, stereo
+
+SAYS = {
+    "kalibr": {"pinhole", "radtan4", "kb4"},
+    "openvins": {"pinhole", "radtan4", "kb4"},
+    "vins": {"pinhole", "radtan4", "kb4"},
+    "basalt": set(LENSES),
+    "orbslam3": {"pinhole", "radtan4", "radtan5", "kb4"},
+    "vslamlab": {"pinhole", "radtan4", "radtan5", "kb4"},
+}
+
+
+def exported(rig: Rig, form: str, folder: Path) -> list[ReadCamera]:
+    """Write a rig's calibration, and read it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in write_files(rig, form).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return read(form, folder)
+
+
+def difference(rig: Rig, found: list[ReadCamera]) -> float:
+    """Return by how many pixels the same points of the IMU's frame fall elsewhere, at most."""
+    points = np.random.default_rng(1).uniform(-0.7, 0.7, (300, 3)) + np.array([0, 0, 2])
+    worst = 0.0
+    for announced, each in zip(rig.cameras, found, strict=True):
+        pose = pose_matrix(announced.position, announced.orientation)
+        pixels = announced.info.project(points)
+        assert np.isfinite(pixels).all()
+        off = each.project(points @ pose[:3, :3].T + pose[:3, 3]) - pixels
+        worst = max(worst, float(np.abs(off).max()))
+    return worst
+
+
+def test_every_format_is_written_and_read() -> None:
+    assert set(FORMATS) == set(READERS) == set(SAYS)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_stereo_pair_projects_the_same_or_is_refused(
+    form: str, lens: str, tmp_path: Path
+) -> None:
+    rig = stereo(lens, time_offset=0.005)
+    if lens not in SAYS[form]:
+        with pytest.raises(ValueError, match=f"{form} has no word for its lens.*basalt has one"):
+            write_files(rig, form)
+        return
+    found = exported(rig, form, tmp_path)
+    assert difference(rig, found) < 1e-6
+    assert {each.time_offset for each in found} <= {-0.005, None}
+
+
+@settings(max_examples=25)
+@given(
+    k=st.tuples(*[st.floats(-0.2, 0.2)] * 2),
+    focal=st.tuples(*[st.floats(200, 900)] * 2),
+    place=st.tuples(*[st.floats(-2, 2)] * 3),
+    form=st.sampled_from(sorted(FORMATS)),
+)
+def test_any_radtan_camera_projects_the_same(
+    k: tuple[float, float],
+    focal: tuple[float, float],
+    place: tuple[float, float, float],
+    form: str,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    info = CameraInfo(
+        width=640,
+        height=480,
+        fx=focal[0],
+        fy=focal[1],
+        cx=300.5,
+        cy=251.25,
+        distortion=(*k, 1e-3, -1e-3, 0.0),
+    )
+    rig = Rig("drone", (msgspec.structs.replace(camera(), info=info, position=place),), IMU)
+    found = exported(rig, form, tmp_path_factory.mktemp(form))
+    rays = np.random.default_rng(2).uniform(-0.25, 0.25, (100, 3)) + np.array([0, 0, 2])
+    pose = pose_matrix(place, rig.cameras[0].orientation)
+    moved = rays @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(found[0].project(moved), info.project(rays), atol=1e-6)
+
+
+def test_a_transposed_transform_is_found(tmp_path: Path) -> None:
+    rig = Rig("drone", (camera(),), IMU)
+    assert difference(rig, exported(rig, "basalt", tmp_path)) < 1e-6
+    path = tmp_path / "calibration.json"
+    text = path.read_text()
+    turned = re.sub(r'"q([xyz])": (-?)', lambda m: f'"q{m[1]}": {"" if m[2] else "-"}', text)
+    path.write_text(turned)
+    assert difference(rig, read("basalt", tmp_path)) > 100.0
+
+
+def test_the_noise_is_in_each_programs_unit(tmp_path: Path) -> None:
+    rig = stereo()
+    kalibr = write_files(rig, "kalibr")["imu.yaml"]
+    assert "gyroscope_noise_density: 0.00015\n" in kalibr
+    assert "update_rate: 200.0" in kalibr
+    vins = write_files(rig, "vins")["vins.yaml"]
+    acc_n = re.search(r"^acc_n: (.*)$", vins, re.M)
+    assert acc_n is not None
+    assert float(acc_n[1]) == pytest.approx(2e-3 * 200**0.5)
+    orb = write_files(rig, "orbslam3")["orbslam3.yaml"]
+    assert "IMU.NoiseAcc: 0.002\n" in orb
+
+
+def test_kalibrs_files_are_plain_yaml_and_the_chain_closes() -> None:
+    yaml: Any = importlib.import_module("yaml")
+    files = write_files(stereo("kb4"), "kalibr")
+    chain = yaml.safe_load(files["camchain-imucam.yaml"])
+    first, second = (np.array(chain[name]["T_cam_imu"]) for name in ("cam0", "cam1"))
+    np.testing.assert_allclose(np.array(chain["cam1"]["T_cn_cnm1"]) @ first, second, atol=1e-12)
+    assert chain["cam0"]["cam_overlaps"] == [1]
+    assert yaml.safe_load(files["imu.yaml"])["rostopic"] == "/drone/imu"
+    lab = yaml.safe_load(write_files(stereo("kb4"), "vslamlab")["calibration.yaml"])
+    assert lab["cameras"][1]["distortion_type"] == "equid4"
+    assert lab["imus"][0]["sigma_g_c"] == 1.5e-4
+
+
+def test_opencv_reads_every_file_that_is_meant_for_it() -> None:
+    for form in ("openvins", "vins", "orbslam3"):
+        for text in write_files(stereo(), form).values():
+            flags = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
+            assert cv2.FileStorage(text, flags).root().keys()
+
+
+def test_without_an_imu_the_body_stands_in_its_place(tmp_path: Path) -> None:
+    rig = Rig("cv", (camera(),), None)
+    for form in sorted(set(FORMATS) - {"openvins"}):
+        files = write_files(rig, form)
+        assert "imu.yaml" not in files
+        if form != "orbslam3":  # which has no transform without an IMU
+            assert difference(rig, exported(rig, form, tmp_path / form)) < 1e-6
+    with pytest.raises(ValueError, match="openvins: expected an IMU on cv, found none"):
+        write_files(rig, "openvins")
+
+
+def test_what_has_no_word_is_a_comment_or_refused() -> None:
+    rolling = Rig("drone", (camera(readout=0.02, time_offset=0.01),), IMU)
+    for form in ("kalibr", "openvins", "vslamlab", "orbslam3"):
+        assert any(
+            "rolling shutter: 0.02 s" in text for text in write_files(rolling, form).values()
+        )
+    assert "rolling_shutter_tr: 0.02" in write_files(rolling, "vins")["vins.yaml"]
+    assert "0.01 s late" in write_files(rolling, "orbslam3")["orbslam3.yaml"]
+    two = Rig("drone", (camera(time_offset=0.01), camera("other")), IMU)
+    with pytest.raises(ValueError, match="basalt has one time_offset for all cameras"):
+        write_files(two, "basalt")
+
+
+def test_an_imu_on_another_body_is_refused() -> None:
+    elsewhere = msgspec.structs.replace(IMU, frame_id="other")
+    with pytest.raises(ValueError, match="drone/left: expected a camera mounted on other"):
+        write_files(Rig("drone", (camera(),), elsewhere), "kalibr")
