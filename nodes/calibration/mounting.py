@@ -5,37 +5,28 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from events import CameraAnnouncement, ImuAnnouncement
+from events import CameraAnnouncement
 from events.poses import inverse, pose_matrix
 from nodes.dataset.rig import Rig
 
 Floats = npt.NDArray[np.float64]
 
 
-def body_frame(imu: ImuAnnouncement) -> str:
-    """Return the frame that an IMU is mounted on."""
-    return str(getattr(imu, "parent_frame_id", imu.frame_id))
-
-
-def imu_in_body(imu: ImuAnnouncement | None) -> Floats:
-    """Return the IMU's pose in the body's frame, shape (4, 4); the body itself without an IMU."""
-    if imu is None or not hasattr(imu, "position"):
-        return np.eye(4)
-    return pose_matrix(imu.position, getattr(imu, "orientation", (1.0, 0.0, 0.0, 0.0)))
-
-
 def camera_in_imu(rig: Rig, camera: CameraAnnouncement) -> Floats:
-    """Return the pose of a camera's optical frame in the IMU's frame, shape (4, 4).
+    """Return the pose of a camera's optical frame in the IMU's frame (or the body's), shape (4, 4).
 
     Raises:
         ValueError: They are not mounted on one body.
     """
-    if rig.imu is not None and body_frame(rig.imu) != camera.parent_frame_id:
+    if rig.imu is not None and rig.imu.parent_frame_id != camera.parent_frame_id:
         raise ValueError(
-            f"{camera.source}: expected a camera mounted on {body_frame(rig.imu)}, as "
+            f"{camera.source}: expected a camera mounted on {rig.imu.parent_frame_id}, as "
             f"{rig.imu.source} is, found one on {camera.parent_frame_id}"
         )
-    return inverse(imu_in_body(rig.imu)) @ pose_matrix(camera.position, camera.orientation)
+    in_body = pose_matrix(camera.position, camera.orientation)
+    if rig.imu is None:
+        return in_body
+    return inverse(pose_matrix(rig.imu.position, rig.imu.orientation)) @ in_body
 
 
 def pair(rig: Rig) -> tuple[CameraAnnouncement, ...]:

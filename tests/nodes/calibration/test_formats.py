@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from events import CameraInfo
 from events.poses import pose_matrix
+from events.rotations import from_rpy
 from nodes.calibration.formats import FORMATS, write_files
 from nodes.calibration.readers import READERS, ReadCamera, read
 from nodes.dataset.rig import Rig
@@ -169,7 +170,21 @@ def test_what_has_no_word_is_a_comment_or_refused() -> None:
         write_files(two, "basalt")
 
 
+def test_an_imu_that_is_turned_and_moved_is_what_transforms_speak_of(tmp_path: Path) -> None:
+    imu = msgspec.structs.replace(
+        IMU, position=(0.03, -0.02, 0.01), orientation=from_rpy(0.2, 0.1, 1.5)
+    )
+    rig = Rig("drone", (camera(),), imu)
+    pose, points = pose_matrix(imu.position, imu.orientation), np.array([[0.3, 0.2, 2.0]])
+    seen = pose_matrix(rig.cameras[0].position, rig.cameras[0].orientation)
+    in_body = points @ seen[:3, :3].T + seen[:3, 3]
+    in_imu = (in_body - pose[:3, 3]) @ pose[:3, :3]
+    for form in FORMATS:
+        found = exported(rig, form, tmp_path / form)[0].project(in_imu)
+        np.testing.assert_allclose(found, rig.cameras[0].info.project(points), atol=1e-6)
+
+
 def test_an_imu_on_another_body_is_refused() -> None:
-    elsewhere = msgspec.structs.replace(IMU, frame_id="other")
+    elsewhere = msgspec.structs.replace(IMU, parent_frame_id="other")
     with pytest.raises(ValueError, match="drone/left: expected a camera mounted on other"):
         write_files(Rig("drone", (camera(),), elsewhere), "kalibr")
