@@ -104,11 +104,12 @@ def convert_points(axes: Axes, points: npt.NDArray[np.float32]) -> npt.NDArray[n
 
 
 def convert_covariance(axes: Axes, covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Take the covariance of a pose from our axes to ROS's, or back.
+    """Take the covariance of a pose, or of a position, from our axes to ROS's, or back.
 
     Args:
         axes: Kind of the parent frame, about whose fixed axes the angles are.
-        covariance: 36 numbers, row-major, (x, y, z, roll, pitch, yaw).
+        covariance: Row-major; 36 numbers, (x, y, z, roll, pitch, yaw), or 9, (x, y, z).
     """
-    turn = np.kron(np.eye(2), _MATRICES[axes])
-    return (turn @ covariance.reshape(6, 6) @ turn.T).ravel()
+    size = 3 if covariance.size == 9 else 6
+    turn = np.kron(np.eye(size // 3), _MATRICES[axes])
+    return (turn @ covariance.reshape(size, size) @ turn.T).ravel()

@@ -1,12 +1,22 @@
-"""Cameras that ROS has: what their CameraInfo says, as the announcement of a camera."""
+"""What a CameraInfo says of a camera that is announced, and the other way round."""
 
 from __future__ import annotations
 
 from math import isfinite
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from events import CameraAnnouncement, CameraInfo
+from events.camera_info import COEFFICIENTS
 from events.frames import OPTICAL_TO_FRD
+
+
+def projection_matrix(camera: CameraAnnouncement) -> npt.NDArray[np.float64]:
+    """Return P, shape (3, 4): K, and of a stereo rig's right camera -fx times its baseline."""
+    info = camera.info
+    return np.column_stack([info.matrix(), [-info.fx * camera.baseline, 0.0, 0.0]])
 
 
 def camera_announcement(
@@ -21,15 +31,17 @@ def camera_announcement(
         frame_id: If set, stands in the place of the message's own.
 
     Raises:
-        ValueError: The message is no calibration of a pinhole camera.
+        ValueError: The message is no calibration of a camera.
     """
+    info = camera_info(message)
     return CameraAnnouncement(
         stamp=0,
         source=source,
         images=images,
-        info=camera_info(message),
+        info=info,
         rate=30.0,  # nobody says
         latency=0.0,
+        baseline=abs(float(message.p[3])) / info.fx,
         frame_id=frame_id or message.header.frame_id,
         parent_frame_id="base_link",
         position=(0.0, 0.0, 0.0),
@@ -41,7 +53,7 @@ def camera_info(message: Any) -> CameraInfo:
     """Read the intrinsics of a CameraInfo.
 
     Raises:
-        ValueError: It describes no pinhole camera with plumb_bob distortion.
+        ValueError: It describes no camera with a distortion that `CameraInfo` knows.
     """
     fx, skew, cx, _, fy, cy, *_ = (float(value) for value in message.k)
     coefficients = tuple(float(value) for value in message.d)
@@ -62,11 +74,16 @@ def camera_info(message: Any) -> CameraInfo:
             f"{message.binning_x} x {message.binning_y} and a region of interest of "
             f"{message.roi.width} x {message.roi.height} pixels"
         )
-    plain = not any(coefficients)
-    if not (plain or (message.distortion_model == "plumb_bob" and len(coefficients) == 5)):
+    model = message.distortion_model
+    if not any(coefficients) and model != "equidistant":
+        model, coefficients = "plumb_bob", (0.0,) * 5
+    expected = COEFFICIENTS.get(model, 0)
+    # plumb_bob of four has no k3; OpenCV's rational model may have more, of a thin prism and tilt.
+    coefficients += (0.0,) * (expected - len(coefficients) if len(coefficients) == 4 else 0)
+    if not expected or len(coefficients) < expected or any(coefficients[expected:]):
+        known = ", ".join(f"{name} with {count}" for name, count in COEFFICIENTS.items())
         raise ValueError(
-            f"expected plumb_bob with 5 coefficients, found {message.distortion_model!r:.80} "
-            f"with {len(coefficients)}"
+            f"expected one of {known} coefficients, found {model!r:.80} with {len(message.d)}"
         )
     return CameraInfo(
         width=int(message.width),
@@ -75,5 +92,6 @@ def camera_info(message: Any) -> CameraInfo:
         fy=fy,
         cx=cx,
         cy=cy,
-        distortion=(0.0,) * 5 if plain else coefficients,
+        distortion_model=model,
+        distortion=coefficients[:expected],
     )

@@ -7,6 +7,7 @@ import msgspec
 from events import CameraAnnouncement
 from events.frames import Axes, axes_of
 from nodes.ros_messages.topics import ros_name
+from nodes.vehicles import Vehicles
 
 
 class CameraFrames(msgspec.Struct, frozen=True):
@@ -27,15 +28,12 @@ class FrameNames:
     def __init__(self) -> None:
         self._cameras: dict[str, tuple[str, str]] = {}
         """Optical frame to the camera's source and its own name."""
-        self._vehicles: list[str] = []
-
-    def add_vehicle(self, source: str) -> None:
-        """Add a vehicle."""
-        if source not in self._vehicles:
-            self._vehicles.append(source)
+        self.vehicles = Vehicles()
+        """Whose frames are distinguished."""
 
     def add(self, camera: CameraAnnouncement) -> CameraFrames:
         """Add a camera: its frames have its own name, or its vehicle's too if that is taken."""
+        self.vehicles.announced(camera)
         if camera.frame_id not in self._cameras:
             name = ros_name(camera.source.rpartition("/")[2])
             if any(known == name for _, known in self._cameras.values()):
@@ -52,13 +50,9 @@ class FrameNames:
             return None
         source, name = known
         prefix = ""
-        if len(self._vehicles) > 1 and (vehicle := self._carrier(source)):
+        if len(self.vehicles.names) > 1 and (vehicle := self.vehicles.carrier(source)):
             prefix, name = f"{ros_name(vehicle)}/", ros_name(source.rpartition("/")[2])
         return CameraFrames(f"{prefix}{name}_link", f"{prefix}{name}_optical_frame")
-
-    def vehicle(self, source: str) -> str:
-        """Return the vehicle that a source belongs to: else the first; empty if there is none."""
-        return self._carrier(source) or (self._vehicles[0] if self._vehicles else "")
 
     def name(self, frame_id: str, source: str = "") -> str:
         """Return what ROS calls a frame that a source names."""
@@ -67,16 +61,10 @@ class FrameNames:
         camera = self.camera(frame_id)
         if camera is not None:
             return camera.optical
-        if len(self._vehicles) > 1:
-            return f"{ros_name(self.vehicle(source))}/{frame_id}"
-        return frame_id
+        vehicle = self.vehicles.of(source)
+        own = frame_id.removeprefix(f"{vehicle}/")  # ``drone/lidar``, which names it already
+        return f"{ros_name(vehicle)}/{own}" if len(self.vehicles.names) > 1 else own
 
     def axes(self, frame_id: str) -> Axes:
         """Return how a frame's axes lie."""
         return "optical" if frame_id in self._cameras else axes_of(frame_id)
-
-    def _carrier(self, source: str) -> str:
-        for vehicle in self._vehicles:
-            if source == vehicle or source.startswith(f"{vehicle}/"):
-                return vehicle
-        return ""

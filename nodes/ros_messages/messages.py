@@ -8,21 +8,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from events import (
-    CameraInfo,
+    CameraAnnouncement,
     FluidPressure,
     Imu,
     ImuAnnouncement,
     MagneticField,
+    MagnetometerAnnouncement,
     NavSatFix,
     Odometry,
     PoseEstimate,
     PoseStamped,
     Quaternion,
     Range,
+    RangeAnnouncement,
     Score,
+    SensorAnnouncement,
     Vector3,
+    Wind,
 )
 from events.frames import Axes, convert_covariance, convert_rotation, convert_vector
+from nodes.ros_messages.calibration import projection_matrix
 from nodes.ros_messages.frame_names import FrameNames
 from nodes.ros_messages.stamps import Time
 from nodes.ros_messages.typestore import TypeStore
@@ -123,20 +128,18 @@ class Messages:
         )
         return self._store.serialize(message)
 
-    def camera_info(self, time: Time, info: CameraInfo, frame_id: str) -> bytearray:
-        """Return a sensor_msgs/CameraInfo: plumb_bob; K, R (one) and P of a single camera."""
-        k = info.matrix()
-        projection = np.zeros((3, 4))
-        projection[:, :3] = k
+    def camera_info(self, time: Time, camera: CameraAnnouncement) -> bytearray:
+        """Return a sensor_msgs/CameraInfo: K, D, R (one) and P, with a stereo rig's baseline."""
+        info = camera.info
         message = self._store.message("sensor_msgs/msg/CameraInfo")(
-            header=self._header(time, frame_id),
+            header=self._header(time, camera.frame_id),
             height=info.height,
             width=info.width,
-            distortion_model="plumb_bob",
+            distortion_model=info.distortion_model,
             d=np.array(info.distortion, np.float64),
-            k=k.ravel(),
+            k=info.matrix().ravel(),
             r=np.eye(3).ravel(),
-            p=projection.ravel(),
+            p=projection_matrix(camera).ravel(),
             binning_x=0,
             binning_y=0,
             roi=self._store.message("sensor_msgs/msg/RegionOfInterest")(
@@ -168,14 +171,16 @@ class Messages:
         stamp = self._store.message("builtin_interfaces/msg/Time")(sec=time[0], nanosec=time[1])
         return self._store.serialize(self._store.message("rosgraph_msgs/msg/Clock")(clock=stamp))
 
-    def range(self, time: Time, event: Range) -> bytearray:
-        """Return a sensor_msgs/Range; ours says nothing of its mounting, so it is the body's."""
+    def range(self, time: Time, event: Range, sensor: RangeAnnouncement | None = None) -> bytearray:
+        """Return a sensor_msgs/Range of a sensor that looks along its frame's x axis."""
         type_ = self._store.message("sensor_msgs/msg/Range")
-        more = {"variance": 0.0} if "variance" in type_.__annotations__ else {}  # since Iron
+        more = {}
+        if "variance" in type_.__annotations__:  # since Iron; 0 says: not known
+            more["variance"] = 0.0 if sensor is None else sensor.noise**2
         message = type_(
-            header=self._header(time, "base_link", event.source),
+            header=self._header(time, event.frame_id, event.source),
             radiation_type=type_.INFRARED,
-            field_of_view=0.0,
+            field_of_view=event.field_of_view,
             min_range=event.min_range,
             max_range=event.max_range,
             range=event.range,
@@ -183,36 +188,64 @@ class Messages:
         )
         return self._store.serialize(message)
 
-    def pressure(self, time: Time, event: FluidPressure) -> bytearray:
+    def pressure(
+        self, time: Time, event: FluidPressure, sensor: SensorAnnouncement | None = None
+    ) -> bytearray:
         """Return a sensor_msgs/FluidPressure."""
         message = self._store.message("sensor_msgs/msg/FluidPressure")(
-            header=self._header(time, "base_link", event.source),
+            header=self._header(time, _frame(sensor), event.source),
             fluid_pressure=event.fluid_pressure,
             variance=event.variance,
         )
         return self._store.serialize(message)
 
-    def magnetic_field(self, time: Time, event: MagneticField) -> bytearray:
-        """Return a sensor_msgs/MagneticField; its covariance of zeros says: not known."""
+    def magnetic_field(
+        self, time: Time, event: MagneticField, sensor: MagnetometerAnnouncement | None = None
+    ) -> bytearray:
+        """Return a sensor_msgs/MagneticField; a covariance of zeros says: not known."""
+        axes = self._frames.axes(event.frame_id)
         message = self._store.message("sensor_msgs/msg/MagneticField")(
-            header=self._header(time, "base_link", event.source),
-            magnetic_field=self._vector(convert_vector("body", event.magnetic_field)),
-            magnetic_field_covariance=_ZEROS_9,
+            header=self._header(time, event.frame_id, event.source),
+            magnetic_field=self._vector(convert_vector(axes, event.magnetic_field)),
+            magnetic_field_covariance=_ZEROS_9 if sensor is None else _diagonal(sensor.noise**2),
         )
         return self._store.serialize(message)
 
-    def fix(self, time: Time, event: NavSatFix) -> bytearray:
-        """Return a sensor_msgs/NavSatFix of a plain GPS fix, whose covariance is not known."""
+    def fix(
+        self, time: Time, event: NavSatFix, sensor: SensorAnnouncement | None = None
+    ) -> bytearray:
+        """Return a sensor_msgs/NavSatFix of a plain GPS fix; its covariance is in ENU."""
         status = self._store.message("sensor_msgs/msg/NavSatStatus")
         type_ = self._store.message("sensor_msgs/msg/NavSatFix")
+        covariance, known = _ZEROS_9, type_.COVARIANCE_TYPE_UNKNOWN
+        if event.position_covariance:
+            covariance = convert_covariance("world", np.array(event.position_covariance))
+            known = type_.COVARIANCE_TYPE_KNOWN
         message = type_(
-            header=self._header(time, "base_link", event.source),
+            header=self._header(time, _frame(sensor), event.source),
             status=status(status=status.STATUS_FIX, service=status.SERVICE_GPS),
             latitude=event.latitude,
             longitude=event.longitude,
             altitude=event.altitude,
-            position_covariance=_ZEROS_9,
-            position_covariance_type=type_.COVARIANCE_TYPE_UNKNOWN,
+            position_covariance=covariance,
+            position_covariance_type=known,
+        )
+        return self._store.serialize(message)
+
+    def fix_velocity(self, time: Time, event: NavSatFix) -> bytearray:
+        """Return a geometry_msgs/TwistStamped of a receiver's velocity, in ``map``."""
+        linear = self._vector(convert_vector("world", event.velocity))
+        message = self._store.message("geometry_msgs/msg/TwistStamped")(
+            header=self._header(time, "map"),
+            twist=self._make["twist"](linear=linear, angular=self._vector((0.0, 0.0, 0.0))),
+        )
+        return self._store.serialize(message)
+
+    def wind(self, time: Time, event: Wind) -> bytearray:
+        """Return a geometry_msgs/Vector3Stamped of the air's velocity, in ``map``."""
+        message = self._store.message("geometry_msgs/msg/Vector3Stamped")(
+            header=self._header(time, "map"),
+            vector=self._vector(convert_vector("world", event.velocity)),
         )
         return self._store.serialize(message)
 
@@ -238,6 +271,10 @@ class Messages:
     def _quaternion(self, rotation: Quaternion) -> Any:
         w, x, y, z = rotation
         return self._make["quaternion"](x=x, y=y, z=z, w=w)
+
+
+def _frame(sensor: SensorAnnouncement | None) -> str:
+    return "base_link" if sensor is None else sensor.frame_id
 
 
 def _diagonal(variance: float) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -9,9 +9,15 @@ import msgspec
 
 from events import (
     Announcement,
+    BarometerAnnouncement,
+    BodyAnnouncement,
     CameraAnnouncement,
     EstimatorAnnouncement,
     ImuAnnouncement,
+    LidarAnnouncement,
+    MagnetometerAnnouncement,
+    NavSatAnnouncement,
+    RangeAnnouncement,
     VehicleAnnouncement,
 )
 from nodes.ros_messages.settings import PublishingConfig, TopicGroup
@@ -36,7 +42,10 @@ TopicKind = Literal[
     "pressure",
     "magnetic",
     "fix",
+    "fix_velocity",
     "lidar",
+    "wind",
+    "body_pose",
     "path",
     "tf",
     "tf_static",
@@ -66,7 +75,10 @@ TOPICS: dict[TopicKind, tuple[str, str, TopicGroup]] = {
     "pressure": ("{}/pressure", "sensor_msgs/msg/FluidPressure", "pressures"),
     "magnetic": ("{}/mag", "sensor_msgs/msg/MagneticField", "magnetic_fields"),
     "fix": ("{}/fix", "sensor_msgs/msg/NavSatFix", "fixes"),
-    "lidar": ("{}/lidar", "sensor_msgs/msg/PointCloud2", "lidar_scans"),
+    "fix_velocity": ("{}/vel", "geometry_msgs/msg/TwistStamped", "fixes"),
+    "lidar": ("{}/points", "sensor_msgs/msg/PointCloud2", "lidar_scans"),
+    "wind": ("{}/wind", "geometry_msgs/msg/Vector3Stamped", "wind"),
+    "body_pose": ("{}/pose", "geometry_msgs/msg/PoseStamped", "body_poses"),
     "path": ("{}/path", "nav_msgs/msg/Path", "paths"),
     "tf": ("/tf", "tf2_msgs/msg/TFMessage", "transforms"),
     "tf_static": ("/tf_static", "tf2_msgs/msg/TFMessage", "transforms"),
@@ -82,9 +94,21 @@ _QOS: dict[TopicKind, Qos] = {
 
 _SENSORS: set[TopicKind] = {
     "image", "mono", "info", "compressed", "depth", "depth_info", "compressed_depth",
-    "segmentation", "lidar", "imu", "range", "pressure", "magnetic", "fix"
+    "segmentation", "lidar", "imu", "range", "pressure", "magnetic", "fix",
+    "fix_velocity",
 }  # fmt: skip
 """With the quality of service of rclcpp's ``SensorDataQoS``."""
+
+
+_KINDS: dict[type[Announcement], TopicKind] = {
+    ImuAnnouncement: "imu",
+    BarometerAnnouncement: "pressure",
+    MagnetometerAnnouncement: "magnetic",
+    RangeAnnouncement: "range",
+    LidarAnnouncement: "lidar",
+    BodyAnnouncement: "body_pose",
+}
+"""What is announced with one topic."""
 
 
 class Publication(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,8 +135,9 @@ def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Publi
     if group not in config.publish or (kind == "clock" and config.time == "wall"):
         return None
     name = pattern.format(ros_name(source))
-    if kind == "imu" and name.endswith("/imu/imu"):
-        name = name.removesuffix("/imu")
+    above, _, last = name.rpartition("/")
+    if kind in _SENSORS and above.endswith(f"/{last}"):  # /drone/imu, not /drone/imu/imu
+        name = above
     full = topic_name(config.namespace, name)
     given = config.topics.get(full, config.topics.get(name))
     if kind == "estimate" and config.covariance:
@@ -133,12 +158,14 @@ def announced_topics(announcement: Announcement, config: PublishingConfig) -> It
     match announcement:
         case CameraAnnouncement(images=images):
             kinds = [*camera_topics(images, config), "pose"]
-        case ImuAnnouncement():
-            kinds = ["imu"]
         case VehicleAnnouncement():
             kinds = ["odometry", "path"]
         case EstimatorAnnouncement():
             kinds = ["estimate", "path"]
+        case NavSatAnnouncement():
+            kinds = ["fix", "fix_velocity"]
+        case _:
+            kinds = [kind for of, kind in _KINDS.items() if isinstance(announcement, of)]
     for kind in kinds:
         if found := publication(kind, announcement.source, config):
             yield found

@@ -13,6 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from events import (
     Announcement,
+    BodyAnnouncement,
     CameraAnnouncement,
     DepthImage,
     EstimatorAnnouncement,
@@ -20,7 +21,6 @@ from events import (
     FluidPressure,
     Image,
     Imu,
-    ImuAnnouncement,
     LidarScan,
     MagneticField,
     NavSatFix,
@@ -31,8 +31,10 @@ from events import (
     Range,
     Score,
     SegmentationImage,
+    TrackedFeatures,
     TransformStamped,
     VehicleAnnouncement,
+    Wind,
 )
 from events.frames import convert_points, convert_rotation, convert_vector
 from nodes.ros_messages.builder import MessageBuilder
@@ -65,8 +67,8 @@ LARGE: tuple[type[Event], ...] = (
 """Events whose messages take long to make: `Publishing.large` has a function for each."""
 
 SMALL: tuple[type[Event], ...] = (
-    *(Odometry, PoseStamped, PoseEstimate, TransformStamped, Score),
-    *(Imu, Range, FluidPressure, MagneticField, NavSatFix),
+    *(Odometry, PoseStamped, PoseEstimate, TransformStamped, Score, TrackedFeatures),
+    *(Imu, Range, FluidPressure, MagneticField, NavSatFix, Wind),
 )
 """Events that `Publishing.small` takes."""
 
@@ -120,7 +122,9 @@ class Publishing(Generic[P]):
         self._messages = Messages(store, self._names)
         self._transforms = Transforms(self._names, config.vehicle, config.tf)
         self._cameras: dict[str, CameraAnnouncement] = {}
-        self._imus: dict[str, ImuAnnouncement] = {}
+        self._announced: dict[tuple[TopicKind, str], Announcement] = {}
+        """By kind and source of the topic."""
+        self._bodies: set[str] = set()
         self._vehicles: list[str] = []
         self._estimators: list[str] = []
         self._publishers: dict[tuple[TopicKind, str], P | None] = {}
@@ -144,11 +148,13 @@ class Publishing(Generic[P]):
             PoseEstimate: self._estimate,
             TransformStamped: self._transform,
             Imu: self._imu,
-            Range: lambda event: self._plain("range", event, messages.range),
-            FluidPressure: lambda event: self._plain("pressure", event, messages.pressure),
-            MagneticField: lambda event: self._plain("magnetic", event, messages.magnetic_field),
-            NavSatFix: lambda event: self._plain("fix", event, messages.fix),
+            Range: lambda event: self._measured("range", event, messages.range),
+            FluidPressure: lambda event: self._measured("pressure", event, messages.pressure),
+            MagneticField: lambda event: self._measured("magnetic", event, messages.magnetic_field),
+            NavSatFix: self._fix,
+            Wind: lambda event: self._plain("wind", event, messages.wind),
             Score: self._score,
+            TrackedFeatures: self._names.vehicles.tracked,  # no message: whose estimates they are
         }
 
     @property
@@ -160,8 +166,8 @@ class Publishing(Generic[P]):
         """Declare the topics of what a node announced."""
         if isinstance(announcement, CameraAnnouncement):
             self._cameras[announcement.source] = announcement
-        elif isinstance(announcement, ImuAnnouncement):
-            self._imus[announcement.source] = announcement
+        elif isinstance(announcement, BodyAnnouncement):
+            self._bodies.add(announcement.source)
         elif isinstance(announcement, VehicleAnnouncement):
             self._vehicles.append(announcement.source)
         elif isinstance(announcement, EstimatorAnnouncement):
@@ -169,6 +175,7 @@ class Publishing(Generic[P]):
         self._transforms.announced(announcement)
         for found in announced_topics(announcement, self._config):
             self._declare(found)
+            self._announced[found.kind, found.source] = announcement
 
     def warm_up(self) -> None:
         """Make everything that a first message needs, while there is time."""
@@ -291,8 +298,7 @@ class Publishing(Generic[P]):
     def _info(self, kind: TopicKind, event: Image | DepthImage) -> None:
         camera = self._cameras.get(event.source)
         if camera is not None and (publisher := self._publisher(kind, event.source)):
-            time, frame = self._time(event.stamp), camera.frame_id
-            publisher.put(self._messages.camera_info(time, camera.info, frame))
+            publisher.put(self._messages.camera_info(self._time(event.stamp), camera))
 
     # What is small.
 
@@ -303,10 +309,11 @@ class Publishing(Generic[P]):
         self._path(event)
 
     def _pose(self, event: PoseStamped) -> None:
-        """Put a pose; a camera's is that of its optical frame."""
+        """Put a pose: of a camera's optical frame, or of a body that moves by itself."""
         camera = self._cameras.get(event.source)
         axes = "body" if camera is None else self._names.axes(camera.frame_id)
-        self._plain("pose", event, lambda time, each: self._messages.pose(time, each, axes))
+        kind: TopicKind = "body_pose" if event.source in self._bodies else "pose"
+        self._plain(kind, event, lambda time, each: self._messages.pose(time, each, axes))
         self._tf(event.stamp, self._transforms.pose(event))
 
     def _estimate(self, event: PoseEstimate) -> None:
@@ -326,8 +333,17 @@ class Publishing(Generic[P]):
             self._put_static()
 
     def _imu(self, event: Imu) -> None:
-        noise = self._imus.get(event.source)
-        self._plain("imu", event, lambda time, each: self._messages.imu(time, each, noise))
+        self._measured("imu", event, self._messages.imu)
+
+    def _fix(self, event: NavSatFix) -> None:
+        """Put where a receiver is, and how fast it moves."""
+        self._measured("fix", event, self._messages.fix)
+        self._plain("fix_velocity", event, self._messages.fix_velocity)
+
+    def _measured(self, kind: TopicKind, event: Event, make: Callable[..., bytearray]) -> None:
+        """Put a measurement by a function that wants to know what its sensor announced."""
+        sensor = self._announced.get((kind, event.source))
+        self._plain(kind, event, lambda time, each: make(time, each, sensor))
 
     def _score(self, event: Score) -> None:
         """Put a number, on a topic of its subject and metric."""

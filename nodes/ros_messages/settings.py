@@ -25,6 +25,8 @@ TopicGroup = Literal[
     "magnetic_fields",
     "fixes",
     "lidar_scans",
+    "wind",
+    "body_poses",
     "clock",
     "paths",
 ]

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from events import (
     Announcement,
+    BodyAnnouncement,
     CameraAnnouncement,
     Odometry,
     PoseEstimate,
     PoseStamped,
+    SensorAnnouncement,
     TransformStamped,
     VehicleAnnouncement,
 )
@@ -20,6 +22,7 @@ from events.poses import Pose, relative
 from events.rotations import inverse, multiply
 from nodes.ros_messages.frame_names import FrameNames
 from nodes.ros_messages.messages import Transform
+from nodes.ros_messages.topics import ros_name
 
 _LINK_IN_OPTICAL = inverse(OPTICAL_TO_FLU)
 
@@ -40,18 +43,20 @@ class Transforms:
         self._starts: dict[str, Pose] = {}
         """By vehicle."""
         self._fixed: dict[tuple[str, str], tuple[str, Pose]] = {}
-        """Vehicle and child to parent and pose; names are given when all are known."""
+        """Vehicle (or sensor) and child to parent and pose; names are given when all are known."""
         self._mounted: dict[str, tuple[str, str, Pose] | None] = {}
         """Optical frame of a camera to source, parent and pose; none if nothing carries it."""
         self._free: dict[str, str] = {}
         """Sources of cameras that nothing carries, to their optical frame."""
+        self._bodies: set[str] = set()
+        """Sources of what moves by itself; each is its frame, too."""
 
     def announced(self, announcement: Announcement) -> None:
         """Add where a vehicle starts, or where a camera is mounted."""
         if isinstance(announcement, VehicleAnnouncement):
             source = announcement.source
             if self._only in {"", source} and source not in self._starts:
-                self._names.add_vehicle(source)
+                self._names.vehicles.add(source)
                 self._starts[source] = announcement.position, announcement.orientation
                 self._fixed[source, "odom"] = "map", self._starts[source]
         elif isinstance(announcement, CameraAnnouncement):
@@ -64,19 +69,27 @@ class Transforms:
                 mounting = announcement.position, announcement.orientation
                 self._mounted[optical] = announcement.source, parent, mounting
 
+        elif isinstance(announcement, SensorAnnouncement):
+            if announcement.frame_id != announcement.parent_frame_id:
+                mounting = announcement.position, announcement.orientation
+                key = announcement.source, announcement.frame_id
+                self._fixed[key] = announcement.parent_frame_id, mounting
+        elif isinstance(announcement, BodyAnnouncement):
+            self._bodies.add(announcement.source)
+
     def add_static(self, event: TransformStamped) -> bool:
         """Add a fixed transform that a node sent; tell whether it is new."""
-        key = self._names.vehicle(event.source), event.child_frame_id
-        if self._names.camera(event.child_frame_id) or key in self._fixed:
+        vehicle, child = self._names.vehicles.of(event.source), event.child_frame_id
+        if self._names.camera(child) or self._is_fixed(vehicle, child):
             return False
-        self._fixed[key] = event.frame_id, (event.translation, event.rotation)
+        self._fixed[vehicle, child] = event.frame_id, (event.translation, event.rotation)
         return True
 
     def static(self) -> list[Transform]:
         """Return all fixed transforms."""
         found = [
-            self._turned(parent, child, pose, vehicle)
-            for (vehicle, child), (parent, pose) in self._fixed.items()
+            self._turned(parent, child, pose, source)
+            for (source, child), (parent, pose) in self._fixed.items()
         ]
         for optical, mounted in self._mounted.items():
             if mounted is not None:
@@ -100,7 +113,12 @@ class Transforms:
         return self._place(event) if event.source == self._body else []
 
     def pose(self, event: PoseStamped) -> list[Transform]:
-        """Return where a free camera is."""
+        """Return where a free camera is, or a body that moves by itself."""
+        if event.source in self._bodies:
+            axes = self._names.axes(event.frame_id)
+            rotation = convert_rotation(axes, "body", event.orientation)
+            place = convert_vector(axes, event.position)
+            return [Transform(event.frame_id, ros_name(event.source), place, rotation)]
         frame_id = self._free.get(event.source)
         if frame_id is None:
             return []
@@ -110,19 +128,26 @@ class Transforms:
     def moving(self, event: TransformStamped) -> list[Transform]:
         """Return a moving transform that a node sent."""
         child = event.child_frame_id
-        fixed = (self._names.vehicle(event.source), child) in self._fixed
+        fixed = self._is_fixed(self._names.vehicles.of(event.source), child)
         if fixed or self._names.camera(child) or child == "base_link":
             return []
         pose = event.translation, event.rotation
         return [self._turned(event.frame_id, child, pose, event.source)]
 
+    def _is_fixed(self, vehicle: str, child: str) -> bool:
+        """Tell whether a frame of a vehicle has its place already."""
+        return any(
+            frame == child and self._names.vehicles.of(source) == vehicle
+            for source, frame in self._fixed
+        )
+
     def _of_body(self, source: str) -> bool:
-        return self._names.vehicle(source) == self._names.vehicle(self._body)
+        return self._names.vehicles.of(source) == self._names.vehicles.of(self._body)
 
     def _place(self, event: Odometry | PoseEstimate) -> list[Transform]:
         parent, child = event.frame_id, event.child_frame_id
-        vehicle = self._names.vehicle(event.source)
-        if (vehicle, child) in self._fixed or self._names.camera(child):
+        vehicle = self._names.vehicles.of(event.source)
+        if self._is_fixed(vehicle, child) or self._names.camera(child):
             return []
         pose, start = (event.position, event.orientation), self._starts.get(vehicle)
         if parent == "map" and start is not None:

@@ -32,7 +32,7 @@ TOPICS = {
     "/drone/camera/pose": "geometry_msgs/msg/PoseStamped",
     "/drone/fix": "sensor_msgs/msg/NavSatFix",
     "/drone/imu": "sensor_msgs/msg/Imu",
-    "/drone/lidar/lidar": "sensor_msgs/msg/PointCloud2",
+    "/drone/lidar/points": "sensor_msgs/msg/PointCloud2",
     "/drone/mag": "sensor_msgs/msg/MagneticField",
     "/drone/odom": "nav_msgs/msg/Odometry",
     "/drone/path": "nav_msgs/msg/Path",
@@ -86,7 +86,12 @@ def test_the_client_decodes_every_topic(seen: tuple[Any, Any, str]) -> None:
     assert heard["/drone/pressure"]["fluid_pressure"] == 1e5
     assert heard["/drone/mag"]["magnetic_field"] == {"x": 1e-5, "y": -2e-5, "z": -3e-5}
     assert heard["/drone/fix"]["latitude"] == 47.0
-    assert [f["name"] for f in heard["/drone/lidar/lidar"]["fields"]] == ["x", "y", "z"]
+    assert [f["name"] for f in heard["/drone/lidar/points"]["fields"]] == [
+        *"xyz",
+        "intensity",
+        "ring",
+        "time",
+    ]
     assert heard["/battery"]["percentage"] == 0.75
     for path in (heard["/drone/path"], heard["/vo/path"]):
         assert path["header"]["frame_id"] == path["poses"][0]["header"]["frame_id"] == "map"

@@ -60,7 +60,7 @@ def valid(type_: str) -> bytes:
             pixels = np.zeros((3, 4, 3), np.uint8)
             return bytes(ImageWriter(store, "f", "rgb8").write((3, 7), pixels))
         case "CameraInfo":
-            return bytes(messages.camera_info((3, 7), samples.camera().info, "f"))
+            return bytes(messages.camera_info((3, 7), samples.camera()))
         case "Imu":
             orientation = make("geometry_msgs/msg/Quaternion")(x=0.0, y=0.0, z=0.0, w=1.0)
             zeros = np.zeros(9)

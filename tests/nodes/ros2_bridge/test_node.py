@@ -141,7 +141,8 @@ def test_further_sensors_paths_and_mappings_of_the_users_own(listener: Listener)
         "0/drone/pressure": 1,
         "0/drone/mag": 1,
         "0/drone/fix": 1,
-        "0/drone/lidar/lidar": 1,
+        "0/drone/vel": 1,
+        "0/drone/lidar/points": 1,
         "0/drone/camera/depth/camera_info": 1,
         "0/drone/camera/depth/image_raw": 1,
         "0/drone/camera/depth/image_raw/compressedDepth": 1,
@@ -180,7 +181,7 @@ def test_a_camera_of_ros_is_waited_for_and_announced(
     type_ = "sensor_msgs/msg/CameraInfo"
     topic = Topic(name="/eye/camera_info", type=type_, hash=samples.store().hash(type_))
     info = samples.camera().info
-    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), info, "eye_optical")
+    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera())
     done = threading.Event()
 
     def publish() -> None:

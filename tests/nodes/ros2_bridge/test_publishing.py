@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from events import Event, Image, PointCloud
+from events import Event, Image, PointCloud, PoseEstimate, TrackedFeatures
 from nodes.ros2_bridge.node import Ros2Bridge
 from runtime.testing import run_node
 from tests.nodes.ros2_bridge.mappings import Battery
@@ -136,6 +136,26 @@ def test_two_vehicles_have_topics_and_frames_of_their_own(bridge: Bridge) -> Non
     assert children == ["drone/base_link", "other/base_link"]
     children = [t.child_frame_id for t in static.read()[-1].transforms]
     assert len(children) == len(set(children)) == 6
+
+
+def test_an_estimate_is_in_the_frames_of_the_vehicle_whose_camera_it_follows(
+    bridge: Bridge,
+) -> None:
+    other = msgspec.structs.replace(samples.vehicle(), source="other")
+    cameras = [samples.camera(), samples.camera("other/camera")]
+    features = TrackedFeatures(
+        stamp=1,
+        source="vo",
+        frame_id="other/camera_optical",
+        points=np.zeros((0, 2), np.float32),
+        inliers=np.zeros(0, np.bool_),
+    )
+    estimate = PoseEstimate(
+        stamp=1, source="vo", position=(0.0, 0.0, 0.0), orientation=(1.0, 0.0, 0.0, 0.0)
+    )
+    session = bridge([samples.vehicle(), other, *cameras, features, estimate])
+    (pose,) = session.on("/vo/pose")
+    assert [message.header.frame_id for message in pose.read()] == ["other/odom"]
 
 
 @pytest.mark.parametrize(

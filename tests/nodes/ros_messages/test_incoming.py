@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from events import (
+    CameraInfo,
     Event,
     Imu,
     Odometry,
@@ -21,7 +22,7 @@ from events import (
 )
 from events.rotations import normalize
 from nodes.ros2_bridge.settings import Subscription
-from nodes.ros_messages.calibration import camera_announcement
+from nodes.ros_messages.calibration import camera_announcement, camera_info
 from nodes.ros_messages.frame_names import FrameNames
 from nodes.ros_messages.incoming import READERS, MessageContext
 from nodes.ros_messages.messages import Messages
@@ -169,11 +170,50 @@ def test_a_pose_becomes_a_place_with_a_heading() -> None:
 
 def test_a_calibration_becomes_an_announcement() -> None:
     names = FrameNames()
-    data = Messages(samples.store(), names).camera_info((0, 0), samples.camera().info, "eye")
+    data = Messages(samples.store(), names).camera_info((0, 0), samples.camera())
     message = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
     found = camera_announcement(message, "ros/eye", ("rgb",))
     assert found.info == samples.camera().info
-    assert (found.source, found.images, found.frame_id) == ("ros/eye", ("rgb",), "eye")
+    assert (found.source, found.images) == ("ros/eye", ("rgb",))
+    assert found.frame_id == "drone/camera_optical"
+
+
+LENSES = [
+    CameraInfo(width=64, height=48, fx=50.0, fy=51.0, cx=31.0, cy=24.0, **lens)
+    for lens in (
+        {"distortion": (-0.3, 0.1, 1e-3, -2e-3, 0.02)},
+        {
+            "distortion_model": "rational_polynomial",
+            "distortion": (0.4, -0.1, 1e-4, 2e-4, 0.02, 0.7, -0.05, 0.01),
+        },
+        {"distortion_model": "equidistant", "distortion": (-0.01, 0.012, -0.008, 0.001)},
+        {"distortion_model": "equidistant", "distortion": (0.0,) * 4},
+    )
+]
+
+
+@pytest.mark.parametrize("info", LENSES, ids=["radtan", "rational", "kb4", "ideal fisheye"])
+def test_each_distortion_goes_to_ros_and_back(info: CameraInfo) -> None:
+    camera = msgspec.structs.replace(samples.camera(), info=info, baseline=0.11)
+    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), camera)
+    message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
+    assert message.distortion_model == info.distortion_model
+    assert message.p[3] == pytest.approx(-50.0 * 0.11)  # as stereo_image_proc reads it
+    found = camera_announcement(message, "eye", ("rgb",))
+    assert found.info == info
+    assert found.baseline == pytest.approx(0.11)
+
+
+def test_coefficients_may_be_as_few_or_as_many_as_calibrators_write() -> None:
+    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera())
+    message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
+    message.d = np.array([-0.3, 0.1, 1e-3, -2e-3])
+    assert camera_info(message).distortion == (-0.3, 0.1, 1e-3, -2e-3, 0.0)
+    message.distortion_model, message.d = "rational_polynomial", np.r_[np.full(8, 0.1), np.zeros(6)]
+    assert camera_info(message).distortion == (0.1,) * 8
+    message.d = np.full(14, 0.1)  # with a thin prism
+    with pytest.raises(ValueError, match=r"rational_polynomial with 8.* coefficients, found"):
+        camera_info(message)
 
 
 def part(width: int, height: int) -> Any:
@@ -182,7 +222,7 @@ def part(width: int, height: int) -> Any:
 
 
 def test_a_calibration_may_name_the_whole_image() -> None:
-    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera().info, "eye")
+    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera())
     message = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
     message.roi, message.binning_x, message.binning_y = part(64, 48), 1, 1
     assert camera_announcement(message, "eye", ("rgb",)).info == samples.camera().info
@@ -225,7 +265,7 @@ def test_optical_axes_stay_as_they_are(frame: str) -> None:
         {"width": 0},
         {"k": np.zeros(9)},
         {"k": np.full(9, np.nan)},
-        {"distortion_model": "equidistant", "d": np.ones(4)},
+        {"distortion_model": "fov", "d": np.ones(1)},
         {"d": np.array([0.1, np.nan, 0.0, 0.0, 0.0])},
         {"d": np.array([0.1, np.inf, 0.0, 0.0, 0.0])},
         {"binning_x": 2, "binning_y": 2},
@@ -234,7 +274,7 @@ def test_optical_axes_stay_as_they_are(frame: str) -> None:
     ],
 )
 def test_a_calibration_that_is_none_is_refused(wrong: dict[str, Any]) -> None:
-    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera().info, "eye")
+    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera())
     message = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
     for field, value in wrong.items():
         setattr(message, field, value)

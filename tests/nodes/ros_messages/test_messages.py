@@ -8,14 +8,18 @@ import numpy as np
 import pytest
 
 from events import (
+    BarometerAnnouncement,
     FluidPressure,
     Imu,
     MagneticField,
+    MagnetometerAnnouncement,
     NavSatFix,
     PoseEstimate,
     PoseStamped,
     Range,
+    RangeAnnouncement,
     Score,
+    Wind,
 )
 from nodes.ros_messages.frame_names import FrameNames
 from nodes.ros_messages.messages import Messages, Transform
@@ -100,7 +104,7 @@ def test_an_estimate_in_odom_is_turned_as_a_body_is(messages: Messages) -> None:
 
 def test_a_calibration_has_k_r_p_and_plumb_bob(messages: Messages) -> None:
     info = samples.camera().info
-    data = messages.camera_info(TIME, info, "drone/camera_optical")
+    data = messages.camera_info(TIME, samples.camera())
     message = read(data, "sensor_msgs/msg/CameraInfo")
     assert message.header.frame_id == "camera_optical_frame"
     assert (message.width, message.height, message.distortion_model) == (64, 48, "plumb_bob")
@@ -119,9 +123,16 @@ def test_transforms_clock_range_and_score_arrive_as_they_are(messages: Messages)
     assert wxyz(got.transform.rotation) == (0.5, 0.5, -0.5, 0.5)
     clock = read(messages.clock(TIME), "rosgraph_msgs/msg/Clock").clock
     assert (clock.sec, clock.nanosec) == TIME
-    distance = Range(stamp=0, source="drone", range=1.5, min_range=0.5, max_range=4.0)
-    message = read(messages.range(TIME, distance), "sensor_msgs/msg/Range")
+    limits: dict[str, Any] = {"min_range": 0.5, "max_range": 4.0}
+    distance = Range(
+        stamp=0, source="drone/down", frame_id="down", range=1.5, field_of_view=0.1, **limits
+    )
+    sensor = RangeAnnouncement(stamp=0, source="drone/down", rate=20.0, noise=0.02, **limits)
+    message = read(messages.range(TIME, distance, sensor), "sensor_msgs/msg/Range")
     assert (message.range, message.min_range, message.max_range) == (1.5, 0.5, 4.0)
+    assert message.header.frame_id == "down"
+    assert message.field_of_view == pytest.approx(0.1)
+    assert message.variance == pytest.approx(4e-4)
     score = Score(stamp=0, source="e", subject="vo", metric="ate", value=0.25, unit="m")
     assert read(messages.score(score), "std_msgs/msg/Float64").data == 0.25
 
@@ -139,7 +150,47 @@ def test_pressure_field_and_fix_are_in_the_bodys_frame_and_axes(messages: Messag
     message = read(messages.fix(TIME, fix), "sensor_msgs/msg/NavSatFix")
     assert (message.latitude, message.longitude, message.altitude) == (47.4, 8.5, 488.0)
     assert (message.status.status, message.status.service) == (0, 1)
-    assert message.position_covariance_type == 0
+    assert message.position_covariance_type == message.COVARIANCE_TYPE_UNKNOWN
+
+
+def test_what_sensors_announce_is_in_their_messages(messages: Messages) -> None:
+    magnetometer = MagnetometerAnnouncement(
+        stamp=0, source="drone/mag", rate=50.0, noise=1e-7, field=(2e-5, 0.0, 4e-5)
+    )
+    field = MagneticField(stamp=0, source="drone/mag", magnetic_field=(2e-5, 1e-6, 4e-5))
+    message = read(
+        messages.magnetic_field(TIME, field, magnetometer), "sensor_msgs/msg/MagneticField"
+    )
+    np.testing.assert_allclose(np.diag(message.magnetic_field_covariance.reshape(3, 3)), 1e-14)
+    pressure = FluidPressure(stamp=0, source="drone/baro", fluid_pressure=101_325.0)
+    barometer = BarometerAnnouncement(
+        stamp=0, source="drone/baro", rate=50.0, frame_id="board", noise=3.0, altitude=0.0
+    )
+    message = read(messages.pressure(TIME, pressure, barometer), "sensor_msgs/msg/FluidPressure")
+    assert message.header.frame_id == "board"
+
+
+def test_a_fix_has_its_covariance_and_velocity_in_enu(messages: Messages) -> None:
+    fix = NavSatFix(
+        stamp=0,
+        source="drone/gps",
+        latitude=47.4,
+        longitude=8.5,
+        altitude=488.0,
+        position_covariance=(1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0),  # north, east, down
+        velocity=(1.0, 2.0, -3.0),
+    )
+    message = read(messages.fix(TIME, fix), "sensor_msgs/msg/NavSatFix")
+    assert message.position_covariance_type == message.COVARIANCE_TYPE_KNOWN
+    np.testing.assert_allclose(
+        message.position_covariance.reshape(3, 3), [[2, 0.1, -0.3], [0.1, 1, -0.2], [-0.3, -0.2, 3]]
+    )
+    message = read(messages.fix_velocity(TIME, fix), "geometry_msgs/msg/TwistStamped")
+    assert message.header.frame_id == "map"
+    assert xyz(message.twist.linear) == (2.0, 1.0, 3.0)
+    wind = Wind(stamp=0, source="drone", velocity=(1.0, 2.0, -3.0))
+    message = read(messages.wind(TIME, wind), "geometry_msgs/msg/Vector3Stamped")
+    assert (message.header.frame_id, xyz(message.vector)) == ("map", (2.0, 1.0, 3.0))
 
 
 def test_a_range_of_humble_has_no_variance() -> None:

@@ -7,7 +7,13 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
-from events import PoseEstimate, PoseStamped, TransformStamped
+from events import (
+    BodyAnnouncement,
+    LidarAnnouncement,
+    PoseEstimate,
+    PoseStamped,
+    TransformStamped,
+)
 from events.poses import pose_matrix
 from nodes.ros_messages.frame_names import FrameNames
 from nodes.ros_messages.messages import Transform
@@ -143,6 +149,58 @@ def test_a_free_camera_moves_in_the_map() -> None:
     np.testing.assert_allclose(lookup(every, "eye_link")[:3, 3], (2, 1, 3))
     optical = lookup(every, "eye_optical_frame")
     np.testing.assert_allclose(optical[:3, 2], (0, 1, 0), atol=1e-12)  # looks north
+
+
+def lidar(source: str) -> LidarAnnouncement:
+    return LidarAnnouncement(
+        stamp=0,
+        source=source,
+        rate=10.0,
+        frame_id=source,
+        position=(0.1, 0.2, -0.3),
+        channels=16,
+        columns=1024,
+        horizontal_fov=6.28,
+        elevations=(-0.3, 0.3),
+        noise=0.0,
+        min_range=0.1,
+        max_range=50.0,
+    )
+
+
+def test_a_sensor_is_where_it_is_mounted() -> None:
+    tree = made(samples.vehicle(), lidar("drone/lidar"))
+    every = tree.static() + tree.odometry(samples.odometry())
+    assert {"odom", "base_link", "lidar"} == {each.child for each in every}
+    np.testing.assert_allclose(lookup(every, "lidar")[:3, 3], (2.6, 0.8, 3.3), atol=1e-12)
+    twice = TransformStamped(
+        stamp=0,
+        source="drone",
+        frame_id="base_link",
+        child_frame_id="drone/lidar",
+        translation=(0.0, 0.0, 0.0),
+        rotation=(1.0, 0.0, 0.0, 0.0),
+        static=True,
+    )
+    assert not tree.add_static(twice)
+    other = msgspec.structs.replace(samples.vehicle(), source="other")
+    tree = made(lidar("drone/lidar"), samples.vehicle(), other, lidar("other/lidar"))
+    assert {each.child: each.parent for each in tree.static() if "lidar" in each.child} == {
+        "drone/lidar": "drone/base_link",
+        "other/lidar": "other/base_link",
+    }
+
+
+def test_a_body_that_moves_by_itself_has_a_frame_in_the_map() -> None:
+    body = BodyAnnouncement(stamp=0, source="world/person", kind="person", object_ids=(3,))
+    tree = made(samples.vehicle(), body)
+    pose = PoseStamped(
+        stamp=1, source="world/person", position=(1.0, 2.0, -3.0), orientation=samples.EAST
+    )
+    (found,) = tree.pose(pose)
+    assert (found.parent, found.child) == ("map", "world/person")
+    assert found.translation == (2.0, 1.0, 3.0)
+    np.testing.assert_allclose(found.rotation, (1, 0, 0, 0), atol=1e-12)
 
 
 def test_no_frame_gets_two_parents() -> None:
