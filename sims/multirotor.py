@@ -10,15 +10,12 @@ import math
 from collections.abc import Iterable
 from typing import Any, Literal
 
-import msgspec
-
 from events import (
     Announcement,
     Collision,
     Command,
     FluidPressure,
     Imu,
-    ImuAnnouncement,
     Odometry,
     PathAnnouncement,
     Setpoint,
@@ -28,7 +25,7 @@ from events import (
 from events.rotations import rotate_inverse
 from runtime import Output, Tick, every, on
 from sims.cameras import add_camera, check_cameras
-from sims.sensors import ImuNoise, SensorOutputs, SensorsConfig, SensorSuite, Truth
+from sims.sensors import SensorOutputs, SensorsConfig, SensorSuite, mount_imu
 from sims.simulator import Rate, Simulator
 from sims.vehicle import (
     STANDING_HEIGHT,
@@ -112,8 +109,8 @@ class Multirotor(Simulator[MultirotorConfig]):
             config.limits,
             setpoint_timeout=config.setpoint_timeout,
         )
-        self._noise = ImuNoise(config.imu, config.imu_rate, self.rng)
-        self._suite = SensorSuite(self, config, SensorOutputs(self.pressures), FRAME, self._truth)
+        outputs = SensorOutputs(self.pressures)
+        self._suite = SensorSuite(self, config, outputs, FRAME, self._physics, self._advance)
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
         self._odometry_stamp = -1
@@ -139,6 +136,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         config = self.config
         world = load_world(config.world, bare=self.checking)
         attach_vehicle(world, self.name, self._start, math.radians(config.yaw))
+        mount_imu(world, self.name, config.imu)
         for camera in config.cameras:
             add_camera(world, f"{self.name}/{FRAME}", camera, f"{self.name}/")
         return world.compile()
@@ -154,13 +152,6 @@ class Multirotor(Simulator[MultirotorConfig]):
             control_rate=self.config.control_rate,
             position=state.position,
             orientation=state.orientation,
-        )
-        yield ImuAnnouncement(
-            stamp=0,
-            source=f"{self.name}/imu",
-            rate=self.config.imu_rate,
-            frame_id=FRAME,
-            **msgspec.structs.asdict(self.config.imu),
         )
         yield from self._suite.announcements()
         yield from super().announce()
@@ -240,18 +231,8 @@ class Multirotor(Simulator[MultirotorConfig]):
     def sample_sensors(self, tick: Tick) -> None:
         """Send an IMU sample and the ground truth, and expose the cameras that this triggers."""
         stamp = self._advance(tick)
-        # Between two steps the acceleration is constant.
-        _, force = self._physics.imu()
         state, qpos, qvel = self._physics.state_at(stamp)
-        rates, force = self._noise.add(state.angular_velocity, force)
-        self.imu.send(
-            Imu(
-                stamp=stamp,
-                source=f"{self.name}/imu",
-                angular_velocity=rates,
-                linear_acceleration=force,
-            )
-        )
+        self.imu.send(self._suite.imu.sample(stamp, state))
         self._send_odometry(stamp, state)
         for camera in self._triggered:
             self.rig.expose(camera, stamp, qpos, qvel)
@@ -265,11 +246,6 @@ class Multirotor(Simulator[MultirotorConfig]):
         state, qpos, qvel = self._physics.state_at(stamp)
         self._send_odometry(stamp, state)
         self.rig.expose(camera, stamp, qpos, qvel)
-
-    def _truth(self, tick: Tick) -> Truth:
-        stamp = self._advance(tick)
-        state, qpos, _ = self._physics.state_at(stamp)
-        return Truth(stamp, state.position, state.orientation, state.velocity, qpos)
 
     def _advance(self, tick: Tick) -> int:
         """Step the physics up to a tick, and return the stamp of the state then.

@@ -6,14 +6,16 @@ when it is due.
 """
 
 from sims.sensors.barometer import Barometer, BarometerSpec
-from sims.sensors.imu import ImuNoise, ImuParameters
+from sims.sensors.imu import ImuModel, ImuNoise, ImuParameters, Vibration
 from sims.sensors.sensor import Sensor, SensorSpec, Truth
 from sims.sensors.settings import SensorsConfig
 from sims.sensors.suite import SensorOutputs, SensorSuite
+from sims.sensors.vehicle_imu import VehicleImu, mount_imu
 
 __all__ = [
     "Barometer",
     "BarometerSpec",
+    "ImuModel",
     "ImuNoise",
     "ImuParameters",
     "Sensor",
@@ -22,4 +24,7 @@ __all__ = [
     "SensorSuite",
     "SensorsConfig",
     "Truth",
+    "VehicleImu",
+    "Vibration",
+    "mount_imu",
 ]

@@ -1,76 +1,159 @@
-"""Noise of an IMU: white noise and a bias that is a random walk. True values are in `physics`."""
+"""An IMU: noise, bias, scale, range, steps and vibration on the true motion of its place."""
 
 from __future__ import annotations
 
+import math
 from math import sqrt
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from events import Vector3
+from events import ImuAnnouncement, Quaternion, Vector3
+from events.rotations import from_rpy, inverse, multiply, rotate, rotate_inverse
+from sims.sensors.sensor import NonNegative
 
 _BLOCK = 512
 """Samples drawn at once: numpy's cost per call is that of a few hundred random numbers."""
 
+Floats = npt.NDArray[np.float64]
 
-class ImuParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Noise of an IMU, named as in `events.ImuAnnouncement`; by default that of a usual MEMS.
+
+class Vibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Vibration of the body by rotors out of balance, at multiples of their true speeds.
+
+    A rotor's force grows with the square of its speed, as its thrust does; it turns in the plane of
+    the rotors at odd multiples, and acts along their axis at even ones. Above half of the IMU's
+    rate it is seen at another frequency, as with a real IMU without a filter.
 
     Attributes:
-        gyroscope_noise_density: White noise of the angular velocity, rad/s/√Hz.
-        gyroscope_random_walk: Random walk of its bias, rad/s²/√Hz.
-        accelerometer_noise_density: White noise of the acceleration, m/s²/√Hz.
-        accelerometer_random_walk: Random walk of its bias, m/s³/√Hz.
+        amplitude: Of the acceleration of each rotor's first harmonic at full thrust, m/s².
+        angular_amplitude: Of the angular velocity there, rad/s.
+        rotor_speed: Speed of a rotor at full thrust, revolutions per second.
+        harmonics: Strength of each multiple of the speed, relative to `amplitude`.
     """
 
-    gyroscope_noise_density: float = 1.7e-4
-    gyroscope_random_walk: float = 2e-5
-    accelerometer_noise_density: float = 2e-3
-    accelerometer_random_walk: float = 3e-3
+    amplitude: NonNegative = 0.0
+    angular_amplitude: NonNegative = 0.0
+    rotor_speed: NonNegative = 130.0
+    harmonics: tuple[NonNegative, ...] = (1.0, 0.5)
+
+
+class ImuParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Errors of an IMU, named as in `events.ImuAnnouncement`; by default the noise of a usual MEMS.
+
+    Attributes:
+        gyroscope_noise_density: White noise of the angular velocity, rad/s/√Hz (AirSim:
+            ``AngularRandomWalk``, in °/√h).
+        gyroscope_random_walk: Random walk of its bias, rad/s²/√Hz (AirSim: ``GyroBiasStability``
+            / √``GyroBiasStabilityTau``).
+        accelerometer_noise_density: White noise of the acceleration, m/s²/√Hz (AirSim:
+            ``VelocityRandomWalk``, in mg/√Hz).
+        accelerometer_random_walk: Random walk of its bias, m/s³/√Hz (AirSim:
+            ``AccelBiasStability`` / √``AccelBiasStabilityTau``).
+        ideal: No errors at all, whatever the other settings say of them.
+        gyroscope_turn_on_bias: Standard deviation of the bias at the start, rad/s.
+        accelerometer_turn_on_bias: Standard deviation of the bias at the start, m/s².
+        gyroscope_scale_error: Standard deviation of each axis' relative error of scale.
+        accelerometer_scale_error: Standard deviation of each axis' relative error of scale.
+        gyroscope_misalignment: Standard deviation of the axes' small angles, rad.
+        accelerometer_misalignment: Standard deviation of the axes' small angles, rad.
+        gyroscope_matrix: Scale and misalignment in place of drawn ones: 9 numbers, row by row.
+        accelerometer_matrix: Scale and misalignment in place of drawn ones: 9 numbers, row by row.
+        g_sensitivity: Angular velocity that an acceleration feigns, rad/s per m/s².
+        gyroscope_range: Greatest angular velocity that it shows, rad/s; 0 is no limit.
+        accelerometer_range: Greatest acceleration that it shows, m/s²; 0 is no limit.
+        gyroscope_resolution: Step of the angular velocity, rad/s; 0 is none.
+        accelerometer_resolution: Step of the acceleration, m/s²; 0 is none.
+        vibration: Vibration by the rotors.
+        sampling: ``instant``: a sample is the motion at its stamp. ``mean``: it is the mean since
+            the sample before, as of IMUs that give delta angles and delta velocities.
+        position: Position on the body, metres forward, right, down of the centre of mass (FRD).
+        orientation: Roll, pitch, yaw in the body's frame, degrees, applied yaw first (Z-Y-X).
+    """
+
+    gyroscope_noise_density: NonNegative = 1.7e-4
+    gyroscope_random_walk: NonNegative = 2e-5
+    accelerometer_noise_density: NonNegative = 2e-3
+    accelerometer_random_walk: NonNegative = 3e-3
+    ideal: bool = False
+    gyroscope_turn_on_bias: NonNegative = 0.0
+    accelerometer_turn_on_bias: NonNegative = 0.0
+    gyroscope_scale_error: NonNegative = 0.0
+    accelerometer_scale_error: NonNegative = 0.0
+    gyroscope_misalignment: NonNegative = 0.0
+    accelerometer_misalignment: NonNegative = 0.0
+    gyroscope_matrix: tuple[float, ...] = ()
+    accelerometer_matrix: tuple[float, ...] = ()
+    g_sensitivity: NonNegative = 0.0
+    gyroscope_range: NonNegative = 0.0
+    accelerometer_range: NonNegative = 0.0
+    gyroscope_resolution: NonNegative = 0.0
+    accelerometer_resolution: NonNegative = 0.0
+    vibration: Vibration = Vibration()
+    sampling: Literal["instant", "mean"] = "instant"
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Vector3 = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for field in ("gyroscope_matrix", "accelerometer_matrix"):
+            if len(getattr(self, field)) not in (0, 9):
+                found = len(getattr(self, field))
+                raise ValueError(f"{field}: expected 9 numbers, row by row, found {found}")
+
+    @property
+    def rotation(self) -> Quaternion:
+        """Rotation from the IMU's frame to the body."""
+        roll, pitch, yaw = (math.radians(angle) for angle in self.orientation)
+        return from_rpy(roll, pitch, yaw)
+
+    @property
+    def mounted(self) -> bool:
+        """Whether it is anywhere but in the body's origin, and its axes."""
+        return any(self.position) or any(self.orientation)
 
 
 class ImuNoise:
     """Adds noise to true samples taken at a fixed rate.
 
-    The continuous model, truth + bias + white noise with the bias a random walk from zero, sampled
-    at intervals dt: standard deviation density/√dt for the noise and random_walk·√dt for each
-    step of the bias (J. Crassidis, *Sigma-point Kalman filtering for integrated GPS and inertial
+    The continuous model, truth + bias + white noise with the bias a random walk, sampled at
+    intervals dt: standard deviation density/√dt for the noise and random_walk·√dt for each step of
+    the bias (J. Crassidis, *Sigma-point Kalman filtering for integrated GPS and inertial
     navigation*, 2006; the same as Kalibr's "IMU noise model").
 
     Args:
         parameters: Parameters of the noise.
         rate: Samples per second.
         generator: Source of the random numbers; equal seeds give equal noise.
+        bias: Bias at the start: rad/s, then m/s², shape (6,).
 
     Raises:
         ValueError: The rate is not positive, or a parameter is negative.
     """
 
     def __init__(
-        self, parameters: ImuParameters, rate: float, generator: np.random.Generator
+        self,
+        parameters: ImuParameters,
+        rate: float,
+        generator: np.random.Generator,
+        bias: Floats | None = None,
     ) -> None:
         if not rate > 0.0:
             raise ValueError(f"rate: expected a number > 0, found {rate}")
-        for field, value in msgspec.structs.asdict(parameters).items():
-            if not value >= 0.0:
-                raise ValueError(f"{field}: expected a number >= 0, found {value}")
+        densities: list[float] = []
+        walks: list[float] = []
+        for sensor in ("gyroscope", "accelerometer"):
+            for field, into in (("noise_density", densities), ("random_walk", walks)):
+                value = getattr(parameters, f"{sensor}_{field}")
+                if not value >= 0.0:
+                    raise ValueError(f"{sensor}_{field}: expected a number >= 0, found {value}")
+                into.append(value)
         root = sqrt(1.0 / rate)
-        self._white = np.repeat(
-            [
-                parameters.gyroscope_noise_density / root,
-                parameters.accelerometer_noise_density / root,
-            ],
-            3,
-        )
-        self._step = np.repeat(
-            [
-                parameters.gyroscope_random_walk * root,
-                parameters.accelerometer_random_walk * root,
-            ],
-            3,
-        )
+        self._white = np.repeat([density / root for density in densities], 3)
+        self._step = np.repeat([walk * root for walk in walks], 3)
         self._generator = generator
-        self._bias = np.zeros(6)
+        self._bias = np.zeros(6) if bias is None else bias
         self._errors: list[list[float]] = []
         self._next = 0
 
@@ -89,9 +172,237 @@ class ImuNoise:
         ax, ay, az = specific_force
         return (wx + ex, wy + ey, wz + ez), (ax + fx, ay + fy, az + fz)
 
+    def errors(self, count: int) -> Floats:
+        """Return the errors of the next samples, rad/s and m/s², shape (count, 6).
+
+        They are drawn in blocks: `add` goes on after the last block that these have begun.
+        """
+        blocks = []
+        for _ in range(-(-count // _BLOCK)):
+            self._draw()
+            blocks.append(self._errors)
+        self._next = len(self._errors)
+        return np.concatenate(blocks)[:count]
+
     def _draw(self) -> None:
         numbers = self._generator.standard_normal((_BLOCK, 12))
         bias = self._bias + np.cumsum(numbers[:, 6:] * self._step, axis=0)
         self._bias = bias[-1]
         self._errors = (numbers[:, :6] * self._white + bias).tolist()
         self._next = 0
+
+
+class ImuModel:
+    """An IMU with all its errors: told the true motion of its place, it returns what it measures.
+
+    Args:
+        parameters: Its settings.
+        rate: Samples per second.
+        noise: Source of the random numbers of its noise.
+        constants: Source of what is drawn once: bias at the start, scale, misalignment, phases.
+    """
+
+    def __init__(
+        self,
+        parameters: ImuParameters,
+        rate: float,
+        noise: np.random.Generator,
+        constants: np.random.Generator,
+    ) -> None:
+        if parameters.ideal:
+            kept = {name: getattr(parameters, name) for name in _NO_ERRORS}
+            kept["vibration"] = msgspec.structs.replace(
+                parameters.vibration, amplitude=0.0, angular_amplitude=0.0
+            )
+            silent = dict.fromkeys(ImuParameters.__struct_fields__[:4], 0.0)
+            parameters = ImuParameters(**{**silent, **kept})
+        self.parameters = p = parameters
+        self._rate = rate
+        drawn = constants.standard_normal((2, 10))
+        self.matrices = [
+            _matrix(given, scale, angle, numbers[1:])
+            for given, scale, angle, numbers in zip(
+                (p.gyroscope_matrix, p.accelerometer_matrix),
+                (p.gyroscope_scale_error, p.accelerometer_scale_error),
+                (p.gyroscope_misalignment, p.accelerometer_misalignment),
+                drawn,
+                strict=True,
+            )
+        ]
+        turn_on = np.repeat([p.gyroscope_turn_on_bias, p.accelerometer_turn_on_bias], 3)
+        self._noise = ImuNoise(p, rate, noise, turn_on * constants.standard_normal(6))
+        self._phases = constants.uniform(0.0, 2.0 * math.pi, 4)
+        self._limits = [
+            (p.gyroscope_range, p.gyroscope_resolution),
+            (p.accelerometer_range, p.accelerometer_resolution),
+        ]
+        self._linear = not p.g_sensitivity and all(np.array_equal(m, _EYE) for m in self.matrices)
+        self._shaken = bool(p.vibration.amplitude or p.vibration.angular_amplitude)
+        self._from_body = inverse(p.rotation)
+
+    def measure(
+        self, angular_velocity: Vector3, specific_force: Vector3, thrusts: Any
+    ) -> tuple[Vector3, Vector3]:
+        """Return the next sample.
+
+        Args:
+            angular_velocity: True, rad/s, in the IMU's frame.
+            specific_force: True, m/s², in the IMU's frame.
+            thrusts: Thrust of each of the four rotors, 0 to 1 of its greatest.
+        """
+        rates, force = angular_velocity, specific_force
+        if self._shaken:
+            rates, force = self._shake(rates, force, thrusts)
+        if not self._linear:
+            gyroscope, accelerometer = self.matrices
+            turned = gyroscope @ rates + self.parameters.g_sensitivity * np.asarray(force)
+            rates, force = _vector(turned), _vector(accelerometer @ force)
+        rates, force = self._noise.add(rates, force)
+        return _limited(rates, *self._limits[0]), _limited(force, *self._limits[1])
+
+    def announcement(self, source: str, body: str, stamp: int = 0) -> ImuAnnouncement:
+        """Return what the IMU will provide.
+
+        Args:
+            source: Its source, and its frame if it is not the body's.
+            body: Frame of the body.
+            stamp: Nanoseconds on the run's clock.
+        """
+        p = self.parameters
+        same = {name: getattr(p, name) for name in _ANNOUNCED}
+        return ImuAnnouncement(
+            stamp=stamp,
+            source=source,
+            rate=self._rate,
+            frame_id=source if p.mounted else body,
+            parent_frame_id=body,
+            orientation=p.rotation,
+            gyroscope_matrix=tuple(self.matrices[0].ravel().tolist()),
+            accelerometer_matrix=tuple(self.matrices[1].ravel().tolist()),
+            vibration=p.vibration.amplitude,
+            averaged=p.sampling == "mean",
+            **same,
+        )
+
+    def _shake(self, rates: Vector3, force: Vector3, thrusts: Any) -> tuple[Vector3, Vector3]:
+        """Add the vibration of the rotors, and turn them on."""
+        vibration = self.parameters.vibration
+        share = np.clip(np.asarray(thrusts, dtype=np.float64), 0.0, None)
+        speeds = vibration.rotor_speed * np.sqrt(share)
+        self._phases = (self._phases + 2.0 * math.pi * speeds / self._rate) % (2.0 * math.pi)
+        total = np.zeros(3)
+        for index, strength in enumerate(vibration.harmonics, start=1):
+            weight = strength * share
+            if self.parameters.sampling == "mean":
+                weight = weight * np.sinc(index * speeds / self._rate)
+            cosine, sine = (
+                weight @ np.cos(index * self._phases),
+                weight @ np.sin(index * self._phases),
+            )
+            total += np.array((cosine, sine, 0.0) if index % 2 else (0.0, 0.0, cosine))
+        x, y, z = rotate(self._from_body, _vector(total))
+        a, b = vibration.angular_amplitude, vibration.amplitude
+        return (
+            (rates[0] + a * x, rates[1] + a * y, rates[2] + a * z),
+            (force[0] + b * x, force[1] + b * y, force[2] + b * z),
+        )
+
+
+class Motion(msgspec.Struct, frozen=True, gc=False):
+    """How an IMU's place moves at an instant.
+
+    Attributes:
+        orientation: Rotation from the IMU's frame to NED.
+        velocity: Metres per second NED.
+    """
+
+    orientation: Quaternion
+    velocity: Vector3
+
+
+def motion_at(
+    parameters: ImuParameters, orientation: Quaternion, velocity: Vector3, rates: Vector3
+) -> Motion:
+    """Return the motion of an IMU's place on a body.
+
+    Args:
+        parameters: Settings of the IMU.
+        orientation: Rotation from the body to NED.
+        velocity: Of the body's origin, metres per second NED.
+        rates: Angular velocity of the body, rad/s in its frame.
+    """
+    lever = rotate(orientation, _cross(rates, parameters.position))
+    x, y, z = (a + b for a, b in zip(velocity, lever, strict=True))
+    return Motion(multiply(orientation, parameters.rotation), (x, y, z))
+
+
+def mean_between(
+    before: Motion, after: Motion, seconds: float, gravity: float
+) -> tuple[Vector3, Vector3]:
+    """Return mean angular velocity and specific force between two instants, in the IMU's frame.
+
+    They are those of a constant angular velocity that leads from one to the other, and of a
+    constant specific force in the frame halfway: integrated so, they give back the motion.
+    """
+    turn = multiply(inverse(before.orientation), after.orientation)
+    w, *axis = turn if turn[0] >= 0.0 else tuple(-x for x in turn)
+    sine = math.hypot(*axis)
+    factor = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
+    wx, wy, wz = (factor * x / seconds for x in axis)
+    half = _half_turn((wx, wy, wz), seconds)
+    ax, ay, az = ((b - a) / seconds for a, b in zip(before.velocity, after.velocity, strict=True))
+    return (wx, wy, wz), rotate_inverse(multiply(before.orientation, half), (ax, ay, az - gravity))
+
+
+_EYE = np.eye(3)
+_NO_ERRORS = ("sampling", "position", "orientation")
+_ANNOUNCED = (
+    "gyroscope_noise_density",
+    "gyroscope_random_walk",
+    "accelerometer_noise_density",
+    "accelerometer_random_walk",
+    "gyroscope_turn_on_bias",
+    "accelerometer_turn_on_bias",
+    "g_sensitivity",
+    "gyroscope_range",
+    "accelerometer_range",
+    "gyroscope_resolution",
+    "accelerometer_resolution",
+    "position",
+)
+
+
+def _half_turn(rates: Vector3, seconds: float) -> Quaternion:
+    """Return the rotation by half of rates · seconds."""
+    angle = math.hypot(*rates) * seconds / 2.0
+    scale = seconds / 4.0 * (math.sin(angle / 2.0) / (angle / 2.0) if angle > 1e-12 else 1.0)
+    x, y, z = (scale * rate for rate in rates)
+    return (math.cos(angle / 2.0), x, y, z)
+
+
+def _matrix(given: tuple[float, ...], scale: float, angle: float, numbers: Floats) -> Floats:
+    """Return scale and misalignment: as given, or of 9 normal numbers."""
+    if given:
+        return np.array(given).reshape(3, 3)
+    drawn = numbers.reshape(3, 3) * (angle * (1.0 - _EYE) + scale * _EYE)
+    return np.asarray(_EYE + drawn)
+
+
+def _limited(vector: Vector3, limit: float, step: float) -> Vector3:
+    """Return a vector in whole steps, cut off at a limit; 0 is no limit or no step."""
+    if step:
+        x, y, z = (round(value / step) * step for value in vector)
+        vector = (x, y, z)
+    if limit:
+        x, y, z = (min(max(value, -limit), limit) for value in vector)
+        vector = (x, y, z)
+    return vector
+
+
+def _cross(a: Vector3, b: Vector3) -> Vector3:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def _vector(array: Any) -> Vector3:
+    x, y, z = array.tolist()
+    return (x, y, z)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from abc import ABC, abstractmethod
 from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -140,3 +141,9 @@ class GaussMarkov:
         """Return the next values, shape (size,)."""
         self.value = self._keep * self.value + self._input * random.standard_normal(len(self.value))
         return self.value
+
+
+def generator_of(parent: np.random.Generator, name: str) -> np.random.Generator:
+    """Return a generator that depends on a node's and a sensor's name; the parent's stays."""
+    entropy = parent.bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
+    return np.random.default_rng([*entropy, zlib.crc32(name.encode())])

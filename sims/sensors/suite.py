@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import functools
-import zlib
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from events import (
+    Announcement,
     Event,
     FluidPressure,
-    SensorAnnouncement,
     TransformStamped,
 )
 from runtime import Node, Tick
 from runtime.sender import Sender
 from sims.sensors.barometer import Barometer
-from sims.sensors.sensor import Place, Sensor, Truth
+from sims.sensors.sensor import Place, Sensor, Truth, generator_of
 from sims.sensors.settings import SensorsConfig
+from sims.sensors.vehicle_imu import VehicleImu
+from sims.vehicle import Physics
 
 
 class SensorOutputs(msgspec.Struct, frozen=True):
@@ -30,7 +30,7 @@ class SensorOutputs(msgspec.Struct, frozen=True):
 
 
 class SensorSuite:
-    """All sensors of one body but its cameras and its IMU.
+    """All sensors of one vehicle but its cameras.
 
     Every measurement has the stamp of the state that it is of, and is sent `latency` later. A
     sensor's random numbers depend on the run's seed, its node's name and its own only.
@@ -40,7 +40,8 @@ class SensorSuite:
         config: Their settings.
         outputs: Where the events go.
         frame_id: Frame of the body.
-        truth: Returns what is true at a tick.
+        physics: The vehicle, in a world that `mount_imu` has seen.
+        advance: Steps the physics up to a tick, and returns the stamp of the state then.
     """
 
     def __init__(
@@ -49,11 +50,15 @@ class SensorSuite:
         config: SensorsConfig,
         outputs: SensorOutputs,
         frame_id: str,
-        truth: Callable[[Tick], Truth],
+        physics: Physics,
+        advance: Callable[[Tick], int],
     ) -> None:
         self._node = node
         self._outputs = outputs
-        self._truth = truth
+        self._physics = physics
+        self._advance = advance
+        self.imu = VehicleImu(node, config, physics, frame_id)
+        """The IMU, whose samples the vehicle's node takes and sends itself."""
 
         def make(model: type[Sensor[Any]], spec: Any, name: str) -> Sensor[Any]:
             place = Place(f"{node.name}/{name}", frame_id, config.origin)
@@ -71,12 +76,15 @@ class SensorSuite:
             measure = functools.partial(self._measure, sensor)
             self._node.every(sensor.spec.rate, measure, sensor.source.partition("/")[2])
 
-    def announcements(self) -> Iterable[SensorAnnouncement]:
+    def announcements(self) -> Iterable[Announcement]:
         """Return the announcements of the sensors."""
-        return (sensor.announcement() for sensor in self.sensors)
+        yield self.imu.announcement()
+        for sensor in self.sensors:
+            yield sensor.announcement()
 
     def transforms(self) -> Iterable[TransformStamped]:
         """Return the pose of each sensor's frame in the body's, constant for the run."""
+        yield from self.imu.transforms(self._node.clock.now())
         for sensor in self.sensors:
             yield TransformStamped(
                 stamp=self._node.clock.now(),
@@ -90,7 +98,10 @@ class SensorSuite:
 
     def _measure(self, sensor: Sensor[Any], tick: Tick) -> None:
         if tick.stamp >= sensor.spec.startup_delay * 1e9:
-            self._send_later(sensor, sensor.measure(self._truth(tick)))
+            stamp = self._advance(tick)
+            state, qpos, _ = self._physics.state_at(stamp)
+            truth = Truth(stamp, state.position, state.orientation, state.velocity, qpos)
+            self._send_later(sensor, sensor.measure(truth))
 
     def _send_later(self, sensor: Sensor[Any], event: Event) -> None:
         send = getattr(self._outputs, sensor.port).send
@@ -103,9 +114,3 @@ class SensorSuite:
             send(event)
 
         self._node.start(wait())
-
-
-def generator_of(parent: np.random.Generator, name: str) -> np.random.Generator:
-    """Return a generator that depends on a node's and a sensor's name; the parent's stays."""
-    entropy = parent.bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
-    return np.random.default_rng([*entropy, zlib.crc32(name.encode())])

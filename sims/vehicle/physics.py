@@ -77,12 +77,15 @@ class Physics:
         joint = model.joint(f"{name}/free")
         pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
         motor = model.actuator(f"{name}/motor1").id
+        thrust = int(model.actuator(f"{name}/motor1").actadr[0])
         sensor = int(model.sensor(f"{name}/gyroscope").adr[0])
         # Views on MuJoCo's own memory; `tolist` makes plain floats of them in one C call each.
         self._of_pose, self._of_twist = slice(pose, pose + 7), slice(twist, twist + 6)
         self._pose = self.data.qpos[self._of_pose]
         self._twist = self.data.qvel[self._of_twist]
         self._motors = self.data.ctrl[motor : motor + 4]
+        self.thrusts = self.data.act[thrust : thrust + 4]
+        """Thrust of each rotor, 0 to 1 of its greatest; present values, not to be written to."""
         self._imu = self.data.sensordata[sensor : sensor + 6]
 
     @property
@@ -126,7 +129,8 @@ class Physics:
     def imu(self) -> tuple[Vector3, Vector3]:
         """Return the true angular velocity (rad/s, FRD) and specific force (m/s², FRD).
 
-        Measured at the centre of mass. At rest the specific force is (0, 0, -9.81).
+        Measured at the vehicle's site `imu`, which is the centre of mass unless it was moved. At
+        rest the specific force is (0, 0, -9.81).
         """
         self.simulation.refresh()
         wx, wy, wz, ax, ay, az = self._imu.tolist()

@@ -1,12 +1,20 @@
-"""IMU noise: as large as its data sheet says, growing as it should, and the same for a seed."""
+"""The IMU: noise as large as its data sheet says, and each error of its own kind."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from sims.sensors import ImuNoise, ImuParameters
+from events.rotations import from_rpy, multiply, rotate
+from sims.sensors import ImuModel, ImuNoise, ImuParameters, Vibration
+from sims.sensors.imu import Motion, mean_between, motion_at
 
 REST = ((0.0, 0.0, 0.0), (0.0, 0.0, -9.81))
 RATE = 200.0
@@ -20,7 +28,7 @@ def samples(noise: ImuNoise, count: int) -> npt.NDArray[np.float64]:
     return np.asarray(measured - truth)
 
 
-def noise_of(seed: int = 0, **parameters: float) -> ImuNoise:
+def noise_of(seed: int = 0, **parameters: Any) -> ImuNoise:
     return ImuNoise(ImuParameters(**parameters), RATE, np.random.default_rng(seed))
 
 
@@ -83,3 +91,217 @@ def test_impossible_noise_is_refused_by_name() -> None:
         noise_of(gyroscope_random_walk=-1.0)
     with pytest.raises(ValueError, match="rate"):
         ImuNoise(ImuParameters(), 0.0, np.random.default_rng())
+
+
+HOVER = (0.45, 0.45, 0.45, 0.45)
+
+
+def model_of(seed: int = 0, rate: float = RATE, **parameters: Any) -> ImuModel:
+    """Return an IMU without noise, but with the errors asked for."""
+    silent = dict.fromkeys(ImuParameters.__struct_fields__[:4], 0.0)
+    noise, constants = np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1])
+    return ImuModel(ImuParameters(**(silent | parameters)), rate, noise, constants)
+
+
+def taken(model: ImuModel, count: int) -> npt.NDArray[np.float64]:
+    rows = [
+        (*rates, *force) for rates, force in (model.measure(*REST, HOVER) for _ in range(count))
+    ]
+    return np.array(rows)
+
+
+def allan_variances(
+    values: npt.NDArray[np.float64], sizes: npt.NDArray[np.int64]
+) -> npt.NDArray[np.float64]:
+    """Return overlapping Allan variances, shape (sizes, 6), of samples, shape (n, 6)."""
+    total = np.vstack([np.zeros(6), np.cumsum(values, axis=0)])
+    found = []
+    for size in sizes:
+        means = (total[size:] - total[:-size]) / size
+        found.append(0.5 * np.mean((means[size:] - means[:-size]) ** 2, axis=0))
+    return np.array(found)
+
+
+def densities_of(values: npt.NDArray[np.float64], rate: float) -> npt.NDArray[np.float64]:
+    """Return noise density and random walk of gyroscope and accelerometer, shape (2, 2).
+
+    Fits N²/τ + K² τ/3 (IEEE Std 952, annex C) to their Allan variances, whose relative error
+    grows with √τ.
+    """
+    sizes = np.unique(np.geomspace(2, 50 * rate, 24).astype(np.int64))
+    variances = allan_variances(values, sizes).reshape(-1, 2, 3).mean(axis=2)
+    seconds = sizes / rate
+    squared = []
+    for sensor in range(2):
+        weight = 1.0 / (variances[:, sensor] * np.sqrt(seconds))
+        terms = np.column_stack([1.0 / seconds, seconds / 3.0]) * weight[:, None]
+        squared.append(np.linalg.lstsq(terms, variances[:, sensor] * weight, rcond=None)[0])
+    return np.sqrt(squared)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_allan_deviation_gives_the_announced_numbers(seed: int) -> None:
+    rate = 50.0
+    noise = ImuNoise(ImuParameters(), rate, np.random.default_rng(seed))
+    announced = model_of(rate=rate, **_noise_fields(ImuParameters())).announcement("a", "b")
+    expected = [
+        [announced.gyroscope_noise_density, announced.gyroscope_random_walk],
+        [announced.accelerometer_noise_density, announced.accelerometer_random_walk],
+    ]
+    found = densities_of(noise.errors(int(4 * 3600 * rate)), rate)
+    np.testing.assert_allclose(found, expected, rtol=0.1)
+
+
+def test_an_imu_that_is_worse_than_announced_is_found_by_its_allan_deviation() -> None:
+    worse = ImuParameters(gyroscope_noise_density=2.1e-4)
+    found = densities_of(ImuNoise(worse, 50.0, np.random.default_rng(1)).errors(360_000), 50.0)
+    assert found[0, 0] > 1.1 * ImuParameters().gyroscope_noise_density
+
+
+def _noise_fields(parameters: ImuParameters) -> dict[str, Any]:
+    return {name: getattr(parameters, name) for name in ImuParameters.__struct_fields__[:4]}
+
+
+def test_an_ideal_imu_tells_the_truth_whatever_else_its_settings_say() -> None:
+    worst = ImuParameters(
+        ideal=True,
+        gyroscope_turn_on_bias=1.0,
+        accelerometer_scale_error=0.5,
+        g_sensitivity=1.0,
+        gyroscope_range=0.1,
+        accelerometer_resolution=1.0,
+        vibration=Vibration(amplitude=9.0),
+        sampling="mean",
+    )
+    model = ImuModel(worst, RATE, np.random.default_rng(0), np.random.default_rng(1))
+    assert model.measure((1.0, 2.0, 3.0), (4.0, 5.0, 6.5), HOVER) == ((1, 2, 3), (4, 5, 6.5))
+    announced = model.announcement("drone/imu", "base_link")
+    assert announced.averaged
+    assert announced.gyroscope_noise_density == announced.vibration == 0.0
+    assert announced.gyroscope_range == announced.gyroscope_turn_on_bias == 0.0
+
+
+def test_the_bias_at_the_start_is_drawn_once_with_its_deviation() -> None:
+    starts = []
+    for seed in range(300):
+        rows = taken(model_of(seed, gyroscope_turn_on_bias=0.02, accelerometer_turn_on_bias=0.3), 3)
+        np.testing.assert_array_equal(rows[0], rows[2])
+        starts.append(rows[0] - (0, 0, 0, 0, 0, -9.81))
+    spread = np.std(starts, axis=0)
+    np.testing.assert_allclose(spread, np.repeat([0.02, 0.3], 3), rtol=0.15)
+
+
+def test_the_matrix_is_the_announced_one() -> None:
+    model = model_of(gyroscope_scale_error=0.01, accelerometer_misalignment=0.02)
+    announced = model.announcement("drone/imu", "base_link")
+    gyroscope, accelerometer = (
+        np.reshape(m, (3, 3)) for m in (announced.gyroscope_matrix, announced.accelerometer_matrix)
+    )
+    rates, force = model.measure((1.0, -2.0, 3.0), (4.0, 5.0, -6.0), HOVER)
+    np.testing.assert_allclose(rates, gyroscope @ (1.0, -2.0, 3.0))
+    np.testing.assert_allclose(force, accelerometer @ (4.0, 5.0, -6.0))
+    assert np.count_nonzero(gyroscope - np.diag(np.diag(gyroscope))) == 0
+    np.testing.assert_array_equal(np.diag(accelerometer), 1.0)
+    assert 0.0 < np.abs(accelerometer - np.eye(3)).max() < 0.1
+
+
+def test_given_matrices_are_used_and_must_have_nine_numbers() -> None:
+    turned = (0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 2.0)
+    model = model_of(gyroscope_matrix=turned, gyroscope_scale_error=0.5)
+    assert model.measure((1.0, 2.0, 3.0), REST[1], HOVER)[0] == (2.0, -1.0, 6.0)
+    with pytest.raises(ValueError, match=r"accelerometer_matrix: expected 9 numbers.*found 3"):
+        ImuParameters(accelerometer_matrix=(1.0, 2.0, 3.0))
+
+
+def test_an_acceleration_feigns_a_turn() -> None:
+    rates, _ = model_of(g_sensitivity=1e-3).measure((0.0, 0.0, 0.0), (1.0, 2.0, -9.0), HOVER)
+    assert rates == pytest.approx((1e-3, 2e-3, -9e-3))
+
+
+@given(value=st.floats(-50, 50), limit=st.floats(0.5, 40), step=st.floats(1e-4, 0.4))
+def test_it_shows_whole_steps_up_to_its_range(value: float, limit: float, step: float) -> None:
+    model = model_of(accelerometer_range=limit, accelerometer_resolution=step)
+    _, (x, _, _) = model.measure((0.0, 0.0, 0.0), (value, 0.0, 0.0), HOVER)
+    assert abs(x) <= limit
+    if abs(x) < limit:
+        assert abs(x - value) <= step * 0.500001
+        assert x / step == pytest.approx(round(x / step), abs=1e-6)
+    else:
+        assert abs(value) >= limit - 0.500001 * step
+
+
+def test_vibration_is_at_multiples_of_the_rotors_speed_and_as_strong_as_its_square() -> None:
+    """At 2/9 of the thrust a rotor of 130 revolutions a second turns with 61.3."""
+    shaken = Vibration(amplitude=2.0, rotor_speed=130.0, harmonics=(1.0, 0.5))
+    model = model_of(rate=1000.0, vibration=shaken)
+    thrusts = (2 / 9, 0.0, 0.0, 0.0)
+    rows = np.array([model.measure(*REST, thrusts)[1] for _ in range(4000)])
+    spectrum = np.abs(np.fft.rfft(rows - rows.mean(axis=0), axis=0)) / 2000.0
+    frequency = np.fft.rfftfreq(4000, 1e-3)
+    expected = 130.0 * math.sqrt(2 / 9)
+    assert frequency[spectrum[:, 0].argmax()] == pytest.approx(expected, abs=0.3)
+    assert frequency[spectrum[:, 2].argmax()] == pytest.approx(2 * expected, abs=0.3)
+    assert np.ptp(rows[:, 0]) / 2 == pytest.approx(2.0 * 2 / 9, rel=0.01)
+    assert np.ptp(rows[:, 2]) / 2 == pytest.approx(0.5 * 2.0 * 2 / 9, rel=0.02)
+    np.testing.assert_array_equal(
+        [model.measure(*REST, (0.0,) * 4)[1] for _ in range(3)], [REST[1]] * 3
+    )
+
+
+def test_mean_samples_filter_vibration() -> None:
+    """A sinc of frequency over rate: a rotor that turns once a period leaves no trace."""
+    shaken = Vibration(amplitude=2.0, rotor_speed=100.0, harmonics=(1.0,))
+    thrusts = (1.0, 0.0, 0.0, 0.0)
+    for rate, share in ((100.0, 0.0), (400.0, np.sinc(0.25))):
+        model = model_of(rate=rate, vibration=shaken, sampling="mean")
+        rows = np.array([model.measure(*REST, thrusts)[1] for _ in range(400)])
+        assert np.hypot(rows[:, 0], rows[:, 1]).max() == pytest.approx(2.0 * share, abs=1e-9)
+
+
+@given(
+    angles=st.tuples(*[st.floats(-3, 3)] * 3),
+    turn=st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+    velocities=st.tuples(*[st.floats(-9, 9)] * 6),
+)
+def test_mean_samples_integrate_to_the_very_motion(
+    angles: tuple[float, ...], turn: tuple[float, ...], velocities: tuple[float, ...]
+) -> None:
+    """Turning by rates · dt gives the later orientation, and the force halfway the velocity."""
+    start = from_rpy(*angles)
+    half = _turn(tuple(x / 2 for x in turn))
+    before = Motion(start, velocities[:3])  # type: ignore[arg-type]
+    after = Motion(multiply(start, multiply(half, half)), velocities[3:])  # type: ignore[arg-type]
+    rates, force = mean_between(before, after, 0.005, 9.81)
+    np.testing.assert_allclose(np.multiply(rates, 0.005), turn, atol=1e-12)
+    halfway = multiply(start, half)
+    gained = np.multiply(np.add(rotate(halfway, force), (0.0, 0.0, 9.81)), 0.005)
+    np.testing.assert_allclose(gained, np.subtract(after.velocity, before.velocity), atol=1e-12)
+
+
+def _turn(vector: tuple[float, ...]) -> tuple[float, float, float, float]:
+    angle = math.hypot(*vector)
+    scale = math.sin(angle / 2) / angle if angle else 0.5
+    x, y, z = (scale * v for v in vector)
+    return (math.cos(angle / 2), x, y, z)
+
+
+def test_an_imu_off_the_centre_moves_with_the_body() -> None:
+    """Turning right at 2 rad/s, a place 0.5 m ahead moves to the right."""
+    parameters = ImuParameters(position=(0.5, 0.0, 0.0), orientation=(0.0, 0.0, 90.0))
+    motion = motion_at(parameters, (1.0, 0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (0.0, 0.0, 2.0))
+    assert motion.velocity == pytest.approx((3.0, 1.0, 0.0))
+    assert rotate(motion.orientation, (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0))
+
+
+def test_defaults_are_the_noise_alone() -> None:
+    """What was drawn before there were other errors is drawn still, to the bit."""
+    noise = ImuNoise(ImuParameters(), RATE, np.random.default_rng(3))
+    model = ImuModel(ImuParameters(), RATE, np.random.default_rng(3), np.random.default_rng(9))
+    for _ in range(600):
+        assert model.measure(*REST, HOVER) == noise.add(*REST)
+
+
+def test_settings_survive_a_file() -> None:
+    parameters = ImuParameters(vibration=Vibration(amplitude=1.0), sampling="mean")
+    again = msgspec.json.decode(msgspec.json.encode(parameters), type=ImuParameters)
+    assert again == parameters
