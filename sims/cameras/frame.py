@@ -18,6 +18,9 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         stamp: Nanoseconds on the run's clock: the instant of exposure.
         position: The optical frame's origin, metres in ``map`` (NED).
         orientation: Rotation from the optical frame to ``map``.
+        exposure: Seconds that the shutter was open.
+        gain: Factor of the amplifier.
+        light: Mean light of the image, if it is metered (`Development.meter`).
         rgb: uint8, shape (height, width, 3).
         grey: uint8, shape (height, width).
         depth: float32 metres along the optical z axis, shape (height, width); ``inf`` where
@@ -29,6 +32,9 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     stamp: int
     position: Vector3
     orientation: Quaternion
+    exposure: float = 0.0
+    gain: float = 1.0
+    light: float | None = None
     rgb: npt.NDArray[np.uint8] | None = None
     grey: npt.NDArray[np.uint8] | None = None
     depth: npt.NDArray[np.float32] | None = None

@@ -35,8 +35,15 @@ def noisy_image(
     """Return the image plus Gaussian noise of `sigma` grey levels, clipped to 0..255."""
     if sigma <= 0.0:
         return image
-    noise = _look_up(_steps(sigma), _draw(image.shape, random))
+    noise = noise_steps(image.shape, sigma, 255, random)
     return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def noise_steps(
+    shape: tuple[int, ...], sigma: float, limit: int, random: np.random.Generator
+) -> npt.NDArray[np.int16]:
+    """Return Gaussian noise in whole numbers, none beyond a limit (at most 32767) either way."""
+    return _look_up(_steps(sigma, limit), _draw(shape, random))
 
 
 def noisy_depth(
@@ -85,7 +92,7 @@ def _quantiles() -> npt.NDArray[np.float32]:
 
 
 @functools.lru_cache(maxsize=16)
-def _steps(sigma: float) -> npt.NDArray[np.int16]:
-    """Return the same in whole grey levels. More than 255 make no difference to an image."""
-    levels = np.clip(np.rint(sigma * _quantiles()), -255, 255)
+def _steps(sigma: float, limit: int) -> npt.NDArray[np.int16]:
+    """Return the same, times sigma, in whole numbers up to a limit."""
+    levels = np.clip(np.rint(sigma * _quantiles()), -limit, limit)
     return np.asarray(levels, dtype=np.int16)

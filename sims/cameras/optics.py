@@ -1,14 +1,19 @@
-"""Effects of lens and shutter on an image. Those of the sensor are in `sims.cameras.noise`."""
+"""Effects of lens and shutter on the light of an image.
+
+What the image sensor makes of it is in `sims.cameras.development`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-Image = npt.NDArray[np.uint8]
+Image = npt.NDArray[np.uint16]
+"""Codes of linear light, shape (height, width, 3) or (height, width)."""
 
 MOST = 9
 """Renderings of one exposure, at most: each costs as much as an image without motion blur."""
@@ -18,7 +23,7 @@ def defocused(image: Image, sigma: float) -> Image:
     """Return the image seen through a lens whose point spread is a Gaussian of `sigma` pixels."""
     if sigma <= 0.0:
         return image
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.uint8)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.uint16)
 
 
 def moments(exposure: float, shift: float) -> list[float]:
@@ -36,9 +41,11 @@ def moments(exposure: float, shift: float) -> list[float]:
     return [exposure * ((k + 0.5) / count - 0.5) for k in range(count)]
 
 
-def mean(images: list[Image]) -> Image:
+def mean(images: Sequence[Image]) -> Image:
     """Return the mean of images of one shape, rounded."""
-    total = np.zeros(images[0].shape, np.uint16)
+    if len(images) == 1:
+        return images[0]
+    total = np.zeros(images[0].shape, np.uint32)
     for image in images:
         total += image
-    return ((total + len(images) // 2) // len(images)).astype(np.uint8)
+    return np.asarray((total + len(images) // 2) // len(images), dtype=images[0].dtype)

@@ -17,9 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Quaternion, Vector3
+from sims.cameras.development import Development
 from sims.cameras.frame import Frame
-from sims.cameras.noise import generator, grey_of, noisy_depth, noisy_image
-from sims.cameras.optics import defocused, mean, moments
+from sims.cameras.noise import generator, grey_of, noisy_depth
+from sims.cameras.optics import moments
 from sims.cameras.shot import Shot
 from sims.cameras.spec import CameraSpec, camera_info
 from sims.cameras.stage import NEAR, RANGE, Colours, Depths, Floats, Stage
@@ -87,6 +88,7 @@ class CameraRenderer:
         self._model = model
         self._seed = seed
         self._cameras = {spec.name: (spec, _number(model, prefix + spec.name)) for spec in cameras}
+        self._developments = {spec.name: Development(spec) for spec in cameras}
         width = max((spec.width for spec in cameras), default=1)
         height = max((spec.height for spec in cameras), default=1)
         self._stage = Stage(model, width, height, threads)
@@ -99,7 +101,12 @@ class CameraRenderer:
         qvel: Floats | None = None,
     ) -> dict[str, Frame]:
         """Expose some cameras at one state: `expose`, with a frame for each name."""
-        frames = self.expose(tuple(Shot(name, stamp_ns, qpos, qvel) for name in names))
+        shots = []
+        for name in names:
+            spec, _ = self._cameras[name]
+            exposure = float(spec.reference_exposure if spec.auto_exposure else spec.exposure)
+            shots.append(Shot(name, stamp_ns, qpos, qvel, exposure=exposure, gain=spec.gain))
+        frames = self.expose(tuple(shots))
         return dict(zip(names, frames, strict=True))
 
     def expose(self, shots: tuple[Shot, ...]) -> tuple[Frame, ...]:
@@ -133,7 +140,7 @@ class CameraRenderer:
         """Draw what falls on the sensor, at each of the moments that make up the exposure."""
         kinds, stage, size = set(spec.images), self._stage, (spec.height, spec.width)
         coloured = not kinds.isdisjoint({"rgb", "grey"})
-        blurred = coloured and spec.exposure > 0.0 and shot.moves()
+        blurred = coloured and shot.exposure > 0.0 and shot.moves()
         self._look(shot, spec, number, 0.0)
         pose = stage.pose(number)
         middle, depth = stage.colour_and_depth(size, coloured, "depth" in kinds or blurred)
@@ -142,7 +149,7 @@ class CameraRenderer:
         if blurred and middle is not None and depth is not None:
             shift = self._shift(shot, spec, number, depth)
             colours = []
-            for moment in moments(spec.exposure, shift):
+            for moment in moments(shot.exposure, shift):
                 if moment == 0.0:
                     colours.append(middle)
                     continue
@@ -155,12 +162,16 @@ class CameraRenderer:
     def _develop(self, shot: Shot, spec: CameraSpec, captured: Captured) -> Frame:
         """Make of what was drawn the images that the sensor gives."""
         random = generator(self._seed, spec.name, shot.stamp)
-        rgb = grey = None
+        development, exposure, gain = self._developments[spec.name], shot.exposure, shot.gain
+        rgb = grey = light = None
         if captured.colours:
-            rgb = defocused(mean(captured.colours), spec.blur)
             if "grey" in spec.images:
-                grey = noisy_image(grey_of(rgb), spec.noise, random)
-            rgb = noisy_image(rgb, spec.noise, random) if "rgb" in spec.images else None
+                greys = [grey_of(image) for image in captured.colours]
+                grey = development.develop(greys, random, exposure, gain)
+            if "rgb" in spec.images:
+                rgb = development.develop(captured.colours, random, exposure, gain)
+            if spec.auto_exposure and (seen := grey if rgb is None else rgb) is not None:
+                light = development.meter(seen)
         depth = captured.depth
         if depth is not None:
             depth = noisy_depth(depth, spec.depth_noise, random)
@@ -169,6 +180,9 @@ class CameraRenderer:
             stamp=shot.stamp,
             position=position,
             orientation=orientation,
+            exposure=exposure,
+            gain=gain,
+            light=light,
             rgb=rgb,
             grey=grey,
             depth=depth,
@@ -183,7 +197,8 @@ class CameraRenderer:
     def _shift(self, shot: Shot, spec: CameraSpec, number: int, depth: Depths) -> float:
         """Return the approximate motion of the image while the shutter is open, pixels."""
         poses = []
-        for moment in (-0.5 * spec.exposure, 0.5 * spec.exposure):
+        half = 0.5 * (shot.exposure)
+        for moment in (-half, half):
             self._look(shot, spec, number, moment)
             poses.append(self._stage.pose(number))
         (here, turn), (there, other) = poses

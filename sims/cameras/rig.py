@@ -25,6 +25,7 @@ from events import (
 from runtime import Node, Worker
 from runtime.sender import Sender
 from sims.cameras.delivery import delay_of
+from sims.cameras.exposure import ExposureControl
 from sims.cameras.frame import Frame
 from sims.cameras.renderer import CameraRenderer, model_to_bytes
 from sims.cameras.shot import Shot
@@ -42,11 +43,9 @@ class CameraOutputs(msgspec.Struct, frozen=True):
 
 class _Exposure(NamedTuple):
     spec: CameraSpec
-    stamp: int
+    shot: Shot
     due: int
     """Time of delivery (ns), unless that of the exposure before is later."""
-    qpos: npt.NDArray[np.float64]
-    qvel: npt.NDArray[np.float64] | None
 
 
 class CameraRig:
@@ -81,6 +80,11 @@ class CameraRig:
         self._seed = 0
         self._last: dict[str, asyncio.Future[None]] = {}
         self._in_flight = dict.fromkeys(self._specs, 0)
+        self._controls = {
+            spec.name: ExposureControl(spec.auto_exposure, float(spec.reference_exposure))
+            for spec in specs
+            if spec.auto_exposure is not None
+        }
         self.lost = dict.fromkeys(self._specs, 0)
         """Exposures not delivered because a camera's settings ask for that."""
         self.skipped = dict.fromkeys(self._specs, 0)
@@ -152,6 +156,11 @@ class CameraRig:
             qvel: Its velocity, shape (nv,), for motion blur; not copied. None: at rest.
         """
         spec = self._specs[camera]
+        exposure, gain = float(spec.exposure), spec.gain
+        if camera in self._controls:
+            opens = stamp - round(spec.longest_exposure / 2.0 * 1e9)
+            exposure, gain = self._controls[camera].next(opens)
+        shot = Shot(camera, stamp, qpos, qvel, exposure=exposure, gain=gain)
         delay = delay_of(spec, self._seed, stamp)
         if delay is None:
             self.lost[camera] += 1
@@ -165,8 +174,8 @@ class CameraRig:
         done = asyncio.get_running_loop().create_future()
         before = self._last.get(camera)
         self._last[camera] = done
-        exposure = _Exposure(spec, stamp, stamp + round(delay * 1e9), qpos, qvel)
-        self._node.start(self._deliver(exposure, before, done))
+        due = stamp + round(delay * 1e9)
+        self._node.start(self._deliver(_Exposure(spec, shot, due), before, done))
 
     def log_missing(self) -> None:
         """Log how many exposures were not delivered, and why."""
@@ -186,10 +195,9 @@ class CameraRig:
         done: asyncio.Future[None],
     ) -> None:
         assert self._renderer is not None
-        spec, stamp, due, qpos, qvel = exposure
+        spec, shot, due = exposure
         wait = max(due - self._node.clock.now(), 0) / 1e9
         try:
-            shot = Shot(spec.name, stamp, qpos, qvel)
             (frame,) = await self._renderer.call_for(wait, CameraRenderer.expose, (shot,))
             # Of two processes, or of two delays, the later may be through first: keep the order.
             if before is not None and not before.done():
@@ -203,6 +211,9 @@ class CameraRig:
         source = f"{self._node.name}/{spec.name}"
         frame_id = optical_frame(spec, f"{self._node.name}/")
         out, stamp = self._outputs, frame.stamp
+        if frame.light is not None:
+            now = self._node.clock.now()
+            self._controls[spec.name].delivered(now, frame.exposure, frame.gain, frame.light)
         out.camera_poses.send(
             PoseStamped(
                 stamp=stamp, source=source, position=frame.position, orientation=frame.orientation
@@ -225,8 +236,19 @@ class CameraRig:
                     source=source if frame.rgb is None else f"{source}/grey",
                     frame_id=frame_id,
                     encoding="mono8",
+                    exposure_time=frame.exposure,
+                    gain=frame.gain,
                     data=frame.grey,
                 )
             )
         if frame.rgb is not None:
-            out.images.send(Image(stamp=stamp, source=source, frame_id=frame_id, data=frame.rgb))
+            out.images.send(
+                Image(
+                    stamp=stamp,
+                    source=source,
+                    frame_id=frame_id,
+                    exposure_time=frame.exposure,
+                    gain=frame.gain,
+                    data=frame.rgb,
+                )
+            )

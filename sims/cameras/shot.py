@@ -34,6 +34,8 @@ class Shot(NamedTuple):
             unless `motion` is known. None: at rest.
         motion: The states from the beginning of the first row's exposure to the end of the last
             one's; needed by a rolling shutter.
+        exposure: Seconds that the shutter is open.
+        gain: Factor of the amplifier.
     """
 
     camera: str
@@ -41,6 +43,8 @@ class Shot(NamedTuple):
     qpos: Floats
     qvel: Floats | None = None
     motion: Motion | None = None
+    exposure: float = 0.0
+    gain: float = 1.0
 
     def moves(self) -> bool:
         """Return whether the state may change while the shutter is open."""

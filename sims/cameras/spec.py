@@ -11,13 +11,18 @@ from typing import Annotated, Literal
 
 import msgspec
 import mujoco
+import numpy as np
 
 import events
 from events.base import Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation
+from events.photometry import response_light
 from events.rotations import from_rpy, multiply
 from runtime.config.parameters import Changeable
+from runtime.paths import NameOrPath
 from runtime.units import Latency
+from sims.cameras.exposure import AutoExposure
+from sims.cameras.response import noise_at, read_response
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=8192)]
@@ -41,6 +46,22 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             stay as they are.
         exposure: Seconds that the shutter is open, half of them before the stamp: motion blurs
             the image. Depth, segmentation and pose are those of the stamp.
+        gain: Factor on the light of an image, as of a sensor's amplifier; it makes the shot noise
+            stronger, too.
+        reference_exposure: Exposure time at which an image of gain 1 is as bright as the scene is
+            drawn; a shorter one makes it darker in proportion, in linear light. 0: exposure times
+            make no difference to the brightness.
+        auto_exposure: Exposure time and gain chosen for each image by the light of the last
+            delivered one, beginning with `reference_exposure`, which it needs; in the place of
+            `exposure` and `gain`.
+        vignette: Coefficients a1, a2, … of the share of light ``1 + a1 r² + a2 r⁴ + …`` at the
+            distance r from the principal point, in halves of the image's diagonal. cos⁴ of an angle
+            that is 45° in the corner is about ``[-2, 2.54, -1.86, 0.57]``.
+        full_well: Electrons that fill a pixel at gain 1 (white), typically 5000 to 50000: each
+            pixel has the noise of their number (shot noise). 0: none.
+        response: Curve from light to grey levels: ``srgb``, ``linear``, ``gamma`` (of 2.2), or a
+            file of the light of each of the 256 grey levels, as the ``pcalib.txt`` of TUM's monoVO
+            data set. What is drawn is taken to be sRGB.
         blur: Standard deviation, in pixels, of the Gaussian that a point becomes out of focus.
         noise: Standard deviation of additive Gaussian noise, grey levels (0 to 255).
         depth_noise: k in sigma = k z²: standard deviation (metres) of the noise at depth z.
@@ -61,6 +82,12 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     orientation: Vector3 = (0.0, 0.0, 0.0)
     light: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
     exposure: Latency = Latency(0)  # immutable
+    gain: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
+    reference_exposure: Latency = Latency(0)
+    auto_exposure: AutoExposure | None = None
+    vignette: tuple[float, ...] = ()
+    full_well: NonNegative = 0.0
+    response: NameOrPath = "srgb"
     blur: NonNegative = 0.0
     noise: NonNegative = 0.0
     depth_noise: NonNegative = 0.0
@@ -73,6 +100,27 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if not self.images or len(set(self.images)) != len(self.images):
             found = ", ".join(self.images) or "none"
             raise ValueError(f"images: expected one or more kinds, each once, found {found}")
+        fixed = self.exposure or self.gain != 1.0
+        if self.auto_exposure and (fixed or not self.reference_exposure):
+            raise ValueError(
+                "auto_exposure: expected a reference_exposure, and neither exposure nor gain, "
+                f"found {self.reference_exposure:g} s, {self.exposure:g} s and {self.gain:g}"
+            )
+        if self.reference_exposure and not self.longest_exposure:
+            raise ValueError(
+                "reference_exposure: expected an exposure (or auto_exposure) beside it, found none"
+            )
+        shares = np.polynomial.Polynomial((1.0, *self.vignette))(np.linspace(0.0, 1.0, 101))
+        if not (shares.min() >= 0.0 and shares.max() <= 1.0):
+            raise ValueError(
+                "vignette: expected shares of light from 0 to 1 all over the image, found "
+                f"{shares.min():.3g} to {shares.max():.3g}"
+            )
+
+    @property
+    def longest_exposure(self) -> float:
+        """Longest time for which the shutter is open, seconds."""
+        return self.auto_exposure.max_exposure if self.auto_exposure else self.exposure
 
 
 def check_cameras(specs: Iterable[CameraSpec]) -> None:
@@ -87,10 +135,10 @@ def check_cameras(specs: Iterable[CameraSpec]) -> None:
         if spec.name in names:
             raise ValueError(f"{where}: expected a name of its own, found two cameras called so")
         names.add(spec.name)
-        if spec.exposure > 1.0 / spec.rate:
+        if spec.longest_exposure > 1.0 / spec.rate:
             raise ValueError(
                 f"{where}: exposure: expected at most the {1e3 / spec.rate:.4g} ms between two "
-                f"exposures, found {1e3 * spec.exposure:.4g} ms"
+                f"exposures, found {1e3 * spec.longest_exposure:.4g} ms"
             )
 
 
@@ -123,6 +171,8 @@ def announcement(
         stamp: Nanoseconds on the run's clock.
     """
     position, orientation = optical_in_body(spec)
+    response = read_response(spec.response)
+    electrons = spec.full_well / spec.gain
     return events.CameraAnnouncement(
         stamp=stamp,
         source=source,
@@ -130,6 +180,13 @@ def announcement(
         info=camera_info(spec),
         rate=spec.rate,
         latency=float(spec.latency),
+        exposure=float(spec.longest_exposure),
+        noise=noise_at(response_light(response), 128, spec.noise, electrons),
+        full_well=spec.full_well,
+        reference_exposure=float(spec.reference_exposure),
+        response=response,
+        vignette=spec.vignette,
+        depth_noise=spec.depth_noise,
         frame_id=optical_frame(spec, prefix),
         parent_frame_id=parent_frame_id,
         position=position,

@@ -11,8 +11,8 @@ from sims.cameras.optics import MOST, defocused, mean, moments
 @pytest.mark.parametrize("sigma", [0.7, 1.5, 4.0])
 def test_a_point_out_of_focus_is_a_gaussian(sigma: float) -> None:
     """Of the spread that is asked for, about where the point was."""
-    point = np.zeros((61, 61), np.uint8)
-    point[28:33, 28:33] = 255  # five pixels wide, so that rounding doesn't eat the flanks
+    point = np.zeros((61, 61), np.uint16)
+    point[28:33, 28:33] = 65535  # five pixels wide, so that rounding doesn't eat the flanks
     found = defocused(point, sigma).astype(np.float64)
     weight = found.sum(0) / found.sum()
     place = np.arange(61)
@@ -22,7 +22,7 @@ def test_a_point_out_of_focus_is_a_gaussian(sigma: float) -> None:
 
 
 def test_no_blur_costs_nothing() -> None:
-    image = np.zeros((4, 4), np.uint8)
+    image = np.zeros((4, 4), np.uint16)
     assert defocused(image, 0.0) is image
 
 
@@ -40,8 +40,8 @@ def test_moments_are_a_pixel_apart_at_most(shift: float, count: int) -> None:
 
 
 def test_the_mean_is_rounded_and_does_not_overflow() -> None:
-    values = np.array([[255, 255, 0], [255, 254, 0], [255, 254, 2]], np.uint8)
+    values = np.array([[65535, 65535, 0], [65535, 65534, 0], [65535, 65534, 2]], np.uint16)
     found = mean([row[None] for row in values])
-    assert found.dtype == np.uint8
-    np.testing.assert_array_equal(found, [[255, 254, 1]])
-    assert mean([np.full((1, 1), 255, np.uint8)] * 9)[0, 0] == 255
+    assert found.dtype == np.uint16
+    np.testing.assert_array_equal(found, [[65535, 65534, 1]])
+    assert mean([np.full((1, 1), 65535, np.uint16)] * 9)[0, 0] == 65535

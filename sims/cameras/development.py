@@ -1,0 +1,136 @@
+"""From light to an image: what lens and image sensor make of what was drawn for one exposure.
+
+The grey levels that MuJoCo draws are taken to be sRGB's (IEC 61966-2-1), and their white to be the
+light that fills a pixel at the reference exposure. Light beyond it was cut off in drawing, so a
+short exposure darkens the image, but brings no overexposed surface back.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from events.photometry import response_light, srgb_light, vignette_map
+from sims.cameras.noise import noise_steps, noisy_image
+from sims.cameras.optics import defocused, mean
+from sims.cameras.response import read_response
+from sims.cameras.spec import CameraSpec, camera_info
+
+Image = npt.NDArray[np.uint8]
+Codes = npt.NDArray[np.uint16]
+
+_LINEAR = 65535.0
+"""Code of white in linear light."""
+_ROOT = 40000.0
+"""Code of the root of white: there is room for 2.7 times as much light."""
+_METERED = 4
+"""The exposure meter looks at every fourth row and column."""
+
+
+class Development:
+    """Develops the exposures of one camera.
+
+    In this order: mean over the moments of the exposure (motion blur), defocus, vignette, exposure
+    time and gain, shot noise, response, and noise of the same size at all grey levels. All but the
+    last two are in linear light. What is off costs nothing: an image of an ideal camera stays
+    as it is, byte for byte.
+
+    Args:
+        spec: The camera.
+
+    Raises:
+        ValueError: The file of its response is missing or holds something else.
+    """
+
+    def __init__(self, spec: CameraSpec) -> None:
+        self._spec = spec
+        response = read_response(spec.response)
+        self._light = response_light(response)
+        self._srgb = not response
+        self._vignette: Codes | None = None
+        if any(spec.vignette):
+            shares = np.sqrt(vignette_map(camera_info(spec), spec.vignette))
+            self._vignette = np.rint(shares * _LINEAR).astype(np.uint16)
+        # With automatic exposure the same few exposure times and gains come again and again.
+        self._table = functools.lru_cache(maxsize=8)(self._make_table)
+        self._levels = functools.lru_cache(maxsize=8)(self._make_levels)
+
+    def develop(
+        self,
+        images: Sequence[Image],
+        random: np.random.Generator,
+        exposure: float = 0.0,
+        gain: float = 1.0,
+    ) -> Image:
+        """Return the image of one exposure.
+
+        Args:
+            images: What was drawn at equally spaced moments of it, each of shape (height, width, 3)
+                or (height, width).
+            random: For the noise.
+            exposure: Seconds that the shutter was open.
+            gain: Factor of the amplifier.
+        """
+        reference = self._spec.reference_exposure
+        factor = gain * (exposure / reference if reference else 1.0)
+        through_root = self._vignette is not None or self._spec.full_well > 0.0
+        light = self._collected(images)
+        if light is images[0] and self._srgb and factor == 1.0 and not through_root:
+            levels: Any = images[0]
+        else:
+            seen = cv2.LUT(light, self._table(light.itemsize, factor, through_root))
+            levels = self._read_out(seen, gain, random) if through_root else seen
+        return noisy_image(np.asarray(levels, np.uint8), self._spec.noise, random)
+
+    def meter(self, image: Image) -> float:
+        """Return the mean light of a developed image, 0 to 1, as an exposure meter sees it."""
+        codes = np.rint(self._light * _LINEAR).astype(np.uint16)
+        seen = codes[image[::_METERED, ::_METERED]]  # whole numbers: any order of adding will do
+        return int(seen.sum(dtype=np.int64)) / (seen.size * _LINEAR)
+
+    def _collected(self, images: Sequence[Image]) -> Image | Codes:
+        """Return what passes the lens: grey levels as drawn, or codes of linear light."""
+        if len(images) == 1 and self._spec.blur <= 0.0:
+            return images[0]
+        codes = np.rint(srgb_light() * _LINEAR).astype(np.uint16)[None]
+        light = mean([np.asarray(cv2.LUT(image, codes), np.uint16) for image in images])
+        return defocused(light, self._spec.blur)
+
+    def _make_table(self, itemsize: int, factor: float, root: bool) -> Image | Codes:
+        """Return what becomes of light: the code of its root, or its grey level at once."""
+        light = factor * (srgb_light() if itemsize == 1 else np.arange(65536) / _LINEAR)
+        if root:
+            return np.minimum(np.rint(np.sqrt(light) * _ROOT), 65535).astype(np.uint16)[None]
+        return self._grey_levels(light)
+
+    def _read_out(self, root: Any, gain: float, random: np.random.Generator) -> Image:
+        """Return the grey levels of light whose root is given.
+
+        The root of a Poisson-distributed number n has the standard deviation 1/2, whatever n is
+        (F. J. Anscombe, "The transformation of Poisson, binomial and negative-binomial data",
+        Biometrika 1948); its square exceeds the mean by 1/4.
+        """
+        if self._vignette is not None:
+            shares = cv2.merge([self._vignette] * (root.size // self._vignette.size))
+            root = cv2.multiply(root, shares, scale=1.0 / _LINEAR)
+        electrons = self._spec.full_well / gain
+        sigma = 0.5 / math.sqrt(electrons) if electrons else 0.0
+        if sigma:
+            steps = noise_steps(root.shape, sigma * _ROOT, 32767, random)
+            root = cv2.add(root, steps, dtype=cv2.CV_16U)
+        return np.asarray(cv2.LUT(root, self._levels(sigma)), np.uint8)
+
+    def _make_levels(self, sigma: float) -> Image:
+        """Return the grey level of each code of a root that has noise."""
+        root = np.arange(65536) / _ROOT
+        return self._grey_levels(np.maximum(root * root - sigma * sigma, 0.0))
+
+    def _grey_levels(self, light: npt.NDArray[np.float64]) -> Image:
+        levels = np.rint(np.interp(light, self._light, np.arange(256.0)))
+        return np.asarray(levels, np.uint8)[None]
