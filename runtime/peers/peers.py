@@ -15,9 +15,10 @@ from runtime.clock import Clock
 from runtime.config.model import Config
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
 from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.peers.clock_sync import ClockFollower, compare
+from runtime.peers.clock_sync import ClockFollower
 from runtime.peers.compatibility import name_of
 from runtime.peers.joint_shutdown import JointShutdown
+from runtime.peers.joint_start import JointStart
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
 from runtime.peers.messages import (
@@ -44,12 +45,8 @@ from runtime.real_clock import RealClock
 from runtime.sender import Listener
 from runtime.summary import Summary
 from runtime.tasks import Fault
-from runtime.wire import pack, unpack
 
 log = logging.getLogger("visnav.runtime")
-
-LEAD = 50_000_000
-"""Nanoseconds between the message to begin and the first update: it must reach all before."""
 
 
 class Run(Protocol):
@@ -80,14 +77,13 @@ class Peers:
         self._clock = clock
         self._run = run
         self._membership = Membership(config, only, self)
+        self._start = JointStart(self._membership, clock, float(config.run.startup_limit))
         self.shutdown = JointShutdown(self._membership, self._gather)
         self._remote: RemoteEvents | None = None
         self._loop: LockstepLoop | None = None
         self._token: TimeTokenHolder | None = None
-        self._announced = Announcements({})
         self._early: list[tuple[Member, OfTheRun, Event | None]] = []
-        self._ready = self._decided = self._begun = self._suspended = self._ends = False
-        self._decider: Member | None = None
+        self._begun = self._suspended = self._ends = False
         self._lost_early: list[Member] = []
         self._apart: set[int] = set()
         self._ended_here: list[str] = []
@@ -121,70 +117,11 @@ class Peers:
 
     async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Send the others what the nodes here announce; return what all do, in file order."""
-        self._announced = Announcements(
-            {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in own.items()}
-        )
-        self._membership.broadcast(self._announced)
-        others = self._membership.present
-        await self._membership.until(
-            lambda: all(m.announced is not None for m in others()),
-            whom=lambda m: m.announced is None,
-            limit=self._start_up_limit(),
-        )
-        everything = dict(own)
-        for member in others():
-            if member.announced is not None:
-                for name, frames in member.announced.by_node.items():
-                    try:
-                        everything[name] = [_announcement(frame) for frame in frames]
-                    except WireError as error:
-                        raise PeerError(f"{name}, at {member.place}: {error}") from None
-        return [a for name in self._membership.nodes for a in everything.get(name, ())]
+        return await self._start.announce(own)
 
     async def begin(self) -> None:
-        """Agree on when the first update is, and wait for it.
-
-        One process decides that the run has begun, once all are ready. A loss before that ends
-        the run; one after it is dealt with as in the run, also by a process that learns of it
-        before it learns that the run has begun. A process that comes back to a run
-        that goes on joins it where it is.
-        """
-        membership = self._membership
-        reference = self._decider = self._reference()
-        if reference is not None and self._token is None:
-            await compare(reference, membership.until)
-        self._ready = True
-        self._membership.broadcast(Ready())
-        if reference is None:
-            await membership.until(
-                lambda: all(m.ready for m in membership.present()),
-                whom=lambda m: not m.ready,
-                limit=self._start_up_limit(),
-            )
-            self._decided = True
-            origin = time.monotonic_ns() + LEAD
-            self._membership.broadcast(FirstUpdate(origin))
-        else:
-            await membership.until(
-                lambda: reference.begin is not None,
-                whom=lambda m: not m.ready or m is reference,
-                limit=self._start_up_limit(),
-            )
-            assert reference.begin is not None
-            self._decided = True
-            best = reference.exchanges.best()
-            origin = reference.begin.origin - (best.offset if best else 0)
-            if self._loop is not None:
-                self._loop.move(reference.begin.now, self._loop.orders())
-        if isinstance(self._clock, RealClock):
-            await asyncio.sleep(max(origin - time.monotonic_ns(), 0) / 1e9)
-            self._clock.start_at(origin)
-            self._follow(reference)
-
-    def _start_up_limit(self) -> float:
-        """Return the real seconds that all nodes of another process may take to start up."""
-        most = max((len(m.nodes) for m in self._membership.present()), default=1)
-        return float(self._config.run.startup_limit) * (most + 1)
+        """Agree on when the first update is, and wait for it."""
+        self._follow(await self._start.begin())
 
     def _follow(self, member: Member | None) -> None:
         if member is not None and isinstance(self._clock, RealClock):
@@ -281,7 +218,7 @@ class Peers:
                     raise WireError("expected announcements of its own nodes")
                 member.announced = message
                 if self._begun:  # it was gone, and needs ours again
-                    member.outbox.send(self._announced)
+                    member.outbox.send(self._start.announced)
             case FinalSummary():
                 try:
                     part = msgspec.json.decode(message.part, type=Summary)
@@ -324,9 +261,7 @@ class Peers:
 
     def lost(self, member: Member) -> None:
         """Deal with the loss of a process as its nodes' `on_error` says."""
-        if not (self._begun or self._ends) and (
-            self._decided or (self._ready and self._decider not in {None, member})
-        ):
+        if not (self._begun or self._ends) and self._start.may_have_begun(member):
             self._lost_early.append(member)
             return
         lost = set(member.nodes) - self.shutdown.ended_nodes
@@ -433,13 +368,6 @@ class Peers:
             member.outbox.send(NodeEnded(node))
         self._gather()
 
-    def _reference(self) -> Member | None:
-        """Return the process whose clock counts, or `None` if it is this one."""
-        present = self._membership.present()
-        running = [m for m in present if m.hello.running]
-        first = min(running or present, key=lambda m: m.number, default=None)
-        return first if first and (running or first.number < self._membership.me) else None
-
     # Sending.
 
     def _broadcast_in_order(self, message: Ordered) -> None:
@@ -463,10 +391,3 @@ class Peers:
     def _send_to(self, number: int, message: Message, event: Event | None) -> None:
         if member := self._membership.numbered(number):
             member.outbox.send(message, event)
-
-
-def _announcement(frame: bytes) -> Announcement:
-    event = unpack(frame)
-    if not isinstance(event, Announcement):
-        raise WireError(f"expected an announcement, found {type(event).__name__}")
-    return event
