@@ -208,10 +208,14 @@ class BarometerAnnouncement(SensorAnnouncement):
     Attributes:
         noise: Standard deviation of the white noise, pascal.
         altitude: Altitude of the origin of ``map`` above sea level, metres.
+        drift: Standard deviation of the slow error, relative to the pressure.
+        drift_time: Time constant of the slow error, seconds.
     """
 
     noise: float
     altitude: float
+    drift: float = 0.0
+    drift_time: float = 0.0
 
 
 class NavSatAnnouncement(SensorAnnouncement):
@@ -223,6 +227,10 @@ class NavSatAnnouncement(SensorAnnouncement):
         altitude: Metres above the WGS 84 ellipsoid, of the origin of ``map``.
         horizontal_noise: Standard deviation of the white noise, north and east, metres.
         vertical_noise: Standard deviation of the white noise, down, metres.
+        horizontal_drift: Standard deviation of the slow error, north and east, metres.
+        vertical_drift: Standard deviation of the slow error, down, metres.
+        drift_time: Time constant of the slow error, seconds.
+        velocity_noise: Standard deviation of the velocity's white noise, metres per second.
     """
 
     latitude: float
@@ -230,6 +238,10 @@ class NavSatAnnouncement(SensorAnnouncement):
     altitude: float
     horizontal_noise: float
     vertical_noise: float
+    horizontal_drift: float = 0.0
+    vertical_drift: float = 0.0
+    drift_time: float = 0.0
+    velocity_noise: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -242,10 +254,12 @@ class MagnetometerAnnouncement(SensorAnnouncement):
     Attributes:
         noise: Standard deviation of the white noise of each axis, tesla.
         field: Of the earth at the origin of ``map``, tesla in ``map``.
+        bias: Greatest constant error of each axis, tesla.
     """
 
     noise: float
     field: Vector3
+    bias: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -175,7 +175,7 @@ class Range(Event):
 
     Attributes:
         frame_id: Frame of the sensor, which looks along its x axis.
-        range: Metres; ``inf`` if nothing is in reach.
+        range: Metres; ``inf`` if nothing is in reach, ``-inf`` if something is too close (REP 117).
         field_of_view: Radians; 0 of a single ray.
         min_range: Metres.
         max_range: Metres.

@@ -16,8 +16,11 @@ from events import (
     Command,
     FluidPressure,
     Imu,
+    MagneticField,
+    NavSatFix,
     Odometry,
     PathAnnouncement,
+    Range,
     Setpoint,
     VehicleAnnouncement,
     VehicleEvent,
@@ -39,7 +42,7 @@ from sims.vehicle import (
 )
 from sims.vehicle.clearance import FALL, Clearance, trouble_at_start, trouble_on_path
 from sims.vehicle.physics import Contact
-from sims.worlds import load_world
+from sims.worlds import Dynamics, load_world
 
 FRAME = "base_link"
 """Frame of the vehicle's body."""
@@ -71,6 +74,7 @@ class MultirotorConfig(SensorsConfig):
 
     def __post_init__(self) -> None:
         check_cameras(self.cameras)
+        super().__post_init__()
         for camera in self.cameras:
             if self.trigger == "imu" and camera.rate > self.imu_rate:
                 raise ValueError(
@@ -89,6 +93,9 @@ class Multirotor(Simulator[MultirotorConfig]):
 
     imu = Output(Imu)
     pressures = Output(FluidPressure)
+    fixes = Output(NavSatFix)
+    magnetic_fields = Output(MagneticField)
+    ranges = Output(Range)
     vehicle_events = Output(VehicleEvent)
 
     frame_id = FRAME
@@ -109,8 +116,10 @@ class Multirotor(Simulator[MultirotorConfig]):
             config.limits,
             setpoint_timeout=config.setpoint_timeout,
         )
-        outputs = SensorOutputs(self.pressures)
-        self._suite = SensorSuite(self, config, outputs, FRAME, self._physics, self._advance)
+        outputs = SensorOutputs(self.pressures, self.fixes, self.magnetic_fields, self.ranges)
+        self._suite = SensorSuite(
+            self, config, outputs, FRAME, self._physics, self._advance, Dynamics()
+        )
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
         self._odometry_stamp = -1

@@ -6,7 +6,11 @@ when it is due.
 """
 
 from sims.sensors.barometer import Barometer, BarometerSpec
+from sims.sensors.gnss import Gnss, GnssSpec
 from sims.sensors.imu import ImuModel, ImuNoise, ImuParameters, Vibration
+from sims.sensors.magnetometer import Magnetometer, MagnetometerSpec
+from sims.sensors.range_finder import RangeFinder, RangeFinderSpec
+from sims.sensors.rays import Rays
 from sims.sensors.sensor import Sensor, SensorSpec, Truth
 from sims.sensors.settings import SensorsConfig
 from sims.sensors.suite import SensorOutputs, SensorSuite
@@ -15,9 +19,16 @@ from sims.sensors.vehicle_imu import VehicleImu, mount_imu
 __all__ = [
     "Barometer",
     "BarometerSpec",
+    "Gnss",
+    "GnssSpec",
     "ImuModel",
     "ImuNoise",
     "ImuParameters",
+    "Magnetometer",
+    "MagnetometerSpec",
+    "RangeFinder",
+    "RangeFinderSpec",
+    "Rays",
     "Sensor",
     "SensorOutputs",
     "SensorSpec",

@@ -78,5 +78,9 @@ class Barometer(Sensor[BarometerSpec]):
     def announcement(self) -> BarometerAnnouncement:
         """Return what the barometer will provide."""
         return BarometerAnnouncement(
-            **self.mounting(), noise=self.spec.noise, altitude=self.place.origin[2]
+            **self.mounting(),
+            noise=self.spec.noise,
+            altitude=self.place.origin[2],
+            drift=self.spec.drift,
+            drift_time=float(self.spec.drift_time),
         )

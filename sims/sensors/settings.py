@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from sims.sensors.barometer import BarometerSpec
+from sims.sensors.gnss import GnssSpec
 from sims.sensors.imu import ImuParameters
+from sims.sensors.magnetometer import MagnetometerSpec
+from sims.sensors.range_finder import RangeFinderSpec
 from sims.simulator import Rate, SimulatorConfig
 
 
@@ -15,8 +18,25 @@ class SensorsConfig(SimulatorConfig):
             sent at each exposure.
         imu: Noise of the IMU.
         barometer: The barometer; none if it is not set. ``{}`` is one with all its defaults.
+        gnss: The satellite receiver; none if it is not set.
+        magnetometer: The magnetometer; none if it is not set.
+        range_finders: The range finders.
     """
 
     imu_rate: Rate = 200
     imu: ImuParameters = ImuParameters()
     barometer: BarometerSpec | None = None
+    gnss: GnssSpec | None = None
+    magnetometer: MagnetometerSpec | None = None
+    range_finders: tuple[RangeFinderSpec, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = {"imu", "barometer", "gnss", "magnetometer"}
+        for field in ("cameras", "range_finders"):
+            for spec in getattr(self, field):
+                if spec.name in names:
+                    raise ValueError(
+                        f"{field}: {spec.name}: expected a name of its own, found that of "
+                        "another sensor"
+                    )
+                names.add(spec.name)

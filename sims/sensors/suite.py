@@ -12,21 +12,32 @@ from events import (
     Announcement,
     Event,
     FluidPressure,
+    MagneticField,
+    NavSatFix,
+    Range,
     TransformStamped,
 )
 from runtime import Node, Tick
 from runtime.sender import Sender
 from sims.sensors.barometer import Barometer
+from sims.sensors.gnss import Gnss
+from sims.sensors.magnetometer import Magnetometer
+from sims.sensors.range_finder import RangeFinder
+from sims.sensors.rays import Rays
 from sims.sensors.sensor import Place, Sensor, Truth, generator_of
 from sims.sensors.settings import SensorsConfig
 from sims.sensors.vehicle_imu import VehicleImu
 from sims.vehicle import Physics
+from sims.worlds import Dynamics
 
 
 class SensorOutputs(msgspec.Struct, frozen=True):
     """Outputs of the node that carries the sensors."""
 
     pressures: Sender[FluidPressure]
+    fixes: Sender[NavSatFix]
+    magnetic_fields: Sender[MagneticField]
+    ranges: Sender[Range]
 
 
 class SensorSuite:
@@ -42,6 +53,7 @@ class SensorSuite:
         frame_id: Frame of the body.
         physics: The vehicle, in a world that `mount_imu` has seen.
         advance: Steps the physics up to a tick, and returns the stamp of the state then.
+        dynamics: What moves in the world by itself.
     """
 
     def __init__(
@@ -52,6 +64,7 @@ class SensorSuite:
         frame_id: str,
         physics: Physics,
         advance: Callable[[Tick], int],
+        dynamics: Dynamics,
     ) -> None:
         self._node = node
         self._outputs = outputs
@@ -60,15 +73,21 @@ class SensorSuite:
         self.imu = VehicleImu(node, config, physics, frame_id)
         """The IMU, whose samples the vehicle's node takes and sends itself."""
 
-        def make(model: type[Sensor[Any]], spec: Any, name: str) -> Sensor[Any]:
+        def make(
+            model: Callable[..., Sensor[Any]], spec: Any, name: str, *rest: Any
+        ) -> Sensor[Any]:
             place = Place(f"{node.name}/{name}", frame_id, config.origin)
-            return model(spec, place, generator_of(node.rng, name))
+            return model(spec, place, generator_of(node.rng, name), *rest)
 
+        single = {"barometer": Barometer, "gnss": Gnss, "magnetometer": Magnetometer}
         self.sensors = [
-            make(model, spec, name)
-            for model, spec, name in ((Barometer, config.barometer, "barometer"),)
-            if spec is not None
+            make(model, getattr(config, name), name)
+            for name, model in single.items()
+            if getattr(config, name) is not None
         ]
+        if config.range_finders:
+            rays = Rays(physics.model, dynamics, f"{node.name}/base_link")
+            self.sensors += [make(RangeFinder, s, s.name, rays) for s in config.range_finders]
 
     def start(self) -> None:
         """Have all sensors measure at their rates; call it in `on_startup`."""

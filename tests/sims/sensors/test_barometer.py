@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from events import Vector3
-from sims.sensors import Barometer, BarometerSpec, Truth
+from sims.sensors import Barometer, BarometerSpec
 from sims.sensors.barometer import altitude_at, pressure_at
-from sims.sensors.sensor import Place
-
-ORIGIN = (47.641468, -122.140165, 122.0)
+from tests.sims.sensors.truths import ORIGIN, PLACE, random, truth
 
 
-def barometer(seed: int = 0, **settings: float | str | Vector3) -> Barometer:
-    place = Place("drone/barometer", "base_link", ORIGIN)
-    return Barometer(BarometerSpec(**settings), place, np.random.default_rng(seed))  # type: ignore[arg-type]
-
-
-def truth(down: float = 0.0, orientation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)) -> Truth:
-    return Truth(0, (1.0, 2.0, down), orientation, (0.0, 0.0, 0.0), None)  # type: ignore[arg-type]
+def barometer(seed: int = 0, **settings: Any) -> Barometer:
+    return Barometer(BarometerSpec(**settings), PLACE, random(seed))
 
 
 def errors(sensor: Barometer, count: int) -> npt.NDArray[np.float64]:
@@ -43,8 +37,10 @@ def test_the_altitude_shown_is_airsims() -> None:
 
 def test_without_errors_it_measures_the_pressure_of_its_own_place() -> None:
     sensor = barometer(noise=0.0, drift=0.0, position=(0.0, 0.0, 2.0))
-    assert sensor.measure(truth(-10.0)).fluid_pressure == pressure_at(122.0 + 10.0 - 2.0)
-    upside_down = truth(-10.0, (0.0, 1.0, 0.0, 0.0))
+    assert sensor.measure(truth((1.0, 2.0, -10.0))).fluid_pressure == pressure_at(
+        122.0 + 10.0 - 2.0
+    )
+    upside_down = truth((1.0, 2.0, -10.0), (0.0, 1.0, 0.0, 0.0))
     assert sensor.measure(upside_down).fluid_pressure == pressure_at(122.0 + 10.0 + 2.0)
 
 

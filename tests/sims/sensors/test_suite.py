@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 
-from events import BarometerAnnouncement, FluidPressure, Imu, TransformStamped
-from runtime.testing import NodeResult, run_node
+from events import (
+    BarometerAnnouncement,
+    FluidPressure,
+    Imu,
+    MagneticField,
+    MagnetometerAnnouncement,
+    NavSatAnnouncement,
+    NavSatFix,
+    Range,
+    RangeAnnouncement,
+    TransformStamped,
+)
+from runtime.errors import ConfigError
+from runtime.testing import NodeResult, run_node, spec
 from sims.multirotor import Multirotor
 from sims.sensors.barometer import pressure_at
 from tests.sims.vehicle.flight import WORLD
@@ -62,3 +75,50 @@ def test_a_sensor_changes_nothing_of_the_others() -> None:
 def test_equal_seeds_give_equal_measurements_whatever_else_is_measured() -> None:
     alone, again = fly(barometer={}), fly(barometer={}, imu_rate=100)
     assert alone.of(FluidPressure) == again.of(FluidPressure)
+
+
+def test_all_sensors_are_announced_mounted_and_sent() -> None:
+    down = {"name": "altimeter", "orientation": [0, -90, 0], "rate": 10, "min_range": 0.01}
+    ahead = {"name": "bumper", "rate": 20, "max_range": 3.0}
+    result = fly(
+        origin=[10.0, 20.0, 300.0],
+        gnss={"startup_delay": 0, "latency": 0, "rate": 10},
+        magnetometer={"rate": 25},
+        range_finders=[down, ahead],
+    )
+    (gnss,), (field,) = result.of(NavSatAnnouncement), result.of(MagnetometerAnnouncement)
+    assert (gnss.latitude, gnss.longitude, gnss.altitude) == (10.0, 20.0, 300.0)
+    assert field.field[0] > 3e-5  # near the equator the field points north
+    assert [e.source for e in result.of(RangeAnnouncement)] == ["drone/altimeter", "drone/bumper"]
+    children = {e.child_frame_id for e in result.of(TransformStamped)}
+    assert children == {"drone/gnss", "drone/magnetometer", "drone/altimeter", "drone/bumper"}
+    assert len(result.of(NavSatFix)) == 5
+    assert result.of(NavSatFix)[-1].altitude == pytest.approx(300.1, abs=0.01)
+    assert len(result.of(MagneticField)) == 13
+    ranges = {
+        source: [e.range for e in result.of(Range) if e.source == source]
+        for source in ("drone/altimeter", "drone/bumper")
+    }
+    assert len(ranges["drone/altimeter"]) == 5
+    assert ranges["drone/altimeter"] == pytest.approx([0.1] * 5, abs=0.1)
+    assert ranges["drone/bumper"] == [math.inf] * 10
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        ({"range_finders": [{"name": "gnss"}]}, "gnss: expected a name of its own"),
+        (
+            {"cameras": [{"name": "front"}], "range_finders": [{"name": "front"}]},
+            "range_finders: front: expected a name of its own",
+        ),
+        ({"origin": [91.0, 0.0, 0.0]}, "origin"),
+        ({"barometer": {"nois": 1.0}}, "nois"),
+        ({"magnetometer": {"year": 2035.0}}, "year"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_with_the_file(
+    config: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        spec(Multirotor, "drone", config)
