@@ -103,7 +103,7 @@ class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
         beside = np.hypot(xyz[:, 0], xyz[:, 1])
         angle = np.arctan2(beside, xyz[:, 2])
         seen = angle < self.widest_angle()
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             if self.distortion_model == "equidistant":
                 # Where the axis meets the image every direction is as good.
                 share = np.where(beside > 0.0, _fisheye(self.distortion)(angle) / beside, 0.0)
@@ -204,13 +204,14 @@ def _undistort(d: tuple[float, ...], uv: Floats, xy: Floats) -> Floats:
     """Return what `_brown` distorts to `uv`, by Newton's method with numeric slopes."""
     step = 1e-6
     right, down = np.array([step, 0.0]), np.array([0.0, step])
-    for _ in range(12):
-        off = _brown(d, xy) - uv
-        along_x = (_brown(d, xy + right) - _brown(d, xy - right)) / (2 * step)
-        along_y = (_brown(d, xy + down) - _brown(d, xy - down)) / (2 * step)
-        determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+    # Where nothing falls on a pixel it runs away, which `unproject` finds.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for _ in range(12):
+            off = _brown(d, xy) - uv
+            along_x = (_brown(d, xy + right) - _brown(d, xy - right)) / (2 * step)
+            along_y = (_brown(d, xy + down) - _brown(d, xy - down)) / (2 * step)
+            determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
             dx = (off[:, 0] * along_y[:, 1] - off[:, 1] * along_y[:, 0]) / determinant
             dy = (along_x[:, 0] * off[:, 1] - along_x[:, 1] * off[:, 0]) / determinant
-        xy = xy - np.column_stack([dx, dy])
+            xy = xy - np.column_stack([dx, dy])
     return xy

@@ -27,6 +27,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             nothing was hit.
         segmentation: int32 object numbers (geom ids), shape (height, width); -1 where nothing
             was hit.
+        undistorted: The same images without distortion, if they are wanted.
     """
 
     stamp: int
@@ -39,3 +40,4 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     grey: npt.NDArray[np.uint8] | None = None
     depth: npt.NDArray[np.float32] | None = None
     segmentation: npt.NDArray[np.int32] | None = None
+    undistorted: Frame | None = None

@@ -12,6 +12,7 @@ import math
 import time
 from typing import Any, NamedTuple
 
+import msgspec
 import mujoco
 import numpy as np
 import numpy.typing as npt
@@ -19,11 +20,13 @@ import numpy.typing as npt
 from events.base import Quaternion, Vector3
 from sims.cameras.development import Development
 from sims.cameras.frame import Frame
+from sims.cameras.lens import undistorted
 from sims.cameras.noise import generator, grey_of, noisy_depth
 from sims.cameras.optics import moments
 from sims.cameras.shot import Shot
-from sims.cameras.spec import CameraSpec, camera_info
+from sims.cameras.spec import CameraSpec, camera_info, is_plain
 from sims.cameras.stage import NEAR, RANGE, Colours, Depths, Floats, Stage
+from sims.cameras.view import Drawn, View, looked_up
 
 
 def model_to_bytes(model: Any) -> bytes:
@@ -89,9 +92,12 @@ class CameraRenderer:
         self._seed = seed
         self._cameras = {spec.name: (spec, _number(model, prefix + spec.name)) for spec in cameras}
         self._developments = {spec.name: Development(spec) for spec in cameras}
-        width = max((spec.width for spec in cameras), default=1)
-        height = max((spec.height for spec in cameras), default=1)
-        self._stage = Stage(model, width, height, threads)
+        self._undistorted = {
+            spec.name: undistorted(camera_info(spec)) for spec in cameras if spec.undistorted
+        }
+        self._views = {spec.name: View(camera_info(spec), is_plain(spec)) for spec in cameras}
+        width, height = np.max([(1, 1), *(v.largest() for v in self._views.values())], axis=0)
+        self._stage = Stage(model, int(width), int(height), threads)
 
     def render(
         self,
@@ -138,13 +144,14 @@ class CameraRenderer:
 
     def _capture(self, shot: Shot, spec: CameraSpec, number: int) -> Captured:
         """Draw what falls on the sensor, at each of the moments that make up the exposure."""
-        kinds, stage, size = set(spec.images), self._stage, (spec.height, spec.width)
+        kinds, stage, view = set(spec.images), self._stage, self._views[spec.name]
         coloured = not kinds.isdisjoint({"rgb", "grey"})
         blurred = coloured and shot.exposure > 0.0 and shot.moves()
         self._look(shot, spec, number, 0.0)
         pose = stage.pose(number)
-        middle, depth = stage.colour_and_depth(size, coloured, "depth" in kinds or blurred)
-        numbers = stage.segmentation(size) if "segmentation" in kinds else None
+        middle, depth, numbers = view.draw(
+            stage, coloured, "depth" in kinds or blurred, "segmentation" in kinds
+        )
         colours = [] if middle is None else [middle]
         if blurred and middle is not None and depth is not None:
             shift = self._shift(shot, spec, number, depth)
@@ -154,7 +161,7 @@ class CameraRenderer:
                     colours.append(middle)
                     continue
                 self._look(shot, spec, number, moment)
-                image, _ = stage.colour_and_depth(size, True, False)
+                image = view.draw(stage, True, False, False).colours
                 assert image is not None
                 colours.append(image)
         return Captured(colours, depth if "depth" in kinds else None, numbers, pose)
@@ -176,7 +183,7 @@ class CameraRenderer:
         if depth is not None:
             depth = noisy_depth(depth, spec.depth_noise, random)
         position, orientation = captured.pose
-        return Frame(
+        frame = Frame(
             stamp=shot.stamp,
             position=position,
             orientation=orientation,
@@ -188,6 +195,16 @@ class CameraRenderer:
             depth=depth,
             segmentation=captured.numbers,
         )
+        if not spec.undistorted:
+            return frame
+        _, *maps = self._undistorted[spec.name]
+        rgb, depth, segmentation = looked_up(Drawn(rgb, depth, captured.numbers), *maps)
+        if grey is not None:
+            grey = looked_up(Drawn(grey, None, None), *maps).colours
+        twin = msgspec.structs.replace(
+            frame, rgb=rgb, grey=grey, depth=depth, segmentation=segmentation
+        )
+        return msgspec.structs.replace(frame, undistorted=twin)
 
     def _look(self, shot: Shot, spec: CameraSpec, number: int, seconds: float) -> None:
         """Set the scene up as a camera sees it some seconds after an exposure's stamp."""

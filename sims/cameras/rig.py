@@ -27,9 +27,13 @@ from runtime.sender import Sender
 from sims.cameras.delivery import delay_of
 from sims.cameras.exposure import ExposureControl
 from sims.cameras.frame import Frame
+from sims.cameras.lens import undistorted
 from sims.cameras.renderer import CameraRenderer, model_to_bytes
 from sims.cameras.shot import Shot
 from sims.cameras.spec import CameraSpec, announcement, optical_frame, optical_in_body
+
+UNDISTORTED = "/undistorted"
+"""Ends the source of a camera's images without distortion."""
 
 
 class CameraOutputs(msgspec.Struct, frozen=True):
@@ -53,7 +57,8 @@ class CameraRig:
 
     Every image has the stamp of its exposure, and is sent `latency` seconds, and up to `jitter`
     more, after it. Just before, the pose of the camera is sent, with the same stamp and source. A
-    camera with both ``rgb`` and ``grey`` sends the grey images as ``<source>/grey``.
+    camera with both ``rgb`` and ``grey`` sends the grey images as ``<source>/grey``; one with
+    ``undistorted`` sends all a second time, as ``<source>/undistorted``.
 
     Args:
         node: The node that carries the cameras; a camera's source is ``<node>/<camera>``.
@@ -117,13 +122,19 @@ class CameraRig:
         """Return the announcements of the cameras."""
         name = self._node.name
         for spec in self._specs.values():
-            yield announcement(
+            said = announcement(
                 spec,
                 source=f"{name}/{spec.name}",
                 prefix=f"{name}/",
                 parent_frame_id=parent_frame_id,
                 stamp=self._node.clock.now(),
             )
+            yield said
+            if spec.undistorted:
+                source, (pinhole, _, _) = said.source, undistorted(said.info)
+                yield msgspec.structs.replace(
+                    said, source=source + UNDISTORTED, undistorted=source, info=pinhole
+                )
 
     def transforms(self, parent_frame_id: str) -> Iterable[TransformStamped]:
         """Return the pose of each camera's optical frame in the body's, constant for the run."""
@@ -210,10 +221,15 @@ class CameraRig:
     def _send(self, spec: CameraSpec, frame: Frame) -> None:
         source = f"{self._node.name}/{spec.name}"
         frame_id = optical_frame(spec, f"{self._node.name}/")
-        out, stamp = self._outputs, frame.stamp
         if frame.light is not None:
             now = self._node.clock.now()
             self._controls[spec.name].delivered(now, frame.exposure, frame.gain, frame.light)
+        self._send_images(source, frame_id, frame)
+        if frame.undistorted is not None:
+            self._send_images(source + UNDISTORTED, frame_id, frame.undistorted)
+
+    def _send_images(self, source: str, frame_id: str, frame: Frame) -> None:
+        out, stamp = self._outputs, frame.stamp
         out.camera_poses.send(
             PoseStamped(
                 stamp=stamp, source=source, position=frame.position, orientation=frame.orientation
@@ -229,26 +245,18 @@ class CameraRig:
                     stamp=stamp, source=source, frame_id=frame_id, data=frame.segmentation
                 )
             )
-        if frame.grey is not None:
+        for encoding, data in (("mono8", frame.grey), ("rgb8", frame.rgb)):
+            if data is None:
+                continue
+            second = encoding == "mono8" and frame.rgb is not None
             out.images.send(
                 Image(
                     stamp=stamp,
-                    source=source if frame.rgb is None else f"{source}/grey",
+                    source=f"{source}/grey" if second else source,
                     frame_id=frame_id,
-                    encoding="mono8",
+                    encoding=encoding,
                     exposure_time=frame.exposure,
                     gain=frame.gain,
-                    data=frame.grey,
-                )
-            )
-        if frame.rgb is not None:
-            out.images.send(
-                Image(
-                    stamp=stamp,
-                    source=source,
-                    frame_id=frame_id,
-                    exposure_time=frame.exposure,
-                    gain=frame.gain,
-                    data=frame.rgb,
+                    data=data,
                 )
             )

@@ -5,6 +5,7 @@ No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.free`,
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 from typing import Annotated, Literal
@@ -22,6 +23,7 @@ from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
 from sims.cameras.exposure import AutoExposure
+from sims.cameras.intrinsics import Intrinsics, Lens, intrinsics
 from sims.cameras.response import noise_at, read_response
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
@@ -30,14 +32,20 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 
 
 class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a pinhole camera: ideal by default, with errors as its settings say.
+    """Settings of a camera: an ideal pinhole by default, with errors as its settings say.
 
     Attributes:
         name: Name of the camera, unique on its body.
         images: Kinds of image that it gives.
         width: Width of its images, pixels.
         height: Height of its images, pixels.
-        fov: **Horizontal** field of view, degrees.
+        fov: **Horizontal** field of view, degrees, with what the lens does to it.
+        intrinsics: fx, fy, cx, cy in pixels, in place of `fov`; a pixel's centre has whole
+            coordinates.
+        lens: Distortion; none by default. Depth stays planar along the optical axis, and is
+            ``inf`` 90° or more off it. Pixels on which no ray falls are black.
+        undistorted: Whether the images are sent a second time without distortion, as those of a
+            pinhole camera of the same intrinsics, with source ``<camera>/undistorted``.
         rate: Exposures per second, at equal intervals.
         position: Position on the body, metres forward, right, down (FRD).
         orientation: Roll, pitch, yaw of the camera in the body's frame, degrees, applied yaw first
@@ -76,7 +84,10 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     images: tuple[ImageKind, ...] = ("rgb", "depth")
     width: Pixels = 512
     height: Pixels = 512
-    fov: Annotated[float, msgspec.Meta(ge=1.0, le=170.0)] = 90.0
+    fov: Annotated[float, msgspec.Meta(ge=1.0, le=360.0)] = 90.0
+    intrinsics: Intrinsics | None = None
+    lens: Lens | None = None
+    undistorted: bool = False
     rate: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 30.0
     position: Vector3 = (0.15, 0.0, 0.0)
     orientation: Vector3 = (0.0, 0.0, 0.0)
@@ -100,6 +111,8 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if not self.images or len(set(self.images)) != len(self.images):
             found = ", ".join(self.images) or "none"
             raise ValueError(f"images: expected one or more kinds, each once, found {found}")
+        if camera_info(self).is_pinhole and self.undistorted:
+            raise ValueError("undistorted: expected a lens that distorts, found none")
         fixed = self.exposure or self.gain != 1.0
         if self.auto_exposure and (fixed or not self.reference_exposure):
             raise ValueError(
@@ -142,9 +155,25 @@ def check_cameras(specs: Iterable[CameraSpec]) -> None:
             )
 
 
+@functools.lru_cache(maxsize=64)
+def _info(
+    width: int, height: int, fov: float, given: Intrinsics | None, lens: Lens | None
+) -> events.CameraInfo:
+    return intrinsics(width, height, fov, given, lens)
+
+
 def camera_info(spec: CameraSpec) -> events.CameraInfo:
-    """Return the camera's intrinsics: square pixels, the principal point at the centre."""
-    return events.CameraInfo.from_fov(spec.width, spec.height, math.radians(spec.fov))
+    """Return the camera's intrinsics.
+
+    Raises:
+        ValueError: The lens does not reach as far as the field of view.
+    """
+    return _info(spec.width, spec.height, spec.fov, spec.intrinsics, spec.lens)
+
+
+def is_plain(spec: CameraSpec) -> bool:
+    """Return whether a camera is an ideal pinhole, described by its field of view alone."""
+    return spec.intrinsics is None and camera_info(spec).is_pinhole
 
 
 def optical_in_body(spec: CameraSpec) -> tuple[Vector3, Quaternion]:
@@ -195,13 +224,18 @@ def announcement(
 
 
 def vertical_fov(spec: CameraSpec) -> float:
-    """Return the vertical field of view in degrees, which is what MuJoCo's cameras are given."""
+    """Return the vertical field of view in degrees, which is what MuJoCo's cameras are given.
+
+    Of a camera that draws in frames of its own (`sims.cameras.view`) it has no effect.
+    """
+    if not is_plain(spec):
+        return 90.0
     half = math.tan(math.radians(spec.fov) / 2.0) * spec.height / spec.width
     return math.degrees(2.0 * math.atan(half))
 
 
 def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: str) -> str:
-    """Mount a camera on a body of the world, and make the image buffer large enough.
+    """Mount a camera on a body of the world.
 
     Args:
         world: The world, which is changed.
@@ -232,7 +266,4 @@ def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: s
         quat=flip_yz_rotation(orientation),
         fovy=vertical_fov(spec),
     )
-    screen = world.visual.global_
-    screen.offwidth = max(screen.offwidth, spec.width)
-    screen.offheight = max(screen.offheight, spec.height)
     return name

@@ -52,6 +52,7 @@ class Stage:
 
     def __init__(self, model: Any, width: int, height: int, threads: int) -> None:
         self._context: Any = None
+        self._axes: Floats | None = None
         self._gl: Any = None
         self.model = model
         self._data = mujoco.MjData(model)
@@ -98,6 +99,7 @@ class Stage:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)  # lights that track something ask for it
         mujoco.mj_camlight(model, data)
+        self._axes = None
         self._camera.fixedcamid = camera_id
         category = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, category, self._scene)
@@ -105,6 +107,28 @@ class Stage:
             for source in self._scene.lights[: self._scene.nlight]:
                 for part in (source.ambient, source.diffuse, source.specular):
                     part *= light
+
+    def aim(self, turn: Floats, left: float, right: float, top: float, bottom: float) -> None:
+        """Draw what follows with another frame than the camera's own, until the next `look`.
+
+        Args:
+            turn: Axes of the view (right, down, ahead) in the camera's optical frame, shape (3, 3).
+            left: The edges of the image, as coordinates x/z and y/z in these axes.
+            right: See `left`.
+            top: See `left`.
+            bottom: See `left`.
+        """
+        if self._axes is None:
+            own = self._scene.camera[0]
+            ahead, up = np.array(own.forward, np.float64), np.array(own.up, np.float64)
+            self._axes = np.array([np.cross(ahead, up), -up, ahead])
+        _, down, ahead = turn @ self._axes
+        for camera in self._scene.camera:  # of both eyes; an image is drawn from their mean
+            near = float(camera.frustum_near)
+            camera.forward[:], camera.up[:] = ahead, -down
+            camera.frustum_center = 0.5 * (left + right) * near
+            camera.frustum_width = 0.5 * (right - left) * near  # half of it
+            camera.frustum_top, camera.frustum_bottom = -top * near, -bottom * near
 
     def colour_and_depth(
         self, size: Size, colour: bool, depth: bool

@@ -1,0 +1,158 @@
+"""From drawings to what falls on a camera's sensor: whole images, or bands of their rows."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraInfo
+from sims.cameras.lens import MARGIN, Face, Maps, faces
+from sims.cameras.stage import Colours, Depths, Stage
+
+Numbers = npt.NDArray[np.int32]
+
+CREASE = 1e-3
+"""Second difference of the inverse depth, as a share of it, from which on neighbouring pixels are
+taken to show different surfaces. On a plane it is zero."""
+
+
+class Drawn(NamedTuple):
+    """What a camera sees, as far as it was asked for, of some of its rows.
+
+    Attributes:
+        colours: uint8, shape (rows, width, 3); black where no ray falls on the image.
+        depth: float32 planar depth of the optical frame, metres, shape (rows, width); ``inf``
+            where nothing is, and 90° or more off the axis, where it would not be positive.
+        numbers: int32 object numbers, shape (rows, width); -1 where nothing is.
+    """
+
+    colours: Colours | None
+    depth: Depths | None
+    numbers: Numbers | None
+
+
+class View:
+    """How one camera's images come from drawings.
+
+    Args:
+        info: The camera's intrinsics.
+        framed: Whether the model's camera has just this frame, so that nothing is aimed.
+    """
+
+    def __init__(self, info: CameraInfo, framed: bool = False) -> None:
+        self.info = info
+        self._framed = framed
+        self._faces = faces(info)
+
+    def largest(self) -> tuple[int, int]:
+        """Return width and height of a buffer that takes every drawing, pixels."""
+        width = max((face.width for face in self._faces), default=1)
+        return width, max((face.height for face in self._faces), default=1)
+
+    def draw(
+        self,
+        stage: Stage,
+        colour: bool,
+        depth: bool,
+        numbers: bool,
+        rows: tuple[int, int] | None = None,
+    ) -> Drawn:
+        """Draw what the camera sees.
+
+        Args:
+            stage: A stage that looks through the camera.
+            colour: Whether colours are wanted.
+            depth: Whether depth is wanted.
+            numbers: Whether object numbers are wanted.
+            rows: First row, and the one after the last; None for all.
+        """
+        first, last = rows or (0, self.info.height)
+        size = last - first, self.info.width
+        if self._framed and rows is None:
+            return _drawn(stage, size, colour, depth, numbers)
+        if len(self._faces) == 1 and self._faces[0].columns is None:
+            _aim(stage, self._faces[0], 0, first, *size[::-1])
+            return _drawn(stage, size, colour, depth, numbers)
+        seen = Drawn(
+            np.zeros((*size, 3), np.uint8) if colour else None,
+            np.full(size, np.inf, np.float32) if depth else None,
+            np.full(size, -1, np.int32) if numbers else None,
+        )
+        for face in self._faces:
+            _add(seen, stage, face, first, last)
+        return seen
+
+
+def looked_up(drawn: Drawn, columns: Maps, rows: Maps) -> Drawn:
+    """Return images whose pixels lie at other places of the ones given.
+
+    Colours are interpolated, numbers are the nearest pixel's. Of depth the inverse is
+    interpolated, since that is linear on any plane; where surfaces meet it is the nearest pixel's.
+
+    Args:
+        drawn: The images.
+        columns: Column of each pixel, shape (h, w); outside them if there is none.
+        rows: Row of each pixel.
+    """
+    colours, depth, numbers = drawn
+    if colours is not None:
+        colours = np.asarray(cv2.remap(colours, columns, rows, cv2.INTER_LINEAR), np.uint8)
+    if depth is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = np.reciprocal(depth)  # 0 where nothing is
+            bent = ~(np.abs(cv2.Laplacian(inverse, cv2.CV_32F)) <= CREASE * inverse)
+            rough = cv2.remap(np.where(bent, np.uint8(255), np.uint8(0)), columns, rows, 1)
+            nearest = cv2.remap(inverse, columns, rows, cv2.INTER_NEAREST)
+            smooth = cv2.remap(inverse, columns, rows, cv2.INTER_LINEAR)
+            inverse = np.where(rough > 0, nearest, smooth)
+            depth = np.asarray(np.reciprocal(inverse), np.float32)
+    if numbers is not None:
+        numbers = np.asarray(
+            cv2.remap(numbers, columns, rows, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, -1),
+            np.int32,
+        )
+    return Drawn(colours, depth, numbers)
+
+
+def _add(seen: Drawn, stage: Stage, face: Face, first: int, last: int) -> None:
+    """Draw of a face what some rows of an image need, and put it there."""
+    assert face.columns is not None
+    assert face.rows is not None
+    assert face.mask is not None
+    mask = face.mask[first:last]
+    if not mask.any():
+        return
+    columns, rows = face.columns[first:last], face.rows[first:last]
+    left, right = _span(columns[mask], face.width)
+    top, bottom = _span(rows[mask], face.height)
+    _aim(stage, face, left, top, right - left, bottom - top)
+    wanted = (image is not None for image in seen)
+    drawn = _drawn(stage, (bottom - top, right - left), *wanted)
+    part = looked_up(drawn, columns - np.float32(left), rows - np.float32(top))
+    if part.depth is not None and face.steepness is not None:
+        part = part._replace(depth=part.depth * face.steepness[first:last])
+    for whole, piece in zip(seen, part, strict=True):
+        if whole is not None and piece is not None:
+            whole[mask] = piece[mask]
+
+
+def _span(places: Maps, length: int) -> tuple[int, int]:
+    """Return the first pixel to draw, and the one after the last, for all places to be known."""
+    first, last = math.floor(places.min()) - MARGIN + 1, math.ceil(places.max()) + MARGIN
+    return max(first, 0), min(last, length)
+
+
+def _aim(stage: Stage, face: Face, left: int, top: int, width: int, height: int) -> None:
+    """Have a stage draw a rectangle of a face's pixels."""
+    (across, down), x, y = face.pitch, face.left, face.top
+    edges = x + left * across, x + (left + width) * across
+    stage.aim(face.turn, *edges, y + top * down, y + (top + height) * down)
+
+
+def _drawn(stage: Stage, size: tuple[int, int], colour: bool, depth: bool, numbers: bool) -> Drawn:
+    colours, planar = stage.colour_and_depth(size, colour, depth)
+    return Drawn(colours, planar, stage.segmentation(size) if numbers else None)
