@@ -307,7 +307,9 @@ def test_the_undistorted_twin_shows_the_same_world() -> None:
     assert twin.depth is not None
     assert expected.rgb is not None
     assert expected.depth is not None
-    alike = np.equal(twin.segmentation, expected.segmentation)
+    assert twin.segmentation is not None
+    assert expected.segmentation is not None
+    alike = twin.segmentation == expected.segmentation
     assert alike.mean() > 0.985
     same = alike & np.isfinite(expected.depth)
     assert same.mean() > 0.1
