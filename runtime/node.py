@@ -14,7 +14,16 @@ import functools
 import zlib
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Generic, ParamSpec, Protocol, dataclass_transform, get_args
+from typing import (
+    Any,
+    ClassVar,
+    Generic,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    dataclass_transform,
+    get_args,
+)
 
 import msgspec
 import numpy as np
@@ -54,13 +63,38 @@ class NodeConfig(msgspec.Struct, metaclass=_ConfigMeta, frozen=True, kw_only=Tru
 C = TypeVar("C", bound=NodeConfig, default=NodeConfig)
 
 
+class Sibling(NamedTuple):
+    """A node of the run, as the file describes it.
+
+    Attributes:
+        name: As in the file.
+        node: Its class.
+        config: Its settings.
+        sources: Ports that the file narrows to a source.
+        here: Whether it runs in this process.
+    """
+
+    name: str
+    node: type[Node[Any]]
+    config: Any
+    sources: Mapping[str, str]
+    here: bool
+
+
 class Host(Protocol):
-    """What a run does for its nodes; see the methods of `Node` that call these."""
+    """What a run does for its nodes; see the methods of `Node` that call these.
+
+    Attributes:
+        siblings: All nodes of the run, in file order.
+        shared: What nodes of this process share, by name.
+    """
 
     seed: int
     clock: Clock
     out: Path | None
     checking: bool
+    siblings: tuple[Sibling, ...]
+    shared: dict[str, Any]
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as part of a node."""
@@ -204,6 +238,25 @@ class Node(Generic[C]):
         """Finish: flush and close. May send; nodes before this one in the file still receive it."""
 
     # What a node can ask for.
+
+    def siblings(self, cls: type[Any]) -> tuple[Sibling, ...]:
+        """Return the run's nodes of a class, this one included, in file order.
+
+        They are known by their settings before any of them starts up, those in other processes
+        too.
+        """
+        return tuple(each for each in self._host.siblings if issubclass(each.node, cls))
+
+    def share(self, name: str, make: Callable[[], R]) -> R:
+        """Return what nodes of this process share under a name; whoever asks first makes it.
+
+        It outlives a restart of any of them, and is forgotten with the run.
+        """
+        shared = self._host.shared
+        if name not in shared:
+            shared[name] = make()
+        found: R = shared[name]
+        return found
 
     async def offload(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
         """Run a slow function in a thread, and await its result; the loop goes on meanwhile.

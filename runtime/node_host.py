@@ -7,15 +7,16 @@ import concurrent.futures
 import functools
 import inspect
 import logging
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Container, Coroutine, Mapping
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 from typing_extensions import TypeVar
 
+from runtime.config.model import Config
 from runtime.instruments import Instruments
-from runtime.node import Node
+from runtime.node import Node, Sibling
 from runtime.node_runner import Create, NodeRunner
 from runtime.parameter_server import ParameterServer
 from runtime.run_state import RunState
@@ -58,6 +59,8 @@ class NodeHost:
         self.out = out
         self.seed = state.config.run.seed
         self.clock = state.clock
+        self.siblings = siblings(state.config, state.runners)
+        self.shared: dict[str, Any] = {}
         self.instruments = instruments
         self.parameters = parameters
         self.stop = stop
@@ -203,6 +206,14 @@ class NodeHost:
 
         self.start(node, serve())
         return hand_over
+
+
+def siblings(config: Config, here: Container[str]) -> tuple[Sibling, ...]:
+    """Return all nodes of a file, as nodes get to know each other; `here` are those that run."""
+    return tuple(
+        Sibling(spec.name, spec.node, spec.config, spec.inputs, spec.name in here)
+        for spec in config.nodes
+    )
 
 
 def _ticker_name(runner: NodeRunner, name: str) -> str:

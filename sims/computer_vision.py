@@ -25,6 +25,7 @@ from events import (
 from events.rotations import from_rpy, from_yaw, multiply, normalize, rotate, rotate_inverse, yaw_of
 from runtime import Tick, every, on
 from runtime.paths import InputPath
+from sims.addressing import Addressee
 from sims.cameras import (
     CameraSpec,
     add_free_camera,
@@ -32,8 +33,9 @@ from sims.cameras import (
     pose_to_qpos,
     qvel_between,
 )
+from sims.shared_world import join_world
 from sims.simulator import Rate, Simulator, SimulatorConfig
-from sims.worlds import load_world
+from sims.worlds import Dynamics, Scene
 
 MOMENT = 1e-3
 """Seconds, half of them before the stamp, over which the camera's velocity is taken."""
@@ -64,9 +66,13 @@ class FreeCameraConfig(SimulatorConfig):
 class FreeCamera(Simulator[FreeCameraConfig]):
     """Cameras that follow set-points or a trajectory file, with no vehicle and no physics.
 
+    Beside vehicles it is in their world, and sees them.
+
     The odometry's twist is that of the trajectory, or of the velocity set-point. At a row of the
     file, where two straight lines meet, it is the mean of both. After a jump to a pose it is zero.
     """
+
+    alone = True
 
     @property
     def frame_id(self) -> str:
@@ -90,16 +96,24 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         self._rows = (
             await self.offload(read_tum, Path(config.trajectory)) if (config.trajectory) else None
         )
-        await self.rig.start(await self.offload(self._build))
+        self._addressee = Addressee(self.name, self.siblings(Simulator), self.sources)
+        self._world = await join_world(self)
+        joint = self._world.model.joint(self.name)
+        pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
+        self._of_pose, self._of_twist = slice(pose, pose + 7), slice(twist, twist + 6)
+        await self.rig.start(self._world)
 
-    def _build(self) -> Any:
-        world = load_world(self.config.world, bare=self.checking)
-        add_free_camera(world, self.name, self.cameras)
-        return world.compile()
+    @classmethod
+    def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
+        """Put the cameras into the world."""
+        add_free_camera(scene.spec, name, _at_rate(config))
+        return Dynamics()
 
     @on(PoseSetpoint, PositionSetpoint, VelocitySetpoint)
     def setpoints(self, event: PoseSetpoint | PositionSetpoint | VelocitySetpoint) -> None:
         """Jump to a pose, or to a position with level attitude, or move with a velocity."""
+        if not self._addressee.obeys(event, "setpoints"):
+            return
         self._velocity = event if isinstance(event, VelocitySetpoint) else None
         if isinstance(event, PoseSetpoint):
             self._position, self._orientation = event.position, normalize(event.orientation)
@@ -130,9 +144,11 @@ class FreeCamera(Simulator[FreeCameraConfig]):
                 angular_velocity=(wx, -wy, -wz),
             )
         )
-        qpos = pose_to_qpos(self._position, self._orientation)
+        _, state, velocities = self._world.state_at(tick.stamp)
+        state[self._of_pose] = pose_to_qpos(self._position, self._orientation)
+        velocities[self._of_twist] = qvel
         for camera in self.config.cameras:
-            self.rig.expose(camera.name, tick.stamp, qpos, qvel)
+            self.rig.expose(camera.name, tick.stamp, state, velocities)
 
     def _pose_in(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
         """Return the pose some seconds after `stamp`, or before it if negative."""

@@ -21,14 +21,18 @@ from events import (
     Odometry,
     PathAnnouncement,
     Range,
+    PilotAnnouncement,
     Setpoint,
+    Vector3,
     VehicleAnnouncement,
     VehicleEvent,
 )
 from events.rotations import rotate_inverse
 from runtime import Output, Tick, every, on
+from sims.addressing import Addressee
 from sims.cameras import add_camera, check_cameras
 from sims.sensors import SensorOutputs, SensorsConfig, SensorSuite, mount_imu
+from sims.shared_world import join_world
 from sims.simulator import Rate, Simulator
 from sims.vehicle import (
     STANDING_HEIGHT,
@@ -42,7 +46,7 @@ from sims.vehicle import (
 )
 from sims.vehicle.clearance import FALL, Clearance, trouble_at_start, trouble_on_path
 from sims.vehicle.physics import Contact
-from sims.worlds import Dynamics, load_world
+from sims.worlds import Dynamics, Scene
 
 FRAME = "base_link"
 """Frame of the vehicle's body."""
@@ -89,6 +93,8 @@ class Multirotor(Simulator[MultirotorConfig]):
     It obeys commands (`Arm`, `Takeoff`, `Hover`, `Land`, `Disarm`), and follows set-points of
     position, velocity, attitude or body rates while it flies. Ground truth is sent as `odometry`
     and `camera_poses`, without noise.
+
+    Several are in one world: they collide, see one another, and obey what names them.
     """
 
     imu = Output(Imu)
@@ -99,17 +105,19 @@ class Multirotor(Simulator[MultirotorConfig]):
     vehicle_events = Output(VehicleEvent)
 
     frame_id = FRAME
+    vehicle = True
 
     async def on_startup(self) -> None:
         """Build the world, and start what renders it."""
         await super().on_startup()
         config = self.config
-        north, east = config.position
-        self._start = (north, east, -config.height - STANDING_HEIGHT)
-        model = await self.offload(self._build)
-        self._physics = Physics(model, self.name)
-        self._clearance = Clearance(model, self.name)
-        await self.offload(self._physics.settle)
+        self._start = start_of(config)
+        self._world = await join_world(self)
+        assert self._world.simulation is not None
+        self._physics = Physics(self._world.simulation, self.name)
+        self._clearance = Clearance(self._world.model, self.name)
+        if not self._physics.time_ns:
+            await self.offload(self._physics.settle)
         self._autopilot = Autopilot(
             self._physics.parameters,
             config.gains,
@@ -118,13 +126,15 @@ class Multirotor(Simulator[MultirotorConfig]):
         )
         outputs = SensorOutputs(self.pressures, self.fixes, self.magnetic_fields, self.ranges)
         self._suite = SensorSuite(
-            self, config, outputs, FRAME, self._physics, self._advance, Dynamics()
+            self, config, outputs, FRAME, self._physics, self._advance, self._world.dynamics
         )
+        self._addressee = Addressee(self.name, self.siblings(Simulator), self.sources)
+        self._pilots: list[PilotAnnouncement] = []
         self._touched: frozenset[str] = frozenset()
         self._refused = ""
         self._odometry_stamp = -1
         self._triggered: list[str] = []
-        await self.rig.start(model)
+        await self.rig.start(self._world)
         free = config.trigger == "free"
         if free:  # an image without latency comes after the IMU sample of its stamp
             self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
@@ -141,14 +151,19 @@ class Multirotor(Simulator[MultirotorConfig]):
         for mounting in self._suite.transforms():
             self.transforms.send(mounting)
 
-    def _build(self) -> Any:
-        config = self.config
-        world = load_world(config.world, bare=self.checking)
-        attach_vehicle(world, self.name, self._start, math.radians(config.yaw))
-        mount_imu(world, self.name, config.imu)
+    async def on_shutdown(self) -> None:
+        """Stop the motors: without a controller the vehicle falls, if others fly on."""
+        await super().on_shutdown()
+        self._physics.set_motors(0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
+        """Put the vehicle, its IMU and its cameras into the world."""
+        attach_vehicle(scene.spec, name, start_of(config), math.radians(config.yaw))
+        mount_imu(scene.spec, name, config.imu)
         for camera in config.cameras:
-            add_camera(world, f"{self.name}/{FRAME}", camera, f"{self.name}/")
-        return world.compile()
+            add_camera(scene.spec, f"{name}/{FRAME}", camera, f"{name}/")
+        return Dynamics()
 
     def announce(self) -> Iterable[Announcement]:
         """Announce the vehicle, its IMU and its cameras."""
@@ -177,23 +192,12 @@ class Multirotor(Simulator[MultirotorConfig]):
                     )
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Refuse a path that cannot be flown, and to share a pilot with another vehicle."""
-        if isinstance(announcement, PathAnnouncement):
-            self._refuse_path(announcement)
-        if not isinstance(announcement, VehicleAnnouncement) or announcement.source == self.name:
+        """Note who sends orders, and refuse a path that cannot be flown."""
+        if isinstance(announcement, PilotAnnouncement):
+            self._pilots.append(announcement)
+        if not isinstance(announcement, PathAnnouncement):
             return
-        if unnarrowed := [port for port in ("commands", "setpoints") if port not in self.sources]:
-            line = ", ".join(f'{port} = "PILOT"' for port in unnarrowed)
-            raise ValueError(
-                "of several vehicles, each was expected to say which node it obeys, but "
-                f"{self.name} obeys them all: write inputs = {{ {line} }} into its entry, "
-                "with the name of that node in place of PILOT"
-            )
-
-    def _refuse_path(self, announcement: PathAnnouncement) -> None:
-        """Raise `ValueError` if this vehicle is to fly a path and cannot."""
-        pilot = self.sources.get("setpoints", announcement.source)
-        if announcement.source != pilot and not announcement.source.startswith(f"{pilot}/"):
+        if not self._addressee.obeys(announcement, "setpoints"):
             return
         if trouble_at_start(self._clearance, self._start):  # which `check` reports
             return
@@ -203,7 +207,8 @@ class Multirotor(Simulator[MultirotorConfig]):
             raise ValueError(trouble)
 
     def check(self) -> Iterable[str]:
-        """Return why the vehicle cannot stand at its start."""
+        """Return why the vehicle cannot stand at its start, or a pilot's orders are for nobody."""
+        yield from self._addressee.complaints(self._pilots)
         if trouble := trouble_at_start(self._clearance, self._start):
             yield f"position: {trouble}"
         elif (fall := self._clearance.ground_below(self._start) or 0.0) > FALL:
@@ -211,17 +216,30 @@ class Multirotor(Simulator[MultirotorConfig]):
 
     @on(Command)
     def commands(self, event: Command) -> None:
-        """Obey a command, or log why it is refused."""
-        if reason := self._autopilot.command(event):
+        """Obey a command that is for this vehicle, or log why it is refused."""
+        if self._is_for_this(event, "commands") and (reason := self._autopilot.command(event)):
             self.log.warning("%s refused: %s", type(event).__name__, reason)
 
     @on(Setpoint)
     def setpoints(self, event: Setpoint) -> None:
-        """Follow a set-point, or log why it is refused, once for each reason in a row."""
+        """Follow a set-point that is for this vehicle, or log why it is refused.
+
+        That is logged once for each reason in a row.
+        """
+        if not self._is_for_this(event, "setpoints"):
+            return
         reason = self._autopilot.command(event) or ""
         if reason and reason != self._refused:
             self.log.warning("%s refused: %s", type(event).__name__, reason)
         self._refused = reason
+
+    def _is_for_this(self, order: Command | Setpoint, port: str) -> bool:
+        if self._addressee.obeys(order, port):
+            return True
+        if reason := self._addressee.refusal(order):
+            what = type(order).__name__
+            self.log.warning("%s of %s refused: vehicle: %s", what, order.source, reason)
+        return False
 
     @every(hz="control_rate")
     def control(self, tick: Tick) -> None:
@@ -298,6 +316,12 @@ class Multirotor(Simulator[MultirotorConfig]):
                     )
                 )
         self._touched = touched
+
+
+def start_of(config: MultirotorConfig) -> Vector3:
+    """Return where a vehicle's ``base_link`` is at the start, metres NED."""
+    north, east = config.position
+    return (north, east, -config.height - STANDING_HEIGHT)
 
 
 def _stands_on(contact: Contact) -> bool:

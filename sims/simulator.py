@@ -22,6 +22,7 @@ from runtime import Duration, Node, NodeConfig, Output
 from runtime.paths import NameOrPath
 from sims.cameras import CameraSpec
 from sims.cameras.rig import CameraOutputs, CameraRig
+from sims.shared_world import Inhabitant
 
 Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
@@ -33,9 +34,10 @@ class SimulatorConfig(NodeConfig):
     """Settings of every simulator.
 
     Attributes:
-        world: Name of a built-in world (``hall``, ``yard``), or path of an MJCF file. In an MJCF
-            file x is north, y is west and z is up; in all settings and events x is north, y is
-            east and z is down (NED). So a geom with ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
+        world: Name of a built-in world (``hall``, ``yard``), or path of an MJCF file; empty for
+            that of the run's other vehicles, or ``hall`` if none names one. In an MJCF file x is
+            north, y is west and z is up; in all settings and events x is north, y is east and z
+            is down (NED). So a geom with ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
         origin: Where the origin of ``map`` is on the earth: latitude and longitude, degrees north
             and east, and altitude, metres above the WGS 84 ellipsoid, which here is sea level too.
         cameras: The cameras that are carried.
@@ -45,7 +47,7 @@ class SimulatorConfig(NodeConfig):
             pose, which hold until the next.
     """
 
-    world: NameOrPath = "hall"
+    world: NameOrPath = ""
     origin: tuple[Latitude, Longitude, float] = (47.641468, -122.140165, 122.0)
     cameras: tuple[CameraSpec, ...] = ()
     camera_processes: Count = 2
@@ -56,7 +58,7 @@ class SimulatorConfig(NodeConfig):
 C = TypeVar("C", bound=SimulatorConfig, default=SimulatorConfig)
 
 
-class Simulator(Node[C], ABC):
+class Simulator(Inhabitant, Node[C], ABC):
     """Base of the simulators' nodes: their common outputs, and the cameras.
 
     A subclass compiles the model in `on_startup`, after that of this class, and then starts the

@@ -11,7 +11,7 @@ import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -25,6 +25,7 @@ from events import (
     Landed,
     Odometry,
     PathAnnouncement,
+    PilotAnnouncement,
     PoseEstimate,
     Shutdown,
     TakenOff,
@@ -45,6 +46,7 @@ class PilotConfig(NodeConfig):
     """Settings of a scripted flight.
 
     Attributes:
+        vehicle: Name of the vehicle that is flown; may be left out if there is only one.
         waypoints: Places to pass, metres in ``map`` (x north, y east, z down: heights are
             negative). The path begins above the place where the vehicle stands. May be left out
             where there is a `figure_eight`.
@@ -63,6 +65,7 @@ class PilotConfig(NodeConfig):
         end_run: Whether the run ends once the vehicle has landed.
     """
 
+    vehicle: str = ""
     waypoints: tuple[Vector3, ...] = ()
     speed: Positive = 1.3
     acceleration: Positive = 1.0
@@ -104,11 +107,13 @@ class Pilot(Node[C], ABC):
     """Why the run ends, once the vehicle has landed."""
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the places to pass, and the room that the excitation needs."""
-        excitation = self.config.excitation
+        """Announce the vehicle, the places to pass, and the room that the excitation needs."""
+        excitation, vehicle = self.config.excitation, self.config.vehicle
+        yield PilotAnnouncement(stamp=0, source=self.name, vehicle=vehicle)
         yield PathAnnouncement(
             stamp=0,
             source=self.name,
+            vehicle=vehicle,
             waypoints=tuple(self.config.places()),
             margin=0.0 if excitation is None else excitation.reach,
         )
@@ -119,25 +124,28 @@ class Pilot(Node[C], ABC):
         self._taken_off = asyncio.Event()
         self._landed = asyncio.Event()
         self._vehicles: list[str] = []
-
-    def on_announcement(self, announcement: Announcement) -> None:
-        """Refuse to fly where it is open which of several vehicles is meant."""
-        if not isinstance(announcement, VehicleAnnouncement):
-            return
-        self._vehicles.append(announcement.source)
-        ports = [
+        self._open_ports = [
             port
             for port, handles in self.declared.handlers.items()
             if port not in self.sources
             and any(issubclass(event, Odometry | VehicleEvent) for event in handles.events)
         ]
-        if ports and len(self._vehicles) > 1:
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Listen to the vehicle that is flown; refuse to fly where it is open which is meant."""
+        if not isinstance(announcement, VehicleAnnouncement):
+            return
+        vehicle = self.config.vehicle
+        if vehicle in ("", announcement.source):
+            self._vehicles.append(announcement.source)
+        if self._open_ports and len(self._vehicles) > 1:
             first = self._vehicles[0]
-            line = ", ".join(f'{port} = "{first}"' for port in ports)
             raise ValueError(
                 f"of several vehicles, {self.name} was expected to say which it flies, but it "
-                f"hears them all: write inputs = {{ {line} }} into its entry, if it is {first}"
+                f'hears them all: write vehicle = "{first}" into its entry, if it is {first}'
             )
+        for port in self._open_ports:
+            self.narrow(port, vehicle or announcement.source)
 
     def update_pose(self, pose: Odometry | PoseEstimate) -> None:
         """Note the vehicle's pose; the first one starts the flight."""
@@ -155,24 +163,32 @@ class Pilot(Node[C], ABC):
 
     async def run(self) -> None:
         """Take off, follow the path, land, and end the run."""
-        clock, name = self.clock, self.name
+        clock = self.clock
         await self._pose_known.wait()
         await clock.sleep(self.config.start_delay)
         assert self.pose is not None
         height = self.pose.position[2] - self.config.places()[0][2]
-        self.commands.send(Takeoff(stamp=clock.now(), source=name, altitude=max(height, 0.5)))
+        self.send_command(Takeoff, altitude=max(height, 0.5))
         await self._taken_off.wait()
         path = await self.offload(self._plan, self.pose)
         if path is not None:
             self.log.info("a path of %.1f m in %.1f s", path.length, path.seconds)
             await self.follow(path)
-        self.commands.send(Hover(stamp=clock.now(), source=name))
-        self.commands.send(Land(stamp=clock.now(), source=name))
+        self.send_command(Hover)
+        self.send_command(Land)
         await self._landed.wait()
         self.log.info("landed")
         await clock.sleep(0.5)
         if self.config.end_run:
-            self.shutdowns.send(Shutdown(stamp=clock.now(), source=name, reason=self.outcome))
+            end = Shutdown(stamp=clock.now(), source=self.name, reason=self.outcome)
+            self.shutdowns.send(end)
+
+    def send_command(self, command: type[Command], **fields: Any) -> None:
+        """Send a command to the vehicle that is flown."""
+        vehicle = self.config.vehicle
+        self.commands.send(
+            command(stamp=self.clock.now(), source=self.name, vehicle=vehicle, **fields)
+        )
 
     def _plan(self, start: Odometry | PoseEstimate) -> WaypointPath | None:
         """Return the path from here; `None` if it has no length and no excitation."""

@@ -6,11 +6,13 @@ Keys are events, whoever sends them; `nodes.window` is one node that does.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Annotated
 
 import msgspec
 
 from events import (
+    Announcement,
     Arm,
     Command,
     Disarm,
@@ -18,6 +20,7 @@ from events import (
     KeyPressed,
     KeyReleased,
     Land,
+    PilotAnnouncement,
     Shutdown,
     Takeoff,
     Vector3,
@@ -97,6 +100,8 @@ class TeleopConfig(NodeConfig):
     """Settings of a `Teleop`.
 
     Attributes:
+        vehicle: Name of the vehicle, or free camera, that is flown; may be left out if there is
+            only one.
         speed: Horizontal speed, metres per second; the same where two keys make a diagonal.
         climb_rate: Vertical speed, metres per second.
         yaw_rate: Turning rate, radians per second.
@@ -107,6 +112,7 @@ class TeleopConfig(NodeConfig):
         keys: The keys of each action.
     """
 
+    vehicle: str = ""
     speed: Changeable[Positive] = 2.0
     climb_rate: Changeable[Positive] = 1.0
     yaw_rate: Changeable[Positive] = 1.0
@@ -135,6 +141,10 @@ class Teleop(Node[TeleopConfig]):
         self._actions = self.config.keys.actions()
         self._held: set[str] = set()  # keys, because two may ask for the same
         self._velocity = _STILL
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce the vehicle that is flown."""
+        yield PilotAnnouncement(stamp=0, source=self.name, vehicle=self.config.vehicle)
 
     async def on_startup(self) -> None:
         """Log the keys of each action."""
@@ -194,6 +204,7 @@ class Teleop(Node[TeleopConfig]):
             VelocitySetpoint(
                 stamp=self.clock.now(),
                 source=self.name,
+                vehicle=self.config.vehicle,
                 frame_id="heading",
                 velocity=velocity,
                 yaw_rate=yaw_rate,
@@ -202,14 +213,13 @@ class Teleop(Node[TeleopConfig]):
 
     def _send_command(self, action: str) -> None:
         stamp, source = self.clock.now(), self.name
-        match action:
-            case "takeoff":
-                altitude = self.config.altitude
-                self.commands.send(Takeoff(stamp=stamp, source=source, altitude=altitude))
-            case "quit":
-                self.shutdowns.send(Shutdown(stamp=stamp, source=source, reason="quit by key"))
-            case _:
-                self.commands.send(_COMMANDS[action](stamp=stamp, source=source))
+        if action == "quit":
+            self.shutdowns.send(Shutdown(stamp=stamp, source=source, reason="quit by key"))
+            return
+        command = Takeoff if action == "takeoff" else _COMMANDS[action]
+        fields = {"altitude": self.config.altitude} if action == "takeoff" else {}
+        vehicle = self.config.vehicle
+        self.commands.send(command(stamp=stamp, source=source, vehicle=vehicle, **fields))
 
 
 def approach(now: Vector3, goal: Vector3, step: float) -> Vector3:

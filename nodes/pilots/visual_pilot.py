@@ -82,7 +82,12 @@ class VisualPilot(Pilot[VisualPilotConfig]):
             now = clock.now()
             x, y, z = path.position[index].tolist()
             yaw = float(path.yaw[index])
-            self.plans.send(PlannedPose(stamp=now, source=self.name, position=(x, y, z), yaw=yaw))
+            vehicle = self.config.vehicle
+            self.plans.send(
+                PlannedPose(
+                    stamp=now, source=self.name, vehicle=vehicle, position=(x, y, z), yaw=yaw
+                )
+            )
             assert self.pose is not None
             # Compared with the path at the stamp of the image, so that its age does not matter.
             then = min(max(round((self.pose.stamp - start) / step), 0), last)
@@ -99,6 +104,7 @@ class VisualPilot(Pilot[VisualPilotConfig]):
                 VelocitySetpoint(
                     stamp=now,
                     source=self.name,
+                    vehicle=vehicle,
                     frame_id="heading",
                     velocity=velocity,
                     yaw_rate=float(path.yaw_rate[index]) + config.yaw_gain * yaw_error,
@@ -118,7 +124,7 @@ class VisualPilot(Pilot[VisualPilotConfig]):
         self.log.warning(
             "no estimate in %s for %g s: waiting for one", self._frame, self.config.estimate_timeout
         )
-        self.commands.send(Hover(stamp=start, source=self.name))
+        self.send_command(Hover)
         while (now := self.clock.now()) - self.pose.stamp > self.config.estimate_timeout * 1e9:
             if now - start > self.config.landing_timeout * 1e9:
                 missed = f"no estimate in {self._frame} for {self.config.landing_timeout:g} s"

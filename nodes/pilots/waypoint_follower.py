@@ -38,6 +38,7 @@ class WaypointFollower(Pilot[PilotConfig]):
                 PositionSetpoint(
                     stamp=self.clock.now(),
                     source=self.name,
+                    vehicle=self.config.vehicle,
                     position=tuple(position),
                     velocity=tuple(velocity),
                     acceleration=tuple(acceleration),

@@ -32,6 +32,7 @@ from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
 from runtime.execute import make_clock, make_loop
 from runtime.graph import input_types, unconnected
 from runtime.node import Node
+from runtime.node_host import siblings
 from runtime.node_runner import NodeRunner
 from runtime.paths import written
 from runtime.schedule import Tick, Ticker
@@ -87,7 +88,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> N
     loop = asyncio.get_running_loop()
     task_factory.install(loop)
     clock = make_clock(config.run, loop)
-    host = _DryHost(config.run.seed, clock)
+    host = _DryHost(config, clock)
     created: set[asyncio.Task[Any]] = set()
 
     def create(coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
@@ -161,9 +162,11 @@ class _DryHost:
     checking = True
     out: Path | None = None
 
-    def __init__(self, seed: int, clock: Clock) -> None:
-        self.seed = seed
+    def __init__(self, config: Config, clock: Clock) -> None:
+        self.seed = config.run.seed
         self.clock = clock
+        self.siblings = siblings(config, {spec.name for spec in config.nodes})
+        self.shared: dict[str, Any] = {}
         self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
         )

@@ -25,7 +25,7 @@ from sims.cameras.noise import generator, grey_of, noisy_depth
 from sims.cameras.optics import moments
 from sims.cameras.shot import Shot
 from sims.cameras.spec import CameraSpec, camera_info, is_plain
-from sims.cameras.stage import NEAR, RANGE, Colours, Depths, Floats, Stage
+from sims.cameras.stage import NEAR, RANGE, Changing, Colours, Depths, Floats, Stage
 from sims.cameras.view import Drawn, View, looked_up
 
 
@@ -73,6 +73,7 @@ class CameraRenderer:
         prefix: Prefix of the cameras' names in the model.
         seed: Seed of the noise.
         threads: Threads of the software renderer, if this is the process's first GL context.
+        dynamics: What moves in the world by itself, as `sims.worlds.Dynamics`.
 
     Raises:
         GraphicsError: There is no GL; the message names what to install.
@@ -86,6 +87,7 @@ class CameraRenderer:
         prefix: str,
         seed: int,
         threads: int = 1,
+        dynamics: Changing | None = None,
     ) -> None:
         model = model_from_bytes(model_bytes)
         self._model = model
@@ -97,7 +99,7 @@ class CameraRenderer:
         }
         self._views = {spec.name: View(camera_info(spec), is_plain(spec)) for spec in cameras}
         width, height = np.max([(1, 1), *(v.largest() for v in self._views.values())], axis=0)
-        self._stage = Stage(model, int(width), int(height), threads)
+        self._stage = Stage(model, int(width), int(height), threads, dynamics)
 
     def render(
         self,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -28,7 +28,7 @@ from sims.cameras.delivery import delay_of
 from sims.cameras.exposure import ExposureControl
 from sims.cameras.frame import Frame
 from sims.cameras.lens import undistorted
-from sims.cameras.renderer import CameraRenderer, model_to_bytes
+from sims.cameras.renderer import CameraRenderer
 from sims.cameras.shot import Shot
 from sims.cameras.spec import CameraSpec, announcement, optical_frame, optical_in_body
 
@@ -43,6 +43,20 @@ class CameraOutputs(msgspec.Struct, frozen=True):
     depth_images: Sender[DepthImage]
     segmentation_images: Sender[SegmentationImage]
     camera_poses: Sender[PoseStamped]
+
+
+class DrawnWorld(Protocol):
+    """What the renderers are told of the world.
+
+    Attributes:
+        dynamics: What moves in it by itself.
+    """
+
+    dynamics: Any
+
+    @property
+    def model_bytes(self) -> bytes:
+        """The compiled world, from `model_to_bytes`."""
 
 
 class _Exposure(NamedTuple):
@@ -95,8 +109,8 @@ class CameraRig:
         self.skipped = dict.fromkeys(self._specs, 0)
         """Exposures left out because the renderer was behind; never in lockstep."""
 
-    async def start(self, model: Any) -> None:
-        """Start the renderers with a compiled model.
+    async def start(self, world: DrawnWorld) -> None:
+        """Start the renderers.
 
         Raises:
             GraphicsError: This machine cannot render.
@@ -106,11 +120,12 @@ class CameraRig:
         self._seed = int(self._node.rng.integers(1 << 31))
         self._renderer = await self._node.worker(
             CameraRenderer,
-            await self._node.offload(model_to_bytes, model),
+            await self._node.offload(lambda: world.model_bytes),
             tuple(self._specs.values()),
             f"{self._node.name}/",
             self._seed,
             self._threads,
+            world.dynamics,
             processes=self._processes,
         )
 

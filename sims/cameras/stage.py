@@ -6,7 +6,7 @@ Here everything is ideal. What lens, shutter and sensor do to an image is put to
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -35,6 +35,13 @@ LOOK = ".look"
 """A geom `<name>.look` is the image of the geom `<name>`, and is numbered as that one is."""
 
 
+class Changing(Protocol):
+    """What a stage must know of what moves in a world by itself."""
+
+    def apply(self, model: Any, data: Any, seconds: float) -> None:
+        """Make the world as it is at a time."""
+
+
 class Stage:
     """Draws the geoms of groups 0 to 2 (MuJoCo's default) of one model.
 
@@ -45,16 +52,25 @@ class Stage:
         width: Width of the largest image, pixels.
         height: Height of the largest image, pixels.
         threads: Threads of the software renderer, if this is the process's first GL context.
+        dynamics: What moves in the world by itself.
 
     Raises:
         GraphicsError: There is no GL; the message names what to install.
     """
 
-    def __init__(self, model: Any, width: int, height: int, threads: int) -> None:
+    def __init__(
+        self,
+        model: Any,
+        width: int,
+        height: int,
+        threads: int,
+        dynamics: Changing | None = None,
+    ) -> None:
         self._context: Any = None
         self._axes: Floats | None = None
         self._gl: Any = None
         self.model = model
+        self._dynamics = dynamics
         self._data = mujoco.MjData(model)
         _set_quality(model, width, height)
         self._numbers = _object_numbers(model)
@@ -79,13 +95,7 @@ class Stage:
         """Make this stage's context the thread's."""
         self._gl.make_current()
 
-    def look(
-        self,
-        camera_id: int,
-        qpos: Floats,
-        seconds: float = 0.0,  # noqa: ARG002  # of what moves by itself
-        light: float = 1.0,
-    ) -> None:
+    def look(self, camera_id: int, qpos: Floats, seconds: float = 0.0, light: float = 1.0) -> None:
         """Set the scene up as a camera sees it.
 
         Args:
@@ -96,6 +106,8 @@ class Stage:
         """
         model, data = self.model, self._data
         data.qpos[:] = qpos
+        if self._dynamics is not None:
+            self._dynamics.apply(model, data, seconds)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)  # lights that track something ask for it
         mujoco.mj_camlight(model, data)

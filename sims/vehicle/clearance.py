@@ -15,7 +15,7 @@ import numpy as np
 
 from events import Vector3
 from events.frames import flip_yz
-from sims.vehicle.model import STANDING_HEIGHT
+from sims.vehicle.model import STANDING_HEIGHT, mover_of
 
 DEPTH = 0.02
 """Metres that a vehicle may reach into something: feet that stand, a propeller that brushes."""
@@ -39,21 +39,31 @@ class Clearance:
         pose = int(model.joint(f"{name}/free").qposadr[0])
         self._place = self._data.qpos[pose : pose + 3]
         mujoco.mj_fwdPosition(model, self._data)
-        # Group 0: solids. Group 1: what is only to be seen, which a ray must not hit.
-        self._only_seen = np.where(model.geom_contype | model.geom_conaffinity, 0, 1)
+        self._movers = [mover_of(model, geom) for geom in range(model.ngeom)]
+        solid = (model.geom_contype | model.geom_conaffinity) != 0
+        # Group 0: solids. Group 1: what a ray must not hit, which is only to be seen or moves.
+        self._no_hits = np.where(solid & (np.array(self._movers) == ""), 0, 1)
 
-    def at(self, place: Vector3) -> str:
-        """Return the name of what the vehicle would be stuck in, level; empty for nothing."""
+    def at(self, place: Vector3, *, now: bool = False) -> str:
+        """Return the name of what the vehicle would be stuck in, level; empty for nothing.
+
+        Args:
+            place: Metres NED.
+            now: Whether it would be there at the start, when other vehicles and what moves by
+                itself are where they begin; later they are elsewhere.
+        """
         self._place[:] = flip_yz(place)
         mujoco.mj_fwdPosition(self._model, self._data)
         contact, body_of = self._data.contact, self._model.geom_bodyid
-        deepest = -DEPTH
-        found = ""
+        deepest, found = 0.0, ""
         for pair, distance in zip(contact.geom.tolist(), contact.dist.tolist(), strict=True):
             own = [geom for geom in pair if body_of[geom] == self._body]
-            if len(own) == 1 and distance < deepest:
+            other = pair[0] if own[-1:] == pair[1:] else pair[1]
+            if len(own) != 1 or (self._movers[other] and not now):
+                continue
+            if distance < min(deepest, 0.0 if self._movers[other] else -DEPTH):
                 deepest = distance
-                found = self._name_of(pair[0] if own[0] == pair[1] else pair[1])
+                found = self._name_of(other)
         return found
 
     def between(self, start: Vector3, end: Vector3) -> str:
@@ -75,7 +85,7 @@ class Clearance:
         direction = np.array(flip_yz((x, y, z)))
         hit = np.zeros(1, np.int32)
         groups = self._model.geom_group.copy()
-        self._model.geom_group[:] = self._only_seen
+        self._model.geom_group[:] = self._no_hits
         try:
             distance = mujoco.mj_ray(
                 self._model,
@@ -94,6 +104,8 @@ class Clearance:
 
     def _name_of(self, geom: int) -> str:
         model = self._model
+        if self._movers[geom]:
+            return self._movers[geom]
         kind = "the ground" if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE else ""
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or mujoco.mj_id2name(
             model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])
@@ -105,7 +117,7 @@ class Clearance:
 
 def trouble_at_start(world: Clearance, place: Vector3) -> str:
     """Return why a vehicle cannot stand at a position; empty if it can."""
-    if found := world.at(place):
+    if found := world.at(place, now=True):
         return f"expected a free place to start at, found {show(place)} in {found}"
     if world.ground_below(place) is None:
         return f"expected ground below the start, found none at {show(place)}: outside the world"

@@ -133,6 +133,18 @@ def read_parameters(model: mujoco.MjModel, name: str) -> VehicleParameters:
     )
 
 
+def mover_of(model: mujoco.MjModel, geom: int) -> str:
+    """Return the name of the vehicle, or of the body that moves by itself, that a geom is part of.
+
+    Empty for what is part of neither: it stands, or is moved by physics only.
+    """
+    root = int(model.body_rootid[model.geom_bodyid[geom]])
+    name = str(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, root) or "")
+    if model.body_mocapid[root] >= 0:
+        return name
+    return name.removesuffix("/base_link") if name.endswith("/base_link") else ""
+
+
 def _read_motor(model: mujoco.MjModel, name: str) -> Motor:
     gear = model.actuator(name).gear.tolist()
     x, y, z = model.site(name).pos.tolist()

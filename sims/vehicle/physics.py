@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Quaternion, Vector3
-from sims.vehicle.model import VehicleParameters, read_parameters
+from sims.vehicle.model import VehicleParameters, mover_of, read_parameters
 from sims.vehicle.simulation import Simulation
 
 Floats = npt.NDArray[np.float64]
@@ -40,7 +40,8 @@ class Contact(msgspec.Struct, frozen=True, gc=False):
     """One point at which the vehicle touches something.
 
     Attributes:
-        other: Name of the other geom; of its body if it has none.
+        other: Name of the vehicle, or of the body that moves by itself, that it touches; else of
+            the geom, or of its body if it has none.
         position: Metres NED.
         normal: Unit vector NED, from the other towards the vehicle.
         speed: Metres per second at which the two close in along the normal; negative if they part.
@@ -196,7 +197,14 @@ class Physics:
         return Contact(self._name_of(geom), (x, -y, -z), (nx, -ny, -nz), closing)
 
     def _velocity_at(self, body: int, point: Vector3) -> Vector3:
-        """Return the velocity (m/s, NWU) of a body's material at a point of the world."""
+        """Return the velocity (m/s, NWU) of a body's material at a point of the world.
+
+        That of a body which moves by itself is the one of its origin.
+        """
+        mocap = int(self.model.body_mocapid[self.model.body_rootid[body]])
+        if mocap >= 0:
+            vx, vy, vz = self.simulation.mocap_velocities[mocap].tolist()
+            return vx, vy, vz
         velocity = np.zeros(6)  # angular, then linear, at the body's origin, in the world's axes
         mujoco.mj_objectVelocity(
             self.model, self.data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0
@@ -207,7 +215,9 @@ class Physics:
         return vx + wy * z - wz * y, vy + wz * x - wx * z, vz + wx * y - wy * x
 
     def _name_of(self, geom: int) -> str:
-        name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_GEOM, geom)
+        name = mover_of(self.model, geom) or mujoco.mj_id2name(
+            self.model, mujoco.mjtObj.mjOBJ_GEOM, geom
+        )
         if not name:
             body = int(self.model.geom_bodyid[geom])
             name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_BODY, body)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -18,6 +19,13 @@ class PhysicsDivergedError(Exception):
     """The state is no longer finite: the world's model or what was written into it is at fault."""
 
 
+class Influence(Protocol):
+    """What makes a world other than its physics do: wind, bodies that move by themselves."""
+
+    def apply(self, model: Any, data: Any, seconds: float) -> None:
+        """Make it as it is at a time; called once for each millisecond, the first one included."""
+
+
 class Simulation:
     """A world, stepped by whole milliseconds.
 
@@ -30,18 +38,21 @@ class Simulation:
 
     Args:
         model: A compiled world.
+        influences: What is applied at each millisecond, in this order.
 
     Attributes:
         model: The compiled world.
         data: MuJoCo's data. Whoever writes a state into it does so before anything is read at
             that instant, or calls `changed`.
         history: The states of the past.
+        mocap_velocities: Of the bodies that move by themselves, m/s NWU, shape (nmocap, 3).
+        diverged: Whether its state was no longer finite once: it is of no use any more.
 
     Raises:
         ValueError: The world has another time step.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, influences: Sequence[Influence] = ()) -> None:
         if abs(model.opt.timestep * 1e9 - TIMESTEP_NS) > 1e-3:
             raise ValueError(
                 f"expected a world with a time step of 0.001 s, found {model.opt.timestep} s"
@@ -49,8 +60,11 @@ class Simulation:
         self.model = model
         self.data: Any = mujoco.MjData(model)
         self.history = History(self)
+        self.diverged = False
+        self._influences = tuple(influences)
         self._steps = 0
         self._fresh = False
+        self._apply()
 
     @property
     def time_ns(self) -> int:
@@ -68,14 +82,17 @@ class Simulation:
         steps = stamp_ns // TIMESTEP_NS - self._steps
         if steps <= 0:
             return
-        if self.history.kept:
+        if self.history.kept or self._influences:
             for _ in range(steps):
-                self.history.add()
+                if self.history.kept:
+                    self.history.add()
                 self._step(1)
+                self._apply()
         else:
             self._step(steps)
         # MuJoCo starts again at time 0 when it finds a number that is not finite.
         if self.data.time < (self._steps - 0.5) * 1e-9 * TIMESTEP_NS:
+            self.diverged = True
             raise PhysicsDivergedError(
                 f"the simulation diverged before {self.time_ns / 1e9:.3f} s: "
                 "its state was no longer finite"
@@ -129,6 +146,13 @@ class Simulation:
         self._steps = 0
         self._fresh = False
         self.history.clear()
+        self._apply()
+
+    def _apply(self) -> None:
+        before = self.data.mocap_pos.copy()
+        for influence in self._influences:
+            influence.apply(self.model, self.data, self._steps * TIMESTEP_NS * 1e-9)
+        self.mocap_velocities = (self.data.mocap_pos - before) / (TIMESTEP_NS * 1e-9)
 
     def _step(self, steps: int) -> None:
         self._steps += steps

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from events import Event
 from runtime.clock import Clock
 from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.node import Node, NodeConfig, make_node
+from runtime.node import Node, NodeConfig, Sibling, make_node
 from runtime.schedule import Tick, Ticker
 from runtime.workers.worker import Worker
 
@@ -51,6 +51,8 @@ class NoHost:
         with_loop.close()
         self.out: Path | None = None
         self.checking = False
+        self.siblings: tuple[Sibling, ...] = ()
+        self.shared: dict[str, Any] = {}
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         raise NotImplementedError

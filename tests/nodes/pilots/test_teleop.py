@@ -10,12 +10,15 @@ import pytest
 
 from events import (
     Arm,
+    Command,
     Disarm,
     Event,
     Hover,
     KeyPressed,
     KeyReleased,
     Land,
+    PilotAnnouncement,
+    Setpoint,
     Shutdown,
     Takeoff,
     Vector3,
@@ -36,7 +39,9 @@ def fly(*keys: str, config: dict[str, Any] | None = None, duration: float = 1.0)
         seconds, key = text.split()
         event = KeyPressed if key[0] == "+" else KeyReleased
         inputs.append(event(stamp=round(float(seconds) * 1e9), source="keyboard", key=key[1:]))
-    return run_node(Teleop, inputs=inputs, config=config, duration=duration, name="teleop")
+    result = run_node(Teleop, inputs=inputs, config=config, duration=duration, name="teleop")
+    assert isinstance(result.sent.pop(0), PilotAnnouncement)
+    return result
 
 
 def velocities(result: NodeResult) -> list[tuple[float, float, float, float]]:
@@ -206,3 +211,9 @@ def test_settings_must_be_positive(setting: str) -> None:
 def test_approach_goes_straight_and_not_too_far(goal: Vector3, expected: Vector3) -> None:
     """A far goal is one step nearer on the straight line, a near one is reached."""
     assert approach((0.0, 0.0, 0.0), goal, 1.0) == pytest.approx(expected)
+
+
+def test_all_orders_name_the_vehicle_that_is_flown() -> None:
+    result = fly("0.1 +t", "0.2 -t", "0.3 +w", config={"vehicle": "b"})
+    assert {e.vehicle for e in result.sent if isinstance(e, Command | Setpoint)} == {"b"}
+    assert [type(e) for e in result.sent][:2] == [Takeoff, VelocitySetpoint]

@@ -12,12 +12,16 @@ import pytest
 
 from events import (
     Announcement,
+    Command,
     Event,
     Hover,
     Land,
     Landed,
     Odometry,
+    PathAnnouncement,
+    PilotAnnouncement,
     PositionSetpoint,
+    Setpoint,
     Shutdown,
     TakenOff,
     Takeoff,
@@ -162,11 +166,16 @@ def test_of_several_vehicles_a_tour_says_which_it_flies() -> None:
     """Otherwise it would begin where the other one is, and end when that has landed."""
     vehicles = [spec(Vehicle, "v"), spec(Vehicle, "w")]
     pilot = spec(WaypointFollower, "pilot", {"waypoints": SQUARE})
-    line = r'inputs = \{ vehicle_events = "v", odometry = "v" \}'
-    with pytest.raises(RefusedError, match=f"^pilot: cannot work with w: .*{line}"):
+    with pytest.raises(RefusedError, match=r'^pilot: cannot work with w: .* write vehicle = "v"'):
         run_nodes([*vehicles, pilot], duration=60)
-    pilot = msgspec.structs.replace(
+    narrowed = msgspec.structs.replace(
         pilot, inputs=dict.fromkeys(("vehicle_events", "odometry"), "w")
     )
-    result = run_nodes([*vehicles, pilot], duration=60)
+    assert run_nodes([*vehicles, narrowed], duration=60).reason == "pilot: flight completed"
+    named = spec(WaypointFollower, "pilot", {"waypoints": SQUARE, "vehicle": "w"})
+    result = run_nodes([*vehicles, named], duration=60)
     assert result.reason == "pilot: flight completed"
+    orders = [e for e in result.sent if isinstance(e, Command | Setpoint)]
+    assert {e.vehicle for e in orders} == {"w"}
+    assert [e.vehicle for e in result.of(PilotAnnouncement)] == ["w"]
+    assert [e.vehicle for e in result.of(PathAnnouncement)] == ["w"]

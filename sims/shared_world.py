@@ -1,0 +1,133 @@
+"""The one world of a run: built once, of all nodes that have something in it, which share it."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from runtime import Node
+from runtime.node import Sibling
+from sims.cameras import model_to_bytes
+from sims.vehicle import Simulation
+from sims.worlds import Dynamics, Scene, WorldError, load_scene
+
+Floats = npt.NDArray[np.float64]
+
+
+class Inhabitant:
+    """Mixin of the nodes that have something in the world."""
+
+    vehicle: ClassVar[bool] = False
+    """Whether it is moved by physics."""
+    alone: ClassVar[bool] = False
+    """Whether it has a world for itself if all nodes of the run that have something in it do."""
+
+    @classmethod
+    @abstractmethod
+    def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
+        """Put what a node of this class has into a world, and return what of it moves by itself.
+
+        Args:
+            scene: The world, which is changed.
+            name: The node's name.
+            config: The node's settings.
+        """
+
+
+class SharedWorld:
+    """A compiled world, its physics, and what of it is to be handed to renderers.
+
+    It outlives a restart of any node: what a vehicle does is then as it was left.
+
+    Args:
+        inhabitants: The nodes that have something in it, in file order.
+        bare: Whether images are left out, since nobody is to see them.
+
+    Attributes:
+        name: Name or path of the world.
+        model: The compiled world.
+        dynamics: What moves in it by itself.
+        simulation: Its physics, which all vehicles share. `None` if there is no vehicle.
+    """
+
+    model: Any
+    dynamics: Dynamics
+    simulation: Simulation | None
+
+    def __init__(self, inhabitants: tuple[Sibling, ...], bare: bool) -> None:
+        named = [each for each in inhabitants if each.config.world]
+        self.name = named[0].config.world if named else "hall"
+        self.named_by = named[0].name if named else ""
+        self._inhabitants = inhabitants
+        self._bare = bare
+        self._built = False
+        self._building = asyncio.Lock()
+
+    async def build(self, node: Node[Any]) -> None:
+        """Build it, if that is not done or its physics have diverged."""
+        async with self._building:
+            if not self._built or (self.simulation and self.simulation.diverged):
+                await node.offload(self._build)
+                self._built = True
+
+    @functools.cached_property
+    def model_bytes(self) -> bytes:
+        """The compiled world, for other processes; made when it is first asked for."""
+        return model_to_bytes(self.model)
+
+    def state_at(self, stamp_ns: int) -> tuple[int, Floats, Floats]:
+        """Step the physics up to a time if it is not there yet, and return the world's state.
+
+        Returns:
+            The state's time: that asked for, or that of the physics if it is further, as may
+            happen in real time. Copies of the generalised positions, shape (nq,), and velocities,
+            shape (nv,).
+        """
+        if self.simulation is None:
+            return stamp_ns, self.model.qpos0.copy(), np.zeros(self.model.nv)
+        self.simulation.advance_to(stamp_ns)
+        stamp_ns = max(stamp_ns, self.simulation.time_ns)
+        return stamp_ns, *self.simulation.state_at(stamp_ns)
+
+    def _build(self) -> None:
+        spec, dynamics = load_scene(self.name, bare=self._bare)
+        vehicles = False
+        for each in self._inhabitants:
+            added = each.node.populate(Scene(spec, dynamics), each.name, each.config)  # type: ignore[attr-defined]
+            dynamics = Dynamics(dynamics.motions + added.motions)
+            vehicles |= each.node.vehicle  # type: ignore[attr-defined]
+        self.model = spec.compile()
+        self.__dict__.pop("model_bytes", None)
+        self.dynamics = dynamics
+        self.simulation = Simulation(self.model, dynamics.solid.motions) if vehicles else None
+
+
+async def join_world(node: Any) -> SharedWorld:
+    """Return the world in which a node has something, built by the first one that asks.
+
+    Raises:
+        WorldError: The node names another world than the others do, or some of them are in
+            another process.
+    """
+    inhabitants, key = node.siblings(Inhabitant), "world"
+    if all(each.node.alone for each in inhabitants):
+        inhabitants = tuple(each for each in inhabitants if each.name == node.name)
+        key = f"world of {node.name}"
+    if absent := [each.name for each in inhabitants if not each.here]:
+        raise WorldError(
+            "expected all that is in one world in one process, found "
+            f"{', '.join(absent)} in another one: name them together after --only"
+        )
+    world: SharedWorld = node.share(key, lambda: SharedWorld(inhabitants, node.checking))
+    if node.config.world not in ("", world.name):
+        raise WorldError(
+            f'world: expected "{world.name}", in which {world.named_by} is, since all vehicles of '
+            f'a run share one world, found "{node.config.world}"'
+        )
+    await world.build(node)
+    return world
