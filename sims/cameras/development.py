@@ -17,12 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from events.photometry import response_light, srgb_light, vignette_map
-from sims.cameras.noise import noise_steps, noisy_image
+from sims.cameras.depth_sensor import DepthMeter
+from sims.cameras.noise import noise_steps, noisy_depth, noisy_image
 from sims.cameras.optics import defocused, mean
 from sims.cameras.response import read_response
 from sims.cameras.spec import CameraSpec, camera_info
 
 Image = npt.NDArray[np.uint8]
+Depths = npt.NDArray[np.float32]
 Codes = npt.NDArray[np.uint16]
 
 _LINEAR = 65535.0
@@ -53,6 +55,8 @@ class Development:
         response = read_response(spec.response)
         self._light = response_light(response)
         self._srgb = not response
+        sensor = spec.depth_sensor
+        self._depth_meter = DepthMeter(sensor, camera_info(spec)) if sensor else None
         self._vignette: Codes | None = None
         if any(spec.vignette):
             shares = np.sqrt(vignette_map(camera_info(spec), spec.vignette))
@@ -88,6 +92,21 @@ class Development:
             levels = self._read_out(seen, gain, random) if through_root else seen
         return noisy_image(np.asarray(levels, np.uint8), self._spec.noise, random)
 
+    def measure(
+        self, depth: Depths, images: Sequence[Image], random: np.random.Generator
+    ) -> Depths:
+        """Return what is measured of true depth.
+
+        Args:
+            depth: Metres, shape (height, width); ``inf`` where nothing was hit.
+            images: As for `develop`, if the depth sensor needs them.
+            random: For the noise.
+        """
+        if self._depth_meter is None:
+            return noisy_depth(depth, self._spec.depth_noise, random)
+        middle = images[len(images) // 2] if images else None
+        return self._depth_meter.measure(depth, middle, random)
+
     def meter(self, image: Image) -> float:
         """Return the mean light of a developed image, 0 to 1, as an exposure meter sees it."""
         codes = np.rint(self._light * _LINEAR).astype(np.uint16)
@@ -118,12 +137,12 @@ class Development:
         """
         if self._vignette is not None:
             shares = cv2.merge([self._vignette] * (root.size // self._vignette.size))
-            root = cv2.multiply(root, shares, scale=1.0 / _LINEAR)
+            cv2.multiply(root, shares, dst=root, scale=1.0 / _LINEAR)
         electrons = self._spec.full_well / gain
         sigma = 0.5 / math.sqrt(electrons) if electrons else 0.0
         if sigma:
             steps = noise_steps(root.shape, sigma * _ROOT, 32767, random)
-            root = cv2.add(root, steps, dtype=cv2.CV_16U)
+            cv2.add(root, steps, dst=root, dtype=cv2.CV_16U)
         return np.asarray(cv2.LUT(root, self._levels(sigma)), np.uint8)
 
     def _make_levels(self, sigma: float) -> Image:

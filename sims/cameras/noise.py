@@ -57,12 +57,19 @@ def noisy_depth(
     """
     if coefficient <= 0.0:
         return depth
-    noise = _look_up(_quantiles() * np.float32(coefficient), _draw(depth.shape, random))
+    noise = gaussian(depth.shape, coefficient, random)
     near = np.minimum(depth, _FARTHEST)
     noise *= near
     noise *= near
     noise += depth
     return np.maximum(noise, np.float32(0.0), out=noise)
+
+
+def gaussian(
+    shape: tuple[int, ...], sigma: float, random: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    """Return Gaussian noise of mean 0."""
+    return _look_up(_quantiles() * np.float32(sigma), _draw(shape, random))
 
 
 def grey_of(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -45,7 +46,8 @@ def mean(images: Sequence[Image]) -> Image:
     """Return the mean of images of one shape, rounded."""
     if len(images) == 1:
         return images[0]
-    total = np.zeros(images[0].shape, np.uint32)
+    total = np.zeros(images[0].shape, np.float32)  # exact: whole numbers below 2**24
     for image in images:
-        total += image
-    return np.asarray((total + len(images) // 2) // len(images), dtype=images[0].dtype)
+        cv2.accumulate(image, total)
+    share: Any = 1.0 / len(images)
+    return np.asarray(cv2.multiply(total, share, dtype=cv2.CV_16U), np.uint16)

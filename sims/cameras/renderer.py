@@ -21,7 +21,7 @@ from events.base import Quaternion, Vector3
 from sims.cameras.development import Development
 from sims.cameras.frame import Frame
 from sims.cameras.lens import undistorted
-from sims.cameras.noise import generator, grey_of, noisy_depth
+from sims.cameras.noise import generator, grey_of
 from sims.cameras.optics import moments
 from sims.cameras.shot import Shot
 from sims.cameras.spec import CameraSpec, camera_info, is_plain
@@ -149,6 +149,7 @@ class CameraRenderer:
         kinds, stage, view = set(spec.images), self._stage, self._views[spec.name]
         coloured = not kinds.isdisjoint({"rgb", "grey"})
         blurred = coloured and shot.exposure > 0.0 and shot.moves()
+        coloured |= spec.depth_sensor is not None and spec.depth_sensor.needs_colours
         self._look(shot, spec, number, 0.0)
         pose = stage.pose(number)
         middle, depth, numbers = view.draw(
@@ -183,7 +184,7 @@ class CameraRenderer:
                 light = development.meter(seen)
         depth = captured.depth
         if depth is not None:
-            depth = noisy_depth(depth, spec.depth_noise, random)
+            depth = development.measure(depth, captured.colours, random)
         position, orientation = captured.pose
         frame = Frame(
             stamp=shot.stamp,
@@ -216,7 +217,7 @@ class CameraRenderer:
     def _shift(self, shot: Shot, spec: CameraSpec, number: int, depth: Depths) -> float:
         """Return the approximate motion of the image while the shutter is open, pixels."""
         poses = []
-        half = 0.5 * (shot.exposure)
+        half = 0.5 * shot.exposure
         for moment in (-half, half):
             self._look(shot, spec, number, moment)
             poses.append(self._stage.pose(number))

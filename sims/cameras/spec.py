@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import mujoco
@@ -22,6 +22,7 @@ from events.rotations import from_rpy, multiply
 from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
+from sims.cameras.depth_sensor import DepthSensor
 from sims.cameras.exposure import AutoExposure
 from sims.cameras.intrinsics import Intrinsics, Lens, intrinsics
 from sims.cameras.response import noise_at, read_response
@@ -73,6 +74,8 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         blur: Standard deviation, in pixels, of the Gaussian that a point becomes out of focus.
         noise: Standard deviation of additive Gaussian noise, grey levels (0 to 255).
         depth_noise: k in sigma = k z²: standard deviation (metres) of the noise at depth z.
+        depth_sensor: A sensor that measures depth by triangulation, with steps, noise, limits and
+            holes; in the place of `depth_noise`.
         latency: Time from exposure to delivery.
         jitter: Greatest random delay in addition; the order of images is kept.
         loss: Share of exposures that are not delivered, chosen at random.
@@ -102,6 +105,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     blur: NonNegative = 0.0
     noise: NonNegative = 0.0
     depth_noise: NonNegative = 0.0
+    depth_sensor: DepthSensor | None = None
     latency: Latency = Latency(0.04)
     jitter: Changeable[Latency] = Latency(0)
     loss: Changeable[Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]] = 0.0
@@ -122,6 +126,19 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if self.reference_exposure and not self.longest_exposure:
             raise ValueError(
                 "reference_exposure: expected an exposure (or auto_exposure) beside it, found none"
+            )
+        if self.depth_sensor and self.depth_noise:
+            raise ValueError(
+                "depth_sensor: expected its own disparity_noise alone, found depth_noise beside it"
+            )
+        if self.depth_sensor and not camera_info(self).is_pinhole:
+            raise ValueError(
+                "depth_sensor: expected a camera without distortion, as such a sensor rectifies "
+                f"its images, found {camera_info(self).distortion_model}"
+            )
+        if self.undistorted and self.vignette:
+            raise ValueError(
+                "undistorted: expected no vignette, whose shape would change, found one beside it"
             )
         shares = np.polynomial.Polynomial((1.0, *self.vignette))(np.linspace(0.0, 1.0, 101))
         if not (shares.min() >= 0.0 and shares.max() <= 1.0):
@@ -215,12 +232,26 @@ def announcement(
         reference_exposure=float(spec.reference_exposure),
         response=response,
         vignette=spec.vignette,
-        depth_noise=spec.depth_noise,
+        **_depth_truth(spec),
         frame_id=optical_frame(spec, prefix),
         parent_frame_id=parent_frame_id,
         position=position,
         orientation=orientation,
     )
+
+
+def _depth_truth(spec: CameraSpec) -> dict[str, Any]:
+    """Return what is announced of the depth: its noise, steps and limits."""
+    sensor = spec.depth_sensor
+    if sensor is None:
+        return {"depth_noise": spec.depth_noise}
+    reach = sensor.reach(camera_info(spec).fx)
+    return {
+        "depth_noise": sensor.disparity_noise / reach,
+        "depth_step": sensor.disparity_step / reach,
+        "min_depth": sensor.min_depth,
+        "max_depth": sensor.max_depth,
+    }
 
 
 def vertical_fov(spec: CameraSpec) -> float:

@@ -21,6 +21,7 @@ from sims.cameras.noise import generator
 
 Image = npt.NDArray[np.uint8]
 LIGHT = srgb_light()
+RADTAN = {"model": "plumb_bob", "coefficients": [-0.1, 0.01, 0.0, 0.0]}
 
 
 def spec(width: int = 64, height: int = 48, **settings: Any) -> CameraSpec:
@@ -196,6 +197,11 @@ def test_defocus_is_in_linear_light() -> None:
         (
             {"auto_exposure": {}, "reference_exposure": "1ms", "gain": 2.0},
             "neither exposure nor gain",
+        ),
+        ({"lens": RADTAN, "depth_sensor": {}}, "depth_sensor: expected a camera without"),
+        (
+            {"lens": RADTAN, "undistorted": True, "vignette": (-0.1,)},
+            "undistorted: expected no vignette",
         ),
         ({"reference_exposure": "1ms"}, "reference_exposure: expected an exposure"),
     ],
