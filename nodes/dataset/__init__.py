@@ -1,7 +1,7 @@
-"""Data sets in the layouts of EuRoC and TUM RGB-D, recorded while a run goes on.
+"""Data sets in the layouts of EuRoC, TUM RGB-D and TUM monoVO, recorded while a run goes on.
 
-`node` listens; `euroc` and `tum_rgbd` are the layouts, `recording` what they have in common,
-`rig` the choice of sensors, `rows` and `images` the files.
+`node` listens; `euroc`, `tum_rgbd` and `tum_mono` are the layouts, `recording` what they have in
+common, `rig` the choice of sensors, `rows` and `images` the files.
 """
 
 from nodes.dataset.node import DatasetConfig, DatasetWriter

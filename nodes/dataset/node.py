@@ -14,6 +14,7 @@ from nodes.dataset.euroc import Euroc
 from nodes.dataset.images import ImageFile
 from nodes.dataset.recording import Recording
 from nodes.dataset.rig import choose
+from nodes.dataset.tum_mono import TumMono
 from nodes.dataset.tum_rgbd import TumRgbd
 from nodes.trajectory.growing import part_name
 from nodes.trajectory.table import EPOCH, epoch_of
@@ -21,6 +22,11 @@ from runtime import Input, Node, NodeConfig, on
 from runtime.errors import ConfigError
 from runtime.paths import OutputPath
 
+_LAYOUTS: dict[str, type[Recording]] = {
+    "euroc": Euroc,
+    "tum_rgbd": TumRgbd,
+    "tum_mono": TumMono,
+}
 _AT_ONCE = 4
 """Images that are being written."""
 
@@ -35,7 +41,8 @@ class DatasetConfig(NodeConfig):
     Attributes:
         format: ``euroc``: grey images of all cameras of the first camera's vehicle (and depth),
             IMU, the vehicle's poses. ``tum_rgbd``: colour and depth images of the first camera
-            and its poses.
+            and its poses. ``tum_mono``: grey images of the first camera with its photometric
+            calibration and poses, as TUM's monoVO data set has them and DSO reads them.
         folder: Its name in the run's folder. A data set that was there is removed.
         depth_factor: Steps of a depth image per metre; 65535 of them are the limit, so 5000
             reach 13.1 m, and depth beyond that is written as none.
@@ -43,7 +50,7 @@ class DatasetConfig(NodeConfig):
             is noted in them (``epoch_ns``), and `nodes.replay` counts from there.
     """
 
-    format: Literal["euroc", "tum_rgbd"] = "euroc"
+    format: Literal["euroc", "tum_rgbd", "tum_mono"] = "euroc"
     folder: Annotated[OutputPath, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")] = "dataset"
     depth_factor: Annotated[float, msgspec.Meta(gt=0)] = 5000.0
     epoch: int | str = EPOCH
@@ -53,7 +60,7 @@ class DatasetConfig(NodeConfig):
 
 
 class DatasetWriter(Node[DatasetConfig]):
-    """Writes images, IMU measurements and the ground truth in the layout of EuRoC or TUM RGB-D.
+    """Writes images, IMU measurements and the ground truth in the layout of EuRoC or of TUM.
 
     Which camera (or vehicle) can be chosen by ``inputs = { images = "drone/front" }``. The world
     of the files is z up: north, west, up. After a restart a numbered folder (``dataset-2``) holds
@@ -139,7 +146,7 @@ class DatasetWriter(Node[DatasetConfig]):
     def _open(self) -> Recording | None:
         """Return the recording, begun at the first event: all announcements have come by then."""
         if self._recording is None and self.out is not None:
-            layout = Euroc if self.config.format == "euroc" else TumRgbd
+            layout = _LAYOUTS[self.config.format]
             try:
                 rig = choose(self._announcements, self.sources.get("images"))
                 epoch = epoch_of(self.config.epoch)
@@ -170,7 +177,7 @@ def _make_empty(folder: Path) -> None:
         ConfigError: It holds something else.
     """
     if folder.is_dir() and any(folder.iterdir()):
-        if not any((folder / sign).exists() for sign in ("mav0", "rgb.txt")):
+        if not any((folder / sign).exists() for sign in ("mav0", "rgb.txt", "times.txt")):
             raise ConfigError(
                 f"folder: expected the name of a new folder, or of an earlier data set, "
                 f"found {folder} with other files"
