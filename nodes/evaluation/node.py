@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -21,18 +22,19 @@ from events import (
     Score,
     TrackedFeatures,
     TrackingEvent,
-    VehicleAnnouncement,
 )
-from events.rotations import from_yaw
 from nodes.evaluation.album import Album
-from nodes.evaluation.judging import Judgement, Thresholds, beside_the_plan, judge
+from nodes.evaluation.flight import Flight, collision_rows
+from nodes.evaluation.judging import Judgement, Thresholds, judge
 from nodes.evaluation.live import LiveErrors
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import FRAMES, file_name, write_results
-from nodes.trajectory import PoseRows, RecentPoses, Trajectory
+from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.growing import GrowingFile
+from nodes.vehicles import Vehicles
 from runtime import Duration, Node, NodeConfig, Output, on
+from runtime.errors import suggest
 from runtime.summary import overall
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -45,6 +47,9 @@ class EvaluationConfig(NodeConfig):
         alignment: How an estimate is laid on the truth: ``none``, ``origin`` (first pose on first
             pose), ``se3``, ``sim3``; ``auto`` is ``sim3`` for scale-free estimators, ``none`` for
             estimates in ``map``, and ``origin`` for all others.
+        vehicle: Name of the vehicle whose truth all estimates are held against; if empty, each
+            estimator's is that which its source names or which carries the camera that it follows,
+            or else the first.
         control_rate: Hertz of the controller for which the newest pose is judged.
         delta: Metres of path over which relative errors are taken.
         gap: Silence of an estimator that counts as lost.
@@ -56,6 +61,7 @@ class EvaluationConfig(NodeConfig):
     """
 
     alignment: Literal["auto", "none", "origin", "se3", "sim3"] = "auto"
+    vehicle: str = ""
     control_rate: Positive = 400
     delta: Positive = 1.0
     gap: Duration = Duration(0.5)  # immutable
@@ -64,7 +70,7 @@ class EvaluationConfig(NodeConfig):
 
 
 class Evaluation(Node[EvaluationConfig]):
-    """Judges every estimator that it receives against the odometry of one vehicle.
+    """Judges every estimator that it receives against the odometry of its vehicle.
 
     Errors are sent as `Score` as the estimates come; the rest is written at the end, and the
     verdict put into the run's summary.
@@ -75,41 +81,48 @@ class Evaluation(Node[EvaluationConfig]):
 
     async def on_startup(self) -> None:
         """Open the files of trajectories: they grow as the run goes on."""
-        self._truth = PoseRows()
-        self._recent = RecentPoses()
-        self._plan = PoseRows()
-        self._setpoints = PoseRows()
+        self._vehicles = Vehicles()
+        self._flights: dict[str, Flight] = {}  # by vehicle
         self._records: dict[str, EstimatorRecord] = {}
         self._live: dict[str, LiveErrors] = {}
         self._frames: dict[str, array[int]] = {}  # stamps by camera
-        self._collisions = 0
         self._album = Album(self.config.image_count)
         self._files: dict[str, GrowingFile] = {}
         self._closed = False
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Take the first vehicle's truth, unless the file names another; expect estimators."""
-        if isinstance(announcement, VehicleAnnouncement):
-            self.narrow("odometry", announcement.source)
-            self.narrow("collisions", announcement.source)
+        """Note vehicles and their cameras; expect estimators."""
+        self._vehicles.announced(announcement)
         if isinstance(announcement, EstimatorAnnouncement):
             record = EstimatorRecord(announcement.scale_free, announcement.method)
             self._records[announcement.source] = record
 
+    def check(self) -> Iterable[str]:
+        """Say if there is no such vehicle as the file names."""
+        if (name := self.config.vehicle) and name not in (names := self._vehicles.names):
+            yield (
+                f"vehicle: expected one that is announced ({', '.join(names) or 'none'}), "
+                f'found "{name}"{suggest(name, names)}'
+            )
+
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
         """Note the truth."""
-        if self._closed:
+        known = self._vehicles.names
+        if self._closed or (known and event.source not in known and "odometry" not in self.sources):
             return
-        self._truth.add(event.stamp, event.position, event.orientation)
-        self._recent.add(event.stamp, event.position, event.orientation)
-        self._append("truth", event)
+        flight = self._flights.get(event.source)
+        if flight is None:
+            self._vehicles.add(event.source)
+            flight = self._flights[event.source] = self._flights.pop("", Flight())
+        flight.add(event)
+        self._append(self._named("truth", event.source), event)
 
     @on(PlannedPose, PositionSetpoint)
     def plans(self, event: PlannedPose | PositionSetpoint) -> None:
-        """Note where the pilot means to be."""
-        rows = self._plan if isinstance(event, PlannedPose) else self._setpoints
-        rows.add(event.stamp, event.position, from_yaw(event.yaw))
+        """Note where a pilot means its vehicle to be."""
+        vehicle = self._vehicles.of(event.vehicle or event.source)
+        self._flights.setdefault(vehicle, Flight()).add_plan(event)
 
     @on(PoseEstimate)
     def estimates(self, event: PoseEstimate) -> None:
@@ -122,7 +135,7 @@ class Evaluation(Node[EvaluationConfig]):
             return
         self._append(name, event)
         self._score(event, "latency", (now - event.stamp) / 1e9, "s")
-        truth = self._recent.at(event.stamp)
+        truth = self._flight_of(name).recent.at(event.stamp)
         if truth is None or record.scale_free:
             return
         live = self._live.setdefault(name, LiveErrors())
@@ -145,13 +158,14 @@ class Evaluation(Node[EvaluationConfig]):
         self._album.add_image(event)
 
     @on(Collision)
-    def collisions(self, event: Collision) -> None:  # noqa: ARG002
-        """Count the vehicle's collisions."""
-        self._collisions += 1
+    def collisions(self, event: Collision) -> None:
+        """Note a vehicle's collision."""
+        self._flights.setdefault(event.source, Flight()).collisions.append(event)
 
     @on(TrackedFeatures)
     def features(self, event: TrackedFeatures) -> None:
-        """Keep an image and its features at intervals."""
+        """Note whose images an estimator looks at; keep one with its features at intervals."""
+        self._vehicles.tracked(event)
         self._album.add_features(event)
 
     async def on_shutdown(self) -> None:
@@ -160,7 +174,7 @@ class Evaluation(Node[EvaluationConfig]):
         for file in self._files.values():
             file.close()
         if not self._records and self.clock.now() > 0:
-            self.log.warning("no estimator has announced itself or sent an estimate")
+            self.log.info("no estimator has announced itself or sent an estimate")
         judgements, verdict = await self.offload(self._finish, self.clock.now())
         for name, judgement in judgements.items():
             figures = verdict["estimators"][name]
@@ -171,16 +185,16 @@ class Evaluation(Node[EvaluationConfig]):
 
     def _finish(self, end: int) -> tuple[dict[str, Judgement], dict[str, Any]]:
         config = self.config
-        truth = self._truth.trajectory() if len(self._truth) else None
-        plan = self._plan.trajectory() if len(self._plan) else None
-        flown: dict[str, float] = {"collisions": self._collisions}
-        if truth is not None and plan is not None:
-            flown |= beside_the_plan(truth, plan)
         cameras = {name: np.array(stamps, np.int64) for name, stamps in self._frames.items()}
+        truths = {v: f.truth.trajectory() for v, f in self._flights.items() if len(f.truth)}
+        flown = {vehicle: flight.figures() for vehicle, flight in self._flights.items()}
         judgements, estimators = {}, {}
         for name, record in self._records.items():
-            judgement = self._judge(record, truth, cameras, end)
-            judgement.figures.update(flown)
+            vehicle = self._vehicle_of(name)
+            judgement = self._judge(record, truths.get(vehicle), self._seen(vehicle, cameras), end)
+            judgement.figures.update(flown.get(vehicle, {}))
+            if len(self._vehicles.names) > 1:
+                judgement.figures["vehicle"] = vehicle
             failed = []
             if judgement.figures.get("ate_rmse_m") is None:
                 failed.append(judgement.figures.get("why", "expected estimates, found none"))
@@ -200,8 +214,11 @@ class Evaluation(Node[EvaluationConfig]):
             "thresholds": msgspec.to_builtins(config.thresholds),
         }
         if self.out is not None:
-            setpoints = self._setpoints.trajectory() if len(self._setpoints) else None
-            write_results(self.out, plan or setpoints, judgements, verdict)
+            plans = {self._named("plan", v): f.plan() for v, f in self._flights.items()}
+            write_results(self.out, plans, judgements, verdict)
+            collisions = [c for flight in self._flights.values() for c in flight.collisions]
+            file = self.out / "trajectories" / "collisions.csv"
+            file.write_text(collision_rows(collisions), encoding="utf-8")
             self._album.write(self.out / "frames")
         return judgements, verdict
 
@@ -233,6 +250,28 @@ class Evaluation(Node[EvaluationConfig]):
             why = f"cannot be judged: {type(error).__name__}: {error}"
             return Judgement(figures={"why": why}, estimate=None)
 
+    def _vehicle_of(self, estimator: str) -> str:
+        """Return the vehicle that an estimator is judged by."""
+        found = self.config.vehicle or self._vehicles.of(estimator)
+        flying = [vehicle for vehicle, flight in self._flights.items() if len(flight.truth)]
+        return flying[0] if len(flying) == 1 else found  # the file may have chosen its odometry
+
+    def _flight_of(self, estimator: str) -> Flight:
+        return self._flights.get(self._vehicle_of(estimator)) or Flight()
+
+    def _seen(
+        self, vehicle: str, cameras: dict[str, npt.NDArray[np.int64]]
+    ) -> dict[str, npt.NDArray[np.int64]]:
+        """Return the stamps of those cameras that may be a vehicle's: of several, its own."""
+        if len(self._vehicles.names) < 2:
+            return cameras
+        return {c: s for c, s in cameras.items() if self._vehicles.carrier(c) in {"", vehicle}}
+
+    def _named(self, what: str, vehicle: str) -> str:
+        """Return the name of a file: ``truth`` of the first vehicle, ``truth.<name>`` of others."""
+        first = next(iter(self._vehicles.names), vehicle)
+        return what if vehicle == first else f"{what}.{vehicle}"
+
     def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
         """Add a pose to a file: should the run be killed, what was sent until then is there."""
         if self.out is None:
@@ -242,7 +281,8 @@ class Evaluation(Node[EvaluationConfig]):
             folder = self.out / "trajectories"
             folder.mkdir(exist_ok=True)
             path = folder / f"{file_name(name)}.tum"
-            frame = "map (NED)" if name == "truth" else f"{event.frame_id}, as it was sent"
+            true = isinstance(event, Odometry)
+            frame = "map (NED)" if true else f"{event.frame_id}, as it was sent"
             head = f"# {FRAMES.format(frame)}\n"
             file = self._files[name] = GrowingFile(self, path, head)
         file.add(tum_row(event.stamp, event.position, event.orientation))

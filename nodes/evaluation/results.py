@@ -3,6 +3,8 @@
 trajectories/truth.tum              the true poses; it grows with the run
 trajectories/<estimator>.tum        the estimates as they were sent; likewise
 trajectories/plan.tum               where the pilot meant to be
+trajectories/truth.<vehicle>.tum    both of the second vehicle, the third, …
+trajectories/collisions.csv         what the vehicles hit, when and where
 evaluation/<estimator>.csv          errors of each estimate at the time of its image
 evaluation/<estimator>.lost.csv     when it had no pose
 evaluation/<estimator>.ticks.csv    errors of the newest pose there was at each control tick (of a
@@ -13,6 +15,7 @@ evaluation/verdict.json             all figures
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +33,7 @@ FRAMES = "base_link (FRD) in {}: timestamp[s] tx ty tz[m] qx qy qz qw"
 
 def write_results(
     out: Path,
-    plan: Trajectory | None,
+    plans: Mapping[str, Trajectory | None],
     judgements: dict[str, Judgement],
     verdict: dict[str, Any],
 ) -> None:
@@ -38,8 +41,9 @@ def write_results(
     trajectories, evaluation = out / "trajectories", out / "evaluation"
     trajectories.mkdir(exist_ok=True)
     evaluation.mkdir(exist_ok=True)
-    if plan is not None:
-        write_tum(trajectories / "plan.tum", plan, FRAMES.format("map (NED)"))
+    for file, plan in plans.items():
+        if plan is not None:
+            write_tum(trajectories / f"{file}.tum", plan, FRAMES.format("map (NED)"))
     for source, judgement in judgements.items():
         name = file_name(source)
         if judgement.aligned is not None:

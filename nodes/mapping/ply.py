@@ -1,4 +1,4 @@
-"""Clouds as PLY files: binary, little-endian, coloured. Reading them is in `nodes.report.ply`.
+"""Clouds as PLY files: binary, little-endian, coloured.
 
 The format is G. Turk's, "The PLY polygon file format" (1994); it counts what follows the header.
 """
@@ -6,14 +6,49 @@ The format is G. Turk's, "The PLY polygon file format" (1994); it counts what fo
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 )
-_TYPES = {"<f4": "float", "|u1": "uchar"}
+
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "<i2",
+    "int16": "<i2",
+    "ushort": "<u2",
+    "uint16": "<u2",
+    "int": "<i4",
+    "int32": "<i4",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "float64": "<f8",
+}
+_LONGEST_HEADER = 1 << 16
+
+
+class Cloud(msgspec.Struct, frozen=True, eq=False):
+    """Coloured points.
+
+    Attributes:
+        points: Metres in ``map`` (NED), float32, shape (n, 3).
+        colors: Red, green, blue, uint8, shape (n, 3); `None` if the file has none.
+        total: How many the file holds.
+    """
+
+    points: npt.NDArray[np.float32]
+    colors: npt.NDArray[np.uint8] | None
+    total: int
 
 
 def write_ply(
@@ -43,7 +78,8 @@ def write_ply(
     rows["x"], rows["y"], rows["z"] = points.T
     rows["red"], rows["green"], rows["blue"] = colours.T
     axes = ", x north, y east, z down" if frame_id == "map" else ""
-    properties = (f"property {_TYPES[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ())
+    names = {"float32": "float", "uint8": "uchar"}
+    properties = (f"property {names[_VERTEX[n].name]} {n}" for n in _VERTEX.names or ())
     header = "\n".join(
         [
             "ply",
@@ -60,3 +96,61 @@ def write_ply(
         file.write(header.encode("ascii"))
         file.write(rows.tobytes())
     unfinished.replace(path)
+
+
+def read_ply(path: Path, most: int) -> Cloud:
+    """Read the finite points of a cloud, or a sample of them.
+
+    Args:
+        path: The file.
+        most: How many points are enough; if there are more, so many are drawn by lot, always the
+            same.
+
+    Raises:
+        OSError: It cannot be read.
+        ValueError: It is no such file.
+    """
+    with path.open("rb") as file:
+        head = file.read(_LONGEST_HEADER)
+    end = head.find(b"end_header\n")
+    if not head.startswith(b"ply\n") or end < 0:
+        raise ValueError(f"expected a PLY file, found {head[:16]!r}")
+    count, kind = _vertices(head[:end].decode("ascii", "replace").splitlines())
+    start = end + len(b"end_header\n")
+    expected, found = start + count * kind.itemsize, path.stat().st_size
+    if found < expected:
+        raise ValueError(f"expected {count} points in {expected} bytes, found {found} bytes")
+    if not count:
+        return Cloud(np.zeros((0, 3), np.float32), None, 0)
+    rows: np.ndarray[Any, np.dtype[np.void]] = np.memmap(path, kind, "r", start, (count,))
+    if count > most:
+        chosen = np.random.default_rng(0).choice(count, most, replace=False, shuffle=False)
+        rows = rows[np.sort(chosen)]
+    points = np.stack([rows[axis].astype(np.float32) for axis in "xyz"], axis=1)
+    kept = np.isfinite(points).all(axis=1)
+    colors = None
+    if {"red", "green", "blue"} <= set(kind.names or ()):
+        colors = np.stack([rows[c].astype(np.uint8) for c in ("red", "green", "blue")], axis=1)
+        colors = colors[kept]
+    return Cloud(points[kept], colors, count)
+
+
+def _vertices(header: list[str]) -> tuple[int, np.dtype[np.void]]:
+    """Return how many vertices there are, and how one is laid out."""
+    if "format binary_little_endian 1.0" not in header:
+        form = next((line for line in header if line.startswith("format")), "no format")
+        raise ValueError(f"expected format binary_little_endian 1.0, found {form!r}")
+    count, fields, inside = -1, [], False
+    for words in (line.split() for line in header):
+        if words[:1] == ["element"]:
+            if count < 0 and words[1:2] != ["vertex"]:
+                raise ValueError(f"expected the vertices first, found {' '.join(words)!r}")
+            inside = words[1:2] == ["vertex"]
+            count = int(words[2]) if inside else count
+        elif words[:1] == ["property"] and inside:
+            if len(words) != 3 or words[1] not in _TYPES:
+                raise ValueError(f"expected a property of a number, found {' '.join(words)!r}")
+            fields.append((words[2], _TYPES[words[1]]))
+    if count < 0 or not {"x", "y", "z"} <= {name for name, _ in fields}:
+        raise ValueError(f"expected vertices with x, y and z, found {[n for n, _ in fields]}")
+    return count, np.dtype(fields)

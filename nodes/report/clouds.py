@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from nodes.mapping.ply import Cloud, read_ply
 from nodes.report.contents import Run
-from nodes.report.ply import Cloud, read_ply
 from nodes.report.poses import Floats
 from nodes.report.splat import MOST, Shown, View, paint
 from nodes.report.style import DPI, WIDTH, Plot, label, sheet
@@ -65,9 +65,8 @@ def draw_clouds(run: Run) -> list[Plot]:
 
 def _ceiling(run: Run) -> float | None:
     """Return the height (m) above which clouds are cut off: somewhat above where anyone flew."""
-    if run.truth is None:
-        return None
-    return float(-run.truth.positions[:, 2].min()) + _CLEARANCE
+    highest = [float(-truth.positions[:, 2].min()) for truth in run.truths.values()]
+    return max(highest) + _CLEARANCE if highest else None
 
 
 def _shown(name: str, cloud: Cloud, height: float | None) -> Shown:

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from nodes.evaluation.coverage import Interval
 from nodes.evaluation.judging import Errors
@@ -73,12 +75,12 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         folder: Where it is.
         facts: From the summary.
         verdict: What the evaluation concluded.
-        truth: True poses.
-        plan: Where the pilot meant to be.
+        truths: True poses, by vehicle; the first vehicle's first.
+        plans: Where pilots meant their vehicles to be, by vehicle.
+        collisions: Where vehicles hit something: north, east, down, metres, shape (n, 3).
         estimators: By order of the verdict.
         frames: Sample images with features, by estimator's file name.
         clouds: Files of clouds.
-        images: Images that other nodes left.
         config: Text of ``config.toml``.
         log: Its warnings and errors.
         missing: Sentences that say what is not there or cannot be read.
@@ -87,12 +89,12 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     folder: Path
     facts: Facts
     verdict: Verdict | None
-    truth: Trajectory | None
-    plan: Trajectory | None
+    truths: dict[str, Trajectory]
+    plans: dict[str, Trajectory]
+    collisions: npt.NDArray[np.float64]
     estimators: list[Estimator]
     frames: dict[str, list[Path]]
     clouds: list[Path]
-    images: list[Path]
     config: str | None
     log: list[str]
     missing: list[str]
@@ -101,6 +103,15 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     def name(self) -> str:
         """Name of the run."""
         return self.facts.name or self.folder.resolve().name
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """True poses of the first vehicle."""
+        return next(iter(self.truths.values()), None)
+
+    def truth_of(self, estimator: Estimator) -> Trajectory | None:
+        """Return the true poses of the vehicle that an estimator was judged by."""
+        return self.truths.get(str(estimator.figures.get("vehicle")), self.truth)
 
     @property
     def start(self) -> int:

@@ -21,6 +21,7 @@ from nodes.report.style import (
     thin,
     wide_range,
 )
+from nodes.trajectory import Trajectory
 
 SECOND = 1e9
 MILLISECOND = 1e6
@@ -80,16 +81,26 @@ def _shade(run: Run, axis: Any) -> None:
             axis.axvspan(a, b, facecolor=each.color, alpha=0.18, lw=0, zorder=0.5)
 
 
+def _known(run: Run) -> list[tuple[Estimator, Trajectory, Trajectory]]:
+    """Return the estimators with poses, those poses, and the true ones of the same stamps."""
+    found = []
+    for each in run.estimators:
+        truth = run.truth_of(each)
+        if each.aligned is not None and truth is not None:
+            inside = each.aligned.take(truth.covers(each.aligned.stamps))
+            found.append((each, inside, truth.at(inside.stamps)))
+    return found
+
+
 def draw_axes(run: Run) -> Plot | None:
     """Draw the position error of each estimate along north, east and down over time."""
-    known = [(e, e.aligned) for e in run.estimators if e.aligned is not None]
-    if run.truth is None or not known:
+    known = _known(run)
+    if not known:
         return None
-    figure = sheet(4.6, names=[each.name for each, _ in known])
+    figure = sheet(4.6, names=[each.name for each, *_ in known])
     axes: Any = figure.subplots(3, 1, sharex=True)
-    for each, aligned in known:
-        inside = aligned.take(run.truth.covers(aligned.stamps))
-        errors = inside.positions - run.truth.at(inside.stamps).positions
+    for each, inside, truth in known:
+        errors = inside.positions - truth.positions
         some = thin(len(inside))
         stamps = inside.stamps[some]
         lines = broken(errors[some], stamps, each.lost).T
@@ -208,14 +219,10 @@ def _shares(axis: Any, series: list[tuple[Estimator, Floats]], xlabel: str, ylab
 
 def draw_relative(run: Run) -> Plot | None:
     """Draw boxes of the relative errors over several lengths of path."""
-    if run.truth is None:
-        return None
-    known = [(e, e.aligned) for e in run.estimators if e.aligned is not None]
+    known = _known(run)
     boxes = []
     for place, length in enumerate(LENGTHS):
-        for k, (each, aligned) in enumerate(known):
-            inside = aligned.take(run.truth.covers(aligned.stamps))
-            truth = run.truth.at(inside.stamps)
+        for k, (each, inside, truth) in enumerate(known):
             shifts, angles = relative_errors(truth, inside, *path_pairs(truth.distances(), length))
             if len(shifts) >= _FEWEST:
                 share = 0.7 / len(known)
@@ -224,7 +231,7 @@ def draw_relative(run: Run) -> Plot | None:
                 boxes.append((each, where, 0.8 * share, length, values))
     if not boxes:
         return None
-    figure = sheet(3.4, names=[each.name for each, _ in known])
+    figure = sheet(3.4, names=[each.name for each, *_ in known])
     axes: Any = figure.subplots(1, 2)
     for row, axis in enumerate(axes):
         for each in dict.fromkeys(each for each, *_ in boxes):

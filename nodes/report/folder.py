@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from nodes.evaluation.coverage import Interval, seconds
 from nodes.evaluation.judging import Errors
@@ -27,7 +28,6 @@ T = TypeVar("T")
 SIGNS = ("summary.json", "config.toml", "log.txt", "trajectories", "evaluation")
 """A folder with one of these is a run's."""
 
-_IMAGES = ("flight.png", "images.png")
 _LOG_LINES = 200
 _NO_ESTIMATES = {"truth", "plan"}
 _ABOUT = 0.25
@@ -70,45 +70,64 @@ class _Reader:
             verdict = verdict or facts.verdict
         config = self._try("config.toml", _text, "the settings are not known")
         log = self._try("log.txt", _text, "what was logged is not known")
-        truth = self._truth()
-        plan = self._try("trajectories/plan.tum", read_poses)
+        first = _first_vehicle(facts or Facts())
+        truths = self._by_vehicle("truth", first)
+        if not (self.folder / "trajectories" / "truth.tum").is_file():
+            self.missing.append(
+                "trajectories/truth.tum is not there: there is nothing to compare with"
+            )
         return Run(
             folder=self.folder,
             facts=facts or Facts(),
             verdict=verdict,
-            truth=truth,
-            plan=plan,
-            estimators=self._estimators(verdict, truth),
+            truths=truths,
+            plans=self._by_vehicle("plan", first),
+            collisions=self._collisions(),
+            estimators=self._estimators(verdict, truths),
             frames=_frames(self.folder / "frames"),
             clouds=sorted((self.folder / "clouds").glob("*.ply")),
-            images=[p for name in _IMAGES if (p := self.folder / name).is_file()],
             config=config,
             log=_loud(log or ""),
             missing=self.missing,
         )
 
-    def _truth(self) -> Trajectory | None:
-        """Read the truth as the evaluation left it, else as the flight log did."""
-        evaluated = (self.folder / "trajectories" / "truth.tum").is_file()
-        if not evaluated and (self.folder / "trajectory.tum").is_file():
-            return self._try("trajectory.tum", read_poses)
-        return self._try("trajectories/truth.tum", read_poses, "there is nothing to compare with")
+    def _by_vehicle(self, what: str, first: str) -> dict[str, Trajectory]:
+        """Read the file of the first vehicle, and those of all others: ``<what>.<vehicle>.tum``."""
+        paths = sorted((self.folder / "trajectories").glob(f"{what}.*tum"))
+        names = {p.stem.partition(".")[2] or first: f"trajectories/{p.name}" for p in paths}
+        found = {vehicle: self._try(name, read_poses) for vehicle, name in names.items()}
+        order = sorted(found.items(), key=lambda item: item[0] != first)
+        return {vehicle: poses for vehicle, poses in order if poses is not None}
 
-    def _estimators(self, verdict: Verdict | None, truth: Trajectory | None) -> list[Estimator]:
+    def _collisions(self) -> npt.NDArray[np.float64]:
+        found = self._try("trajectories/collisions.csv", _places)
+        return np.empty((0, 3)) if found is None else found
+
+    def _estimators(
+        self, verdict: Verdict | None, truths: dict[str, Trajectory]
+    ) -> list[Estimator]:
         figures = {} if verdict is None else verdict.estimators
         files = {file_name(name): name for name in figures}
-        sent = {p.stem for p in (self.folder / "trajectories").glob("*.tum")} - _NO_ESTIMATES
+        there = {p.stem for p in (self.folder / "trajectories").glob("*.tum")}
+        sent = {name for name in there if name.partition(".")[0] not in _NO_ESTIMATES}
         files |= {file: file for file in sorted(sent - set(files))}
         if not files:
             self.missing.append("no estimator has sent anything, and none was judged")
         return [
-            self._estimator(file, name, COLORS[k % len(COLORS)], figures.get(name, {}), truth)
+            self._estimator(file, name, COLORS[k % len(COLORS)], figures.get(name, {}), truths)
             for k, (file, name) in enumerate(files.items())
         ]
 
     def _estimator(
-        self, file: str, name: str, color: str, figures: dict[str, Any], truth: Trajectory | None
+        self,
+        file: str,
+        name: str,
+        color: str,
+        figures: dict[str, Any],
+        truths: dict[str, Trajectory],
     ) -> Estimator:
+        first = next(iter(truths.values()), None)
+        truth = truths.get(str(figures.get("vehicle")), first)
         found = Estimator(name=name, color=color, figures=figures)
         aligned = self._try(f"evaluation/{file}.aligned.tum", read_poses)
         errors = self._try(f"evaluation/{file}.csv", _errors)
@@ -155,6 +174,18 @@ class _Reader:
             text = str(error).replace(f"{path}: ", "").replace(f"{path}:", "line ")
             self.missing.append(f"{name} cannot be read: {text}")
             return None
+
+
+def _first_vehicle(facts: Facts) -> str:
+    """Return the name of the vehicle that was announced first; empty if none was."""
+    vehicles = (a["source"] for a in facts.announcements if a.get("type") == "VehicleAnnouncement")
+    return str(next(vehicles, ""))
+
+
+def _places(path: Path) -> npt.NDArray[np.float64]:
+    """Read where collisions were, shape (n, 3)."""
+    rows = [line.split(",")[-4:-1] for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+    return np.array(rows, np.float64).reshape(-1, 3)
 
 
 def _facts(path: Path) -> Facts:

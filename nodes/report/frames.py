@@ -23,16 +23,19 @@ _CAPTION = 26
 
 
 def draw_frames(run: Run) -> list[Plot]:
-    """Draw one sheet for each estimator that left images."""
+    """Draw one sheet for each estimator that left images, and each camera that nobody tracks."""
     names = {e.name.replace("/", "_"): e.name for e in run.estimators}
     plots = []
     for file, paths in run.frames.items():
         step = -(-len(paths) // _MOST)
         figure = _sheet(run, paths[::step])
         if figure is not None:
-            name = names.get(file, file)
-            caption = "Rings: tracked features; green agree with the estimated motion, red don't."
-            title = f"Images and features of {name}"
+            title, caption = f"Images of {file}", "Sample images of the camera."
+            if (name := names.get(file)) is not None:
+                title = f"Images and features of {name}"
+                caption = (
+                    "Rings: tracked features; green agree with the estimated motion, red don't."
+                )
             plots.append(Plot(f"frames_{file}", figure, title, caption, raster=True, photo=True))
     return plots
 

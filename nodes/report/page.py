@@ -22,7 +22,7 @@ from nodes.report.curves import (
     draw_relative,
 )
 from nodes.report.folder import read_run
-from nodes.report.frames import draw_frames, read_image
+from nodes.report.frames import draw_frames
 from nodes.report.style import Plot, drawing
 from nodes.report.trajectories import draw_trajectories
 from runtime.summary import WORKER_COLUMNS
@@ -50,11 +50,6 @@ _ALIGNED = {
     "sim3": "laid on the truth as a whole, with scale (Sim3)",
 }
 """How estimates and the truth were brought together, in words."""
-
-_LEFT = {
-    "flight.png": ("The flight", "True path, height and speed, from the flight log.", False),
-    "images.png": ("Images", "Sample images of the cameras, from the flight log.", True),
-}
 
 
 def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:
@@ -113,12 +108,12 @@ def render(
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    left = [_embedded(path, *_LEFT[path.name]) for path in run.images if _can_be_read(run, path)]
     return environment.get_template("page.html.jinja").render(
         run=run,
         main=tables.figures(run, main=True),
         others=tables.figures(run, main=False),
         facts=tables.facts(run),
+        sensors=tables.sensors(run),
         ticks=tables.ticks(run),
         workers=tables.workers(run),
         worker_columns=("worker", *WORKER_COLUMNS),
@@ -126,19 +121,8 @@ def render(
         curves=curves,
         frames=frames,
         clouds=clouds,
-        left=left,
         verdicts=[_verdict(e.name, e.figures, e.color) for e in run.estimators],
     )
-
-
-def _can_be_read(run: Run, path: Path) -> bool:
-    """Tell whether a file that another node left is an image; `Run.missing` says if not."""
-    try:
-        read_image(path)
-    except (OSError, ValueError) as error:
-        run.missing.append(f"{path.name} cannot be read: {error}")
-        return False
-    return True
 
 
 def _written(plot: Plot, folder: Path, formats: Sequence[str]) -> dict[str, str]:
@@ -162,11 +146,13 @@ def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
     """Return what the top of the page says of an estimator."""
     passed = figures.get("passed")
     failed = figures.get("failed")
+    laid = _ALIGNED.get(str(figures.get("alignment")), "")
+    vehicle = f"of {figures['vehicle']}" if "vehicle" in figures else ""
     return {
         "name": name,
         "color": color,
         "method": str(figures.get("method") or ""),
-        "alignment": _ALIGNED.get(str(figures.get("alignment")), ""),
+        "alignment": "; ".join(filter(None, (vehicle, laid))),
         "state": "not judged" if passed is None else "passed" if passed else "failed",
         "failed": [str(each) for each in failed] if isinstance(failed, list) else [],
     }

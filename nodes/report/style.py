@@ -30,7 +30,9 @@ COLORS = (
 )
 """For estimators. The first six are told apart by the colour-blind as well (M. Okabe and K. Ito,
 "Color universal design", 2008)."""
-TRUTH = "#3a3a3a"
+TRUTHS = ("#3a3a3a", "#8a6d3b", "#4f6f52", "#6b5b7a")
+"""For the true paths of the vehicles."""
+HIT = "#b3261e"
 PLAN = "#111111"
 LINE = COLORS[0]
 """Of what belongs to no estimator."""

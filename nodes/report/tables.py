@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from nodes.evaluation.judging import AT_LEAST
 from nodes.report.contents import Facts, Run
@@ -115,8 +116,11 @@ def facts(run: Run) -> list[tuple[str, str]]:
     """Return what is known of the run as a whole."""
     f = run.facts
     rows: list[tuple[str, str]] = []
-    if run.truth is not None:
-        rows.append(("true path", f"{number(run.truth.length())} m"))
+    for vehicle, truth in run.truths.items():
+        name = f"true path of {vehicle}" if len(run.truths) > 1 else "true path"
+        speed = np.linalg.norm(truth.velocities(), axis=1).max()
+        text = f"{number(truth.length())} m, at most {number(float(speed))} m/s"
+        rows.append((name, text))
     if f.clock is not None:
         rows.append(("clock", f.clock))
     if f.seed is not None:
@@ -160,6 +164,36 @@ def _digest(f: Facts) -> str:
     if f.not_deterministic:
         return f"{f.digest} (not promised, because of {', '.join(f.not_deterministic)})"
     return f"{f.digest} (an equal run gives the same)"
+
+
+def sensors(run: Run) -> list[list[str]]:
+    """Return what was announced of each sensor: source, kind, rate, and the rest in words."""
+    rows = []
+    for each in run.facts.announcements:
+        kind = str(each.get("type", "")).removesuffix("Announcement")
+        if "rate" not in each or not kind:
+            continue
+        info = each.get("info") or {}
+        size = [f"{info['width']} × {info['height']}"] if "width" in info else []
+        lens = any(info.get("distortion", ())) or info.get("distortion_model") == "equidistant"
+        size += [str(info["distortion_model"])] if lens else []
+        rest = {k: v for k, v in each.items() if k not in _PLACES and v not in (0, 0.0, "", [])}
+        said = [f"{name.replace('_', ' ')} {_said(value)}" for name, value in rest.items()]
+        rows.append([str(each.get("source")), kind, _said(each["rate"]), ", ".join(size + said)])
+    return rows
+
+
+_PLACES = {
+    "type", "source", "stamp", "rate", "info", "frame_id", "parent_frame_id", "position",
+    "orientation",
+}  # fmt: skip
+"""What the table of sensors shows elsewhere, or not at all."""
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_said, value))
+    return f"{value:g}" if isinstance(value, float) else show(value)
 
 
 def ticks(run: Run) -> list[list[str]]:

@@ -13,8 +13,9 @@ from nodes.evaluation.coverage import Interval
 from nodes.report.contents import Run
 from nodes.report.poses import Floats, broken
 from nodes.report.style import (
+    HIT,
     PLAN,
-    TRUTH,
+    TRUTHS,
     WIDTH,
     Plot,
     bounds,
@@ -58,8 +59,9 @@ def draw_trajectories(run: Run) -> Plot | None:
     if not lines:
         return None
     low, high = _bounds(lines)
-    columns = legend_columns([*(line.name for line in lines), "start", "end"])
-    top = _TOP + _ROW * -(-(len(lines) + 2) // columns)
+    marks = ["start", "end", *(["collision"] if len(run.collisions) else [])]
+    columns = legend_columns([*(line.name for line in lines), *marks])
+    top = _TOP + _ROW * -(-(len(lines) + len(marks)) // columns)
     east, north, up = (high - low).tolist()
     height, *places = _layout(east, north, up, top)
     figure = sheet(height, constrained=False)
@@ -71,9 +73,12 @@ def draw_trajectories(run: Run) -> Plot | None:
         above.plot(x, y, label=line.name, **line.style)
         beside.plot(x, z, **line.style)
         later.plot((line.stamps - run.start) / 1e9, z, **line.style)
-    for k, line in enumerate(lines):
+    for line in lines:
         if line.style["color"] != PLAN:
-            _ends(above, beside, line, main=k == 0)
+            _ends(above, beside, line, main=line is lines[0] or line.style["color"] in TRUTHS)
+    for axis, rows in ((above, [0, 1]), (beside, [0, 2])) if len(run.collisions) else ():
+        hits = _shown(run.collisions)[:, rows]
+        axis.plot(*hits.T, "x", color=HIT, ms=8, mew=1.8, zorder=5, label="collision")
     above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     above.set(xlabel="east (m)", ylabel="north (m)", title="from above")
     beside.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]))
@@ -109,11 +114,14 @@ def _caption(run: Run, *, astray: bool) -> str:
 
 def _lines(run: Run) -> list[_Line]:
     found = []
-    if run.truth is not None:
-        style = {"color": TRUTH, "lw": 3.2, "alpha": 0.45, "solid_capstyle": "round"}
-        found.append(_line("truth", run.truth, style))
-    if run.plan is not None:
-        found.append(_line("plan", run.plan, {"color": PLAN, "lw": 0.9, "ls": (0, (5, 3))}))
+    several = len(run.truths) > 1
+    for k, (vehicle, truth) in enumerate(run.truths.items()):
+        style = {"color": TRUTHS[k % len(TRUTHS)], "lw": 3.2, "alpha": 0.45}
+        style["solid_capstyle"] = "round"
+        found.append(_line(f"truth of {label(vehicle)}" if several else "truth", truth, style))
+    for vehicle, plan in run.plans.items():
+        style = {"color": PLAN, "lw": 0.9, "ls": (0, (5, 3))}
+        found.append(_line(f"plan of {label(vehicle)}" if several else "plan", plan, style))
     for each in run.estimators:
         if each.aligned is not None:
             style = {"color": each.color, "lw": 1.3}
@@ -140,8 +148,9 @@ def _bounds(lines: list[_Line]) -> tuple[Floats, Floats]:
     An estimate that goes astray is followed only so far: as far again as the truth is wide.
     """
     points = np.concatenate([line.points for line in lines])
-    if lines[0].name == "truth":
-        first = lines[0].points
+    true = [line.points for line in lines if line.style["color"] in TRUTHS]
+    if true:
+        first = np.concatenate(true)
         low, high = first.min(axis=0), first.max(axis=0)
         beyond = max(float((high - low).max()), 0.5)
         points = np.clip(points, low - beyond, high + beyond)

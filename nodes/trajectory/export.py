@@ -63,7 +63,7 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
     zero = epoch_of(epoch)
     if form not in FORMATS:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, found {form!r}")
-    truth, estimates = load(run)
+    truths, estimates = load(run)
     if form == "kitti" and not estimates:
         raise ValueError(
             f"{run / 'trajectories'}: expected an estimate to give KITTI's poses their times, "
@@ -71,7 +71,11 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
         )
     # Before anything is written: a run that has no such pair leaves no half of an export.
     pairs = {
-        name: associate(truth, estimate, name=f"{run / 'trajectories' / name}.tum")
+        name: associate(
+            truths.get(_truth_of(run, name), truths[TRUTH]),
+            estimate,
+            name=f"{run / 'trajectories' / name}.tum",
+        )
         for name, estimate in (estimates.items() if form == "kitti" else ())
     }
     folder = out or run / "export"
@@ -89,14 +93,14 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
             written.append(path)
     if form == "kitti":
         return written
-    for name, trajectory in ({TRUTH: truth} | estimates).items():
-        comment = _COMMENT[form, name if name == TRUTH else ""]
+    for name, trajectory in (truths | estimates).items():
+        comment = _COMMENT[form, TRUTH if name in truths else ""]
         comment = f"{comment}\nthe run's time 0 is {zero} ns"
         placed = _placed(trajectory, zero, z_up=form == "euroc")
         if form == "euroc":
             written.append(folder / f"{name}.csv")
             write_euroc(written[-1], placed, comment + _VELOCITIES)
-        if form == "tum" or name != TRUTH:
+        if form == "tum" or name in estimates:
             written.append(folder / f"{name}.tum")
             write_tum(written[-1], placed, comment)
     return written
@@ -145,8 +149,10 @@ class _Summary(msgspec.Struct):
     announcements: list[_Announced] = []
 
 
-def load(run: Path) -> tuple[Trajectory, dict[str, Trajectory]]:
-    """Read a run's true trajectory and its estimates, by name of the estimator.
+def load(run: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:
+    """Read a run's true trajectories and its estimates, both by the names of their files.
+
+    The first vehicle's truth is ``truth``, those of others are ``truth.<vehicle>``.
 
     Raises:
         ValueError: The run left no trajectories, or one of them is none.
@@ -160,10 +166,31 @@ def load(run: Path) -> tuple[Trajectory, dict[str, Trajectory]]:
             f"{folder / TRUTH}.tum: expected the run's true trajectory, found {found}: "
             "a run leaves its trajectories if a node of type nodes.evaluation:Evaluation is in it"
         )
-    truth = read_tum(folder / f"{TRUTH}.tum")
-    estimates = {
-        path.stem: read_tum(path)
-        for path in sorted(folder.glob("*.tum"))
-        if path.stem not in {TRUTH, PLAN}
-    }
-    return truth, estimates
+    truths, estimates = {TRUTH: read_tum(folder / f"{TRUTH}.tum")}, {}
+    for path in sorted(folder.glob("*.tum")):
+        kind = path.stem.partition(".")[0]
+        if kind == TRUTH:
+            truths[path.stem] = read_tum(path)
+        elif kind != PLAN:
+            estimates[path.stem] = read_tum(path)
+    return truths, estimates
+
+
+def _truth_of(run: Path, estimate: str) -> str:
+    """Return the name of the truth that an estimate was judged by, if the verdict names one."""
+    path = run / "evaluation" / "verdict.json"
+    if not path.is_file():
+        return TRUTH
+    found = msgspec.json.decode(path.read_bytes(), type=_Verdict).estimators
+    vehicles = {name.replace("/", "_"): each.vehicle for name, each in found.items()}
+    return f"{TRUTH}.{vehicles.get(estimate, '')}"
+
+
+class _Judged(msgspec.Struct):
+    vehicle: str = ""
+
+
+class _Verdict(msgspec.Struct):
+    """What an export asks of a run's verdict."""
+
+    estimators: dict[str, _Judged] = {}

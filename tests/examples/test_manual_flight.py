@@ -39,7 +39,7 @@ def test_held_keys_move_the_drone_on_both_axes(display: Display, tmp_path: Path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert "WindowClosed" in summary["reason"]
     assert summary["events"]["KeyPressed"] == 3
-    flight = np.loadtxt(tmp_path / "trajectory.tum")
+    flight = np.loadtxt(tmp_path / "trajectories" / "truth.tum")
     north, east = flight[-1, 1:3] - flight[0, 1:3]
     assert north > 0.3
     assert east > 0.3
@@ -59,7 +59,7 @@ def fly(display: Display, folder: Path, log: Path) -> None:
     display.call("xdotool", "keydown", "w", "keydown", "d")
 
     def moved() -> bool:
-        rows = (folder / "trajectory.tum").read_text().splitlines()[1:-1]
+        rows = (folder / "trajectories" / "truth.tum").read_text().splitlines()[1:-1]
         return bool(rows) and min(float(x) for x in rows[-1].split()[1:3]) > 0.4
 
     assert eventually(moved)

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from events import Collision, Event, Image, Odometry
+from runtime import Node, NodeConfig, on
+from runtime.paths import OutputPath
 from tests.runtime.tools.samples_cli import ROOT, command_here
 
 ROOM = """
@@ -41,8 +44,23 @@ name = "odometry"
 type = "nodes.visual_odometry:VisualOdometry"
 [[nodes]]
 name = "log"
-type = "nodes.flight_log:FlightLog"
+type = "tests.runs.test_check:Log"
 """
+
+
+class LogConfig(NodeConfig):
+    """Settings of files in the run's folder."""
+
+    trajectory: OutputPath = "trajectory.tum"
+    plot: OutputPath = "flight.png"
+
+
+class Log(Node[LogConfig]):
+    """A node that writes files."""
+
+    @on(Odometry, Image, Collision)
+    def seen(self, event: Event) -> None:
+        """Take what a log would."""
 
 
 @pytest.fixture
@@ -67,7 +85,7 @@ def test_a_right_file_is_right_from_anywhere(room: Path) -> None:
     assert sorted(each.name for each in room.parent.iterdir()) == ["room.toml", "room.xml"]
 
 
-TYPE = "nodes.flight_log:FlightLog"
+TYPE = "tests.runs.test_check:Log"
 MISTAKES = [
     ("drone.world=none.xml", "drone: world: ", "none.xml: expected an MJCF file, found nothing"),
     ("drone.world=hal", "drone: world: ", 'found "hal"; did you mean hall?'),

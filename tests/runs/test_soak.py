@@ -39,10 +39,6 @@ name = "evaluation"
 type = "nodes.evaluation:Evaluation"
 
 [[nodes]]
-name = "flight_log"
-type = "nodes.flight_log:FlightLog"
-
-[[nodes]]
 name = "scale"
 type = "tests.runs.test_soak:Scale"
 """

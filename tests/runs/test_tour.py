@@ -28,10 +28,10 @@ BUSY = "while True: pass"
 
 
 def flight(folder: Path) -> Path:
-    """Write the standard tour without what estimates and judges into a folder."""
+    """Write the standard tour without its estimator and report into a folder."""
     table = tomllib.loads(CONFIG.read_text())
-    judges = {"odometry", "evaluation", "report"}
-    table["nodes"] = [node for node in table["nodes"] if node["name"] not in judges]
+    left_out = {"odometry", "report"}
+    table["nodes"] = [node for node in table["nodes"] if node["name"] not in left_out]
     path = folder / "flight.toml"
     path.write_text(tomli_w.dumps(table))
     return path
@@ -55,13 +55,13 @@ def test_a_short_flight_leaves_everything(tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert {p.name for p in out.iterdir()} == {
         *("summary.json", "config.toml", "log.txt", ".visnav-run"),
-        *("trajectory.tum", "flight.png", "images.png"),
+        *("trajectories", "evaluation", "frames"),
     }
     found = summary(out)
     assert (found["sim_seconds"], found["reason"], found["error"]) == (2.0, "duration", None)
     assert found["events"]["Imu"] == 400
     assert set(found["drops"].values()) <= {0}
-    rows = (out / "trajectory.tum").read_text().splitlines()
+    rows = (out / "trajectories" / "truth.tum").read_text().splitlines()
     assert len(rows) == 1 + found["events"]["Odometry"]
     cameras = [a for a in found["announcements"] if a["type"] == "CameraAnnouncement"]
     assert [(c["source"], c["rate"]) for c in cameras] == [("drone/camera", 30.0)]
@@ -117,7 +117,8 @@ def test_the_tour_flies_round_the_hall_and_lands(tmp_path: Path) -> None:
     assert (found["events"]["TakenOff"], found["events"]["Landed"]) == (1, 1)
     assert found["events"].get("Collision", 0) == 0
     assert 40 < found["sim_seconds"] < 75
-    last = (tmp_path / "out" / "trajectory.tum").read_text().splitlines()[-1].split()
+    rows = (tmp_path / "out" / "trajectories" / "truth.tum").read_text().splitlines()
+    last = rows[-1].split()
     x, y, z = map(float, last[1:4])
     assert abs(x) < 0.2
     assert abs(y) < 0.2
@@ -137,7 +138,7 @@ def test_the_whole_tour_with_images(tmp_path: Path) -> None:
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 def test_ctrl_c_in_mid_flight_leaves_whole_files(clock: str, tmp_path: Path) -> None:
     settings = changes(*SMALL, f"run.clock={clock}", "run.speed=1.0")
-    trajectory = tmp_path / "out" / "trajectory.tum"
+    trajectory = tmp_path / "out" / "trajectories" / "truth.tum"
     with start(["run", flight(tmp_path), "-q", "--out", "out", *settings], tmp_path) as process:
         deadline = time.monotonic() + 30
         # The file grows by blocks as the vehicle flies; only its growth shows from outside.
@@ -154,4 +155,4 @@ def test_ctrl_c_in_mid_flight_leaves_whole_files(clock: str, tmp_path: Path) -> 
     assert text.endswith("\n")
     assert len(text.splitlines()) == 1 + found["events"]["Odometry"]
     assert all(len(line.split()) == 8 for line in text.splitlines()[1:])
-    assert (tmp_path / "out" / "flight.png").exists()
+    assert (tmp_path / "out" / "evaluation" / "verdict.json").exists()

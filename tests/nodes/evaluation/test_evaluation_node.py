@@ -8,13 +8,27 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
-from events import Event, Image, PlannedPose, PositionSetpoint, Score, TrackedFeatures
+from events import (
+    CameraAnnouncement,
+    CameraInfo,
+    Collision,
+    Event,
+    Image,
+    Odometry,
+    PlannedPose,
+    PositionSetpoint,
+    Score,
+    TrackedFeatures,
+    VehicleAnnouncement,
+)
 from nodes.evaluation import Evaluation
 from nodes.evaluation.results import read_errors
 from nodes.trajectory.formats import read_tum
+from runtime.errors import NodeError
 from runtime.testing import run_node
 from tests.nodes.evaluation.flights import (
     MS,
@@ -201,6 +215,111 @@ def test_of_many_images_a_few_are_kept_with_their_features(tmp_path: Path) -> No
     left, right = drawn[:, :40].astype(int), drawn[:, 40:].astype(int)
     assert (left[..., 1] - left[..., 2]).max() > 60  # a green ring
     assert (right[..., 2] - right[..., 1]).max() > 60  # a red one
+
+
+def test_of_a_camera_that_nobody_tracks_a_few_images_are_kept(tmp_path: Path) -> None:
+    data = np.full((60, 80), 128, np.uint8)
+    events: list[Event] = [
+        Image(stamp=s, source="drone/eye", frame_id="eye", encoding="mono8", data=data)
+        for s in FRAMES
+    ]
+    run(tmp_path, announced(), truth(10), events, image_count=4)
+    names = sorted(path.name for path in (tmp_path / "frames").iterdir())
+    assert 2 <= len(names) <= 4
+    assert names[0] == "drone_eye_000000000000000.jpg"
+
+
+OFFSET = (5.0, -3.0, 1.0)
+"""From the first vehicle to the second, metres."""
+
+
+def camera_of(vehicle: str) -> CameraAnnouncement:
+    return CameraAnnouncement(
+        stamp=0,
+        source=f"{vehicle}/eye",
+        images=("grey",),
+        info=CameraInfo.from_fov(80, 60, 1.5),
+        rate=10.0,
+        latency=0.0,
+        frame_id=f"{vehicle}/eye_optical",
+        parent_frame_id="base_link",
+        position=(0.0, 0.0, 0.0),
+        orientation=(0.5, 0.5, 0.5, 0.5),
+    )
+
+
+def two_flights() -> list[Event]:
+    """Return two vehicles with a camera each, and an estimator that follows the second's camera.
+
+    The second vehicle flies as the first does, elsewhere, and hits something.
+    """
+    events: list[Event] = []
+    for event in [announced()[0], *truth(10)]:
+        assert isinstance(event, VehicleAnnouncement | Odometry)
+        moved = tuple(a + b for a, b in zip(event.position, OFFSET, strict=True))
+        events += [event, msgspec.structs.replace(event, source="second", position=moved)]
+    events += [camera_of("drone"), camera_of("second"), announced()[1]]
+    for stamp in FRAMES:
+        pixel = np.array([[20, 30]], np.float32)
+        events += [
+            TrackedFeatures(
+                stamp=stamp,
+                source="est",
+                frame_id="second/eye_optical",
+                points=pixel,
+                inliers=np.array([True]),
+            ),
+            estimate(stamp, error=OFFSET),
+            PlannedPose(stamp=stamp, source="p", vehicle="second", position=place(stamp), yaw=0.0),
+        ]
+    for vehicle, count in (("drone", 2), ("second", 1)):
+        events += [
+            Collision(
+                stamp=k + 1,
+                source=vehicle,
+                other="wall",
+                position=(1.0, 2.0, -1.5),
+                normal=(1.0, 0.0, 0.0),
+                speed=0.5,
+            )
+            for k in range(count)
+        ]
+    return events
+
+
+def test_an_estimate_is_held_against_the_vehicle_that_carries_its_camera(tmp_path: Path) -> None:
+    scores = run(tmp_path, two_flights())
+    assert max(s.value for s in scores if s.metric == "position_error") < 1e-9
+    verdict = json.loads((tmp_path / "evaluation" / "verdict.json").read_text())
+    figures = verdict["estimators"]["est"]
+    assert figures["vehicle"] == "second"
+    assert figures["ate_rmse_m"] < 1e-9
+    assert figures["collisions"] == 1
+    assert figures["plan_rmse_m"] == pytest.approx(math.sqrt(35.0))  # its own, as far as OFFSET
+    names = {path.name for path in (tmp_path / "trajectories").iterdir()}
+    assert names == {
+        "truth.tum", "truth.second.tum", "plan.second.tum", "est.tum", "collisions.csv"
+    }  # fmt: skip
+    second = read_tum(tmp_path / "trajectories" / "truth.second.tum")
+    np.testing.assert_allclose(second.positions[7], np.add(place(35 * MS), OFFSET), atol=1e-9)
+    rows = (tmp_path / "trajectories" / "collisions.csv").read_text().splitlines()
+    assert rows[1:] == [
+        "1,drone,wall,1.000,2.000,-1.500,0.500",
+        "2,drone,wall,1.000,2.000,-1.500,0.500",
+        "1,second,wall,1.000,2.000,-1.500,0.500",
+    ]
+
+
+def test_the_file_may_say_which_vehicle_is_meant(tmp_path: Path) -> None:
+    figures = judged(tmp_path, two_flights(), vehicle="drone")["estimators"]["est"]
+    assert figures["vehicle"] == "drone"
+    assert figures["ate_rmse_m"] == pytest.approx(math.sqrt(35.0))
+    assert figures["collisions"] == 2
+
+
+def test_a_vehicle_that_is_not_there_is_refused() -> None:
+    with pytest.raises(NodeError, match=r'announced \(drone\), found "drome".*mean .drone'):
+        run_node(Evaluation, inputs=announced(), config={"vehicle": "drome"})
 
 
 def test_an_unknown_threshold_is_refused() -> None:

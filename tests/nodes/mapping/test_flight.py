@@ -11,8 +11,8 @@ import pytest
 
 from events import Odometry
 from nodes.mapping import Mapping
+from nodes.mapping.ply import read_ply
 from nodes.pilots import WaypointFollower
-from nodes.report.ply import read_ply
 from runtime.testing import run_nodes, spec
 from sims.multirotor import Multirotor
 from sims.worlds import TOURS

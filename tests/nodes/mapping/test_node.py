@@ -21,7 +21,7 @@ from events import (
     PoseStamped,
 )
 from nodes.mapping import Mapping
-from nodes.report.ply import read_ply
+from nodes.mapping.ply import read_ply
 from runtime.errors import NodeError, RefusedError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 

@@ -100,7 +100,7 @@ def evaluated(
     for name, judgement in judgements.items():
         if judgement.estimate is not None:
             write_tum(out / "trajectories" / f"{file_name(name)}.tum", judgement.estimate)
-    write_results(out, plan, judgements, verdict)
+    write_results(out, {"plan": plan}, judgements, verdict)
     return verdict
 
 

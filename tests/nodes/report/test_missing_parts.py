@@ -58,14 +58,6 @@ def test_a_run_of_which_only_the_log_is_left(tmp_path: Path) -> None:
     assert list((tmp_path / "plots").iterdir()) == []
 
 
-def test_the_flight_logs_trajectory_stands_in_for_the_truth(tmp_path: Path) -> None:
-    summary(tmp_path)
-    write_tum(tmp_path / "trajectory.tum", walk(2))
-    page = Page(write_report(tmp_path))
-    assert "truth.tum" not in page.text
-    assert (tmp_path / "plots" / "trajectories.png").exists()
-
-
 def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
     truth = walk(3)
     evaluated(tmp_path, truth, {"vo": recorded(truth)}, Thresholds())
@@ -81,8 +73,6 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
     (tmp_path / "frames" / "vo_000.jpg").write_text("none")
     (tmp_path / "frames" / "vo_001.jpg").touch()
     (tmp_path / "frames" / "vo_002.jpg").mkdir()
-    (tmp_path / "flight.png").write_text("none")
-    (tmp_path / "images.png").touch()
     page = Page(write_report(tmp_path))
     for name in (
         "summary.json cannot be read",
@@ -95,8 +85,6 @@ def test_broken_files_are_named_and_the_rest_is_shown(tmp_path: Path) -> None:
         "frames/vo_000.jpg cannot be read: expected a JPEG",
         "frames/vo_001.jpg cannot be read: expected a JPEG",
         "frames/vo_002.jpg cannot be read: [Errno 21]",
-        "flight.png cannot be read: expected a JPEG or PNG, found b'none'",
-        "images.png cannot be read: expected a JPEG or PNG, found b''",
     ):
         assert name in page.text
     names = {p.name for p in (tmp_path / "plots").iterdir()}

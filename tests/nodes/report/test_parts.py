@@ -9,9 +9,9 @@ import pytest
 
 from nodes.evaluation.coverage import Interval
 from nodes.evaluation.judging import Thresholds
+from nodes.mapping.ply import read_ply
 from nodes.report.curves import draw_latency
 from nodes.report.folder import read_run
-from nodes.report.ply import read_ply
 from nodes.report.poses import broken, gaps, read_poses
 from nodes.report.splat import Shown, View, paint
 from nodes.report.style import drawing, label, number

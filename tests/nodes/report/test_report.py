@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from nodes.evaluation.judging import Thresholds
+from nodes.report.folder import read_run
 from nodes.report.page import write_report
 from nodes.trajectory import Trajectory
+from nodes.trajectory.formats import write_tum
 from tests.nodes.report.folders import evaluated, frame, ply, recorded, summary, walk
 
 LIMITS = Thresholds(ate_rmse_m=1e-4, lost_seconds=100.0)
@@ -67,7 +69,6 @@ def lay_out(out: Path) -> None:
     points = random.uniform((-4, -4, -2), (4, 4, 0), (5000, 3))
     ply(out / "clouds" / "truth.ply", points, random.integers(0, 255, (5000, 3)))
     ply(out / "clouds" / "vo.ply", points[:3000])
-    frame(out / "flight.png")
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +105,6 @@ def test_every_section_has_its_title(page: Page) -> None:
         "Relative error over path length",
         "Clouds",
         "Images and features of vo",
-        "The flight",
         "The run",
         "Warnings and errors",
         "What the estimators cost on this machine",
@@ -167,7 +167,59 @@ def test_every_image_is_one_and_shows_something(run: Path, page: Page) -> None:
         assert image is not None
         assert 600 < image.shape[1] <= 1110
         assert image.std() > 5
-    assert page.markup.count("<img") == len(images) + 1  # and flight.png
+    assert page.markup.count("<img") == len(images)
+
+
+def test_of_two_vehicles_each_has_its_line_and_its_estimators(tmp_path: Path) -> None:
+    first, second = walk(10), walk(10, seed=5)
+    far = Trajectory(
+        second.stamps, second.positions + np.array([2.0, 3.0, -1.0]), second.orientations
+    )
+    verdict = evaluated(tmp_path, far, {"vo": recorded(far)}, Thresholds())
+    verdict["estimators"]["vo"]["vehicle"] = "other"
+    trajectories = tmp_path / "trajectories"
+    (trajectories / "truth.tum").rename(trajectories / "truth.other.tum")
+    write_tum(trajectories / "truth.tum", first)
+    place = ",".join(map(str, far.positions[1000]))
+    (trajectories / "collisions.csv").write_text(f"head\n1,other,wall,{place},0.5\n")
+    (tmp_path / "evaluation" / "verdict.json").write_bytes(msgspec.json.encode(verdict))
+    announced = [
+        {"type": "VehicleAnnouncement", "source": "drone"},
+        {"type": "VehicleAnnouncement", "source": "other"},
+        {
+            "type": "BarometerAnnouncement",
+            "source": "drone/barometer",
+            "stamp": 0,
+            "rate": 50.0,
+            "latency": 0.0,
+            "frame_id": "base_link",
+            "noise": 3.0,
+            "altitude": 122.0,
+        },
+        {
+            "type": "CameraAnnouncement",
+            "source": "other/eye",
+            "rate": 30.0,
+            "images": ["grey"],
+            "info": {"width": 640, "height": 480, "distortion_model": "equidistant"},
+        },
+    ]
+    summary(tmp_path, verdict, announcements=announced)
+    page = Page(write_report(tmp_path))
+    run = read_run(tmp_path)
+    assert list(run.truths) == ["drone", "other"]
+    (vo,) = run.estimators
+    assert run.truth_of(vo) is run.truths["other"]
+    for text in (
+        "of other; laid on the truth at its first pose",
+        "true path of drone",
+        "true path of other",
+        "drone/barometer Barometer 50 noise 3, altitude 122",
+        "other/eye Camera 30 640 × 480, equidistant, images grey",
+    ):
+        assert text in page.text
+    assert len(run.collisions) == 1
+    assert (tmp_path / "plots" / "relative.png").exists()
 
 
 @pytest.mark.slow

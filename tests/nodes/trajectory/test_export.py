@@ -78,7 +78,8 @@ NWU = np.diag([1.0, -1.0, -1.0, 1.0])
 def test_poses_stay_where_they_were_and_stamps_are_of_the_epoch(
     run: Path, epoch: int | str, zero: int
 ) -> None:
-    truth, estimates = load(run)
+    truths, estimates = load(run)
+    truth = truths["truth"]
     assert list(estimates) == ["slam", "vo"]
     out = run / "export"
     for form, world in (("tum", np.eye(4)), ("euroc", NWU)):
@@ -103,7 +104,8 @@ def test_an_epoch_that_is_none_is_refused(run: Path, epoch: int | str) -> None:
 
 def test_kittis_poses_are_the_left_cameras_from_identity_line_by_line(run: Path) -> None:
     """As that benchmark's: z forward and x right in the frame of the first pose."""
-    truth, estimates = load(run)
+    truths, estimates = load(run)
+    truth = truths["truth"]
     for announced, mounted in (
         ([], OPTICAL),
         ([{"type": "CameraAnnouncement", "parent_frame_id": "map"}], OPTICAL),
@@ -176,7 +178,8 @@ def test_evos_commands_take_the_files_as_they_are_and_find_our_figures(run: Path
     """`evo_ape` and `evo_rpe` of each format, in processes of their own."""
     for form in ("tum", "euroc", "kitti"):
         export(run, form)
-    truth, estimates = load(run)
+    truths, estimates = load(run)
+    truth = truths["truth"]
     # Only those at stamps of the truth: where evo would pair poses of different times.
     true, said = associate(truth, estimates["vo"])
     aligned = align(said, true, "se3").trajectory
@@ -195,10 +198,30 @@ def test_evos_commands_take_the_files_as_they_are_and_find_our_figures(run: Path
         assert found["rmse"] * 100 == pytest.approx(rpe.translation_percent, abs=2e-4)
 
 
+def test_of_several_vehicles_each_estimate_goes_with_its_own(run: Path) -> None:
+    truths, estimates = load(run)
+    moved = truths["truth"].positions + np.array([1.0, 0.0, 0.0])
+    second = Trajectory(truths["truth"].stamps, moved[::-1], truths["truth"].orientations)
+    write_tum(run / "trajectories" / "truth.second.tum", second)
+    write_tum(run / "trajectories" / "plan.second.tum", second)
+    (run / "evaluation").mkdir()
+    verdict = {"passed": None, "estimators": {"vo": {"vehicle": "second"}, "slam": {}}}
+    (run / "evaluation" / "verdict.json").write_text(json.dumps(verdict))
+    assert {path.name for path in export(run, "tum")} == {
+        "truth.tum", "truth.second.tum", "slam.tum", "vo.tum"
+    }  # fmt: skip
+    export(run, "kitti")
+    for name, true in (("vo", second), ("slam", truths["truth"])):
+        there = true.at(estimates[name].stamps).matrices() @ OPTICAL
+        found = read_kitti(run / "export" / f"{name}.truth.kitti.txt")
+        assert abs(there[0] @ found - there).max() < 1e-9
+
+
 @pytest.mark.slow
 def test_evo_reads_an_estimate_in_a_frame_of_its_own(run: Path) -> None:
     export(run, "kitti")
-    truth, estimates = load(run)
+    truths, estimates = load(run)
+    truth = truths["truth"]
     true, said = associate(truth, estimates["slam"])
     found = evo(run / "export", "ape", "kitti", "slam.truth.kitti.txt", "slam.kitti.txt", "--align")
     ours = absolute_error(true, align(said, true, "se3").trajectory)
