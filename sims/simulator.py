@@ -34,10 +34,11 @@ class SimulatorConfig(NodeConfig):
     """Settings of every simulator.
 
     Attributes:
-        world: Name of a built-in world (``hall``, ``yard``), or path of an MJCF file; empty for
-            that of the run's other vehicles, or ``hall`` if none names one. In an MJCF file x is
-            north, y is west and z is up; in all settings and events x is north, y is east and z
-            is down (NED). So a geom with ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
+        world: Name of a built-in world (``hall``, ``yard``, ``corridor``, ``office``, ``night``,
+            ``forest``), or path of an MJCF file; empty for that of the run's other vehicles, or
+            ``hall`` if none names one. In an MJCF file x is north, y is west and z is up; in all
+            settings and events x is north, y is east and z is down (NED). So a geom with
+            ``pos="1 2 3"`` is at (1, -2, -3) in ``map``.
         origin: Where the origin of ``map`` is on the earth: latitude and longitude, degrees north
             and east, and altitude, metres above the WGS 84 ellipsoid, which here is sea level too.
         cameras: The cameras that are carried.

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from sims.worlds.model import Material, Model, Vector
-from sims.worlds.shapes import FACES, Window, arch, blob, box, cylinder, face_size, quad
+from sims.worlds.shapes import FACES, STEP, Window, arch, blob, box, cylinder, face_size, quad
 
 WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 
@@ -67,12 +67,13 @@ class Builder(Model):
         place: Vector,
         top: Window | None = None,
         side: Window | None = None,
+        sides: int = 24,
     ) -> None:
-        """Add an upright cylinder; `place` is the middle of its base."""
+        """Add an upright cylinder, drawn with some flat sides; `place` is its base's middle."""
         side = side or self.cut(material, 2.0 * math.pi * radius, height)
         top = top or self.cut(material, 2.0 * radius, 2.0 * radius)
         middle = (place[0], place[1], place[2] + height / 2.0)
-        self.look(f"{name}.look", cylinder(radius, height, side, top), material, middle)
+        self.look(f"{name}.look", cylinder(radius, height, side, top, sides), material, middle)
         self.solid(name, mujoco.mjtGeom.mjGEOM_CYLINDER, [radius, height / 2.0], middle)
 
     def crown(self, name: str, material: Material, radii: Vector, place: Vector) -> None:
@@ -90,11 +91,15 @@ class Builder(Model):
         place: Vector,
         facing: float,
         thick: float = 0.3,
+        window: Window = WHOLE,
     ) -> None:
-        """Add a wall that has one side, all of the material; `place` is the middle of its foot."""
+        """Add a wall that has one side; `place` is the middle of its foot.
+
+        It shows all of the material, or that `window` of it, which may repeat it.
+        """
         width, height = size
         middle = (place[0], place[1], place[2] + height / 2.0)
-        self.panel(f"{name}.look", material, WHOLE, size, middle, facing)
+        self.panel(f"{name}.look", material, window, size, middle, facing)
         angle = math.radians(facing)
         behind = (
             place[0] - math.cos(angle) * thick / 2.0,
@@ -103,6 +108,57 @@ class Builder(Model):
         )
         half = [thick / 2.0, width / 2.0, height / 2.0]
         self.solid(name, mujoco.mjtGeom.mjGEOM_BOX, half, behind, facing)
+
+    def floor(
+        self,
+        name: str,
+        material: Material,
+        half: tuple[float, float],
+        *,
+        middle: tuple[float, float] = (0.0, 0.0),
+        window: Window = WHOLE,
+        step: float = STEP,
+    ) -> None:
+        """Add level ground, north up in the material; `half` are its half lengths along x and y.
+
+        It is cut every `step` metres, at the corners of which it is lit.
+        """
+        self._level(f"{name}.look", material, half, (*middle, 0.0), window, 1.0, step)
+        self.solid(name, mujoco.mjtGeom.mjGEOM_PLANE, [*half, 0.1], (*middle, 0.0))
+
+    def ceiling(
+        self,
+        name: str,
+        material: Material,
+        half: tuple[float, float],
+        height: float,
+        *,
+        middle: tuple[float, float] = (0.0, 0.0),
+        window: Window = WHOLE,
+    ) -> None:
+        """Add a ceiling, south up in the material; `half` are its half lengths along x and y."""
+        self._level(f"{name}.look", material, half, (*middle, height), window, -1.0, STEP)
+        place = (*middle, height + 0.1)
+        self.solid(name, mujoco.mjtGeom.mjGEOM_BOX, [*half, 0.1], place)
+
+    def _level(
+        self,
+        name: str,
+        material: Material,
+        half: tuple[float, float],
+        place: Vector,
+        window: Window,
+        up: float,
+        step: float,
+    ) -> None:
+        surface = quad(
+            np.array([up * half[0], half[1], 0.0]),
+            np.array([0.0, -2.0 * half[1], 0.0]),
+            np.array([-2.0 * up * half[0], 0.0, 0.0]),
+            window,
+            step,
+        )
+        self.look(name, surface, material, place)
 
     def panel(
         self,

@@ -10,11 +10,10 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from sims.worlds import decals, hall_surfaces, materials
-from sims.worlds.builder import WHOLE, Builder
+from sims.worlds.builder import Builder
 from sims.worlds.hall_surfaces import (
     BARRELS,
     CEILING_DENSITY,
@@ -27,7 +26,6 @@ from sims.worlds.hall_surfaces import (
 )
 from sims.worlds.model import Material
 from sims.worlds.patterns import Image
-from sims.worlds.shapes import quad
 
 
 def hall(seed: int = 0, bare: bool = False) -> Any:
@@ -151,14 +149,7 @@ def _shell(b: Builder, posters: Material) -> None:
         brick = b.material(name, functools.partial(hall_surfaces.wall, width=width), DENSITY)
         b.wall(name, brick, (width, HEIGHT), (*place, 0.0), facing)
     floor = b.material("floor", hall_surfaces.floor, DENSITY)
-    surface = quad(
-        np.array([NORTH, WEST, 0.0]),
-        np.array([0.0, -2 * WEST, 0.0]),
-        np.array([-2 * NORTH, 0.0, 0.0]),
-        WHOLE,
-    )
-    b.look("floor.look", surface, floor, (0.0, 0.0, 0.0))
-    b.solid("floor", mujoco.mjtGeom.mjGEOM_PLANE, [NORTH, WEST, 0.1], (0.0, 0.0, 0.0))
+    b.floor("floor", floor, (NORTH, WEST))
 
 
 def _roof(b: Builder, wood: Material, steel: Material) -> None:
@@ -177,15 +168,7 @@ def _roof(b: Builder, wood: Material, steel: Material) -> None:
                 hidden=("front", "back"),
             )
     ceiling = b.material("ceiling", hall_surfaces.ceiling, CEILING_DENSITY)
-    surface = quad(
-        np.array([-NORTH, WEST, 0.0]),
-        np.array([0.0, -2 * WEST, 0.0]),
-        np.array([2 * NORTH, 0.0, 0.0]),
-        WHOLE,
-    )
-    b.look("ceiling.look", surface, ceiling, (0.0, 0.0, HEIGHT))
-    half = [NORTH, WEST, 0.1]
-    b.solid("ceiling", mujoco.mjtGeom.mjGEOM_BOX, half, (0.0, 0.0, HEIGHT + 0.1))
+    b.ceiling("ceiling", ceiling, (NORTH, WEST), HEIGHT)
 
 
 def _lights(b: Builder) -> None:

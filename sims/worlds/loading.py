@@ -11,11 +11,21 @@ from typing import Any
 import mujoco
 
 from runtime import VisnavError
+from sims.worlds.corridor import corridor
 from sims.worlds.dynamics import Scene
+from sims.worlds.forest import forest
 from sims.worlds.hall import hall
-from sims.worlds.yard import yard
+from sims.worlds.office import office
+from sims.worlds.yard import night, yard
 
-WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {"hall": hall, "yard": yard}
+WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {
+    "hall": hall,
+    "yard": yard,
+    "corridor": corridor,
+    "office": office,
+    "night": night,
+    "forest": forest,
+}
 """The worlds that are built in: name to the function that makes one from a seed, bare or not. One
 in which something moves by itself is a `Scene`."""
 

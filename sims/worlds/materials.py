@@ -59,6 +59,12 @@ def brick(
     return mix(mix(wall, (0.20, 0.17, 0.16), soot), (0.86, 0.83, 0.78), chalk)
 
 
+def paint(shape: tuple[int, int], random: np.random.Generator, colour: Colour) -> Image:
+    """Return smooth paint, with a grain of half a percent: next to no texture."""
+    coat = np.full((*shape, 3), colour, np.float32)
+    return shade(coat, 0.005 * random.standard_normal(shape, dtype=np.float32))
+
+
 def concrete(
     shape: tuple[int, int],
     random: np.random.Generator,

@@ -116,6 +116,11 @@ class Model:
         tilt: float = 0.0,
     ) -> None:
         """Add a surface that is drawn, without collisions."""
+        self.mesh(name, surface)
+        self.hang(name, name, material, self.spec.worldbody, place, turn, tilt)
+
+    def mesh(self, name: str, surface: Surface) -> None:
+        """Add a surface that can be hung up more than once."""
         self.spec.add_mesh(
             name=name,
             uservert=surface.points.ravel(),
@@ -124,10 +129,22 @@ class Model:
             userface=surface.faces.ravel(),
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
-        self.spec.worldbody.add_geom(
+
+    def hang(
+        self,
+        name: str,
+        mesh: str,
+        material: Material,
+        body: Any,
+        place: Vector = (0.0, 0.0, 0.0),
+        turn: float = 0.0,
+        tilt: float = 0.0,
+    ) -> None:
+        """Put a surface that `mesh` added on a body: drawn, without collisions."""
+        body.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=name,
+            meshname=mesh,
             material=material.name,
             pos=place,
             quat=from_rpy(0.0, math.radians(tilt), math.radians(turn)),
@@ -172,6 +189,7 @@ class Model:
         towards: Vector = (0.0, 0.0, -1.0),
         sun: bool = False,
         fall_off: float = 0.0,
+        cone: float = 0.0,
     ) -> None:
         """Add a light.
 
@@ -182,9 +200,12 @@ class Model:
             towards: Its direction.
             sun: Parallel rays from very far away.
             fall_off: 1/m² in 1 / (1 + fall_off r²).
+            cone: Degrees to each side of its direction that it reaches; 0: to all sides.
         """
         kind = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL if sun else mujoco.mjtLightType.mjLIGHT_POINT
-        self.spec.worldbody.add_light(
+        if cone:
+            kind = mujoco.mjtLightType.mjLIGHT_SPOT
+        light = self.spec.worldbody.add_light(
             name=name,
             type=kind,
             pos=place,
@@ -195,3 +216,5 @@ class Model:
             attenuation=[1.0, 0.0, fall_off],
             castshadow=False,
         )
+        if cone:
+            light.cutoff, light.exponent = cone, 1.5

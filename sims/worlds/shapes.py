@@ -122,9 +122,11 @@ def box(size: tuple[float, float, float], windows: dict[str, Window]) -> Surface
     )
 
 
-def cylinder(radius: float, height: float, side: Window, top: Window | None) -> Surface:
+def cylinder(
+    radius: float, height: float, side: Window, top: Window | None, sides: int = 24
+) -> Surface:
     """Return an upright cylinder about the origin, its top closed if it has a window."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 25)[None, :]  # seen from outside it grows to the right
+    angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)[None, :]  # outside: to the right
     levels = np.linspace(0.5, -0.5, max(1, math.ceil(height / STEP)) + 1)[:, None]
     ones = np.ones((len(levels), 1))
     points = np.stack(
@@ -135,7 +137,7 @@ def cylinder(radius: float, height: float, side: Window, top: Window | None) -> 
         ],
         axis=2,
     )
-    u = side[0] + (side[2] - side[0]) * np.linspace(0, 1, 25)[None, :] * ones
+    u = side[0] + (side[2] - side[0]) * np.linspace(0, 1, sides + 1)[None, :] * ones
     v = side[1] + (side[3] - side[1]) * (0.5 - levels) * np.ones_like(angle)
     parts = [grid(points, np.stack([u, v], axis=2))]
     if top is not None:

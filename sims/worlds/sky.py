@@ -13,10 +13,16 @@ from sims.worlds.patterns import Image, fractal, mix, smooth, to_bytes
 SIZE = 384
 
 
-def add_sky(spec: Any, random: np.random.Generator) -> None:
-    """Give the world a sky: haze at the horizon, blue above, clouds that lie in one plane."""
+def add_sky(spec: Any, random: np.random.Generator, night: bool = False) -> None:
+    """Give the world a sky: haze at the horizon, blue above, clouds that lie in one plane.
+
+    By night all of that is hardly seen, before a few stars.
+    """
     clouds = fractal((1024, 1024), random, coarse=200, fine=6, gain=0.62)
     faces = np.concatenate([_face(axes, clouds) for axes in _AXES], 0)
+    if night:
+        stars = random.uniform(size=faces.shape[:2]) > 0.9993
+        faces = mix(faces * (0.05, 0.06, 0.09), (0.75, 0.78, 0.82), stars.astype(np.float32))
     texture = spec.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=SIZE, height=6 * SIZE, nchannel=3
     )

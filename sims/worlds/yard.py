@@ -1,5 +1,7 @@
 """`yard`: a courtyard in the sun, 30 x 30 m, among houses, with containers, trees and arches.
 
+`night` is the same yard, of the same seed to the brick, by the light of four lamps.
+
 Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres, from the middle. What
 things are made of is in `materials`, `facades` and `decals`; how they get into the model, in
 `builder`; the ground's image, in `yard_ground`.
@@ -11,14 +13,12 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from sims.worlds import decals, facades, materials, yard_ground
 from sims.worlds.builder import WHOLE, Builder
 from sims.worlds.model import Material
 from sims.worlds.patterns import Image, fractal, shade, smooth
-from sims.worlds.shapes import quad
 from sims.worlds.sky import add_sky
 from sims.worlds.yard_ground import CONTAINERS, CRATES, POSTS, TREES
 
@@ -32,10 +32,10 @@ SIDES = {  # the houses' line, how they are turned, widths and storeys from the 
 }
 
 
-def yard(seed: int = 0, bare: bool = False) -> Any:
+def yard(seed: int = 0, bare: bool = False, night: bool = False) -> Any:
     """Return the yard as a `mujoco.MjSpec`; every seed has its own houses, ground and trees."""
     b = Builder("yard", seed, bare)
-    b.spec.visual.headlight.ambient = [0.56, 0.59, 0.66]
+    b.spec.visual.headlight.ambient = [0.07, 0.08, 0.12] if night else [0.56, 0.59, 0.66]
     red = b.material("brick", lambda r: materials.brick((384, 768), r, 80.0), 80.0, 0.12)
     ashlar = b.material("ashlar", _stone, 96.0, 0.22)
     cast = b.material("concrete", lambda r: materials.concrete((512, 512), r, 96.0), 96.0)
@@ -48,25 +48,45 @@ def yard(seed: int = 0, bare: bool = False) -> Any:
     _trees(b)
     _walls(b, red)
     _houses(b)
-    ground = b.material("ground", lambda r: yard_ground.image(r, SUN), yard_ground.DENSITY)
-    half = yard_ground.HALF
-    surface = quad(
-        np.array([half, half, 0.0]),
-        np.array([0.0, -2.0 * half, 0.0]),
-        np.array([-2.0 * half, 0.0, 0.0]),
-        WHOLE,
-        step=2.2,
-    )
-    b.look("ground.look", surface, ground, (0.0, 0.0, 0.0))
-    b.solid("ground", mujoco.mjtGeom.mjGEOM_PLANE, [half, half, 0.1], (0.0, 0.0, 0.0))
-    add_sky(b.spec, b.random)
+    sun = None if night else SUN
+    ground = b.material("ground", lambda r: yard_ground.image(r, sun), yard_ground.DENSITY)
+    step = 0.8 if night else 2.2
+    b.floor("ground", ground, (yard_ground.HALF, yard_ground.HALF), step=step)
+    add_sky(b.spec, b.random, night)
+    (_lamps if night else _daylight)(b)
+    b.spec.stat.center = [0.0, 0.0, 2.0]
+    b.spec.stat.extent = 20.0
+    return b.spec
+
+
+def night(seed: int = 0, bare: bool = False) -> Any:
+    """Return the yard by night as a `mujoco.MjSpec`."""
+    return yard(seed, bare, night=True)
+
+
+def _daylight(b: Builder) -> None:
     b.light("sun", (-10.0, -10.0, 20.0), (0.72, 0.66, 0.54), towards=SUN, sun=True)
     b.light("sky_light", (10.0, 10.0, 20.0), (0.16, 0.18, 0.22), towards=(-0.6, -0.5, -0.4),
             sun=True)  # fmt: skip
     b.light("bounce", (0.0, 0.0, 6.0), (0.14, 0.12, 0.09), towards=(-0.2, 0.7, 0.5), sun=True)
-    b.spec.stat.center = [0.0, 0.0, 2.0]
-    b.spec.stat.extent = 20.0
-    return b.spec
+
+
+def _lamps(b: Builder) -> None:
+    """Light the lamps on the posts, a few windows, and a moon that hardly helps."""
+    shine = b.material("shine", lambda r: materials.paint((64, 64), r, (1.0, 0.93, 0.74)), 64.0,
+                       glow=1.0)  # fmt: skip
+    lit = b.material("lit", lambda r: decals.window_pane((102, 67), r, True), 64.0, glow=0.9)
+    for number, (x, y) in enumerate(POSTS):
+        b.cylinder(f"lamp_{number}", shine, 0.24, 0.2, (x, y, 4.52), top=WHOLE, side=WHOLE)
+        b.light(f"lamp_{number}", (x, y, 4.0), (1.9, 1.5, 0.95), fall_off=0.05,
+                cone=80.0)  # fmt: skip
+    for number in range(18):
+        facing = 90.0 * (number % 4)
+        along, storey = float(b.random.uniform(-14.0, 14.0)), int(b.random.integers(3))
+        c, s = np.cos(np.radians(facing)), np.sin(np.radians(facing))
+        place = (-17.46 * c - along * s, -17.46 * s + along * c, facades.STOREY * storey + 1.55)
+        b.panel(f"lit_{number}", lit, WHOLE, (1.05, 1.6), place, facing)
+    b.light("moon", (0.0, 0.0, 20.0), (0.05, 0.06, 0.09), towards=(0.5, -0.4, -0.7), sun=True)
 
 
 def _containers_and_crates(b: Builder, steel: Material, crates: Material) -> None:

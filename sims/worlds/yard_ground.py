@@ -38,8 +38,8 @@ POSTS = ((12.5, -5.0), (-1.5, 10.9), (-8.9, 3.4), (0.6, -9.9))
 Points = npt.NDArray[np.float64]
 
 
-def image(random: np.random.Generator, sun: tuple[float, float, float]) -> Image:
-    """Return the ground, north up and west left, with shadows for light that goes along `sun`."""
+def image(random: np.random.Generator, sun: tuple[float, float, float] | None) -> Image:
+    """Return the ground, north up and west left, with shadows if light goes along a `sun`."""
     shape = (int(2 * HALF * DENSITY),) * 2
     ground = materials.asphalt(shape, random, DENSITY)
     slabs = materials.tiles(
@@ -64,6 +64,8 @@ def image(random: np.random.Generator, sun: tuple[float, float, float]) -> Image
     ground = mix(ground, materials.grass(shape, random, DENSITY), green * (1.0 - 0.97 * kerb))
     _paint(ground, random)
     ground = _manholes(ground, random)
+    if sun is None:
+        return ground
     mask = _shadows(shape, sun)
     mask = cv2.GaussianBlur(mask, (0, 0), 2.5)
     # The sky still lights what the sun doesn't: shadows are blue.

@@ -16,7 +16,7 @@ import pytest
 
 from events.rotations import from_rpy
 from sims.cameras import CameraRenderer, model_to_bytes, pose_to_qpos
-from sims.worlds import CLEARANCE, TOURS, load_world, tour_length
+from sims.worlds import CLEARANCE, TOURS, WORLDS, load_world, tour_length
 from tests.sims.cameras.scenes import CAMERAS, fresh, scene
 
 ROOT = Path(__file__).parents[3]
@@ -34,13 +34,14 @@ class Probe:
         self.model: Any = world.compile()
         self.data = mujoco.MjData(self.model)
         self.geom = self.model.geom("probe").id
+        self.mocap = int(self.model.body("probe").mocapid[0])
         solid = np.flatnonzero(self.model.geom_contype)
         self.solids = [int(geom) for geom in solid if geom != self.geom]
         mujoco.mj_kinematics(self.model, self.data)
 
     def distance(self, place: tuple[float, float, float], limit: float) -> float:
         x, y, z = place
-        self.data.mocap_pos[0] = (x, -y, -z)
+        self.data.mocap_pos[self.mocap] = (x, -y, -z)
         mujoco.mj_kinematics(self.model, self.data)
         return float(
             min(
@@ -50,7 +51,13 @@ class Probe:
         )
 
 
-@pytest.fixture(params=["hall", pytest.param("yard", marks=pytest.mark.slow)], scope="module")
+QUICK = ("hall", "corridor", "office")
+"""Worlds whose textures are drawn in a moment, or in every run anyway."""
+
+EACH = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in WORLDS]
+
+
+@pytest.fixture(params=EACH, scope="module")
 def probe(request: pytest.FixtureRequest) -> tuple[str, Probe]:
     return request.param, Probe(request.param)
 
@@ -80,7 +87,7 @@ def test_the_examples_fly_clear(probe: tuple[str, Probe]) -> None:
 
 
 def test_the_tour_is_a_tour(probe: tuple[str, Probe]) -> None:
-    """50 to 60 m long, 1.2 to 2.2 m high, with turns both ways, through two arches or portals."""
+    """50 to 60 m long, 1.2 to 2.2 m high; most with turns both ways, some through two arches."""
     name, measure = probe
     points = np.array(TOURS[name])
     assert 50.0 <= tour_length(name) <= 60.0
@@ -89,8 +96,12 @@ def test_the_tour_is_a_tour(probe: tuple[str, Probe]) -> None:
     legs = np.roll(points, -1, axis=0) - points
     heading = np.arctan2(legs[:, 1], legs[:, 0])
     turns = np.degrees((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi)
-    assert turns.max() > 30.0
     assert turns.min() < -30.0
+    if name == "corridor":  # once round the block
+        return
+    assert turns.max() > 30.0
+    if name in ("office", "forest"):
+        return
     passed = set()
     for start, leg in zip(points, legs, strict=True):
         for share in np.linspace(0.0, 1.0, 60):
@@ -137,7 +148,7 @@ def test_a_ball_comes_to_rest_on_the_floor_and_steps_are_cheap(probe: tuple[str,
     assert data.qpos[2] == pytest.approx(0.1, abs=0.01)
 
 
-@pytest.mark.parametrize("name", ["hall", pytest.param("yard", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", EACH)
 def test_sizes_are_modest(name: str) -> None:
     """The model with all its textures stays below 40 MB."""
     assert len(model_to_bytes(fresh(name).compile())) < 40e6
@@ -169,9 +180,10 @@ def views(name: str, measure: Probe) -> Iterator[tuple[tuple[float, float, float
 
 
 @pytest.mark.slow
-def test_there_are_corners_everywhere(probe: tuple[str, Probe]) -> None:
+@pytest.mark.parametrize("name", ["hall", "yard"])
+def test_there_are_corners_everywhere(name: str) -> None:
     """95 % of views have 200 good corners, in 12 of 16 parts of the image."""
-    name, measure = probe
+    measure = Probe(name)
     built = scene(name)
     renderer = CameraRenderer(built.packed, CAMERAS, built.prefix, seed=0)
     good = []

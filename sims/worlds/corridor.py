@@ -1,0 +1,151 @@
+"""`corridor`: a long corridor round a block, 57 m long, every door of which looks alike.
+
+Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres. The corridor runs round a
+rectangle, and the origin is in the middle of its east side. Walls, floor and ceiling repeat one
+image every 2.6 m to the pixel, so opposite places cannot be told from each other.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sims.worlds import materials
+from sims.worlds.builder import WHOLE, Builder
+from sims.worlds.model import Material
+from sims.worlds.patterns import Colour, Image, shade, smooth, specks
+
+MODULE = 2.6
+"""Metres from door to door, and the width of the corridor."""
+
+HEIGHT = 2.7
+NORTH, WEST = 9, 4
+"""Modules along the outer walls."""
+
+DENSITY = 128.0
+
+
+def corridor(seed: int = 0, bare: bool = False) -> Any:
+    """Return the corridor as a `mujoco.MjSpec`; the seed changes grain and speckles only."""
+    b = Builder("corridor", seed, bare)
+    b.spec.visual.headlight.ambient = [0.74, 0.74, 0.72]
+    wall = b.material("wall", _wall, DENSITY)
+    trim = b.material("trim", lambda r: materials.paint((64, 64), r, (0.60, 0.63, 0.62)), 64.0)
+    red = b.material("red", lambda r: materials.paint((64, 64), r, (0.72, 0.13, 0.10)), 64.0)
+    half_x, half_y = NORTH * MODULE / 2.0, WEST * MODULE / 2.0
+    middle = half_y - MODULE / 2.0
+    _pilasters(b, trim, half_x, half_y, middle)
+    for corner, (x, y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
+        place = (x * (half_x - 0.3), middle + y * (half_y - 0.3), 0.0)
+        b.cylinder(f"bin_{corner}", red, 0.17, 0.7, place, top=WHOLE, side=WHOLE)
+    inner = (2.0 * half_x - 2.0 * MODULE, 2.0 * half_y - 2.0 * MODULE, HEIGHT)
+    long, short = (0.0, 0.0, NORTH - 2.0, 1.0), (0.0, 0.0, WEST - 2.0, 1.0)
+    b.box("block", wall, inner, (0.0, middle, 0.0), hidden=("top", "bottom"),
+          windows={"front": short, "back": short, "left": long, "right": long})  # fmt: skip
+    for name, place, facing, modules in (
+        ("wall_north", (half_x, middle, 0.0), 180.0, WEST),
+        ("wall_south", (-half_x, middle, 0.0), 0.0, WEST),
+        ("wall_east", (0.0, middle - half_y, 0.0), 90.0, NORTH),
+        ("wall_west", (0.0, middle + half_y, 0.0), -90.0, NORTH),
+    ):
+        b.wall(name, wall, (modules * MODULE, HEIGHT), place, facing,
+               window=(0.0, 0.0, float(modules), 1.0))  # fmt: skip
+    half, window = (half_x, half_y), (0.0, 0.0, float(WEST), float(NORTH))
+    b.floor("floor", b.material("floor", _floor, DENSITY), half, middle=(0.0, middle),
+            window=window)  # fmt: skip
+    b.ceiling("ceiling", b.material("ceiling", _ceiling, DENSITY, glow=0.25), half, HEIGHT,
+              middle=(0.0, middle), window=window)  # fmt: skip
+    for name, way in (("fill", 1.0), ("glow", -1.0)):  # as bright on each side of the block
+        b.light(name, (0.0, 0.0, 2.0), (0.17, 0.17, 0.17), towards=(0.5 * way, 0.3 * way, -0.4),
+                sun=True)  # fmt: skip
+    b.spec.stat.center = [0.0, middle, 1.3]
+    b.spec.stat.extent = 12.0
+    return b.spec
+
+
+def _pilasters(b: Builder, trim: Material, half_x: float, half_y: float, middle: float) -> None:
+    """Put a pilaster between each two doors, on the outer walls and on the block."""
+    places = []
+    for off, lean in ((0.0, -0.05), (MODULE, 0.05)):
+        x, y = half_x - off, half_y - off
+        for side in (-1.0, 1.0):
+            along, across = (np.arange(MODULE - end, end - 0.1, MODULE).tolist() for end in (x, y))
+            places += [(at, side * (y + lean), 0.0) for at in along]
+            places += [(side * (x + lean), at, 90.0) for at in across]
+    for number, (x, y, turn) in enumerate(places):
+        b.box(f"pilaster_{number}", trim, (0.24, 0.1, HEIGHT), (x, middle + y, 0.0), turn=turn,
+              hidden=("top", "bottom"))  # fmt: skip
+
+
+def _pixels(metres: float) -> int:
+    return round(metres * DENSITY)
+
+
+def _wall(random: np.random.Generator) -> Image:
+    """Return one module of wall: a door with its frame, a notice, a handrail, a skirting."""
+    shape = (_pixels(HEIGHT), _pixels(MODULE))
+    height = HEIGHT - np.arange(shape[0], dtype=np.float32)[:, None] / DENSITY
+    wall = materials.paint(shape, random, (0.86, 0.85, 0.79))
+    lower = materials.paint(shape, random, (0.52, 0.64, 0.61))
+    rail = smooth(0.0, 0.01, 0.05 - np.abs(height - 0.95))
+    wall = np.where(height[..., None] < 0.92, lower, wall)
+    wall = shade(wall, np.broadcast_to(-0.45 * rail, shape))
+
+    def fill(left: float, right: float, low: float, high: float, colour: Colour) -> None:
+        rows, columns = (
+            slice(_pixels(HEIGHT - high), _pixels(HEIGHT - low)),
+            slice(_pixels(left), _pixels(right)),
+        )
+        part = wall[rows, columns]
+        part[:] = materials.paint((part.shape[0], part.shape[1]), random, colour)
+
+    fill(0.0, MODULE, 0.0, 0.10, (0.26, 0.28, 0.29))
+    fill(0.78, 1.82, 0.0, 2.14, (0.36, 0.38, 0.40))
+    fill(0.85, 1.75, 0.02, 2.07, (0.63, 0.47, 0.31))
+    fill(1.42, 1.60, 1.15, 1.85, (0.20, 0.25, 0.28))
+    fill(1.44, 1.58, 1.17, 1.83, (0.55, 0.66, 0.70))
+    fill(0.90, 1.04, 1.00, 1.05, (0.80, 0.80, 0.80))
+    fill(0.85, 1.75, 0.02, 0.24, (0.66, 0.67, 0.68))
+    fill(1.98, 2.26, 1.42, 1.82, (0.93, 0.93, 0.90))
+    for line in range(6):
+        fill(2.01, 2.20 - 0.03 * (line % 3), 1.73 - 0.05 * line, 1.745 - 0.05 * line,
+             (0.30, 0.32, 0.36))  # fmt: skip
+    fill(0.30, 0.50, 1.45, 1.65, (0.10, 0.50, 0.30))
+    fill(0.36, 0.44, 1.49, 1.61, (0.92, 0.95, 0.92))
+    light = np.exp(-((np.arange(shape[1], dtype=np.float32) / DENSITY - MODULE / 2.0) ** 2) / 1.2)
+    fall = 0.16 * light[None, :] * smooth(0.4, 2.5, height) - 0.08
+    return shade(wall, fall.astype(np.float32))
+
+
+def _square(random: np.random.Generator, colour: tuple[float, float, float]) -> tuple[Image, Image]:
+    """Return a module of plain surface, and how near each pixel is to the lamp above it, 0..1."""
+    shape = (_pixels(MODULE), _pixels(MODULE))
+    place = (np.arange(shape[0], dtype=np.float32) + 0.5) / DENSITY - MODULE / 2.0
+    near = np.exp(-(place[:, None] ** 2 + place[None, :] ** 2) / 0.9)
+    return materials.paint(shape, random, colour), near.astype(np.float32)
+
+
+def _floor(random: np.random.Generator) -> Image:
+    floor, near = _square(random, (0.55, 0.56, 0.53))
+    spots = specks(floor.shape[:2], random, count=900, radius=(1.0, 2.0))
+    floor = shade(floor, 0.12 * spots + 0.30 * near - 0.10)
+    floor[:2] *= 0.8
+    floor[:, :2] *= 0.8
+    return floor
+
+
+def _ceiling(random: np.random.Generator) -> Image:
+    ceiling, near = _square(random, (0.74, 0.74, 0.72))
+    ceiling = shade(ceiling, 0.15 * near - 0.05)
+    size = _pixels(MODULE)
+    for line in np.linspace(0.0, size, 5)[:-1].astype(int).tolist():
+        ceiling[line : line + 2] *= 0.72
+        ceiling[:, line : line + 2] *= 0.72
+    quarter = size // 4
+    cv2.rectangle(ceiling, (quarter, size // 2 - 22), (3 * quarter, size // 2 + 22),
+                  (0.45, 0.45, 0.45), -1)  # fmt: skip
+    cv2.rectangle(ceiling, (quarter + 4, size // 2 - 18), (3 * quarter - 4, size // 2 + 18),
+                  (1.0, 1.0, 0.96), -1)  # fmt: skip
+    return ceiling

@@ -1,0 +1,219 @@
+"""`forest`: a wood with thin stems and branches, 40 x 40 m, whose leaves and shadows move.
+
+Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres, from the middle. Where
+things stand is drawn once for all seeds, so that the tour's path stays free.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import cv2
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from sims.worlds import materials
+from sims.worlds.builder import Builder
+from sims.worlds.dynamics import Dynamics, Scene
+from sims.worlds.model import Material, Vector
+from sims.worlds.patterns import Image, fractal, mix, shade, share, smooth, specks
+from sims.worlds.shapes import Surface, cylinder
+from sims.worlds.sky import add_sky
+from sims.worlds.tours import TOURS
+
+HALF = 20.0
+DENSITY = 60.0
+STEMS, BRANCHES = 46, 2
+SUN = (0.40, -0.35, -0.85)
+Points = npt.NDArray[np.float64]
+
+
+class Sway(NamedTuple):
+    """Leaves and shadows that the wind moves: each to and fro about its place, at its own pace.
+
+    Attributes:
+        places: Where they hang when there is no wind, metres, shape (n, 3).
+        phases: Radians, shape (n,).
+        swing: Greatest distance from there, metres, shape (n,).
+        first: Name of the first of n mocap bodies.
+    """
+
+    places: Points
+    phases: Points
+    swing: Points
+    first: str
+
+    @property
+    def solid(self) -> bool:
+        """A vehicle flies through leaves."""
+        return False
+
+    def apply(self, model: Any, data: Any, seconds: float) -> None:
+        """Move the bodies; the movement repeats itself for nobody within a flight."""
+        first = int(model.body(self.first).mocapid[0])
+        slow = np.sin(1.9 * seconds + self.phases)
+        quick = np.sin(5.3 * seconds + 2.7 * self.phases)
+        offset = np.stack([0.7 * slow + 0.3 * quick, 0.6 * quick - 0.3 * slow, 0.2 * quick], axis=1)
+        rows = slice(first, first + len(self.places))
+        data.mocap_pos[rows] = self.places + self.swing[:, None] * offset
+        angle = 0.2 * slow + 0.1 * quick
+        data.mocap_quat[rows] = np.stack(
+            [np.cos(angle / 2), 0.6 * np.sin(angle / 2), 0.8 * np.sin(angle / 2), 0.0 * angle], 1
+        )
+
+
+def forest(seed: int = 0, bare: bool = False) -> Scene:
+    """Return the wood and what moves in it; every seed has its own bark, ground and leaves."""
+    b = Builder("forest", seed, bare)
+    b.spec.visual.headlight.ambient = [0.50, 0.55, 0.48]
+    bark = b.material("bark", _bark, 96.0)
+    green = b.material("leaves", lambda r: materials.leaves((512, 512), r, 96.0), 96.0)
+    ends = _stems(b, bark)
+    sway = _leaves(b, green, ends)
+    back = b.material("thicket", _thicket, 24.0)
+    for number in range(24):
+        angle = 15.0 * number
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        size = (2.0 * HALF * math.tan(math.pi / 24) + 0.05, 24.0)
+        place = (float(-HALF * c), float(-HALF * s), 0.0)
+        b.wall(f"thicket_{number}", back, size, place, angle, window=b.cut(back, *size))
+    b.floor("ground", b.material("ground", _ground, DENSITY), (HALF, HALF), step=2.5)
+    shadows = _shadows(b)
+    add_sky(b.spec, b.random)
+    b.light("sun", (0.0, 0.0, 20.0), (0.66, 0.62, 0.46), towards=SUN, sun=True)
+    b.light("sky_light", (0.0, 0.0, 20.0), (0.12, 0.15, 0.17), towards=(-0.5, 0.5, -0.3), sun=True)
+    b.spec.stat.center = [0.0, 0.0, 2.0]
+    b.spec.stat.extent = 20.0
+    return Scene(b.spec, Dynamics((sway, shadows)))
+
+
+def _free(point: Points, path: Points) -> float:
+    return float(np.linalg.norm(path - point, axis=-1).min())
+
+
+def _stems(b: Builder, bark: Material) -> list[Vector]:
+    """Add stems with branches, none near the tour; return where leaves hang."""
+    fixed = np.random.default_rng(11)
+    tour = np.array(TOURS["forest"]) * (1.0, -1.0, -1.0)
+    share = np.linspace(0.0, 1.0, 40)[:, None, None]
+    path = (tour + share * (np.roll(tour, -1, axis=0) - tour)).reshape(-1, 3)
+    stems: list[Points] = []
+    ends: list[Vector] = []
+    while len(stems) < STEMS:
+        place = fixed.uniform(-16.5, 16.5, 2)
+        crowded = any(math.dist(place, other) < 1.9 for other in stems)
+        if crowded or _free(place, path[:, :2]) < 1.12 or np.hypot(*place) > 17.5:
+            continue
+        number, thin = len(stems), len(stems) % 3 == 2
+        stems.append(place)
+        x, y = place.tolist()
+        radius = 0.035 if thin else float(fixed.uniform(0.09, 0.2))
+        height = 3.2 if thin else float(fixed.uniform(6.5, 8.0))
+        b.cylinder(f"stem_{number}", bark, radius, height, (x, y, 0.0), sides=5 if thin else 9)
+        ends.append((x, y, height))
+        made = 0
+        while made < BRANCHES and not thin:
+            turn, tilt = float(fixed.uniform(0, 360)), float(fixed.uniform(50, 78))
+            length, low = float(fixed.uniform(1.2, 2.4)), float(fixed.uniform(1.2, 4.0))
+            t, r = math.radians(tilt), math.radians(turn)
+            way = np.array([math.sin(t) * math.cos(r), math.sin(t) * math.sin(r), math.cos(t)])
+            line = np.array([x, y, low]) + way * np.linspace(0.0, length, 12)[:, None]
+            if min(_free(point, path) for point in line) < 0.95:
+                continue
+            at: Vector = tuple(((line[0] + line[-1]) / 2.0).tolist())
+            name = f"stem_{number}/branch_{made}"
+            side = b.cut(bark, 0.15, length)
+            b.look(f"{name}.look", cylinder(0.022, length, side, None, 4), bark, at, turn, tilt)
+            b.solid(name, mujoco.mjtGeom.mjGEOM_CYLINDER, [0.022, length / 2], at, turn, tilt)
+            ends.append(tuple(line[-1].tolist()))
+            made += 1
+    return ends
+
+
+def _leaves(b: Builder, green: Material, ends: list[Vector]) -> Sway:
+    """Hang a cluster of leaves at each end, all drawn alike but turned."""
+    sizes = {"spray": (20, 0.6, 0.17), "crown": (64, 2.1, 0.44)}
+    for name, (count, reach, size) in sizes.items():
+        b.mesh(name, _cluster(b, count, reach, size))
+    for number, (x, y, z) in enumerate(ends):
+        body = b.spec.worldbody.add_body(name=f"leaves_{number}", mocap=True, pos=(x, y, z))
+        mesh = "crown" if z > 5.0 else "spray"
+        b.hang(f"leaves_{number}", mesh, green, body, turn=37.0 * number)
+    phases = 2.4 * np.arange(len(ends), dtype=np.float64)
+    swing = np.where(np.array(ends)[:, 2] > 5.0, 0.16, 0.07)
+    return Sway(np.array(ends), phases, swing, "leaves_0")
+
+
+def _cluster(b: Builder, count: int, reach: float, size: float, *, flat: bool = False) -> Surface:
+    """Return leaves, each a diamond with two sides, scattered about the origin, or flat there."""
+    way = b.random.standard_normal((count, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    middle = way * reach * np.cbrt(b.random.uniform(size=(count, 1))) * (1.0, 1.0, 0.6)
+    along = b.random.standard_normal((count, 3)) * (1.0, 1.0, 0.5)
+    along *= size / np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(along, b.random.standard_normal((count, 3)))
+    across *= 0.45 * size / np.linalg.norm(across, axis=1, keepdims=True)
+    corners = np.stack([middle - along, middle - across, middle + along, middle + across], 1)
+    corners[..., 2] *= not flat
+    normal = np.cross(along, across)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    centre = b.random.uniform(0.05, 0.95, (count, 1, 2))
+    texture = centre + np.array([[-0.04, 0], [0, -0.03], [0.04, 0], [0, 0.03]])
+    halves = np.array([[0, 1, 2], [0, 2, 3]])
+    front = (4 * np.arange(count)[:, None, None] + halves).reshape(-1, 3)
+    sides = 4 * count
+    return Surface(
+        np.tile(corners.reshape(-1, 3), (2, 1)),
+        np.concatenate([np.repeat(normal, 4, 0), -np.repeat(normal, 4, 0)]),
+        np.tile(texture.reshape(-1, 2), (2, 1)),
+        np.concatenate([front, front[:, ::-1] + sides]).astype(np.int32),
+    )
+
+
+def _shadows(b: Builder) -> Sway:
+    """Lay the crowns' moving shadows on the ground, last: they are drawn over it."""
+    b.spec.add_material(name="shadow", rgba=[0.02, 0.03, 0.02, 0.30], specular=0.0)
+    fixed = np.random.default_rng(12)
+    places = np.column_stack([fixed.uniform(-11.0, 11.0, (18, 2)), np.full(18, 0.015)])
+    b.mesh("shadow", _cluster(b, 40, 1.6, 0.36, flat=True))
+    for number, place in enumerate(places.tolist()):
+        body = b.spec.worldbody.add_body(name=f"shadow_{number}", mocap=True, pos=place)
+        b.hang(f"shadow_{number}", "shadow", Material("shadow", 1.0, 1.0), body, turn=0.0)
+    return Sway(places, 1.7 * np.arange(18.0), np.full(18, 0.35), "shadow_0")
+
+
+def _bark(random: np.random.Generator) -> Image:
+    image = materials.planks((192, 768), random, 96.0, width=0.05, palette=(
+        (0.36, 0.30, 0.24), (0.30, 0.18, 0.21), (0.42, 0.36, 0.29),
+    ))  # fmt: skip
+    return np.ascontiguousarray(image.transpose(1, 0, 2))
+
+
+def _ground(random: np.random.Generator) -> Image:
+    """Return the wood's ground: grass, soil, fallen leaves, spots of sun."""
+    shape = (int(2 * HALF * DENSITY),) * 2
+    ground = materials.grass(shape, random, DENSITY)
+    where = fractal(shape, random, coarse=4.0 * DENSITY)
+    ground = mix(ground, (0.33, 0.25, 0.17), smooth(-0.4, 0.5, where) * 0.85)
+    fallen = specks(shape, random, count=30000, radius=(1.5, 4.0))
+    ground = mix(ground, (0.58, 0.40, 0.18), np.maximum(fallen, 0.0) * 0.8)
+    ground = shade(ground, -0.5 * np.maximum(-fallen, 0.0))
+    sun = smooth(0.2, 0.7, fractal(shape, random, coarse=1.6 * DENSITY, gain=0.5))
+    return shade(ground, 0.55 * sun - 0.25)
+
+
+def _thicket(random: np.random.Generator) -> Image:
+    """Return 20 x 24 m of dense wood in the distance: stems, leaves, and light that falls in."""
+    shape = (576, 480)
+    height = np.broadcast_to(np.linspace(1.0, 0.0, shape[0], dtype=np.float32)[:, None], shape)
+    wood = materials.leaves(shape, random, 40.0)
+    stems = np.zeros(shape, np.uint8)
+    for x in random.integers(0, shape[1], 44).tolist():
+        lean = int(random.integers(-14, 15))
+        cv2.line(stems, (x, 0), (x + lean, shape[0]), 255, int(random.integers(2, 9)), cv2.LINE_AA)
+    wood = mix(wood, (0.28, 0.24, 0.19), share(stems) * smooth(1.0, 0.2, height))
+    gaps = fractal(shape, random, coarse=48, fine=3, gain=0.9)
+    wood = mix(wood, (0.78, 0.85, 0.80), smooth(1.5, 2.0, gaps + 1.6 * height - 0.6))
+    return shade(wood, 0.9 * height - 0.45)
