@@ -16,6 +16,7 @@ from events import (
     Command,
     FluidPressure,
     Imu,
+    LidarScan,
     MagneticField,
     NavSatFix,
     Odometry,
@@ -102,6 +103,7 @@ class Multirotor(Simulator[MultirotorConfig]):
     fixes = Output(NavSatFix)
     magnetic_fields = Output(MagneticField)
     ranges = Output(Range)
+    lidar_scans = Output(LidarScan)
     vehicle_events = Output(VehicleEvent)
 
     frame_id = FRAME
@@ -124,9 +126,11 @@ class Multirotor(Simulator[MultirotorConfig]):
             config.limits,
             setpoint_timeout=config.setpoint_timeout,
         )
-        outputs = SensorOutputs(self.pressures, self.fixes, self.magnetic_fields, self.ranges)
+        outputs = SensorOutputs(
+            self.pressures, self.fixes, self.magnetic_fields, self.ranges, self.lidar_scans
+        )
         self._suite = SensorSuite(
-            self, config, outputs, FRAME, self._physics, self._advance, self._world.dynamics
+            self, config, outputs, FRAME, self._physics, self._advance, self._world
         )
         self._addressee = Addressee(self.name, self.siblings(Simulator), self.sources)
         self._pilots: list[PilotAnnouncement] = []
@@ -143,7 +147,7 @@ class Multirotor(Simulator[MultirotorConfig]):
             self.every(camera.rate, functools.partial(call, camera.name), camera.name)
         if not free:
             self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
-        self._suite.start()
+        await self._suite.start()
 
     async def run(self) -> None:
         """Send the poses of cameras and sensors on the body, once."""

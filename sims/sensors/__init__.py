@@ -8,9 +8,11 @@ when it is due.
 from sims.sensors.barometer import Barometer, BarometerSpec
 from sims.sensors.gnss import Gnss, GnssSpec
 from sims.sensors.imu import ImuModel, ImuNoise, ImuParameters, Vibration
+from sims.sensors.lidar import Lidar, LidarSpec
 from sims.sensors.magnetometer import Magnetometer, MagnetometerSpec
 from sims.sensors.range_finder import RangeFinder, RangeFinderSpec
 from sims.sensors.rays import Rays
+from sims.sensors.scanner import Scanner
 from sims.sensors.sensor import Sensor, SensorSpec, Truth
 from sims.sensors.settings import SensorsConfig
 from sims.sensors.suite import SensorOutputs, SensorSuite
@@ -24,11 +26,14 @@ __all__ = [
     "ImuModel",
     "ImuNoise",
     "ImuParameters",
+    "Lidar",
+    "LidarSpec",
     "Magnetometer",
     "MagnetometerSpec",
     "RangeFinder",
     "RangeFinderSpec",
     "Rays",
+    "Scanner",
     "Sensor",
     "SensorOutputs",
     "SensorSpec",

@@ -73,31 +73,22 @@ class Place(NamedTuple):
 S = TypeVar("S", bound=SensorSpec)
 
 
-class Sensor(ABC, Generic[S]):
-    """Model of one sensor: told the truth at its rate, it returns what it measures.
+class Mounted(ABC, Generic[S]):
+    """A sensor on a body.
 
     Args:
         spec: Its settings.
         place: Where it is.
-        random: Source of its random numbers; equal seeds give equal measurements.
     """
 
-    port: ClassVar[str]
-    """Output of the vehicle's node that its measurements are sent on."""
-
-    def __init__(self, spec: S, place: Place, random: np.random.Generator) -> None:
+    def __init__(self, spec: S, place: Place) -> None:
         self.spec = spec
         self.place = place
-        self.random = random
 
     @property
     def source(self) -> str:
         """Source of the measurements, and name of their frame."""
         return self.place.source
-
-    @abstractmethod
-    def measure(self, truth: Truth) -> Event:
-        """Return the next measurement."""
 
     @abstractmethod
     def announcement(self) -> SensorAnnouncement:
@@ -115,6 +106,27 @@ class Sensor(ABC, Generic[S]):
             "position": self.spec.position,
             "orientation": self.spec.rotation,
         }
+
+
+class Sensor(Mounted[S]):
+    """Model of one sensor: told the truth at its rate, it returns what it measures.
+
+    Args:
+        spec: Its settings.
+        place: Where it is.
+        random: Source of its random numbers; equal seeds give equal measurements.
+    """
+
+    port: ClassVar[str]
+    """Output of the vehicle's node that its measurements are sent on."""
+
+    def __init__(self, spec: S, place: Place, random: np.random.Generator) -> None:
+        super().__init__(spec, place)
+        self.random = random
+
+    @abstractmethod
+    def measure(self, truth: Truth) -> Event:
+        """Return the next measurement."""
 
 
 class GaussMarkov:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sims.sensors.barometer import BarometerSpec
 from sims.sensors.gnss import GnssSpec
 from sims.sensors.imu import ImuParameters
+from sims.sensors.lidar import LidarSpec
 from sims.sensors.magnetometer import MagnetometerSpec
 from sims.sensors.range_finder import RangeFinderSpec
 from sims.simulator import Rate, SimulatorConfig
@@ -21,6 +22,7 @@ class SensorsConfig(SimulatorConfig):
         gnss: The satellite receiver; none if it is not set.
         magnetometer: The magnetometer; none if it is not set.
         range_finders: The range finders.
+        lidars: The lidars.
     """
 
     imu_rate: Rate = 200
@@ -29,10 +31,11 @@ class SensorsConfig(SimulatorConfig):
     gnss: GnssSpec | None = None
     magnetometer: MagnetometerSpec | None = None
     range_finders: tuple[RangeFinderSpec, ...] = ()
+    lidars: tuple[LidarSpec, ...] = ()
 
     def __post_init__(self) -> None:
         names = {"imu", "barometer", "gnss", "magnetometer"}
-        for field in ("cameras", "range_finders"):
+        for field in ("cameras", "range_finders", "lidars"):
             for spec in getattr(self, field):
                 if spec.name in names:
                     raise ValueError(

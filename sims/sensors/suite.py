@@ -12,6 +12,7 @@ from events import (
     Announcement,
     Event,
     FluidPressure,
+    LidarScan,
     MagneticField,
     NavSatFix,
     Range,
@@ -19,16 +20,18 @@ from events import (
 )
 from runtime import Node, Tick
 from runtime.sender import Sender
+from sims.cameras.rig import DrawnWorld
 from sims.sensors.barometer import Barometer
 from sims.sensors.gnss import Gnss
+from sims.sensors.lidar import Lidar
+from sims.sensors.lidar_rig import LidarRig
 from sims.sensors.magnetometer import Magnetometer
 from sims.sensors.range_finder import RangeFinder
 from sims.sensors.rays import Rays
-from sims.sensors.sensor import Place, Sensor, Truth, generator_of
+from sims.sensors.sensor import Mounted, Place, Sensor, Truth, generator_of
 from sims.sensors.settings import SensorsConfig
 from sims.sensors.vehicle_imu import VehicleImu
 from sims.vehicle import Physics
-from sims.worlds import Dynamics
 
 
 class SensorOutputs(msgspec.Struct, frozen=True):
@@ -38,6 +41,7 @@ class SensorOutputs(msgspec.Struct, frozen=True):
     fixes: Sender[NavSatFix]
     magnetic_fields: Sender[MagneticField]
     ranges: Sender[Range]
+    lidar_scans: Sender[LidarScan]
 
 
 class SensorSuite:
@@ -53,7 +57,7 @@ class SensorSuite:
         frame_id: Frame of the body.
         physics: The vehicle, in a world that `mount_imu` has seen.
         advance: Steps the physics up to a tick, and returns the stamp of the state then.
-        dynamics: What moves in the world by itself.
+        world: The world, as other processes are told of it.
     """
 
     def __init__(
@@ -64,20 +68,23 @@ class SensorSuite:
         frame_id: str,
         physics: Physics,
         advance: Callable[[Tick], int],
-        dynamics: Dynamics,
+        world: DrawnWorld,
     ) -> None:
         self._node = node
         self._outputs = outputs
         self._physics = physics
         self._advance = advance
+        self._world = world
         self.imu = VehicleImu(node, config, physics, frame_id)
         """The IMU, whose samples the vehicle's node takes and sends itself."""
+
+        def place(name: str) -> Place:
+            return Place(f"{node.name}/{name}", frame_id, config.origin)
 
         def make(
             model: Callable[..., Sensor[Any]], spec: Any, name: str, *rest: Any
         ) -> Sensor[Any]:
-            place = Place(f"{node.name}/{name}", frame_id, config.origin)
-            return model(spec, place, generator_of(node.rng, name), *rest)
+            return model(spec, place(name), generator_of(node.rng, name), *rest)
 
         single = {"barometer": Barometer, "gnss": Gnss, "magnetometer": Magnetometer}
         self.sensors = [
@@ -86,11 +93,15 @@ class SensorSuite:
             if getattr(config, name) is not None
         ]
         if config.range_finders:
-            rays = Rays(physics.model, dynamics, f"{node.name}/base_link")
+            rays = Rays(physics.model, world.dynamics, f"{node.name}/base_link")
             self.sensors += [make(RangeFinder, s, s.name, rays) for s in config.range_finders]
+        lidars = [Lidar(spec, place(spec.name)) for spec in config.lidars]
+        self.mounted: list[Mounted[Any]] = [*self.sensors, *lidars]
+        self.lidars = LidarRig(node, lidars, physics, outputs.lidar_scans, advance)
 
-    def start(self) -> None:
+    async def start(self) -> None:
         """Have all sensors measure at their rates; call it in `on_startup`."""
+        await self.lidars.start(self._world)
         for sensor in self.sensors:
             measure = functools.partial(self._measure, sensor)
             self._node.every(sensor.spec.rate, measure, sensor.source.partition("/")[2])
@@ -98,13 +109,13 @@ class SensorSuite:
     def announcements(self) -> Iterable[Announcement]:
         """Return the announcements of the sensors."""
         yield self.imu.announcement()
-        for sensor in self.sensors:
+        for sensor in self.mounted:
             yield sensor.announcement()
 
     def transforms(self) -> Iterable[TransformStamped]:
         """Return the pose of each sensor's frame in the body's, constant for the run."""
         yield from self.imu.transforms(self._node.clock.now())
-        for sensor in self.sensors:
+        for sensor in self.mounted:
             yield TransformStamped(
                 stamp=self._node.clock.now(),
                 source=sensor.source,

@@ -11,6 +11,8 @@ from events import (
     BarometerAnnouncement,
     FluidPressure,
     Imu,
+    LidarAnnouncement,
+    LidarScan,
     MagneticField,
     MagnetometerAnnouncement,
     NavSatAnnouncement,
@@ -122,3 +124,30 @@ def test_settings_that_cannot_be_are_refused_with_the_file(
 ) -> None:
     with pytest.raises(ConfigError, match=said):
         spec(Multirotor, "drone", config)
+
+
+def test_lidars_send_turns_with_the_stamp_of_their_first_ray_when_they_are_over() -> None:
+    lidar = {"name": "top", "rate": 20, "columns": 90, "channels": 4, "latency": "13ms"}
+    flash = {"name": "front", "pattern": "solid_state", "channels": 1, "azimuths": [-30, 30]}
+    flash |= {"columns": 200, "rate": 30, "startup_delay": "100ms"}
+    result = fly(lidars=[lidar, flash], imu_rate=1000)
+    announced = {e.source: e for e in result.of(LidarAnnouncement)}
+    assert announced["drone/top"].channels == 4
+    assert announced["drone/front"].horizontal_fov == pytest.approx(math.pi / 3)
+    scans = [e for e in result.of(LidarScan) if e.source == "drone/top"]
+    assert [e.stamp for e in scans] == [k * SECOND // 20 for k in range(9)]
+    assert all(0.0 <= e.times.min() <= e.times.max() < 0.05 for e in scans)
+    others = [e.stamp for e in result.of(LidarScan) if e.source == "drone/front"]
+    assert others == [k * SECOND // 30 for k in range(3, 14)]
+    for index, event in enumerate(result.sent):
+        if isinstance(event, LidarScan) and event.source == "drone/top":
+            now = max(e.stamp for e in result.sent[:index] if isinstance(e, Imu))
+            assert now - event.stamp == pytest.approx(0.063 * SECOND, abs=0.0011 * SECOND)
+
+
+def test_equal_runs_give_equal_scans() -> None:
+    lidar = {"name": "top", "columns": 90, "channels": 4, "noise": 0.02, "dropout": 0.1}
+    one, again = (fly(lidars=[lidar]).of(LidarScan) for _ in range(2))
+    assert len(one) == 4
+    for a, b in zip(one, again, strict=True):
+        assert a.points.tobytes() == b.points.tobytes()
