@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,8 @@ from events import (
     DepthImage,
     Event,
     Image,
-    Imu,
+    LidarScan,
+    NavSatFix,
     Odometry,
     PointCloud,
     PoseEstimate,
@@ -22,29 +24,36 @@ from events import (
     TrackingLost,
     Vector3,
 )
+from events.frames import convert_covariance
 from nodes.foxglove_server.scene import Trail
-from nodes.viewing.appearance import INLIER, OUTLIER, VEHICLE, Colour, describe
+from nodes.ros_messages.calibration import projection_matrix
+from nodes.ros_messages.images import LIDAR_POINT
+from nodes.viewing.appearance import INLIER, OUTLIER, VEHICLE, Box, Colour, describe
 from nodes.viewing.encoding import depth_in_steps, encode_image
+from nodes.viewing.measurements import as_json, fields_of
 from runtime.schedule import SECOND
 
 _VECTOR = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyz"}}
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
 
-IMU_SCHEMA = {
-    "title": "Imu",
-    "type": "object",
-    "properties": {
-        "timestamp": _TIME,
-        "frame_id": {"type": "string"},
-        "angular_velocity": _VECTOR,
-        "linear_acceleration": _VECTOR,
-    },
-}
 SCORE_SCHEMA = {
     "title": "Score",
     "type": "object",
     "properties": {"timestamp": _TIME, "value": {"type": "number"}, "unit": {"type": "string"}},
 }
+
+_DISTORTIONS = {"equidistant": "kannala_brandt"}
+"""What Foxglove calls distortion models that it has another name for."""
+
+
+def measurement_schema(kind: type[Event]) -> dict[str, Any]:
+    """Return the JSON schema of what `Messages.measurement` makes of events of a type."""
+    hints = get_type_hints(kind)
+    properties = {
+        field: {"type": "number"} if hints[field] is float else _VECTOR for field in fields_of(kind)
+    }
+    frame = {"timestamp": _TIME, "frame_id": {"type": "string"}}
+    return {"title": kind.__name__, "type": "object", "properties": frame | properties}
 
 
 class Messages:
@@ -90,18 +99,18 @@ class Messages:
         return self._m.PoseInFrame(timestamp=self._time(event.stamp), frame_id=frame_id, pose=pose)
 
     def calibration(self, camera: CameraAnnouncement) -> Any:
-        """Return a CameraCalibration: plumb_bob; K, R (one) and P of a single camera."""
-        info, k = camera.info, camera.info.matrix()
+        """Return a CameraCalibration: K, D, R (one) and P, with a stereo rig's baseline."""
+        info = camera.info
         return self._m.CameraCalibration(
             timestamp=self._time(camera.stamp),
             frame_id=camera.frame_id,
             width=info.width,
             height=info.height,
-            distortion_model="plumb_bob",
+            distortion_model=_DISTORTIONS.get(info.distortion_model, info.distortion_model),
             D=list(info.distortion),
-            K=k.ravel().tolist(),
+            K=info.matrix().ravel().tolist(),
             R=np.eye(3).ravel().tolist(),
-            P=np.hstack([k, np.zeros((3, 1))]).ravel().tolist(),
+            P=projection_matrix(camera).ravel().tolist(),
         )
 
     def compressed(self, event: Image, quality: int) -> Any:
@@ -128,17 +137,53 @@ class Messages:
         rows["rgba"] = 255
         if len(event.colors):
             rows["rgba"][:, :3] = event.colors
-        numbers, field = self._m.PackedElementFieldNumericType, self._m.PackedElementField
-        fields = [(name, 4 * i, numbers.Float32) for i, name in enumerate("xyz")]
+        kind = self._m.PackedElementFieldNumericType.Uint8
         colours = ("red", "green", "blue", "alpha")
-        fields += [(name, 12 + i, numbers.Uint8) for i, name in enumerate(colours)]
+        fields = [(name, 12 + i, kind) for i, name in enumerate(colours)]
+        return self._points(event.stamp, frame_id, rows, fields)
+
+    def scan(self, event: LidarScan, frame_id: str) -> Any:
+        """Return a PointCloud of a lidar's turn, with its intensities, rings and times."""
+        rows = np.zeros(len(event.points), LIDAR_POINT)
+        rows["xyz"] = event.points
+        rows["intensity"], rows["ring"], rows["time"] = event.intensities, event.rings, event.times
+        kinds = self._m.PackedElementFieldNumericType
+        fields = [("intensity", 12, kinds.Float32), ("ring", 16, kinds.Uint16)]
+        return self._points(event.stamp, frame_id, rows, [*fields, ("time", 18, kinds.Float32)])
+
+    def _points(
+        self,
+        stamp: int,
+        frame_id: str,
+        rows: npt.NDArray[np.void],
+        more: list[tuple[str, int, Any]],
+    ) -> Any:
+        """Return a PointCloud whose rows begin with x, y and z; `more` are its other fields."""
+        field, number = self._m.PackedElementField, self._m.PackedElementFieldNumericType.Float32
+        fields = [*((name, 4 * i, number) for i, name in enumerate("xyz")), *more]
         return self._m.PointCloud(
-            timestamp=self._time(event.stamp),
+            timestamp=self._time(stamp),
             frame_id=frame_id,
             pose=self._pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
             point_stride=rows.itemsize,
             fields=[field(name=name, offset=at, type=kind) for name, at, kind in fields],
             data=rows.tobytes(),
+        )
+
+    def fix(self, event: NavSatFix, frame_id: str) -> Any:
+        """Return a LocationFix, for Foxglove's map; its covariance is in ENU."""
+        kinds, covariance = self._m.LocationFixPositionCovarianceType, [0.0] * 9
+        if event.position_covariance:
+            turned = convert_covariance("world", np.array(event.position_covariance))
+            covariance = turned.tolist()
+        return self._m.LocationFix(
+            timestamp=self._time(event.stamp),
+            frame_id=frame_id,
+            latitude=event.latitude,
+            longitude=event.longitude,
+            altitude=event.altitude,
+            position_covariance=covariance,
+            position_covariance_type=kinds.Known if event.position_covariance else kinds.Unknown,
         )
 
     def features(self, event: TrackedFeatures) -> Any:
@@ -156,14 +201,10 @@ class Messages:
         ]
         return self._m.ImageAnnotations(points=groups)
 
-    def imu(self, event: Imu) -> dict[str, Any]:
-        """Return what `IMU_SCHEMA` describes."""
-        return {
-            "timestamp": _json_time(event.stamp),
-            "frame_id": event.frame_id,
-            "angular_velocity": dict(zip("xyz", event.angular_velocity, strict=True)),
-            "linear_acceleration": dict(zip("xyz", event.linear_acceleration, strict=True)),
-        }
+    def measurement(self, event: Event) -> dict[str, Any]:
+        """Return what `measurement_schema` describes."""
+        frame = getattr(event, "frame_id", "")
+        return {"timestamp": _json_time(event.stamp), "frame_id": frame, **as_json(event)}
 
     def score(self, event: Score) -> dict[str, Any]:
         """Return what `SCORE_SCHEMA` describes."""
@@ -180,7 +221,7 @@ class Messages:
         )
 
     def scene(self, *entities: Any) -> Any:
-        """Return a SceneUpdate of what `line` and `vehicle` return."""
+        """Return a SceneUpdate of what `line` and `body` return."""
         return self._m.SceneUpdate(entities=list(entities))
 
     def line(self, trail: Trail, name: str, piece: list[Vector3]) -> Any:
@@ -193,15 +234,15 @@ class Messages:
         )
         return self._m.SceneEntity(frame_id=trail.frame_id, id=name, lines=[strip])
 
-    def vehicle(self, name: str, frame_id: str) -> Any:
-        """Return a body with four rotors as a SceneEntity that goes where its frame goes."""
+    def body(self, name: str, frame_id: str, boxes: Sequence[Box] = VEHICLE) -> Any:
+        """Return a body as a SceneEntity that goes where its frame goes; by default a vehicle's."""
         cubes = [
             self._m.CubePrimitive(
                 pose=self._pose(centre, (1.0, 0.0, 0.0, 0.0)),
                 size=self._vector(size),
                 color=self._colour(colour),
             )
-            for centre, size, colour in VEHICLE
+            for centre, size, colour in boxes
         ]
         return self._m.SceneEntity(frame_id=frame_id, id=name, frame_locked=True, cubes=cubes)
 

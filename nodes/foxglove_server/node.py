@@ -12,6 +12,7 @@ from events import (
     DepthImage,
     Event,
     Image,
+    LidarScan,
     PointCloud,
     TrackedFeatures,
 )
@@ -109,13 +110,15 @@ class FoxgloveServer(Node[FoxgloveConfig]):
     @on(TrackedFeatures)
     def features(self, event: TrackedFeatures) -> None:
         """Pass on the features of those images."""
+        if self._publishing is not None:
+            self._publishing.tracked(event)
         if self._selection.selected(event.frame_id, event.stamp):
             self._queues[TrackedFeatures].offer(event)
 
-    @on(PointCloud)
-    def point_clouds(self, event: PointCloud) -> None:
-        """Pass on a point cloud."""
-        self._queues[PointCloud].offer(event)
+    @on(PointCloud, LidarScan)
+    def point_clouds(self, event: PointCloud | LidarScan) -> None:
+        """Pass on a point cloud, or a turn of a lidar."""
+        self._queues[LidarScan if isinstance(event, LidarScan) else PointCloud].offer(event)
 
     @on(*SMALL)
     def measurements(self, event: Event) -> None:

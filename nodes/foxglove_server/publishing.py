@@ -12,6 +12,7 @@ from typing import Any
 
 from events import (
     Announcement,
+    BodyAnnouncement,
     CameraAnnouncement,
     DepthImage,
     EstimatorAnnouncement,
@@ -19,6 +20,8 @@ from events import (
     Image,
     Imu,
     ImuAnnouncement,
+    LidarScan,
+    NavSatFix,
     Odometry,
     PlannedPose,
     PointCloud,
@@ -27,30 +30,35 @@ from events import (
     PositionSetpoint,
     Quaternion,
     Score,
+    SensorAnnouncement,
     TrackedFeatures,
     TrackingEvent,
     Vector3,
     VehicleAnnouncement,
     VehicleEvent,
+    Wind,
 )
-from nodes.foxglove_server.messages import IMU_SCHEMA, SCORE_SCHEMA, Messages
+from nodes.foxglove_server.messages import SCORE_SCHEMA, Messages, measurement_schema
 from nodes.foxglove_server.scene import Trail
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
 from nodes.trajectory import RecentPoses
-from nodes.viewing.appearance import PLAN, TRUTH, Colour, estimate_colour
+from nodes.vehicles import Vehicles
+from nodes.viewing.appearance import PLAN, Colour, estimate_colour, moving_body, truth_colour
 from nodes.viewing.estimates import estimate_frame
+from nodes.viewing.measurements import MEASURED
 from nodes.viewing.selection import PlanSelection
 
 _MAP_IN_WORLD: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
 """North, east, down in east, north, up."""
 
 
-LARGE: tuple[type[Event], ...] = (Image, DepthImage, TrackedFeatures, PointCloud)
+LARGE: tuple[type[Event], ...] = (Image, DepthImage, TrackedFeatures, PointCloud, LidarScan)
 """Events whose messages take long to make: `Publishing.large` has a function for each."""
 
 SMALL: tuple[type[Event], ...] = (
-    *(Odometry, PoseEstimate, PoseStamped, Imu, Score),
+    *MEASURED,
+    *(Odometry, PoseEstimate, PoseStamped, Score),
     *(PlannedPose, PositionSetpoint, TrackingEvent, VehicleEvent),
 )
 """Events that `Publishing.small` takes."""
@@ -73,13 +81,15 @@ class Publishing:
         self._bodies: dict[str, str] = {}  # frames, by vehicle
         self._estimators: dict[str, str] = {}  # parent frames, by source
         self._renamed: dict[str, str] = {}  # the same by what the estimators call them
-        self._truth = RecentPoses()
+        self._vehicles = Vehicles()
+        self._truths: dict[str, RecentPoses] = {}  # by vehicle
         self._trails: dict[str, Trail] = {}
         self._drawn: list[Any] = []
+        self._moving: set[str] = set()  # bodies that move by themselves
         self._static: list[Any] = []
         self._plan = PlanSelection()
         self.large: dict[type[Event], Callable[[Any], None]] = dict(
-            zip(LARGE, (self.image, self.depth, self.features, self.cloud), strict=True)
+            zip(LARGE, (self.image, self.depth, self.features, self.cloud, self.scan), strict=True)
         )
         for topic, kind in (
             ("/tf", "FrameTransforms"),
@@ -96,20 +106,33 @@ class Publishing:
     def announced(self, announcement: Announcement) -> None:
         """Declare the topics of what is announced."""
         topic = _topic(announcement.source)
+        self._vehicles.announced(announcement)
         match announcement:
             case VehicleAnnouncement():
                 self._vehicle(announcement.source, "base_link")
-            case ImuAnnouncement():
-                self._server.declare_json(topic, IMU_SCHEMA)
             case EstimatorAnnouncement():
                 self._server.declare(f"{topic}/pose", "PoseInFrame")
             case CameraAnnouncement():
                 self._camera(announcement)
+            case BodyAnnouncement():
+                box = moving_body(announcement.kind)
+                self._moving.add(announcement.source)
+                self._draw(self._make.body(announcement.source, announcement.source, [box]))
+            case ImuAnnouncement() | SensorAnnouncement():
+                self._sensor(announcement)
+
+    def _sensor(self, sensor: ImuAnnouncement | SensorAnnouncement) -> None:
+        if isinstance(sensor, ImuAnnouncement):
+            self._server.declare_json(_topic(sensor.source), measurement_schema(Imu))
+        if sensor.frame_id != sensor.parent_frame_id:
+            parent = self._frame(sensor.parent_frame_id, sensor.source)
+            place = sensor.position, sensor.orientation
+            self._fix(sensor.stamp, parent, self._frame(sensor.frame_id, sensor.source), *place)
 
     def _camera(self, camera: CameraAnnouncement) -> None:
         server, topic = self._server, _topic(camera.source)
         self._cameras[camera.source] = camera
-        self._frames[camera.frame_id] = camera.source
+        self._frames.setdefault(camera.frame_id, camera.source)
         calibration = self._make.calibration(camera)
         server.declare(f"{topic}/camera_info", "CameraCalibration")
         server.latch(f"{topic}/camera_info", lambda: calibration, camera.stamp)
@@ -120,7 +143,8 @@ class Publishing:
                 server.declare(*self._image_topic(camera.source))
             elif kind == "depth" and self._config.depth:
                 server.declare(f"{topic}/depth", "RawImage")
-        if (parent := camera.parent_frame_id) != "map":
+        if camera.parent_frame_id != "map" and not camera.undistorted:
+            parent = self._frame(camera.parent_frame_id, camera.source)
             self._fix(camera.stamp, parent, camera.frame_id, camera.position, camera.orientation)
 
     # Beside the loop.
@@ -159,7 +183,19 @@ class Publishing:
         message = self._make.cloud(event, self._renamed.get(event.frame_id, event.frame_id))
         self._server.latch(topic, lambda: message, event.stamp)
 
+    def scan(self, event: LidarScan) -> None:
+        """Put a turn of a lidar."""
+        topic = f"{_topic(event.source)}/points"
+        self._server.declare(topic, "PointCloud")
+        if self._server.wanted(topic):
+            frame = self._frame(event.frame_id, event.source)
+            self._server.log(topic, self._make.scan(event, frame), event.stamp)
+
     # At once.
+
+    def tracked(self, event: TrackedFeatures) -> None:
+        """Note whose images an estimator looks at."""
+        self._vehicles.tracked(event)
 
     def small(self, event: Event) -> None:
         """Put the messages of an event that is no image and no point cloud."""
@@ -170,14 +206,14 @@ class Publishing:
                 self.estimate(event)
             case PoseStamped():
                 self.camera_pose(event)
-            case Imu():
-                self.imu(event)
             case Score():
                 self.score(event)
             case PlannedPose() | PositionSetpoint():
                 self.plan(event)
             case TrackingEvent() | VehicleEvent():
                 self.logged(event)
+            case _:
+                self.measurement(event)
 
     def odometry(self, event: Odometry) -> None:
         """Put where a vehicle truly is, as a message and as a transform."""
@@ -185,9 +221,9 @@ class Publishing:
         body = self._vehicle(source, event.child_frame_id)
         self._server.log(f"{_topic(source)}/odometry", self._make.odometry(event, body), stamp)
         self._move(stamp, event.frame_id, body, event.position, event.orientation)
-        if source == next(iter(self._bodies)):
-            self._truth.add(stamp, event.position, event.orientation)
-        self._extend(f"truth/{source}", event.frame_id, TRUTH, stamp, event.position)
+        self._truths[source].add(stamp, event.position, event.orientation)
+        colour = truth_colour(list(self._bodies).index(source))
+        self._extend(f"truth/{source}", event.frame_id, colour, stamp, event.position)
 
     def estimate(self, event: PoseEstimate) -> None:
         """Put an estimate, and the frame it places: ``<estimator>/<body>``.
@@ -209,20 +245,30 @@ class Publishing:
     def plan(self, event: PlannedPose | PositionSetpoint) -> None:
         """Draw where a vehicle is meant to be."""
         if self._plan.select(event):
-            self._extend("plan", "map", PLAN, event.stamp, event.position)
+            name = f"plan/{event.vehicle}" if event.vehicle else "plan"
+            self._extend(name, "map", PLAN, event.stamp, event.position)
 
     def camera_pose(self, event: PoseStamped) -> None:
-        """Put where a free camera is."""
+        """Put where a free camera is, or a body that moves by itself."""
+        if event.source in self._moving:
+            pose = event.position, event.orientation
+            self._move(event.stamp, event.frame_id, event.source, *pose)
         camera = self._cameras.get(event.source)
         if camera is not None and camera.parent_frame_id == "map":
             pose = event.position, event.orientation
             self._move(event.stamp, event.frame_id, camera.frame_id, *pose)
 
-    def imu(self, event: Imu) -> None:
-        """Put a measurement."""
-        topic = _topic(event.source)
-        self._server.declare_json(topic, IMU_SCHEMA)
-        self._server.log(topic, self._make.imu(event), event.stamp)
+    def measurement(self, event: Event) -> None:
+        """Put a measurement; a satellite receiver's also onto the map."""
+        topic, stamp = _topic(event.source), event.stamp
+        if isinstance(event, NavSatFix):
+            self._server.declare(f"{topic}/fix", "LocationFix")
+            frame = self._frame("base_link", event.source)
+            self._server.log(f"{topic}/fix", self._make.fix(event, frame), stamp)
+        if isinstance(event, Wind):
+            topic += "/wind"
+        self._server.declare_json(topic, measurement_schema(type(event)))
+        self._server.log(topic, self._make.measurement(event), stamp)
 
     def score(self, event: Score) -> None:
         """Put a score."""
@@ -242,9 +288,18 @@ class Publishing:
             return known
         body = self._bodies[source] = f"{source}/{frame_id}" if self._bodies else frame_id
         self._server.declare(f"{_topic(source)}/odometry", "Odometry")
-        self._drawn.append(self._make.vehicle(source, body))
-        self._server.latch("/scene", self._whole_scene, 0)
+        self._truths[source] = RecentPoses()
+        self._draw(self._make.body(source, body))
         return body
+
+    def _draw(self, body: Any) -> None:
+        self._drawn.append(body)
+        self._server.latch("/scene", self._whole_scene, 0)
+
+    def _frame(self, frame_id: str, source: str) -> str:
+        """Return what a frame is called of which each vehicle has one: the body's."""
+        vehicle = self._vehicles.of(source)
+        return self._bodies.get(vehicle, frame_id) if frame_id == "base_link" else frame_id
 
     def _parent_of(self, event: PoseEstimate) -> str:
         """Return the frame that an estimator works in, aligned with the truth if it is its own."""
@@ -252,7 +307,8 @@ class Publishing:
             return "map"
         frame_id = f"{event.source}/{event.frame_id}"
         self._renamed.setdefault(event.frame_id, frame_id)
-        if (frame := estimate_frame(event, self._truth)) is not None:
+        truth = self._truths.get(self._vehicles.of(event.source))
+        if (frame := estimate_frame(event, truth)) is not None:
             self._fix(event.stamp, "map", frame_id, *frame)
         return frame_id
 

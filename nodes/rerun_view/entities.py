@@ -5,12 +5,15 @@ map/<vehicle>              a vehicle's body, where it truly is
 map/<vehicle>/<camera>     one of its cameras (optical frame), with its images below
 map/cameras/<camera>       a free camera
 map/truth/<vehicle>        the path it has truly flown
-map/plan                   the path it was meant to fly
+map/plan                   the path it was meant to fly; map/plan/<vehicle> of several
+map/wind/<vehicle>         the wind that it feels
+map/<vehicle>/<lidar>      a lidar with its newest points, or another sensor's frame
+map/world/<body>           a body that moves by itself; its path is map/paths/world/<body>
 map/estimates/<estimator>  the frame an estimator works in; its path and newest pose below
 images/<camera>            images of a camera that nobody announced
 map/clouds/<node>          clouds; map/points/<camera>: points of depth images
 …/cloud/<node>             clouds in the frame of a body, a camera or an estimator
-imu, scores, log           plots and text
+imu, scores, log           plots and text; so pressures, ranges, magnetic_fields, fixes, wind
 """
 
 from __future__ import annotations
@@ -66,9 +69,24 @@ def scores(subject: str, metric: str) -> str:
     return path("scores", metric, subject)
 
 
-def imu(source: str, what: str) -> str:
+def measured(group: str, field: str, source: str) -> str:
     """Return where a plot of measurements is."""
-    return path("imu", what, source)
+    return path(group, field, source)
+
+
+def sensor(source: str) -> str:
+    """Return where a sensor's frame is, or a body that moves by itself."""
+    return path(WORLD, source)
+
+
+def moving_path(body: str) -> str:
+    """Return where the path is of a body that moves by itself."""
+    return path(WORLD, "paths", body)
+
+
+def wind(vehicle: str) -> str:
+    """Return where the arrow of a vehicle's wind is."""
+    return path(WORLD, "wind", vehicle)
 
 
 def images(source: str) -> str:

@@ -15,6 +15,10 @@ _SHOWN = 2
 """Cameras whose images have a place of their own; those of more share tabs."""
 
 
+_ABREAST = 4
+"""Plots that have a place of their own at most."""
+
+
 class Contents(msgspec.Struct):
     """What there is to show.
 
@@ -42,8 +46,11 @@ def layout(rrb: Any, contents: Contents) -> Any:
     if views := _images(rrb, contents):
         above.append(rrb.Vertical(*views))
     rows = [rrb.Horizontal(*above, column_shares=[2.4, 1.0][: len(above)])]
-    if contents.plots:
-        rows.append(rrb.Horizontal(*(_plot(rrb, *each) for each in contents.plots.items())))
+    plots = [_plot(rrb, *each) for each in contents.plots.items()]
+    if len(plots) > _ABREAST:  # the rest share the last place
+        plots[_ABREAST - 1 :] = [rrb.Tabs(*plots[_ABREAST - 1 :])]
+    if plots:
+        rows.append(rrb.Horizontal(*plots))
     return rrb.Blueprint(
         rrb.Vertical(*rows, row_shares=[2.6, 1.0][: len(rows)]),
         rrb.BlueprintPanel(state="collapsed"),

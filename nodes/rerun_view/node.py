@@ -9,7 +9,7 @@ from events import (
     DepthImage,
     Event,
     Image,
-    Imu,
+    LidarScan,
     Odometry,
     PlannedPose,
     PointCloud,
@@ -26,6 +26,7 @@ from nodes.rerun_view.entity_log import Numbered
 from nodes.rerun_view.recorder import Recorder
 from nodes.rerun_view.settings import RerunConfig
 from nodes.trajectory.growing import part_name
+from nodes.viewing.measurements import MEASURED
 from nodes.viewing.selection import ImageSelection
 from runtime import Node, Stream, on
 
@@ -94,9 +95,9 @@ class RerunView(Node[RerunConfig]):
         if self._selection.selected(event.frame_id, event.stamp):
             self._large.offer((self._received, event))
 
-    @on(PointCloud)
-    def point_clouds(self, event: PointCloud) -> None:
-        """Keep clouds."""
+    @on(PointCloud, LidarScan)
+    def point_clouds(self, event: PointCloud | LidarScan) -> None:
+        """Keep clouds, and turns of lidars."""
         self._received += 1
         self._large.offer((self._received, event))
 
@@ -106,10 +107,10 @@ class RerunView(Node[RerunConfig]):
         PoseEstimate,
         PlannedPose,
         PositionSetpoint,
-        Imu,
         Score,
         TrackingEvent,
         VehicleEvent,
+        *MEASURED,
     )
     def measurements(self, event: Event) -> None:
         """Keep what is small."""

@@ -7,15 +7,34 @@ from typing import Any
 
 import numpy as np
 
-from events import Event, Imu, Score, TrackingLost
+from events import (
+    Event,
+    FluidPressure,
+    Imu,
+    MagneticField,
+    NavSatFix,
+    Range,
+    Score,
+    TrackingLost,
+    Wind,
+)
 from nodes.rerun_view import entities
 from nodes.rerun_view.entity_log import EntityLog, Numbered
 from nodes.viewing.appearance import Colour, describe
+from nodes.viewing.measurements import fields_of, numbers
 
 _AXES = [(230, 80, 70), (90, 200, 90), (90, 140, 255)]
 """Colours of x, y, z."""
 
-_MEASURED = ("angular_velocity", "linear_acceleration")
+GROUPS: dict[type[Event], str] = {
+    Imu: "imu",
+    FluidPressure: "pressures",
+    MagneticField: "magnetic_fields",
+    NavSatFix: "fixes",
+    Range: "ranges",
+    Wind: "wind",
+}
+"""Parts of the tree of plots, by type of event."""
 
 _HANDY = {"rad": ("°", 180.0 / np.pi), "s": ("ms", 1000.0)}
 """By unit of a score: what is plotted instead, and how many of it make one."""
@@ -25,6 +44,11 @@ PLOTS = {
     "rotation error (°)": "+ /scores/rotation_error/**",
     "angular velocity (rad/s)": "+ /imu/angular_velocity/**",
     "specific force (m/s²)": "+ /imu/linear_acceleration/**",
+    "pressure (Pa)": "+ /pressures/fluid_pressure/**",
+    "range (m)": "+ /ranges/range/**",
+    "magnetic field (T)": "+ /magnetic_fields/magnetic_field/**",
+    "satellite velocity (m/s)": "+ /fixes/velocity/**",
+    "wind (m/s)": "+ /wind/velocity/**",
 }
 """Which plots have a place in the layout, by title, and what they show."""
 
@@ -45,18 +69,20 @@ class Plots:
         self._colours = colours
         self._known: set[str] = set()
 
-    def imu(self, source: str) -> None:
-        """Prepare the curves of an IMU."""
-        for what in _MEASURED:
-            self._style(entities.imu(source, what), colors=_AXES, names=["x", "y", "z"])
-
-    def measurements(self, source: str, events: Sequence[Numbered[Imu]]) -> None:
-        """Put measurements of one IMU."""
-        self.imu(source)
-        for what in _MEASURED:
-            rows = np.array([getattr(event, what) for _, event in events])
-            columns = self._to.rr.Scalars.columns(scalars=rows)
-            self._to.columns(entities.imu(source, what), events, columns)
+    def measurements(self, kind: type[Event], source: str, events: Sequence[Numbered[Any]]) -> None:
+        """Put measurements of one sensor."""
+        for field in fields_of(kind):
+            entity = entities.measured(GROUPS[kind], field, source)
+            rows = np.array([numbers(event, field) for _, event in events])
+            if rows.shape[1] == 3:
+                self._style(entity, colors=_AXES, names=["x", "y", "z"])
+            else:
+                self._style(entity, names=[source])
+            self._to.columns(entity, events, self._to.rr.Scalars.columns(scalars=rows))
+        if kind is NavSatFix:
+            places = np.array([(event.latitude, event.longitude) for _, event in events])
+            columns = self._to.rr.GeoPoints.columns(positions=places)
+            self._to.columns(entities.path("gps", source), events, columns)
 
     def scores(self, events: Sequence[Numbered[Score]]) -> None:
         """Put scores, of any subject and metric."""
@@ -72,6 +98,11 @@ class Plots:
             self._style(entity, names=[name], **style)
             values = np.array([event.value for _, event in found]) * factor
             self._to.columns(entity, found, self._to.rr.Scalars.columns(scalars=values))
+
+    def note(self, source: str, text: str) -> None:
+        """Put a note of the whole run into the log."""
+        note = self._to.rr.TextLog(f"{source}: {text}", level="WARN")
+        self._to.static(entities.path(entities.LOG, "notes", source), note)
 
     def logged(self, event: Event) -> None:
         """Put an event into the log, in words."""

@@ -17,13 +17,14 @@ import numpy as np
 
 from events import (
     Announcement,
+    BodyAnnouncement,
     CameraAnnouncement,
     DepthImage,
     EstimatorAnnouncement,
     Event,
     Image,
-    Imu,
     ImuAnnouncement,
+    LidarScan,
     Odometry,
     PlannedPose,
     PointCloud,
@@ -32,14 +33,16 @@ from events import (
     PositionSetpoint,
     Score,
     SegmentationImage,
+    SensorAnnouncement,
     TrackedFeatures,
     TrackingEvent,
     VehicleAnnouncement,
     VehicleEvent,
+    Wind,
 )
 from nodes.rerun_view.entity_log import EntityLog, Numbered
 from nodes.rerun_view.layout import Contents, Eye, layout
-from nodes.rerun_view.plots import PLOTS, Plots
+from nodes.rerun_view.plots import GROUPS, PLOTS, Plots
 from nodes.rerun_view.sdk import Viewer, load
 from nodes.rerun_view.settings import RerunConfig
 from nodes.rerun_view.world import World
@@ -53,6 +56,12 @@ left out until it has: the library would first fill hundreds of megabytes, and t
 
 _SECOND_TIMEOUT = 0.01
 """Real seconds for the same, once it took longer."""
+
+
+_NO_DISTORTION = (
+    "its distortion is not shown: Rerun's pinhole has none, so points of the world do not fall on "
+    "their pixels"
+)
 
 
 class Recorder:
@@ -104,11 +113,14 @@ class Recorder:
                 case EstimatorAnnouncement():
                     self._world.estimator(each.source)
                     self._plotted.add("scores")
-                case ImuAnnouncement():
-                    self._plots.imu(each.source)
-                    self._plotted.add("imu")
+                case ImuAnnouncement() | SensorAnnouncement():
+                    self._world.sensor(each)
+                case BodyAnnouncement():
+                    self._world.moving_body(each)
                 case CameraAnnouncement():
                     self._world.camera(each)
+                    if not each.info.is_pinhole:
+                        self._plots.note(each.source, _NO_DISTORTION)
         self._show()
 
     def log(self, batch: Sequence[Numbered[Event]]) -> None:
@@ -126,6 +138,9 @@ class Recorder:
         self._log(batch)
 
     def _log(self, batch: Sequence[Numbered[Event]]) -> None:
+        for _, event in batch:
+            if isinstance(event, TrackedFeatures):
+                self._world.vehicles.tracked(event)  # before the estimates are placed
         together: dict[tuple[type[Event], str], list[Any]] = {}
         for number, event in batch:
             kind = next((kind for kind in _IN_COLUMNS if isinstance(event, kind)), None)
@@ -183,12 +198,14 @@ class Recorder:
             self._world.odometry(source, events)
         elif kind is PoseEstimate:
             self._world.estimates(source, events)
-        elif kind is Imu:
-            self._plots.measurements(source, events)
-            self._plotted.add("imu")
-        else:
+        elif kind is Score:
             self._plots.scores(events)
             self._plotted.add("scores")
+        else:
+            self._plots.measurements(kind, source, events)
+            self._plotted.add(GROUPS[kind])
+            if kind is Wind:
+                self._world.wind(source, events)
 
     def _put(self, number: int, event: Event) -> None:
         world = self._world
@@ -201,8 +218,10 @@ class Recorder:
                 world.segmentation(event)
             case TrackedFeatures():
                 world.features(event)
+            case LidarScan():
+                world.scan(event)
             case PoseStamped():
-                world.camera_pose(event)
+                world.pose(number, event)
             case PointCloud():
                 world.cloud(event)
             case PlannedPose() | PositionSetpoint():
@@ -235,4 +254,4 @@ class Recorder:
         return (x - 0.8 * size, y - 0.45 * size, z - size), (x, y, z)
 
 
-_IN_COLUMNS: tuple[type[Event], ...] = (Odometry, PoseEstimate, Imu, Score)
+_IN_COLUMNS: tuple[type[Event], ...] = (Odometry, PoseEstimate, *GROUPS, Score)

@@ -7,10 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from events import (
+    BodyAnnouncement,
     CameraAnnouncement,
     CameraInfo,
     DepthImage,
     Image,
+    ImuAnnouncement,
+    LidarScan,
     Odometry,
     PlannedPose,
     PointCloud,
@@ -18,22 +21,27 @@ from events import (
     PoseStamped,
     PositionSetpoint,
     SegmentationImage,
+    SensorAnnouncement,
     TrackedFeatures,
     Vector3,
+    Wind,
 )
 from nodes.rerun_view import entities
 from nodes.rerun_view.entity_log import EntityLog, Numbered
 from nodes.rerun_view.scene_points import ScenePoints
 from nodes.rerun_view.settings import RerunConfig
 from nodes.trajectory import RecentPoses
+from nodes.vehicles import Vehicles
 from nodes.viewing.appearance import (
     INLIER,
     OUTLIER,
     PLAN,
-    TRUTH,
     VEHICLE,
+    WIND,
     Colour,
     estimate_colour,
+    moving_body,
+    truth_colour,
 )
 from nodes.viewing.encoding import depth_in_steps, encode_depth, encode_image
 from nodes.viewing.estimates import estimate_frame
@@ -42,6 +50,9 @@ from nodes.viewing.selection import PlanSelection
 
 CENTIMETRES = 100.0
 """Steps of a depth image per metre. Finer ones would show noise, which makes files large."""
+
+_WIND_PERIOD = 100_000_000
+"""Nanoseconds between two arrows of a vehicle's wind."""
 
 _THICK, _THIN = 0.02, 0.01
 """Metres: radii of paths."""
@@ -61,7 +72,11 @@ class World:
         self._config = config
         self._truth: dict[str, RecentPoses] = {}
         self._cameras: dict[str, CameraAnnouncement] = {}  # by source
-        self._frames: dict[str, str] = {}  # entities of cameras, by optical frame
+        self._entities: dict[str, str] = {}  # of cameras, by source
+        self._frames: dict[str, str] = {}  # the same by optical frame; the first camera's
+        self._moving: set[str] = set()  # bodies that move by themselves
+        self._wind_due: dict[str, int] = {}  # by vehicle
+        self.vehicles = Vehicles()
         self._others: dict[str, str] = {}  # entities of bodies and of estimators' own, by frame
         self._scene_points: dict[str, ScenePoints] = {}  # by source
         self._anchored: set[str] = set()
@@ -84,6 +99,8 @@ class World:
         """Prepare a vehicle: a body with four rotors, and its axes."""
         if source in self._truth:
             return
+        self.vehicles.add(source)
+        colour = truth_colour(len(self._truth))
         self._truth[source] = RecentPoses()
         entity = entities.body(source)
         self._to.static(
@@ -96,7 +113,7 @@ class World:
             ),
         )
         self._to.static(entity, self._rr.TransformAxes3D(0.4))
-        self._path(entities.truth(source), TRUTH, _THICK)
+        self._path(entities.truth(source), colour, _THICK)
 
     def estimator(self, source: str) -> None:
         """Prepare an estimator's path, and give it a colour."""
@@ -109,10 +126,13 @@ class World:
         """Prepare a camera: where it sits, and how it sees."""
         config, info = self._config, announced.info
         self._cameras[announced.source] = announced
-        entity = self._frames[announced.frame_id] = entities.camera(announced, list(self._truth))
+        self.vehicles.announced(announced)
+        entity = self._entities[announced.source] = entities.camera(announced, list(self._truth))
+        self._frames.setdefault(announced.frame_id, entity)
         kinds = [kind for kind in announced.images if config.depth or kind != "depth"]
         self.images[entity] = kinds if config.image_rate else []
-        if announced.parent_frame_id != "map":
+        twin = entity.startswith(f"{self._frames[announced.frame_id]}/")  # undistorted images
+        if announced.parent_frame_id != "map" and not twin:
             self._to.static(entity, self._transform(announced.position, announced.orientation))
         for kind in announced.images:
             self._pinhole(f"{entity}/{kind}", info, config.depth_stride if kind == "depth" else 1)
@@ -125,6 +145,20 @@ class World:
                 config.points_max_height,
             )
             self.trails.append(entities.points(announced.source))
+
+    def sensor(self, announced: ImuAnnouncement | SensorAnnouncement) -> None:
+        """Prepare a sensor: where it sits on its vehicle."""
+        entity = entities.sensor(announced.source)
+        if announced.frame_id != announced.parent_frame_id:
+            self._to.static(entity, self._transform(announced.position, announced.orientation))
+
+    def moving_body(self, announced: BodyAnnouncement) -> None:
+        """Prepare a body that moves by itself, and its path."""
+        box, entity = moving_body(announced.kind), entities.sensor(announced.source)
+        shape = self._rr.Boxes3D(centers=[box.centre], sizes=[box.size], colors=[box.colour])
+        self._to.static(f"{entity}/shape", shape)
+        self._path(entities.moving_path(announced.source), box.colour, _THIN)
+        self._moving.add(announced.source)
 
     # What moves.
 
@@ -153,8 +187,8 @@ class World:
             self._anchored.add(source)
             if first.frame_id != "map":
                 self._others.setdefault(first.frame_id, entities.estimate(source))
-                frames = (estimate_frame(first, truth) for truth in self._truth.values())
-                if (frame := next(filter(None, frames), None)) is not None:
+                truth = self._truth.get(self.vehicles.of(source))
+                if (frame := estimate_frame(first, truth)) is not None:
                     self._to.static(entities.estimate(source), self._transform(*frame))
             self._to.static(f"{entities.estimate(source)}/body", self._rr.TransformAxes3D(0.3))
         for number, event in events:
@@ -164,15 +198,37 @@ class World:
     def plan(self, number: int, event: PlannedPose | PositionSetpoint) -> None:
         """Put where a vehicle is meant to be."""
         if self._plan.select(event):
-            self._path(entities.PLAN, PLAN, _THIN)
-            self._extend(entities.PLAN, number, event.stamp, event.position)
+            entity = entities.path(entities.PLAN, event.vehicle)
+            self._path(entity, PLAN, _THIN)
+            self._extend(entity, number, event.stamp, event.position)
 
-    def camera_pose(self, event: PoseStamped) -> None:
-        """Put where a free camera is; that of a vehicle's camera serves its depth images."""
+    def wind(self, vehicle: str, events: Sequence[Numbered[Wind]]) -> None:
+        """Put the wind as an arrow at its vehicle, some times a second: a metre for each m/s."""
+        for number, event in events:
+            there = self._truth[vehicle].at(event.stamp) if vehicle in self._truth else None
+            if there is not None and event.stamp >= self._wind_due.get(vehicle, 0):
+                self._wind_due[vehicle] = event.stamp + _WIND_PERIOD
+                self._to.at(number, event.stamp)
+                arrow = self._rr.Arrows3D(
+                    origins=[there[0]], vectors=[event.velocity], colors=[WIND], radii=[_THICK]
+                )
+                self._to.put(entities.wind(vehicle), arrow)
+
+    def pose(self, number: int, event: PoseStamped) -> None:
+        """Put where a free camera is, or what moves by itself.
+
+        The pose of a vehicle's camera serves its depth images.
+        """
+        if event.source in self._moving:
+            entity = entities.sensor(event.source)
+            self._to.put(entity, self._transform(event.position, event.orientation))
+            path = entities.moving_path(event.source)
+            self._extend(path, number, event.stamp, event.position)
+            return
         camera = self._cameras.get(event.source)
         if camera is not None and camera.parent_frame_id == "map":
             pose = self._transform(event.position, event.orientation)
-            self._to.put(self._frames[camera.frame_id], pose)
+            self._to.put(self._entities[event.source], pose)
         self._extend_scene(event)
 
     # Images, features and point clouds.
@@ -224,6 +280,13 @@ class World:
         colours = event.colors if len(event.colors) else None
         self._to.put(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
 
+    def scan(self, event: LidarScan) -> None:
+        """Put a turn of a lidar, brighter where more light came back."""
+        grey = (55.0 + 200.0 * np.clip(event.intensities, 0.0, 1.0)).astype(np.uint8)
+        colours = np.stack([grey, grey, np.full_like(grey, 255)], axis=1)
+        entity = f"{entities.sensor(event.source)}/points"
+        self._to.put(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
+
     def finish(self) -> None:
         """Put what is left of the paths."""
         for entity, (path, _, _) in self._paths.items():
@@ -232,7 +295,9 @@ class World:
 
     def _place(self, event: Image | DepthImage | SegmentationImage, kind: str) -> str:
         """Return where an image belongs: to its camera, or by itself if nobody announced that."""
-        camera = self._frames.setdefault(event.frame_id, entities.images(event.source))
+        camera = self._entities.get(event.source)
+        if camera is None:  # grey images of a camera with colours, or nobody's
+            camera = self._frames.setdefault(event.frame_id, entities.images(event.source))
         if kind not in (kinds := self.images.setdefault(camera, [])):
             kinds.append(kind)
         return f"{camera}/{kind}"

@@ -10,7 +10,9 @@ Colour = tuple[int, int, int]
 """Red, green, blue, 0 to 255."""
 
 TRUTH: Colour = (80, 220, 120)
+_TRUTHS: list[Colour] = [TRUTH, (60, 200, 190), (170, 215, 70), (40, 160, 110)]
 PLAN: Colour = (140, 140, 150)
+WIND: Colour = (120, 200, 255)
 INLIER: Colour = (90, 240, 120)
 OUTLIER: Colour = (240, 80, 70)
 
@@ -43,9 +45,22 @@ VEHICLE = [
 """A body with a nose and four rotors."""
 
 
+_SIZES: dict[str, Vector3] = {"person": (0.5, 0.5, 1.8), "car": (4.2, 1.8, 1.5)}
+
+
+def moving_body(kind: str) -> Box:
+    """Return a box about as large as what moves by itself: nothing else is known of its shape."""
+    return Box((0.0, 0.0, 0.0), _SIZES.get(kind, (0.5, 0.5, 0.5)), (235, 150, 60))
+
+
 def estimate_colour(index: int) -> Colour:
     """Return the colour of the n-th estimator, from 0."""
     return _ESTIMATES[index % len(_ESTIMATES)]
+
+
+def truth_colour(index: int) -> Colour:
+    """Return the colour of the n-th vehicle's true path, from 0."""
+    return _TRUTHS[index % len(_TRUTHS)]
 
 
 def describe(event: Event) -> str:

@@ -47,13 +47,13 @@ class ImageSelection:
 
 
 class PlanSelection:
-    """Selects what is drawn as the plan: planned poses, or set-points if there is no plan."""
+    """Selects what is drawn as a vehicle's plan: planned poses, or set-points if there are none."""
 
     def __init__(self) -> None:
-        self._kind: type[PlannedPose | PositionSetpoint] | None = None
+        self._kinds: dict[str, type[PlannedPose | PositionSetpoint]] = {}
 
     def select(self, event: PlannedPose | PositionSetpoint) -> bool:
         """Tell whether an event is part of the plan."""
-        if self._kind is not PlannedPose:
-            self._kind = type(event)
-        return isinstance(event, self._kind)
+        if self._kinds.get(event.vehicle) is not PlannedPose:
+            self._kinds[event.vehicle] = type(event)
+        return isinstance(event, self._kinds[event.vehicle])

@@ -3,34 +3,44 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 import struct
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
 
-from events import PointCloud, TrackingLost
+from events import PointCloud, PoseStamped, Range, TrackingLost
 from nodes.foxglove_server import messages
 from nodes.foxglove_server.publishing import Publishing
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
+from nodes.ros_messages.images import LIDAR_POINT
 from tests.nodes.foxglove_server.client import Viewer, doubles, fields
 from tests.nodes.viewing.samples import (
     CAMERA,
     ESTIMATOR,
+    LIDAR,
     MS,
+    PERSON,
+    SECOND_CAMERA,
+    SECOND_VEHICLE,
+    UPRIGHT,
     VEHICLE,
     decoded,
     depth,
     estimate,
     features,
+    fix,
     image,
     imu,
     odometry,
+    scan,
     score,
 )
 
@@ -196,12 +206,12 @@ def test_features_clouds_words_and_numbers_come_too(server: Server, viewer: View
     points = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], np.float32)
     colours = np.array([[1, 2, 3], [4, 5, 6]], np.uint8)
     say.features(features(0))
-    say.imu(imu(0))
+    say.small(imu(0))
     say.score(score(0))
     topics = "/drone/camera/features/vo", "/log", "/drone/imu", "/scores/vo/position_error"
     stage.look(viewer, *topics)
     say.features(features(STAMP))
-    say.imu(imu(STAMP))
+    say.small(imu(STAMP))
     say.score(score(STAMP))
     say.logged(TrackingLost(stamp=STAMP, source="vo", reason="too dark"))
     say.cloud(PointCloud(stamp=STAMP, source="mapping", points=points, colors=colours))
@@ -217,6 +227,85 @@ def test_features_clouds_words_and_numbers_come_too(server: Server, viewer: View
     rows = np.frombuffer(cloud[6][0], np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)]))
     assert rows["xyz"].tolist() == points.tolist()
     assert rows["rgba"][:, :3].tolist() == colours.tolist()
+
+
+def test_lidars_fixes_and_other_sensors_come_too(server: Server, viewer: Viewer) -> None:
+    stage = Stage(server)
+    say = stage.publishing
+    for each in (SECOND_VEHICLE, LIDAR):
+        say.announced(each)
+    far = Range(stamp=STAMP, source="drone/down", range=math.inf, min_range=0.1, max_range=9.0)
+    for event in (far, fix(0)):
+        say.small(event)
+    say.scan(scan(0))
+    stage.look(viewer, "/other/lidar/points", "/drone/gnss/fix", "/drone/gnss", "/drone/down")
+    say.scan(scan(STAMP))
+    cloud = fields(viewer.next("/other/lidar/points"))
+    rows = np.frombuffer(cloud[6][0], LIDAR_POINT)
+    assert rows["xyz"].tolist() == scan(0).points.tolist()
+    assert rows["ring"].tolist() == [0, 15]
+    assert cloud[2] == [b"other/lidar"]
+    say.small(fix(STAMP))
+    located = fields(viewer.next("/drone/gnss/fix"))
+    assert located[1] == [47.5]
+    assert np.frombuffer(located[4][0])[[0, 4, 8]].tolist() == [2.0, 1.0, 3.0]  # east, north, up
+    assert json.loads(viewer.next("/drone/gnss"))["velocity"] == {"x": 1.0, "y": 2.0, "z": 3.0}
+    say.small(far)
+    assert json.loads(viewer.next("/drone/down"))["range"] is None
+    viewer.subscribe("/tf_static")
+    fixed = [fields(each) for each in fields(viewer.next("/tf_static"))[1]]
+    placed = {each[3][0]: each[2][0] for each in fixed}
+    assert placed[b"other/lidar"] == b"other/base_link"
+
+
+def test_each_of_two_vehicles_has_its_cameras_path_and_estimates(
+    server: Server, viewer: Viewer
+) -> None:
+    stage = Stage(server)
+    say = stage.publishing
+    for each in (SECOND_VEHICLE, SECOND_CAMERA, PERSON):
+        say.announced(each)
+    say.tracked(msgspec.structs.replace(features(0), frame_id="other/camera_optical"))
+    second = msgspec.structs.replace(odometry(0), source="other", position=(9.0, 0.0, 0.0))
+    for event in (odometry(0), second, estimate(0, (1.0, 0.0, 0.0), "odom")):
+        say.small(event)
+    stage.look(viewer, "/tf_static", "/tf")
+    fixed = [fields(each) for each in fields(viewer.next("/tf_static"))[1]]
+    placed = {each[3][0]: each for each in fixed}
+    assert placed[b"drone/camera_optical"][2] == [b"base_link"]
+    assert placed[b"other/camera_optical"][2] == [b"other/base_link"]
+    # The estimator's frame begins where the second vehicle was, not the first.
+    origin = fields(placed[b"vo/odom"][4][0])
+    assert abs(origin[1][0] - 9.0) <= 1.0
+    walker = PoseStamped(
+        stamp=STAMP, source="world/person", position=(1.0, 2.0, 3.0), orientation=UPRIGHT
+    )
+    say.small(walker)
+    (moved,) = fields(viewer.next("/tf"))[1]
+    assert fields(moved)[3] == [b"world/person"]
+
+
+@pytest.mark.parametrize(
+    ("model", "count", "called"),
+    [
+        ("plumb_bob", 5, b"plumb_bob"),
+        ("rational_polynomial", 8, b"rational_polynomial"),
+        ("equidistant", 4, b"kannala_brandt"),
+    ],
+)
+def test_a_calibration_has_its_distortion(
+    server: Server, viewer: Viewer, model: Any, count: int, called: bytes
+) -> None:
+    stage = Stage(server)
+    info = msgspec.structs.replace(CAMERA.info, distortion_model=model, distortion=(0.01,) * count)
+    stage.publishing.announced(
+        msgspec.structs.replace(CAMERA, source="drone/right", info=info, baseline=0.1)
+    )
+    stage.look(viewer, "/drone/right/camera_info")
+    found = fields(viewer.next("/drone/right/camera_info"))
+    assert found[4] == [called]
+    assert np.frombuffer(found[5][0]).tolist() == [0.01] * count
+    assert np.frombuffer(found[8][0])[3] == pytest.approx(-4.0 * 0.1)
 
 
 def test_the_run_s_time_is_told(server: Server, viewer: Viewer) -> None:

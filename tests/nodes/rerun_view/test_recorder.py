@@ -9,13 +9,28 @@ import msgspec
 import numpy as np
 import pytest
 
-from events import Event, PointCloud, PositionSetpoint, TrackingLost
+from events import (
+    Announcement,
+    Event,
+    FluidPressure,
+    PlannedPose,
+    PointCloud,
+    PoseStamped,
+    PositionSetpoint,
+    TrackingLost,
+    Wind,
+)
 from nodes.rerun_view.recorder import Recorder
 from nodes.rerun_view.settings import RerunConfig
 from tests.nodes.viewing.samples import (
     CAMERA,
     ESTIMATOR,
+    LIDAR,
     MS,
+    PERSON,
+    SECOND_CAMERA,
+    SECOND_VEHICLE,
+    UPRIGHT,
     VEHICLE,
     Recorded,
     camera_pose,
@@ -23,9 +38,11 @@ from tests.nodes.viewing.samples import (
     depth,
     estimate,
     features,
+    fix,
     image,
     imu,
     odometry,
+    scan,
     score,
 )
 
@@ -170,3 +187,76 @@ def test_the_plan_and_what_happened_are_there(tmp_path: Path) -> None:
     found = record(tmp_path, [*plan, lost])
     assert len(found.of("map/plan", "LineStrips3D:strips")) == 1
     assert found.of("log", "TextLog:text")[0][2] == ["vo: TrackingLost (too dark)"]
+
+
+def record_all(tmp_path: Path, announced: list[Announcement], events: list[Event]) -> Recorded:
+    """Record events of what is announced beside the vehicle, its camera and the estimator."""
+    file = tmp_path / "flight.rrd"
+    recorder = Recorder(RerunConfig(), "test", file)
+    recorder.begin([VEHICLE, CAMERA, ESTIMATOR, *announced])
+    recorder.log(list(enumerate(events)))
+    recorder.close()
+    return Recorded(file)
+
+
+def test_sensors_are_plotted_and_lidars_wind_and_bodies_stand_in_the_world(tmp_path: Path) -> None:
+    wind = Wind(stamp=0, source="drone", velocity=(3.0, 4.0, 0.0))
+    pressure = FluidPressure(stamp=0, source="drone/barometer", fluid_pressure=1e5)
+    walks: list[Event] = [
+        PoseStamped(
+            stamp=i * 100 * MS,
+            source="world/person",
+            position=(1.0, 0.1 * i, -0.9),
+            orientation=UPRIGHT,
+        )
+        for i in range(8)
+    ]
+    events = [odometry(0), wind, pressure, fix(0), scan(0), *walks]
+    found = record_all(tmp_path, [SECOND_VEHICLE, LIDAR, PERSON], events)
+    assert found.values("pressures/fluid_pressure/drone/barometer", "Scalars:scalars") == 1e5
+    velocity = found.values("fixes/velocity/drone/gnss", "Scalars:scalars").ravel()
+    assert velocity.tolist() == [1.0, 2.0, 3.0]
+    place = found.values("gps/drone/gnss", "GeoPoints:positions").ravel()
+    assert place.tolist() == [47.5, 8.25]
+    assert found.values("map/other/lidar", TRANSLATION).ravel() == pytest.approx([0, 0, -0.1])
+    points = found.values("map/other/lidar/points", "Points3D:positions")[0]
+    assert points.tolist() == scan(0).points.tolist()
+    assert found.values("map/wind/drone", "Arrows3D:vectors").ravel().tolist() == [3.0, 4.0, 0.0]
+    assert found.values("map/wind/drone", "Arrows3D:origins").ravel().tolist() == [1.0, 2.0, -3.0]
+    assert len(found.of("map/world/person", TRANSLATION)) == 8
+    assert found.of("map/paths/world/person", "LineStrips3D:strips")
+
+
+def test_of_two_vehicles_each_has_its_path_plan_and_estimates(tmp_path: Path) -> None:
+    second = msgspec.structs.replace(odometry(0), source="other", position=(9.0, 0.0, 0.0))
+    seen = msgspec.structs.replace(features(0), frame_id="other/camera_optical")
+    plan: list[Event] = [
+        PlannedPose(
+            stamp=i * 100 * MS, source="p", vehicle="other", position=(0.1 * i, 0, 0), yaw=0.0
+        )
+        for i in range(8)
+    ]
+    events = [odometry(0), second, seen, estimate(0, (0.0, 0.0, 0.0), "odom"), *plan]
+    found = record_all(tmp_path, [SECOND_VEHICLE, SECOND_CAMERA], events)
+    assert found.values("map/estimates/vo", TRANSLATION).ravel() == pytest.approx([9, 0, 0])
+    assert found.of("map/plan/other", "LineStrips3D:strips")
+    assert found.of("map/other", TRANSLATION)
+    assert "map/other/camera" in found.entities
+
+
+def test_of_a_distorted_camera_it_is_said_that_rerun_shows_none(tmp_path: Path) -> None:
+    info = msgspec.structs.replace(CAMERA.info, distortion=(-0.2, 0.0, 0.0, 0.0, 0.0))
+    bent = msgspec.structs.replace(CAMERA, source="drone/bent", frame_id="bent", info=info)
+    twin = msgspec.structs.replace(
+        bent, source="drone/bent/undistorted", info=CAMERA.info, undistorted="drone/bent"
+    )
+    seen = msgspec.structs.replace(image(0), source="drone/bent", frame_id="bent")
+    straight = msgspec.structs.replace(seen, source="drone/bent/undistorted")
+    found = record_all(tmp_path, [bent, twin], [seen, straight])
+    (note,) = (entity for entity in found.entities if entity.startswith("log/notes"))
+    assert note == "log/notes/drone/bent"
+    assert found.of("map/drone/bent/rgb", "EncodedImage:blob")
+    assert found.of("map/drone/bent/undistorted/rgb", "EncodedImage:blob")
+    # It is below its camera in the tree, and so at the same place.
+    assert found.values("map/drone/bent", TRANSLATION).size == 3
+    assert found.of("map/drone/bent/undistorted", TRANSLATION) == []

@@ -6,16 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from events import (
+    BodyAnnouncement,
     CameraAnnouncement,
     CameraInfo,
     DepthImage,
     EstimatorAnnouncement,
     Image,
     Imu,
+    LidarAnnouncement,
+    LidarScan,
+    NavSatFix,
     Odometry,
     PoseEstimate,
     PoseStamped,
@@ -160,3 +165,48 @@ def _time(columns: dict[str, Any], name: str, row: int) -> int | None:
         return None
     value = column.cast("int64")[row].as_py()
     return None if value is None else int(value)
+
+
+SECOND_VEHICLE = msgspec.structs.replace(VEHICLE, source="other", position=(5.0, 0.0, 0.0))
+SECOND_CAMERA = msgspec.structs.replace(
+    CAMERA, source="other/camera", frame_id="other/camera_optical"
+)
+LIDAR = LidarAnnouncement(
+    stamp=0,
+    source="other/lidar",
+    rate=10.0,
+    frame_id="other/lidar",
+    position=(0.0, 0.0, -0.1),
+    channels=16,
+    columns=1024,
+    horizontal_fov=6.28,
+    elevations=(-0.3, 0.3),
+    noise=0.0,
+    min_range=0.1,
+    max_range=50.0,
+)
+PERSON = BodyAnnouncement(stamp=0, source="world/person", kind="person", object_ids=(3,))
+
+
+def scan(stamp: int, source: str = "other/lidar") -> LidarScan:
+    return LidarScan(
+        stamp=stamp,
+        source=source,
+        frame_id=source,
+        points=np.array([[1, 2, 3], [4, 5, 6]], np.float32),
+        intensities=np.array([0.25, 0.75], np.float32),
+        times=np.array([0.0, 0.05], np.float32),
+        rings=np.array([0, 15], np.uint16),
+    )
+
+
+def fix(stamp: int) -> NavSatFix:
+    return NavSatFix(
+        stamp=stamp,
+        source="drone/gnss",
+        latitude=47.5,
+        longitude=8.25,
+        altitude=450.0,
+        position_covariance=(1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 3.0),
+        velocity=(1.0, 2.0, 3.0),
+    )

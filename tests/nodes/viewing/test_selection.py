@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from events import PlannedPose, PositionSetpoint
 from nodes.viewing.selection import ImageSelection, PlanSelection
 
@@ -35,3 +37,13 @@ def test_set_points_are_the_plan_only_where_there_is_none() -> None:
         False,
         True,
     ]
+
+
+def test_each_vehicle_has_a_plan_of_its_own() -> None:
+    selection = PlanSelection()
+    place = (0.0, 0.0, 0.0)
+    plan = PlannedPose(stamp=0, source="p", vehicle="one", position=place, yaw=0.0)
+    point = PositionSetpoint(stamp=0, source="p", vehicle="two", position=place)
+    assert selection.select(plan)
+    assert selection.select(point)
+    assert not selection.select(msgspec.structs.replace(point, vehicle="one"))
