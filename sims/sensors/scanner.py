@@ -85,7 +85,11 @@ class Scanner:
         directions, times = pattern_of(spec, start / 1e9)
         origins, turns = self._poses(spec, states, times)
         # FRD to FLU, and from there to the world's NWU.
-        rays = (directions * (1.0, -1.0, -1.0)) @ turns.transpose(0, 2, 1)
+        x, y, z = np.moveaxis(directions, -1, 0) * np.array([1.0, -1.0, -1.0])[:, None, None]
+        rays = np.empty_like(directions)
+        for axis in range(3):
+            a, b, c = turns[:, axis].T[:, :, None]
+            rays[..., axis] = a * x + b * y + c * z
         groups = np.minimum(np.rint(times / _STEP).astype(np.intp), len(states) - 1)
         borders = np.flatnonzero(np.diff(groups, prepend=-1))
         groups = groups[borders]
@@ -109,7 +113,7 @@ class Scanner:
             distances[begin:end] = hits.distances.reshape(size)
             geoms[begin:end] = hits.geoms.reshape(size)
             normals[begin:end] = hits.normals.reshape(*size, 3)
-        returned = -(normals * rays).sum(axis=-1) * self._reflectivity[geoms]
+        returned = -np.einsum("cki,cki->ck", normals, rays) * self._reflectivity[geoms]
         return self._measured(spec, start, directions, times, distances, returned)
 
     def _poses(self, spec: LidarSpec, states: Floats, times: Floats) -> tuple[Floats, Floats]:
@@ -134,22 +138,23 @@ class Scanner:
         By their bounding spheres, and for each group of rays the cone around them and the plane
         that they are near to, such as that of a spinning lidar's column.
         """
-        sums = np.add.reduceat(rays.sum(axis=1), borders, axis=0)
+        middle = rays[:, 0] + rays[:, rays.shape[1] // 2] + rays[:, -1]
+        sums = np.add.reduceat(middle, borders, axis=0)
         axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-12)[:, None]
         normals = np.cross(rays[borders, 0], rays[borders, -1])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
         counts = np.diff(borders, append=len(rays))
-        along = (rays @ np.repeat(axes, counts, axis=0)[:, :, None])[..., 0].min(axis=1)
-        off = np.abs((rays @ np.repeat(normals, counts, axis=0)[:, :, None])[..., 0]).max(axis=1)
+        along = np.einsum("cki,ci->kc", rays, np.repeat(axes, counts, axis=0)).min(axis=0)
+        off = np.abs(np.einsum("cki,ci->kc", rays, np.repeat(normals, counts, axis=0))).max(axis=0)
         half = np.arccos(np.clip(np.minimum.reduceat(along, borders), -1.0, 1.0))[:, None]
         off = np.maximum.reduceat(off, borders)[:, None]
         apart = self._rays.data.geom_xpos[None] - origins[:, None]
-        distances = np.maximum(np.linalg.norm(apart, axis=2), 1e-9)
+        distances = np.sqrt(np.einsum("gni,gni->gn", apart, apart)) + 1e-9
         radii = self._radii[None]
         outside = distances > radii
-        angles = np.arccos(np.clip((apart @ axes[:, :, None])[..., 0] / distances, -1.0, 1.0))
+        angles = np.arccos(np.clip(np.einsum("gni,gi->gn", apart, axes) / distances, -1.0, 1.0))
         wide = np.arcsin(np.where(outside, radii, 0.0) / distances)
-        beside = np.abs((apart @ normals[:, :, None])[..., 0]) > radii + off * distances
+        beside = np.abs(np.einsum("gni,gi->gn", apart, normals)) > radii + off * distances
         return np.asarray(outside & ((angles > half + wide) | beside | (distances - radii > reach)))
 
     def _measured(
