@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import ImuAnnouncement, Quaternion, Vector3
-from events.rotations import from_rpy, inverse, multiply, rotate, rotate_inverse
+from events.rotations import from_rpy, inverse, multiply, rotate, rotate_inverse, slerp
 from sims.sensors.sensor import NonNegative
 
 _BLOCK = 512
@@ -210,12 +210,9 @@ class ImuModel:
         constants: np.random.Generator,
     ) -> None:
         if parameters.ideal:
+            silent: dict[str, Any] = dict.fromkeys(ImuParameters.__struct_fields__[:4], 0.0)
             kept = {name: getattr(parameters, name) for name in _NO_ERRORS}
-            kept["vibration"] = msgspec.structs.replace(
-                parameters.vibration, amplitude=0.0, angular_amplitude=0.0
-            )
-            silent = dict.fromkeys(ImuParameters.__struct_fields__[:4], 0.0)
-            parameters = ImuParameters(**{**silent, **kept})
+            parameters = ImuParameters(**silent, **kept)
         self.parameters = p = parameters
         self._rate = rate
         drawn = constants.standard_normal((2, 10))
@@ -269,20 +266,19 @@ class ImuModel:
             stamp: Nanoseconds on the run's clock.
         """
         p = self.parameters
-        same = {name: getattr(p, name) for name in _ANNOUNCED}
-        return ImuAnnouncement(
-            stamp=stamp,
-            source=source,
-            rate=self._rate,
-            frame_id=source if p.mounted else body,
-            parent_frame_id=body,
-            orientation=p.rotation,
-            gyroscope_matrix=tuple(self.matrices[0].ravel().tolist()),
-            accelerometer_matrix=tuple(self.matrices[1].ravel().tolist()),
-            vibration=p.vibration.amplitude,
-            averaged=p.sampling == "mean",
-            **same,
-        )
+        fields = ImuAnnouncement.__struct_fields__
+        same = {name: getattr(p, name) for name in fields if hasattr(p, name)}
+        gyroscope, accelerometer = (tuple(matrix.ravel().tolist()) for matrix in self.matrices)
+        special = {
+            "gyroscope_matrix": gyroscope,
+            "accelerometer_matrix": accelerometer,
+            "vibration": p.vibration.amplitude,
+            "averaged": p.sampling == "mean",
+            "orientation": p.rotation,
+            "parent_frame_id": body,
+            "frame_id": source if p.mounted else body,
+        }
+        return ImuAnnouncement(**{**same, **special}, stamp=stamp, source=source, rate=self._rate)
 
     def _shake(self, rates: Vector3, force: Vector3, thrusts: Any) -> tuple[Vector3, Vector3]:
         """Add the vibration of the rotors, and turn them on."""
@@ -349,35 +345,14 @@ def mean_between(
     sine = math.hypot(*axis)
     factor = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
     wx, wy, wz = (factor * x / seconds for x in axis)
-    half = _half_turn((wx, wy, wz), seconds)
     ax, ay, az = ((b - a) / seconds for a, b in zip(before.velocity, after.velocity, strict=True))
-    return (wx, wy, wz), rotate_inverse(multiply(before.orientation, half), (ax, ay, az - gravity))
+    halfway = slerp(before.orientation, after.orientation, 0.5)
+    return (wx, wy, wz), rotate_inverse(halfway, (ax, ay, az - gravity))
 
 
 _EYE = np.eye(3)
 _NO_ERRORS = ("sampling", "position", "orientation")
-_ANNOUNCED = (
-    "gyroscope_noise_density",
-    "gyroscope_random_walk",
-    "accelerometer_noise_density",
-    "accelerometer_random_walk",
-    "gyroscope_turn_on_bias",
-    "accelerometer_turn_on_bias",
-    "g_sensitivity",
-    "gyroscope_range",
-    "accelerometer_range",
-    "gyroscope_resolution",
-    "accelerometer_resolution",
-    "position",
-)
-
-
-def _half_turn(rates: Vector3, seconds: float) -> Quaternion:
-    """Return the rotation by half of rates · seconds."""
-    angle = math.hypot(*rates) * seconds / 2.0
-    scale = seconds / 4.0 * (math.sin(angle / 2.0) / (angle / 2.0) if angle > 1e-12 else 1.0)
-    x, y, z = (scale * rate for rate in rates)
-    return (math.cos(angle / 2.0), x, y, z)
+"""Settings that are the same of an ideal IMU."""
 
 
 def _matrix(given: tuple[float, ...], scale: float, angle: float, numbers: Floats) -> Floats:
