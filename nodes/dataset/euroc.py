@@ -1,8 +1,8 @@
 """The layout of the EuRoC MAV data sets (ASL's), for any number of cameras of one body.
 
 M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016;
-projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets. The body's frame is FRD, and
-the IMU's. Depth images, which the original lacks, stand beside the cameras.
+projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets. The body's frame is FRD.
+Depth images, which the original lacks, stand beside the cameras.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class Euroc(Recording):
         mav0/state_groundtruth_estimate0/data.csv, sensor.yaml
 
     Raises:
-        ValueError: A camera or the IMU does not sit on the body.
+        ValueError: A camera or the IMU does not sit on the body, or the layout has no word for a
+            camera's distortion.
     """
 
     def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
@@ -50,7 +51,7 @@ class Euroc(Recording):
         frame = rig.cameras[0].parent_frame_id
         for sensor, parent in (
             *((camera.source, camera.parent_frame_id) for camera in rig.cameras),
-            *(((rig.imu.source, rig.imu.frame_id),) if rig.imu is not None else ()),
+            *(((rig.imu.source, rig.imu.parent_frame_id),) if rig.imu is not None else ()),
         ):
             if parent != frame or parent == "map":
                 raise ValueError(
@@ -159,14 +160,14 @@ class Euroc(Recording):
             pose_matrix(camera.position, camera.orientation),
         )
         middle = ", ".join(map(real, (info.fx, info.fy, info.cx, info.cy)))
-        lens = ", ".join(map(real, info.distortion[:4]))
+        model, names, lens = _lens(camera)
         text = (
             f"rate_hz: {real(camera.rate)}\n"
             f"resolution: [{info.width}, {info.height}]\n"
             "camera_model: pinhole\n"
             f"intrinsics: [{middle}]  # fu, fv, cu, cv\n"
-            "distortion_model: radial-tangential\n"
-            f"distortion_coefficients: [{lens}]  # k1, k2, p1, p2\n"
+            f"distortion_model: {model}\n"
+            f"distortion_coefficients: [{', '.join(map(real, lens))}]  # {names}\n"
         )
         self.write(f"mav0/{name}/sensor.yaml", head + text + more)
         return name, self.rows(f"mav0/{name}/data.csv", "#timestamp [ns],filename\n")
@@ -174,7 +175,8 @@ class Euroc(Recording):
     def _imu_yaml(self) -> str:
         imu = self.rig.imu
         assert imu is not None
-        return _head("imu", f"{imu.source}; {_BODY}", np.eye(4)) + (
+        mounting = pose_matrix(imu.position, imu.orientation)
+        return _head("imu", f"{imu.source}; {_BODY}", mounting) + (
             f"rate_hz: {real(imu.rate)}\n"
             "# continuous-time densities, as in Kalibr's files\n"
             f"gyroscope_noise_density: {real(imu.gyroscope_noise_density)}  # rad/s/sqrt(Hz)\n"
@@ -184,6 +186,23 @@ class Euroc(Recording):
             f"accelerometer_random_walk: {real(imu.accelerometer_random_walk)}"
             "  # m/s^3/sqrt(Hz)\n"
         )
+
+
+def _lens(camera: CameraAnnouncement) -> tuple[str, str, tuple[float, ...]]:
+    """Return a distortion model as Kalibr calls it, the coefficients' names, and they themselves.
+
+    Raises:
+        ValueError: It has no name for the model.
+    """
+    model, lens = camera.info.distortion_model, camera.info.distortion
+    if model == "equidistant":
+        return "equidistant", "k1, k2, k3, k4", lens
+    if model == "plumb_bob":
+        name, more = "radial-tangential", lens[4] != 0.0
+        return name, "k1, k2, p1, p2" + ", k3" * more, lens if more else lens[:4]
+    raise ValueError(
+        f"{camera.source}: expected plumb_bob or equidistant distortion, found {model}"
+    )
 
 
 def _head(kind: str, comment: str, pose: npt.NDArray[np.float64]) -> str:

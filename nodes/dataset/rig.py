@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import msgspec
 
 from events import Announcement, CameraAnnouncement, ImuAnnouncement
+from nodes.vehicles import Vehicles
 
 WORLD_AXES = "world: x north, y west, z up; origin on the ground"
 """The world of a data set, for the heads of its files: z up, as their readers expect it.
@@ -40,25 +41,30 @@ def choose(announcements: Sequence[Announcement], named: str | None) -> Rig:
     """
     announced = [a for a in announcements if isinstance(a, CameraAnnouncement)]
     able = [a for a in announced if {"rgb", "grey"} & {*a.images}]
-    cameras = [a for a in able if named is None or _belongs(a, named)]
+    cameras = [a for a in able if (_belongs(a, named) if named is not None else not a.undistorted)]
     if not cameras:
         found = ", ".join(f"{a.source} ({', '.join(a.images)})" for a in announced) or "none"
         called = f" called {named}" if named is not None else ""
         raise ValueError(f"expected a camera with rgb or grey images{called}, found {found}")
+    vehicles = Vehicles()
+    for each in announcements:
+        vehicles.announced(each)
+
+    def body_of(source: str) -> str:
+        return vehicles.carrier(source) or source.rpartition("/")[0] or source
+
     body = body_of(cameras[0].source)
     imus = (
         a for a in announcements if isinstance(a, ImuAnnouncement) and body_of(a.source) == body
     )
+    twins = cameras[0].undistorted  # either what cameras give, or that without distortion
     return Rig(
         body=body,
-        cameras=tuple(a for a in cameras if body_of(a.source) == body),
+        cameras=tuple(
+            a for a in cameras if body_of(a.source) == body and bool(a.undistorted) == bool(twins)
+        ),
         imu=next(imus, None),
     )
-
-
-def body_of(source: str) -> str:
-    """Return the source of the body that carries a sensor: ``drone`` for ``drone/front``."""
-    return source.rpartition("/")[0] or source
 
 
 def _belongs(camera: CameraAnnouncement, named: str) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from events import DepthImage, Image, Imu, Odometry, PoseStamped
 from events.frames import flip_yz, rotation_to_nwu
+from events.rotations import rotate
 from nodes.dataset.images import ImageFile, in_16_bits, in_colour
 from nodes.dataset.recording import Recording, real
 from nodes.dataset.rig import WORLD_AXES, Rig
@@ -80,7 +81,7 @@ class TumRgbd(Recording):
     def imu(self, event: Imu) -> None:
         """Note the accelerations."""
         if self.rig.imu is not None and event.source == self.rig.imu.source:
-            x, y, z = event.linear_acceleration
+            x, y, z = rotate(self.rig.imu.orientation, event.linear_acceleration)
             row = f"{self._seconds(event.stamp)} {x:.9f} {y:.9f} {z:.9f}\n"
             self._files["accelerometer"].add(event.stamp, row)
 
@@ -117,10 +118,11 @@ class TumRgbd(Recording):
         info = self._camera.info
         lens = ", ".join(map(real, info.distortion))
         return (
-            f"# {self._camera.source}: pinhole; pixel centres have whole coordinates\n"
+            f"# {self._camera.source}: pixel centres have whole coordinates\n"
             f"width: {info.width}\nheight: {info.height}\n"
             f"fx: {real(info.fx)}\nfy: {real(info.fy)}\ncx: {real(info.cx)}\ncy: {real(info.cy)}\n"
-            f"distortion: [{lens}]  # k1, k2, p1, p2, k3\n"
+            f"distortion_model: {info.distortion_model}\n"
+            f"distortion: [{lens}]  # as in ROS's camera_info\n"
             f"rate_hz: {real(self._camera.rate)}\n"
             f"depth_factor: {real(self.depth_factor)}\n"
             f"{self.epoch_line()}"

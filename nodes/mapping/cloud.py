@@ -7,7 +7,6 @@ wrong with a point (noise of the depth, an angle, the size of a pixel) grows wit
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -29,12 +28,14 @@ def rays_of(info: CameraInfo, stride: int) -> Points:
         stride: n, along rows and columns alike.
 
     Returns:
-        x and y in the optical frame, shape (ceil(height / n), ceil(width / n), 2).
+        x and y in the optical frame, shape (ceil(height / n), ceil(width / n), 2); NaN where the
+        ray does not meet it, as in the corners of a fisheye.
     """
     rows, columns = np.mgrid[0 : info.height : stride, 0 : info.width : stride]
-    pixels = np.stack([columns, rows], axis=-1).astype(np.float64).reshape(-1, 1, 2)
-    rays = cv2.undistortPoints(pixels, info.matrix(), np.array(info.distortion))
-    return np.asarray(rays, dtype=np.float32).reshape(*rows.shape, 2)
+    rays = info.unproject(np.stack([columns, rows], axis=-1).reshape(-1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        met = np.where(rays[:, 2:] > 0.0, rays[:, :2] / rays[:, 2:], np.nan)
+    return met.astype(np.float32).reshape(*rows.shape, 2)
 
 
 def back_project(
@@ -55,7 +56,7 @@ def back_project(
     """
     if rays.shape != (*depth.shape, 2):
         raise ValueError(f"depth: expected shape {rays.shape[:2]}, found {depth.shape}")
-    seen = (depth > 0.0) & (depth <= max_depth)
+    seen = (depth > 0.0) & (depth <= max_depth) & np.isfinite(rays[..., 0])
     z = depth[seen]
     return np.column_stack([rays[seen] * z[:, None], z]), seen
 

@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -42,6 +43,10 @@ from nodes.trajectory.table import read_rows
 
 _TRUTH = "state_groundtruth_estimate0"
 _BODY = "base_link"
+_MODELS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
+"""Kalibr's names of distortion models, and ours."""
+
+T = TypeVar("T")
 
 
 class Sensor(msgspec.Struct, frozen=True):
@@ -77,6 +82,17 @@ class Sensor(msgspec.Struct, frozen=True):
             raise ReplayError(f"{self.path}: {key}: expected {counts} numbers, found {found}")
         return found
 
+    def converted(self, values: dict[str, Any], kind: type[T]) -> T:
+        """Return values as a struct.
+
+        Raises:
+            ReplayError: They are none.
+        """
+        try:
+            return msgspec.convert(values, kind)
+        except msgspec.ValidationError as error:
+            raise ReplayError(f"{self.path}: {error}") from None
+
 
 class Euroc(FolderReader):
     """Reads the cameras, the first IMU and the ground truth of a data set.
@@ -93,6 +109,7 @@ class Euroc(FolderReader):
         super().__init__(folder, vehicle)
         self._images: dict[str, list[tuple[int, Path]]] = {}
         self._depths: dict[str, tuple[list[tuple[int, Path]], float]] = {}
+        self._imu_frame = _BODY
         try:
             for camera in sorted(folder.glob("cam[0-9]*")):
                 self._announcements.append(self._camera(camera))
@@ -135,7 +152,7 @@ class Euroc(FolderReader):
         return Imu(
             stamp=stamp - self._origin,
             source=f"{self._vehicle}/imu0",
-            frame_id=_BODY,
+            frame_id=self._imu_frame,
             angular_velocity=(values[0], values[1], values[2]),
             linear_acceleration=(values[3], values[4], values[5]),
         )
@@ -158,12 +175,16 @@ class Euroc(FolderReader):
         source = f"{self._vehicle}/{folder.name}"
         width, height = sensor.list("resolution", 2)
         fx, fy, cx, cy = sensor.list("intrinsics", 4)
-        k1, k2, p1, p2, *k3 = sensor.list("distortion_coefficients", 4, 5)
-        model = sensor.texts.get("distortion_model", "")
-        if model != "radial-tangential" and any((k1, k2, p1, p2)):
+        lens = sensor.list("distortion_coefficients", 4, 5)
+        named = sensor.texts.get("distortion_model", "")
+        model = _MODELS.get(named, "" if any(lens) else "plumb_bob")
+        if not model:
             raise ReplayError(
-                f"{sensor.path}: distortion_model: expected radial-tangential, found {model!r}"
+                f"{sensor.path}: distortion_model: expected one of {', '.join(_MODELS)}, "
+                f"found {named!r}"
             )
+        if model == "plumb_bob":
+            lens = [*lens, 0.0][:5]  # of four, k3 is none
         position, orientation = pose_tuples(np.reshape(sensor.list("data", 16), (4, 4)))
         self._images[source] = rows = self._index(folder)
         images = ["grey"]
@@ -178,14 +199,10 @@ class Euroc(FolderReader):
             stamp=0,
             source=source,
             images=tuple(images),
-            info=CameraInfo(
-                width=int(width),
-                height=int(height),
-                fx=fx,
-                fy=fy,
-                cx=cx,
-                cy=cy,
-                distortion=(k1, k2, p1, p2, k3[0] if k3 else 0.0),
+            info=sensor.converted(
+                {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+                | {"distortion_model": model, "distortion": lens},
+                CameraInfo,
             ),
             rate=sensor.number("rate_hz"),
             latency=0.0,
@@ -197,11 +214,17 @@ class Euroc(FolderReader):
 
     def _imu_announcement(self) -> ImuAnnouncement:
         sensor = read_sensor(self._folder / "imu0" / "sensor.yaml")
+        given = sensor.list("data", 16) if "data" in sensor.lists else np.eye(4)
+        position, orientation = pose_tuples(np.reshape(given, (4, 4)))
+        if (position, orientation) != ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)):
+            self._imu_frame = f"{self._vehicle}/imu0"
         return ImuAnnouncement(
             stamp=0,
             source=f"{self._vehicle}/imu0",
             rate=sensor.number("rate_hz"),
-            frame_id=_BODY,
+            frame_id=self._imu_frame,
+            position=position,
+            orientation=orientation,
             gyroscope_noise_density=sensor.number("gyroscope_noise_density", 0.0),
             gyroscope_random_walk=sensor.number("gyroscope_random_walk", 0.0),
             accelerometer_noise_density=sensor.number("accelerometer_noise_density", 0.0),

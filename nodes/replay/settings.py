@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from events import CameraInfo
+from events.camera_info import DistortionModel
 from runtime import Changeable, Duration, NodeConfig
 from runtime.paths import InputPath
 
@@ -38,14 +40,27 @@ class Pinhole(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         fy: Pixels.
         cx: Pixels.
         cy: Pixels.
-        distortion: plumb_bob: k1, k2, p1, p2, k3.
+        distortion_model: As in ROS's ``camera_info``.
+        distortion: Its coefficients: of plumb_bob k1, k2, p1, p2, k3.
     """
 
     fx: Annotated[float, msgspec.Meta(gt=0)]
     fy: Annotated[float, msgspec.Meta(gt=0)]
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion_model: DistortionModel = "plumb_bob"
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        self.info(1, 1)
+
+    def info(self, width: int, height: int) -> CameraInfo:
+        """Return the intrinsics of images of a size.
+
+        Raises:
+            ValueError: The number of coefficients is not that of the model.
+        """
+        return CameraInfo(width=width, height=height, **msgspec.structs.asdict(self))
 
 
 class ReplayConfig(NodeConfig):

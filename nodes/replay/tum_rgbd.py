@@ -17,7 +17,6 @@ from pathlib import Path
 from events import (
     Announcement,
     CameraAnnouncement,
-    CameraInfo,
     DepthImage,
     Image,
     Odometry,
@@ -85,14 +84,10 @@ class TumRgbd(FolderReader):
             self._factor = sensor.number("depth_factor", depth_factor)
             rate = sensor.number("rate_hz", rate)
             if camera is None:
-                k1, k2, p1, p2, k3 = sensor.list("distortion", 5)
-                camera = Pinhole(
-                    fx=sensor.number("fx"),
-                    fy=sensor.number("fy"),
-                    cx=sensor.number("cx"),
-                    cy=sensor.number("cy"),
-                    distortion=(k1, k2, p1, p2, k3),
-                )
+                model = sensor.texts.get("distortion_model", "plumb_bob")
+                lens = {"distortion_model": model, "distortion": sensor.lists.get("distortion")}
+                middle = {name: sensor.number(name) for name in ("fx", "fy", "cx", "cy")}
+                camera = sensor.converted({**middle, **lens}, Pinhole)
         if camera is None:
             raise ReplayError(
                 f"{folder}: expected a camera.yaml or the setting camera, found neither: write "
@@ -155,15 +150,7 @@ class TumRgbd(FolderReader):
                 stamp=0,
                 source=self._source,
                 images=(*images, "depth") if self._depth else images,
-                info=CameraInfo(
-                    width=width,
-                    height=height,
-                    fx=camera.fx,
-                    fy=camera.fy,
-                    cx=camera.cx,
-                    cy=camera.cy,
-                    distortion=camera.distortion,
-                ),
+                info=camera.info(width, height),
                 rate=rate,
                 latency=0.0,
                 frame_id=self._frame_id,

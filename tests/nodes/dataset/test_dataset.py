@@ -14,9 +14,19 @@ import pytest
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
-from events import Event, Odometry, Shutdown
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    Event,
+    ImuAnnouncement,
+    Odometry,
+    Shutdown,
+)
+from events.rotations import from_rpy, rotate
 from nodes.dataset import DatasetWriter
 from nodes.dataset.images import ImageFile
+from nodes.replay.formats import open_reader
+from nodes.replay.settings import ReplayConfig
 from nodes.trajectory.formats import read_euroc, read_tum
 from runtime.errors import ConfigError, FatalError, NodeError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
@@ -34,6 +44,7 @@ from tests.nodes.dataset.samples import (
     yaml,
 )
 
+TURNED = from_rpy(0.1, -0.2, 0.3)
 STAMPS = ["1577836800000000000", "1577836800030000000", "1577836800060000000"]
 SECONDS = ["1577836800.000000000", "1577836800.030000000", "1577836800.060000000"]
 
@@ -215,12 +226,67 @@ def test_without_a_camera_the_run_ends_with_a_reason(tmp_path: Path) -> None:
         narrowed(tmp_path, flight(), "euroc", "drone/frnt")
 
 
+LENSES: dict[str, dict[str, Any]] = {
+    "radtan": {"distortion": (-0.28, 0.07, 2e-4, -1e-4, 0.0)},
+    "radtan with k3": {"distortion": (-0.28, 0.07, 2e-4, -1e-4, 0.01)},
+    "fisheye": {"distortion_model": "equidistant", "distortion": (-0.01, 0.012, -0.008, 0.001)},
+    "ideal fisheye": {"distortion_model": "equidistant", "distortion": (0.0,) * 4},
+}
+
+
+@pytest.mark.parametrize("form", ["euroc", "tum_rgbd"])
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_a_replay_announces_the_lens_and_the_mounting_that_were_recorded(
+    tmp_path: Path, form: str, lens: dict[str, Any]
+) -> None:
+    info = msgspec.structs.replace(camera().info, **lens)
+    sensors: list[Event] = [
+        msgspec.structs.replace(camera(), info=info),
+        msgspec.structs.replace(
+            imu_announcement(frame="drone/imu"), position=(0.1, 0.0, -0.02), orientation=TURNED
+        ),
+    ]
+    twin = msgspec.structs.replace(
+        camera(), source="drone/front/undistorted", undistorted="drone/front"
+    )
+    events = [e for e in flight() if not isinstance(e, Announcement)]
+    data = record(tmp_path, [*sensors, twin, *events], form)
+    found = {
+        type(each): each
+        for each in open_reader(
+            ReplayConfig(file=str(data / "mav0" if form == "euroc" else data)), "drone"
+        ).announcements()
+    }
+    seen = found[CameraAnnouncement]
+    assert isinstance(seen, CameraAnnouncement)
+    assert seen.info == info
+    if form == "euroc":
+        inertial = found[ImuAnnouncement]
+        assert isinstance(inertial, ImuAnnouncement)
+        assert inertial.position == pytest.approx((0.1, 0.0, -0.02))
+        assert inertial.orientation == pytest.approx(TURNED)
+        assert not (data / "mav0" / "cam1").exists()  # the twin is no camera of its own
+    else:
+        force = (data / "accelerometer.txt").read_text().splitlines()[3].split()[1:]
+        assert [float(f) for f in force] == pytest.approx(rotate(TURNED, (0.0, 0.0, -9.81)))
+
+
+def test_a_lens_that_euroc_has_no_word_for_is_refused(tmp_path: Path) -> None:
+    rational = {"distortion_model": "rational_polynomial", "distortion": (0.1,) * 8}
+    info = msgspec.structs.replace(camera().info, **rational)
+    with pytest.raises(FatalError, match="drone/front: expected plumb_bob or equidistant"):
+        record(tmp_path, [msgspec.structs.replace(camera(), info=info)], "euroc")
+
+
 @pytest.mark.parametrize(
     "announced",
     [
         [camera(parent="map")],
         [camera(), camera("arm", parent="gripper")],
-        [imu_announcement(frame="imu_link"), camera()],
+        [
+            msgspec.structs.replace(imu_announcement(), parent_frame_id="gimbal"),
+            camera(),
+        ],
     ],
 )
 def test_sensors_off_the_body_are_refused_for_euroc(announced: Any, tmp_path: Path) -> None:

@@ -135,6 +135,21 @@ def test_a_lens_that_distorts_is_allowed_for() -> None:
     np.testing.assert_allclose(pixels[:, 0], expected, atol=0.02)
 
 
+def test_a_fisheyes_rays_to_the_side_and_back_give_no_points() -> None:
+    info = CameraInfo(
+        width=64, height=48, fx=15.0, fy=15.0, cx=31.5, cy=23.5,
+        distortion_model="equidistant", distortion=(0.0,) * 4,
+    )  # fmt: skip
+    rays = rays_of(info, 1)
+    points, seen = back_project(np.ones((48, 64), np.float32), rays, 10.0)
+    assert not seen[23, 0]  # 120 degrees off the axis
+    assert seen[23, 31]
+    assert np.isfinite(points).all()
+    rows, columns = np.nonzero(seen)
+    expected = np.column_stack([columns, rows])
+    np.testing.assert_allclose(info.project(points), expected, atol=2e-3)
+
+
 def test_what_is_too_far_or_was_not_hit_is_left_out() -> None:
     depth = np.array([[1.0, np.inf, 0.0], [5.0, 5.01, np.nan]], np.float32)
     points, seen = back_project(depth, np.zeros((2, 3, 2), np.float32), 5.0)

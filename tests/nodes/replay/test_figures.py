@@ -241,7 +241,7 @@ def test_a_wrong_choice_of_topics_is_an_error(bag: Path, topic: str, use: str, w
     [
         ("intrinsics: [458.654, ", "intrinsics: [", "intrinsics: expected 4 numbers, found"),
         ("rate_hz: 20", "rate_hz: often", "rate_hz: expected a number, found often"),
-        ("radial-tangential", "equidistant", "expected radial-tangential, found 'equidistant'"),
+        ("radial-tangential", "fov", "expected one of radial-tangential, equidistant, found 'fov'"),
         ("1.0]\n\n# Camera", "x]\n\n# Camera", "data: expected numbers"),
     ],
 )
