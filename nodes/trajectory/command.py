@@ -1,4 +1,4 @@
-"""``export``: a run's trajectories and calibration, as files for other tools."""
+"""``export``: a run's trajectories, measurements and calibration, as files for other tools."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ class Format(Enum):
     tum = "tum"
     euroc = "euroc"
     kitti = "kitti"
+    csv = "csv"
     kalibr = "kalibr"
     openvins = "openvins"
     vins = "vins"
@@ -41,13 +42,16 @@ def export(
         typer.Option(help="Of a calibration: a camera, or a vehicle; the first if not given."),
     ] = None,
 ) -> None:
-    """Write a run's trajectories, or its calibration, as other tools read them.
+    """Write a run's trajectories, measurements or calibration, as other tools read them.
 
     tum, euroc and kitti are the true and the estimated trajectories, as evo reads them.
     tum and euroc give one file each for the truth and every estimator; euroc adds the estimates
     in TUM's format, which is what evo_ape euroc compares with, and turns all to a world with z
     up. kitti has no stamps, so it gives a pair of files for every estimator, pose by pose: those
     of the first camera, from identity.
+
+    csv gives what IMU, barometer, magnetometer, satellite receiver and range finders measured, and
+    the wind: a file each, if the run has a recording.
 
     The others are calibrations: cameras, IMU and the transforms between them, as that program's
     files say it: kalibr, openvins, vins (VINS-Fusion), basalt, orbslam3, and vslamlab, which also
@@ -56,11 +60,14 @@ def export(
     """
     from nodes.calibration.export import export_calibration
     from nodes.trajectory import export as exports
+    from nodes.trajectory.measurements import export_measurements
     from runtime.errors import ConfigError
 
     try:
         if form.value in exports.FORMATS:
             written = exports.export(run, form.value, out, epoch)
+        elif form is Format.csv:
+            written = export_measurements(run, out, epoch)
         else:
             written = export_calibration(run, form.value, out, epoch, camera)
     except (ValueError, OSError) as error:
