@@ -53,7 +53,8 @@ class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         max_slant: Greatest angle between the ray and the surface's normal, degrees; in 3×3 pixels,
             so that edges of objects are lost, too. 90: any.
         min_brightness: ``structured_light``: least light of a surface seen head-on, as a share
-            of white's, in linear light; aslant more by the angle's cosine. 0: any.
+            of white's, in linear light; aslant more by the angle's cosine. The camera's ``light``
+            makes no difference to it. 0: any.
         min_contrast: ``stereo``: least standard deviation of 7×7 pixels, grey levels. 0: any.
     """
 
@@ -65,7 +66,7 @@ class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     min_depth: NonNegative = 0.4
     max_depth: Positive = 10.0
     max_slant: Annotated[float, msgspec.Meta(ge=0.0, le=90.0)] = 80.0
-    min_brightness: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.01
+    min_brightness: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.005
     min_contrast: NonNegative = 1.0
 
     def __post_init__(self) -> None:
@@ -96,9 +97,10 @@ class DepthMeter:
     Args:
         sensor: Settings.
         info: The camera, without distortion.
+        light: Factor on the lights of the scene in the images: the projector's is the same.
     """
 
-    def __init__(self, sensor: DepthSensor, info: CameraInfo) -> None:
+    def __init__(self, sensor: DepthSensor, info: CameraInfo, light: float = 1.0) -> None:
         self._sensor = sensor
         self._info = info
         self._reach = sensor.reach(info.fx)
@@ -107,7 +109,9 @@ class DepthMeter:
         rows = np.arange(info.height, dtype=np.float32)[:, None]
         self._v = ((rows - info.cy) / info.fy).astype(np.float32)
         self._ray = 1.0 + self._u**2 + self._v**2  # length of the ray at depth 1, squared
-        self._light = np.square(srgb_light()).astype(np.float32)[None]
+        levels = np.arange(256.0)
+        brightness = np.interp(levels / light, levels, srgb_light())
+        self._light = np.square(brightness).astype(np.float32)[None]
 
     def measure(
         self, depth: Depths, colour: npt.NDArray[np.uint8] | None, random: np.random.Generator

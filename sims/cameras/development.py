@@ -56,7 +56,7 @@ class Development:
         self._light = response_light(response)
         self._srgb = not response
         sensor = spec.depth_sensor
-        self._depth_meter = DepthMeter(sensor, camera_info(spec)) if sensor else None
+        self._depth_meter = DepthMeter(sensor, camera_info(spec), spec.light) if sensor else None
         self._vignette: Codes | None = None
         if any(spec.vignette):
             shares = np.sqrt(vignette_map(camera_info(spec), spec.vignette))

@@ -135,6 +135,10 @@ def test_dark_surfaces_are_lost_to_structured_light_and_plain_ones_to_stereo() -
     assert dark[:, 100:200].all()
     assert not dark[:, :100].any()
     assert not dark[:, 200:].any()
+    dim = (colour / 2).astype(np.uint8)  # the projector has a light of its own
+    meter = DepthMeter(DepthSensor(**settings), INFO, light=0.5)
+    found = np.isinf(meter.measure(wall(2.0), dim, generator(1, "c", 7)))
+    np.testing.assert_array_equal(found, dark)
     plain = np.isinf(measured(wall(2.0), colour, **settings | {"model": "stereo"}))
     assert plain[:, 110:190].all()
     assert not plain[:, 224:].any()
