@@ -7,6 +7,7 @@ set-points, or follows a trajectory file; each update gives one set of images.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,6 +37,9 @@ from sims.cameras import (
 from sims.shared_world import join_world
 from sims.simulator import Rate, Simulator, SimulatorConfig
 from sims.worlds import Dynamics, Scene
+
+Course = Callable[[int], tuple[Vector3, Quaternion]]
+"""Poses in ``map`` at times (ns)."""
 
 MOMENT = 1e-3
 """Seconds, half of them before the stamp, over which the camera's velocity is taken."""
@@ -102,6 +106,7 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
         self._of_pose, self._of_twist = slice(pose, pose + 7), slice(twist, twist + 6)
         await self.rig.start(self._world)
+        self._world.remember(self.rig.past)
 
     @classmethod
     def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
@@ -126,11 +131,11 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         if self._rows is not None and not self._follow(tick.stamp):
             self.stop("trajectory ended")
             return
-        self._position, self._orientation = self._drifted(
-            (tick.stamp - self._stamp) / 1e9, tick.stamp
-        )
+        if self._rows is None:
+            self._position, self._orientation = self._course(tick.stamp)(tick.stamp)
         self._stamp = tick.stamp
-        before, after = (self._pose_in(sign * MOMENT / 2, tick.stamp) for sign in (-1, 1))
+        course, half = self._course(tick.stamp), round(MOMENT / 2 * 1e9)
+        before, after = (course(tick.stamp + sign * half) for sign in (-1, 1))
         qvel = qvel_between(pose_to_qpos(*before), pose_to_qpos(*after), MOMENT)
         vx, vy, vz, wx, wy, wz = qvel.tolist()  # FLU, as MuJoCo has it: half a turn from FRD
         self.odometry.send(
@@ -147,28 +152,34 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         _, state, velocities = self._world.state_at(tick.stamp)
         state[self._of_pose] = pose_to_qpos(self._position, self._orientation)
         velocities[self._of_twist] = qvel
+
+        def past_state(stamp: int) -> npt.NDArray[np.float64]:
+            qpos = self._world.past_state(stamp)
+            qpos[self._of_pose] = pose_to_qpos(*course(stamp))
+            return qpos
+
         for camera in self.config.cameras:
-            self.rig.expose(camera.name, tick.stamp, state, velocities)
+            self.rig.expose(camera.name, tick.stamp, state, velocities, past_state)
 
-    def _pose_in(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
-        """Return the pose some seconds after `stamp`, or before it if negative."""
-        if self._rows is not None:
-            return pose_at(self._rows, stamp / 1e9 + seconds)
-        return self._drifted(seconds, stamp)
-
-    def _drifted(self, seconds: float, stamp: int) -> tuple[Vector3, Quaternion]:
-        """Return where the velocity that holds at `stamp`, if one does, takes the camera."""
-        order = self._velocity
+    def _course(self, stamp: int) -> Course:
+        """Return the way on which the camera is at `stamp`, as poses of times (ns) near it."""
+        rows = self._rows
+        if rows is not None:
+            return lambda time: pose_at(rows, time / 1e9)
+        order, position, orientation = self._velocity, self._position, self._orientation
         if order is None or stamp - order.stamp > self.config.setpoint_timeout * 1e9:
-            return self._position, self._orientation
-        velocity = order.velocity
+            return lambda _: (position, orientation)
+        velocity, since = order.velocity, self._stamp
         if order.frame_id == "heading":
-            velocity = rotate(from_yaw(yaw_of(self._orientation)), velocity)
-        x, y, z = self._position
-        vx, vy, vz = velocity
-        turn = from_yaw(order.yaw_rate * seconds)
-        place = (x + vx * seconds, y + vy * seconds, z + vz * seconds)
-        return place, normalize(multiply(turn, self._orientation))
+            velocity = rotate(from_yaw(yaw_of(orientation)), velocity)
+
+        def drifted(time: int) -> tuple[Vector3, Quaternion]:
+            (x, y, z), (vx, vy, vz), seconds = position, velocity, (time - since) / 1e9
+            place = (x + vx * seconds, y + vy * seconds, z + vz * seconds)
+            turn = from_yaw(order.yaw_rate * seconds)
+            return place, normalize(multiply(turn, orientation))
+
+        return drifted
 
     def _follow(self, stamp: int) -> bool:
         """Take the pose of this time from the trajectory; False when it is over."""

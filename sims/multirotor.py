@@ -31,7 +31,7 @@ from events import (
 from events.rotations import rotate_inverse
 from runtime import Output, Tick, every, on
 from sims.addressing import Addressee
-from sims.cameras import add_camera, check_cameras
+from sims.cameras import CameraSpec, add_camera, check_cameras
 from sims.sensors import SensorOutputs, SensorsConfig, SensorSuite, mount_imu
 from sims.shared_world import join_world
 from sims.simulator import Rate, Simulator
@@ -61,10 +61,9 @@ class MultirotorConfig(SensorsConfig):
         height: Height of the ground there, metres above the world's zero.
         yaw: Heading at the start, degrees clockwise from north.
         control_rate: Rate of the controller, Hz.
-        trigger: ``free``: each camera exposes at its own rate, at equal intervals. ``imu``: the
-            next IMU sample after that triggers the exposure, so that image, depth, pose and IMU
-            share their stamps; the intervals are equal only if the camera's rate divides the
-            IMU's.
+        trigger: ``free``: each camera exposes at its own rate. ``imu``: an IMU sample triggers the
+            exposure, so that image, depth, pose and IMU share their stamps; a camera whose rate
+            does not divide the IMU's is free as well. In any case the intervals are equal.
         gains: Gains of the controller.
         limits: Limits of the controller.
     """
@@ -80,12 +79,6 @@ class MultirotorConfig(SensorsConfig):
     def __post_init__(self) -> None:
         check_cameras(self.cameras)
         super().__post_init__()
-        for camera in self.cameras:
-            if self.trigger == "imu" and camera.rate > self.imu_rate:
-                raise ValueError(
-                    f"cameras: {camera.name}: rate: expected at most the {self.imu_rate:g} Hz of "
-                    f'the IMU that triggers it (or trigger = "free"), found {camera.rate:g} Hz'
-                )
 
 
 class Multirotor(Simulator[MultirotorConfig]):
@@ -139,14 +132,14 @@ class Multirotor(Simulator[MultirotorConfig]):
         self._odometry_stamp = -1
         self._triggered: list[str] = []
         await self.rig.start(self._world)
-        free = config.trigger == "free"
-        if free:  # an image without latency comes after the IMU sample of its stamp
-            self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
-        for camera in config.cameras:
-            call = self._expose if free else self._trigger
-            self.every(camera.rate, functools.partial(call, camera.name), camera.name)
-        if not free:
-            self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
+        self._world.remember(self.rig.past)
+        tied = [camera for camera in config.cameras if self._is_tied(camera)]
+        for camera in tied:
+            self.every(camera.rate, functools.partial(self._trigger, camera.name), camera.name)
+        self.every(config.imu_rate, self.sample_sensors, "sample_sensors")
+        for camera in config.cameras:  # an image without latency comes after the IMU's sample
+            if camera not in tied:
+                self.every(camera.rate, functools.partial(self._expose, camera.name), camera.name)
         await self._suite.start()
 
     async def run(self) -> None:
@@ -183,17 +176,21 @@ class Multirotor(Simulator[MultirotorConfig]):
         )
         yield from self._suite.announcements()
         yield from super().announce()
-        if self.config.trigger == "imu":
-            for camera in self.config.cameras:
-                periods = self.config.imu_rate / camera.rate
-                if not math.isclose(periods, round(periods)):
-                    self.log.warning(
-                        "%s: %g Hz does not divide the %g Hz of the IMU that triggers it: its "
-                        'exposures come at unequal intervals (trigger = "free": at equal ones)',
-                        camera.name,
-                        camera.rate,
-                        self.config.imu_rate,
-                    )
+        for camera in self.config.cameras:
+            if self.config.trigger == "imu" and not self._is_tied(camera):
+                self.log.warning(
+                    "%s: %g Hz does not divide the %g Hz of the IMU that is to trigger it: it "
+                    "exposes at its own rate, and shares no stamps with the IMU",
+                    camera.name,
+                    camera.rate,
+                    self.config.imu_rate,
+                )
+
+    def _is_tied(self, camera: CameraSpec) -> bool:
+        """Return whether samples of the IMU trigger a camera."""
+        periods = self.config.imu_rate / camera.rate
+        whole = round(periods) > 0 and math.isclose(periods, round(periods))
+        return self.config.trigger == "imu" and whole
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Note who sends orders, and refuse a path that cannot be flown."""
@@ -266,7 +263,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         self.imu.send(self._suite.imu.sample(stamp, state))
         self._send_odometry(stamp, state)
         for camera in self._triggered:
-            self.rig.expose(camera, stamp, qpos, qvel)
+            self.rig.expose(camera, stamp, qpos, qvel, self._world.past_state)
         self._triggered.clear()
 
     def _trigger(self, camera: str, _: Tick) -> None:
@@ -276,7 +273,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         stamp = self._advance(tick)
         state, qpos, qvel = self._physics.state_at(stamp)
         self._send_odometry(stamp, state)
-        self.rig.expose(camera, stamp, qpos, qvel)
+        self.rig.expose(camera, stamp, qpos, qvel, self._world.past_state)
 
     def _advance(self, tick: Tick) -> int:
         """Step the physics up to a tick, and return the stamp of the state then.

@@ -94,6 +94,19 @@ class SharedWorld:
         stamp_ns = max(stamp_ns, self.simulation.time_ns)
         return stamp_ns, *self.simulation.state_at(stamp_ns)
 
+    def remember(self, seconds: float) -> None:
+        """Keep the states of the last `seconds` for `past_state`, if any are wanted."""
+        if seconds and self.simulation is not None:
+            # In real time, they may be asked for later.
+            self.simulation.history.keep(seconds + 1.0)
+
+    def past_state(self, stamp_ns: int) -> Floats:
+        """Return the generalised positions at a time that has come, shape (nq,)."""
+        if self.simulation is None:
+            return self.state_at(stamp_ns)[1]
+        self.simulation.advance_to(stamp_ns)
+        return self.simulation.history.at(stamp_ns)[0].copy()
+
     def _build(self) -> None:
         spec, dynamics = load_scene(self.name, bare=self._bare)
         vehicles = False

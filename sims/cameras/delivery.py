@@ -1,4 +1,4 @@
-"""Delay and loss of images: a function of seed, camera and stamp."""
+"""Delay, loss and stamps of images: a function of seed, camera and time of exposure."""
 
 from __future__ import annotations
 
@@ -19,3 +19,16 @@ def delay_of(spec: CameraSpec, seed: int, stamp_ns: int) -> float | None:
     if random.random() < spec.loss:
         return None
     return float(spec.latency) + float(spec.jitter) * random.random()
+
+
+def stamp_error(spec: CameraSpec, seed: int, stamp_ns: int) -> int:
+    """Return the nanoseconds by which the stamps of an exposure are late.
+
+    Args:
+        spec: The camera.
+        seed: Seed of the rig.
+        stamp_ns: True time of the exposure.
+    """
+    random = generator(seed, f"{spec.name}/stamp", stamp_ns)
+    error = float(spec.time_jitter) * random.uniform(-1.0, 1.0) if spec.time_jitter else 0.0
+    return round((float(spec.time_offset) + error) * 1e9)

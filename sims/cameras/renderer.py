@@ -18,15 +18,17 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Quaternion, Vector3
+from events.poses import pose_matrix
 from sims.cameras.development import Development
 from sims.cameras.frame import Frame
 from sims.cameras.lens import undistorted
 from sims.cameras.noise import generator, grey_of
 from sims.cameras.optics import moments
 from sims.cameras.shot import Shot
-from sims.cameras.spec import CameraSpec, camera_info, is_plain
-from sims.cameras.stage import NEAR, RANGE, Changing, Colours, Depths, Floats, Stage
-from sims.cameras.view import Drawn, View, looked_up
+from sims.cameras.shutter import image_speeds, row_bands, row_time, small_camera
+from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain
+from sims.cameras.stage import Changing, Colours, Depths, Floats, Stage
+from sims.cameras.view import Drawn, View, looked_up, stacked
 
 
 def model_to_bytes(model: Any) -> bytes:
@@ -45,6 +47,9 @@ def model_from_bytes(data: bytes) -> Any:
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": data})
 
 
+Pose = tuple[Vector3, Quaternion]
+
+
 class Captured(NamedTuple):
     """What falls on a camera's sensor in one exposure, before its own errors.
 
@@ -53,13 +58,14 @@ class Captured(NamedTuple):
             in order; empty if no colour is wanted.
         depth: float32 metres, shape (height, width), if wanted.
         numbers: int32 object numbers, shape (height, width), if wanted.
-        pose: The optical frame's position and orientation in ``map`` at the stamp.
+        poses: The optical frame's position and orientation in ``map`` at the stamp; of a rolling
+            shutter at the first, the middle and the last row.
     """
 
     colours: list[Colours]
     depth: Depths | None
     numbers: npt.NDArray[np.int32] | None
-    pose: tuple[Vector3, Quaternion]
+    poses: tuple[Pose, ...]
 
 
 class CameraRenderer:
@@ -69,7 +75,7 @@ class CameraRenderer:
 
     Args:
         model_bytes: From `model_to_bytes`; has a camera `<prefix><name>` for each spec.
-        cameras: Settings of the cameras.
+        cameras: Settings of the cameras; a stereo rig is two.
         prefix: Prefix of the cameras' names in the model.
         seed: Seed of the noise.
         threads: Threads of the software renderer, if this is the process's first GL context.
@@ -89,11 +95,17 @@ class CameraRenderer:
         threads: int = 1,
         dynamics: Changing | None = None,
     ) -> None:
+        cameras = tuple(eye for spec in cameras for eye in eyes(spec))
         model = model_from_bytes(model_bytes)
         self._model = model
         self._seed = seed
         self._cameras = {spec.name: (spec, _number(model, prefix + spec.name)) for spec in cameras}
         self._developments = {spec.name: Development(spec) for spec in cameras}
+        self._small = {
+            spec.name: View(small_camera(camera_info(spec)))
+            for spec in cameras
+            if spec.readout or spec.longest_exposure
+        }
         self._undistorted = {
             spec.name: undistorted(camera_info(spec)) for spec in cameras if spec.undistorted
         }
@@ -145,29 +157,47 @@ class CameraRenderer:
         self._stage.close()
 
     def _capture(self, shot: Shot, spec: CameraSpec, number: int) -> Captured:
-        """Draw what falls on the sensor, at each of the moments that make up the exposure."""
+        """Draw what falls on the sensor, in each band of rows that is exposed at a time of its own.
+
+        Colours are drawn at each of the moments that make up the exposure, all else in its middle.
+        """
         kinds, stage, view = set(spec.images), self._stage, self._views[spec.name]
         coloured = not kinds.isdisjoint({"rgb", "grey"})
-        blurred = coloured and shot.exposure > 0.0 and shot.moves()
+        exposure = shot.exposure if coloured and shot.moves() else 0.0
         coloured |= spec.depth_sensor is not None and spec.depth_sensor.needs_colours
-        self._look(shot, spec, number, 0.0)
-        pose = stage.pose(number)
-        middle, depth, numbers = view.draw(
-            stage, coloured, "depth" in kinds or blurred, "segmentation" in kinds
+        readout = float(spec.readout) if shot.moves() else 0.0
+        bands: list[tuple[int, int]] = [(0, spec.height)]
+        times = [0.0]
+        if exposure + readout > 0.0:
+            speeds = self._speeds(shot, spec, number, exposure + readout)
+            bands = row_bands(spec.height, float(speeds.max()) * readout)
+            times = moments(exposure, float(np.quantile(speeds, 0.9)) * exposure)
+        poses = [
+            self._pose(shot, number, moment)
+            for moment in ((-0.5 * readout, 0.0, 0.5 * readout) if spec.readout else ())
+        ]
+        drawn: list[list[Drawn]] = [[] for _ in times]
+        for rows in bands:
+            middle = row_time(readout, (rows[0] + rows[1] - 1) / 2.0, spec.height)
+            for pieces, moment in zip(drawn, times, strict=True):
+                self._look(shot, spec, number, middle + moment)
+                alone = moment == 0.0
+                if not spec.readout and alone:
+                    poses.append(stage.pose(number))
+                pieces.append(
+                    view.draw(
+                        stage,
+                        coloured,
+                        alone and "depth" in kinds,
+                        alone and "segmentation" in kinds,
+                        rows if len(bands) > 1 else None,
+                    )
+                )
+        whole = [stacked(pieces) for pieces in drawn]
+        _, depth, numbers = whole[len(whole) // 2]
+        return Captured(
+            [w.colours for w in whole if w.colours is not None], depth, numbers, tuple(poses)
         )
-        colours = [] if middle is None else [middle]
-        if blurred and middle is not None and depth is not None:
-            shift = self._shift(shot, spec, number, depth)
-            colours = []
-            for moment in moments(shot.exposure, shift):
-                if moment == 0.0:
-                    colours.append(middle)
-                    continue
-                self._look(shot, spec, number, moment)
-                image = view.draw(stage, True, False, False).colours
-                assert image is not None
-                colours.append(image)
-        return Captured(colours, depth if "depth" in kinds else None, numbers, pose)
 
     def _develop(self, shot: Shot, spec: CameraSpec, captured: Captured) -> Frame:
         """Make of what was drawn the images that the sensor gives."""
@@ -185,11 +215,13 @@ class CameraRenderer:
         depth = captured.depth
         if depth is not None:
             depth = development.measure(depth, captured.colours, random)
-        position, orientation = captured.pose
+        poses = captured.poses
+        position, orientation = poses[len(poses) // 2]
         frame = Frame(
             stamp=shot.stamp,
             position=position,
             orientation=orientation,
+            ends=(poses[0], poses[-1]) if spec.readout else None,
             exposure=exposure,
             gain=gain,
             light=light,
@@ -214,17 +246,21 @@ class CameraRenderer:
         state = shot.state(self._model, seconds)
         self._stage.look(number, state, shot.stamp * 1e-9 + seconds, spec.light)
 
-    def _shift(self, shot: Shot, spec: CameraSpec, number: int, depth: Depths) -> float:
-        """Return the approximate motion of the image while the shutter is open, pixels."""
-        poses = []
-        half = 0.5 * shot.exposure
-        for moment in (-half, half):
-            self._look(shot, spec, number, moment)
-            poses.append(self._stage.pose(number))
-        (here, turn), (there, other) = poses
-        angle = 2.0 * math.acos(min(abs(sum(a * b for a, b in zip(turn, other, strict=True))), 1.0))
-        nearest = float(np.quantile(np.minimum(depth[::8, ::8], RANGE), 0.05))
-        return camera_info(spec).fx * (angle + math.dist(here, there) / max(nearest, NEAR))
+    def _pose(self, shot: Shot, number: int, seconds: float) -> Pose:
+        """Return where a camera is some seconds after an exposure's stamp."""
+        self._stage.move(shot.state(self._model, seconds))
+        return self._stage.pose(number)
+
+    def _speeds(self, shot: Shot, spec: CameraSpec, number: int, seconds: float) -> Floats:
+        """Return the speeds of what a camera sees while it is exposed, pixels per second."""
+        small = self._small[spec.name]
+        # At least every 2 ms, or a vibration would be missed.
+        times = np.linspace(-0.5, 0.5, 2 * math.ceil(seconds / 0.004) + 1) * seconds
+        poses = [pose_matrix(*self._pose(shot, number, moment)) for moment in times.tolist()]
+        self._look(shot, spec, number, 0.0)
+        depth = small.draw(self._stage, False, True, False).depth
+        assert depth is not None
+        return image_speeds(camera_info(spec), small.info, depth, poses, seconds)
 
 
 def _number(model: Any, name: str) -> int:

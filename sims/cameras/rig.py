@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
@@ -22,15 +22,19 @@ from events import (
     SegmentationImage,
     TransformStamped,
 )
+from events.base import Quaternion, Vector3
 from runtime import Node, Worker
 from runtime.sender import Sender
-from sims.cameras.delivery import delay_of
+from sims.cameras.delivery import delay_of, stamp_error
 from sims.cameras.exposure import ExposureControl
 from sims.cameras.frame import Frame
 from sims.cameras.lens import undistorted
 from sims.cameras.renderer import CameraRenderer
-from sims.cameras.shot import Shot
-from sims.cameras.spec import CameraSpec, announcement, optical_frame, optical_in_body
+from sims.cameras.shot import Motion, Shot
+from sims.cameras.spec import CameraSpec, announcement, eyes, optical_frame, optical_in_body
+
+STEP = 1_000_000
+"""Nanoseconds between the states that are known of an exposure."""
 
 UNDISTORTED = "/undistorted"
 """Ends the source of a camera's images without distortion."""
@@ -59,18 +63,27 @@ class DrawnWorld(Protocol):
         """The compiled world, from `model_to_bytes`."""
 
 
+States = Callable[[int], npt.NDArray[np.float64]]
+"""Gives the world's true generalised positions, shape (nq,), at a time (ns)."""
+
+
 class _Exposure(NamedTuple):
     spec: CameraSpec
-    shot: Shot
+    shots: tuple[Shot, ...]
+    """Of each of its eyes."""
     due: int
     """Time of delivery (ns), unless that of the exposure before is later."""
+    states: States | None
+    """Gives the states while the shutter is open, when they have come about."""
 
 
 class CameraRig:
     """All cameras of one body.
 
-    Every image has the stamp of its exposure, and is sent `latency` seconds, and up to `jitter`
-    more, after it. Just before, the pose of the camera is sent, with the same stamp and source. A
+    Every image has the stamp of its exposure (with the error of the camera's clock), and is sent
+    `latency` seconds, and up to `jitter` more, after it. Just before, the pose of the camera is
+    sent, with the same stamp and source; of a rolling shutter also those of the first and the last
+    row, with their stamps. The images of a stereo rig's cameras are sent together. A
     camera with both ``rgb`` and ``grey`` sends the grey images as ``<source>/grey``; one with
     ``undistorted`` sends all a second time, as ``<source>/undistorted``.
 
@@ -137,24 +150,35 @@ class CameraRig:
         """Return the announcements of the cameras."""
         name = self._node.name
         for spec in self._specs.values():
-            said = announcement(
-                spec,
-                source=f"{name}/{spec.name}",
-                prefix=f"{name}/",
-                parent_frame_id=parent_frame_id,
-                stamp=self._node.clock.now(),
-            )
-            yield said
-            if spec.undistorted:
-                source, (pinhole, _, _) = said.source, undistorted(said.info)
-                yield msgspec.structs.replace(
-                    said, source=source + UNDISTORTED, undistorted=source, info=pinhole
+            left, *others = eyes(spec)
+            for eye in (left, *others):
+                said = announcement(
+                    eye,
+                    source=f"{name}/{eye.name}",
+                    prefix=f"{name}/",
+                    parent_frame_id=parent_frame_id,
+                    stamp=self._node.clock.now(),
                 )
+                if spec.stereo and eye is not left:
+                    said = msgspec.structs.replace(
+                        said, baseline=spec.stereo.baseline, stereo=f"{name}/{left.name}"
+                    )
+                yield said
+                if spec.undistorted:
+                    source, (pinhole, _, _) = said.source, undistorted(said.info)
+                    stereo = said.stereo and said.stereo + UNDISTORTED
+                    yield msgspec.structs.replace(
+                        said,
+                        source=source + UNDISTORTED,
+                        undistorted=source,
+                        stereo=stereo,
+                        info=pinhole,
+                    )
 
     def transforms(self, parent_frame_id: str) -> Iterable[TransformStamped]:
         """Return the pose of each camera's optical frame in the body's, constant for the run."""
         name = self._node.name
-        for spec in self._specs.values():
+        for spec in (eye for entry in self._specs.values() for eye in eyes(entry)):
             position, orientation = optical_in_body(spec)
             yield TransformStamped(
                 stamp=self._node.clock.now(),
@@ -166,12 +190,21 @@ class CameraRig:
                 static=True,
             )
 
+    @property
+    def past(self) -> float:
+        """Seconds for which a vehicle has to remember its states, for `expose` to ask for them."""
+        return max(
+            (2.0 * spec.half + spec.offset for spec in self._specs.values() if _spans(spec)),
+            default=0.0,
+        )
+
     def expose(
         self,
         camera: str,
         stamp: int,
         qpos: npt.NDArray[np.float64],
         qvel: npt.NDArray[np.float64] | None = None,
+        states: States | None = None,
     ) -> None:
         """Expose a camera at a state; its events are sent when they are due.
 
@@ -180,13 +213,17 @@ class CameraRig:
             stamp: Time of the state (ns).
             qpos: The state, shape (nq,); not copied.
             qvel: Its velocity, shape (nv,), for motion blur; not copied. None: at rest.
+            states: Gives the state at other times, for a rolling shutter or a second eye that is
+                exposed later: it is asked as soon as all rows have been exposed.
         """
         spec = self._specs[camera]
         exposure, gain = float(spec.exposure), spec.gain
         if camera in self._controls:
-            opens = stamp - round(spec.longest_exposure / 2.0 * 1e9)
+            opens = stamp - round((spec.longest_exposure + spec.readout) / 2.0 * 1e9)
             exposure, gain = self._controls[camera].next(opens)
-        shot = Shot(camera, stamp, qpos, qvel, exposure=exposure, gain=gain)
+        shots = tuple(
+            Shot(eye.name, stamp, qpos, qvel, exposure=exposure, gain=gain) for eye in eyes(spec)
+        )
         delay = delay_of(spec, self._seed, stamp)
         if delay is None:
             self.lost[camera] += 1
@@ -201,7 +238,8 @@ class CameraRig:
         before = self._last.get(camera)
         self._last[camera] = done
         due = stamp + round(delay * 1e9)
-        self._node.start(self._deliver(_Exposure(spec, shot, due), before, done))
+        asked = states if _spans(spec) else None
+        self._node.start(self._deliver(_Exposure(spec, shots, due, asked), before, done))
 
     def log_missing(self) -> None:
         """Log how many exposures were not delivered, and why."""
@@ -221,35 +259,50 @@ class CameraRig:
         done: asyncio.Future[None],
     ) -> None:
         assert self._renderer is not None
-        spec, shot, due = exposure
-        wait = max(due - self._node.clock.now(), 0) / 1e9
+        spec, shots, due, states = exposure
         try:
-            (frame,) = await self._renderer.call_for(wait, CameraRenderer.expose, (shot,))
+            if states is not None:
+                await self._node.clock.sleep_until(shots[0].stamp + _ns(spec.half + spec.offset))
+                shots = _in_motion(spec, shots, states)
+            wait = max(due - self._node.clock.now(), 0) / 1e9
+            frames = await self._renderer.call_for(wait, CameraRenderer.expose, shots)
             # Of two processes, or of two delays, the later may be through first: keep the order.
             if before is not None and not before.done():
                 await asyncio.wait([before])
-            self._send(spec, frame)
+            if (light := frames[0].light) is not None:
+                now, (frame, *_) = self._node.clock.now(), frames
+                self._controls[spec.name].delivered(now, frame.exposure, frame.gain, light)
+            late = stamp_error(spec, self._seed, shots[0].stamp)
+            for eye, frame in zip(eyes(spec), frames, strict=True):
+                self._send(eye, frame, frame.stamp + late)
         finally:
             self._in_flight[spec.name] -= 1
             done.set_result(None)
 
-    def _send(self, spec: CameraSpec, frame: Frame) -> None:
+    def _send(self, spec: CameraSpec, frame: Frame, stamp: int) -> None:
         source = f"{self._node.name}/{spec.name}"
         frame_id = optical_frame(spec, f"{self._node.name}/")
-        if frame.light is not None:
-            now = self._node.clock.now()
-            self._controls[spec.name].delivered(now, frame.exposure, frame.gain, frame.light)
-        self._send_images(source, frame_id, frame)
+        poses = [(stamp, (frame.position, frame.orientation))]
+        if frame.ends is not None:
+            half, (first, last) = _ns(spec.readout / 2.0), frame.ends
+            poses = [(stamp - half, first), *poses, (stamp + half, last)]
+        self._send_images(source, frame_id, stamp, frame, poses)
         if frame.undistorted is not None:
-            self._send_images(source + UNDISTORTED, frame_id, frame.undistorted)
+            self._send_images(source + UNDISTORTED, frame_id, stamp, frame.undistorted, poses)
 
-    def _send_images(self, source: str, frame_id: str, frame: Frame) -> None:
-        out, stamp = self._outputs, frame.stamp
-        out.camera_poses.send(
-            PoseStamped(
-                stamp=stamp, source=source, position=frame.position, orientation=frame.orientation
+    def _send_images(
+        self,
+        source: str,
+        frame_id: str,
+        stamp: int,
+        frame: Frame,
+        poses: list[tuple[int, tuple[Vector3, Quaternion]]],
+    ) -> None:
+        out = self._outputs
+        for when, (position, orientation) in poses:
+            out.camera_poses.send(
+                PoseStamped(stamp=when, source=source, position=position, orientation=orientation)
             )
-        )
         if frame.depth is not None:
             out.depth_images.send(
                 DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=frame.depth)
@@ -275,3 +328,27 @@ class CameraRig:
                     data=data,
                 )
             )
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+def _spans(spec: CameraSpec) -> bool:
+    """Return whether an entry's rows and eyes are exposed at several times."""
+    return bool(spec.readout or spec.offset)
+
+
+def _in_motion(spec: CameraSpec, shots: tuple[Shot, ...], states: States) -> tuple[Shot, ...]:
+    """Return the shots of an entry's eyes, each at its time, with the true states meanwhile."""
+    begin = shots[0].stamp - _ns(spec.half)
+    end = shots[0].stamp + _ns(spec.half + spec.offset)
+    times = [begin, *range(begin - begin % STEP + STEP, end, STEP), end]
+    known = np.array([states(time) for time in times])
+    moved = []
+    for shot, late in zip(shots, (0, _ns(spec.offset)), strict=False):
+        stamp = shot.stamp + late
+        motion = Motion((np.array(times) - stamp) * 1e-9, known)
+        qpos = states(stamp) if late else shot.qpos
+        moved.append(shot._replace(stamp=stamp, qpos=qpos, motion=motion))
+    return tuple(moved)

@@ -18,7 +18,7 @@ import events
 from events.base import Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation
 from events.photometry import response_light
-from events.rotations import from_rpy, multiply
+from events.rotations import from_rpy, multiply, rotate
 from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
@@ -30,6 +30,18 @@ from sims.cameras.response import noise_at, read_response
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=8192)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+
+
+class Stereo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A second camera beside the first, with one trigger for both.
+
+    Attributes:
+        baseline: Distance of the right camera from the left one along the image's rows, metres.
+        offset: Time by which the right camera is exposed later; its stamps say so.
+    """
+
+    baseline: Annotated[float, msgspec.Meta(gt=0.0)]
+    offset: Latency = Latency(0)
 
 
 class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -55,6 +67,8 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             stay as they are.
         exposure: Seconds that the shutter is open, half of them before the stamp: motion blurs
             the image. Depth, segmentation and pose are those of the stamp.
+        readout: Time from the first row's exposure to the last one's (rolling shutter); the stamp
+            is that of the middle row. Depth and segmentation are read out alike.
         gain: Factor on the light of an image, as of a sensor's amplifier; it makes the shot noise
             stronger, too.
         reference_exposure: Exposure time at which an image of gain 1 is as bright as the scene is
@@ -79,6 +93,11 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         latency: Time from exposure to delivery.
         jitter: Greatest random delay in addition; the order of images is kept.
         loss: Share of exposures that are not delivered, chosen at random.
+        time_offset: Time by which the stamps are late on the clock of the IMU and the ground truth:
+            all that a camera sends of an exposure carries the same shifted stamp.
+        time_jitter: Greatest random error of the stamps besides, either way.
+        stereo: Makes two cameras of this one, ``<name>_left`` and, a baseline to its right,
+            ``<name>_right``; none by default.
         render_time: Least real time that a frame takes to draw, to test how a run copes with a
             scene that is too heavy for the machine.
     """
@@ -96,6 +115,7 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     orientation: Vector3 = (0.0, 0.0, 0.0)
     light: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
     exposure: Latency = Latency(0)  # immutable
+    readout: Latency = Latency(0)
     gain: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
     reference_exposure: Latency = Latency(0)
     auto_exposure: AutoExposure | None = None
@@ -109,6 +129,9 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     latency: Latency = Latency(0.04)
     jitter: Changeable[Latency] = Latency(0)
     loss: Changeable[Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]] = 0.0
+    time_offset: Latency = Latency(0)
+    time_jitter: Latency = Latency(0)
+    stereo: Stereo | None = None
     render_time: Latency = Latency(0)
 
     def __post_init__(self) -> None:
@@ -152,23 +175,65 @@ class CameraSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         """Longest time for which the shutter is open, seconds."""
         return self.auto_exposure.max_exposure if self.auto_exposure else self.exposure
 
+    @property
+    def half(self) -> float:
+        """Seconds from the first row's opening to the stamp, and on to the last one's closing."""
+        return 0.5 * (self.readout + self.longest_exposure)
+
+    @property
+    def offset(self) -> float:
+        """Seconds by which the last of its exposures is later than the first."""
+        return float(self.stereo.offset) if self.stereo else 0.0
+
+
+def eyes(spec: CameraSpec) -> tuple[CameraSpec, ...]:
+    """Return the cameras that an entry describes: itself, or the left and the right one."""
+    if spec.stereo is None:
+        return (spec,)
+    left = msgspec.structs.replace(spec, name=f"{spec.name}_left", stereo=None)
+    place, turn = optical_in_body(spec)
+    x, y, z = rotate(turn, (spec.stereo.baseline, 0.0, 0.0))
+    there = (place[0] + x, place[1] + y, place[2] + z)
+    return left, msgspec.structs.replace(left, name=f"{spec.name}_right", position=there)
+
 
 def check_cameras(specs: Iterable[CameraSpec]) -> None:
     """Check what can be known of a body's cameras before there is a world.
 
     Raises:
-        ValueError: Two have one name, or a shutter would still be open at the next exposure.
+        ValueError: Two have one name, a shutter would still be open at the next exposure or at the
+            time of delivery, or the order of stamps could be lost.
     """
     names: set[str] = set()
     for spec in specs:
-        where = f"cameras: {spec.name}"
-        if spec.name in names:
-            raise ValueError(f"{where}: expected a name of its own, found two cameras called so")
-        names.add(spec.name)
-        if spec.longest_exposure > 1.0 / spec.rate:
+        where, period = f"cameras: {spec.name}", 1.0 / spec.rate
+        for eye in eyes(spec):
+            if eye.name in names:
+                raise ValueError(
+                    f"{where}: expected a name of its own, found two cameras called {eye.name}"
+                )
+            names.add(eye.name)
+        complete = spec.half + spec.offset
+        for setting, found, most, what in (
+            ("exposure", spec.longest_exposure, period, "between two exposures"),
+            ("readout", spec.readout, period, "between two exposures"),
+            ("stereo.offset", spec.offset, period, "between two exposures"),
+            ("time_jitter", spec.time_jitter, period / 2.0, "of half the time between two stamps"),
+        ):
+            if found > most:
+                raise ValueError(
+                    f"{where}: {setting}: expected at most the {1e3 * most:.4g} ms {what}, "
+                    f"found {1e3 * found:.4g} ms"
+                )
+        if spec.latency < complete:
             raise ValueError(
-                f"{where}: exposure: expected at most the {1e3 / spec.rate:.4g} ms between two "
-                f"exposures, found {1e3 * spec.longest_exposure:.4g} ms"
+                f"{where}: latency: expected at least the {1e3 * complete:.4g} ms until its last "
+                f"row has been exposed, found {1e3 * spec.latency:.4g} ms"
+            )
+        if spec.undistorted and spec.readout:
+            raise ValueError(
+                f"{where}: undistorted: expected a global shutter, since rows without distortion "
+                f"are not those that are read out, found a readout of {1e3 * spec.readout:.4g} ms"
             )
 
 
@@ -227,6 +292,9 @@ def announcement(
         rate=spec.rate,
         latency=float(spec.latency),
         exposure=float(spec.longest_exposure),
+        readout=float(spec.readout),
+        time_offset=float(spec.time_offset),
+        time_jitter=float(spec.time_jitter),
         noise=noise_at(response_light(response), 128, spec.noise, electrons),
         full_well=spec.full_well,
         reference_exposure=float(spec.reference_exposure),
@@ -265,8 +333,8 @@ def vertical_fov(spec: CameraSpec) -> float:
     return math.degrees(2.0 * math.atan(half))
 
 
-def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: str) -> str:
-    """Mount a camera on a body of the world.
+def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: str) -> None:
+    """Mount a camera, or both of a stereo rig, on a body of the world.
 
     Args:
         world: The world, which is changed.
@@ -275,26 +343,25 @@ def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: s
         spec: The camera.
         prefix: Goes before the camera's name: ``drone/``.
 
-    Returns:
-        The camera's name in the model.
-
     Raises:
         ValueError: The world has no such body, or has a camera of that name already.
     """
-    name = f"{prefix}{spec.name}"
     body = world.body(body_name)
-    if body is None:
-        known = ", ".join(other.name for other in world.bodies)
-        raise ValueError(f"camera {name}: expected a body of the world ({known}), got {body_name}")
-    if world.camera(name) is not None:
-        raise ValueError(f"camera {name}: expected a name of its own, but the world has one so")
-    position, orientation = optical_in_body(spec)
-    # MuJoCo's camera looks along -z with y up: the half turn about x on both sides of the
-    # rotation takes optical-in-FRD to camera-in-FLU.
-    body.add_camera(
-        name=name,
-        pos=flip_yz(position),
-        quat=flip_yz_rotation(orientation),
-        fovy=vertical_fov(spec),
-    )
-    return name
+    for eye in eyes(spec):
+        name = f"{prefix}{eye.name}"
+        if body is None:
+            known = ", ".join(other.name for other in world.bodies)
+            raise ValueError(
+                f"camera {name}: expected a body of the world ({known}), got {body_name}"
+            )
+        if world.camera(name) is not None:
+            raise ValueError(f"camera {name}: expected a name of its own, but the world has one so")
+        position, orientation = optical_in_body(eye)
+        # MuJoCo's camera looks along -z with y up: the half turn about x on both sides of the
+        # rotation takes optical-in-FRD to camera-in-FLU.
+        body.add_camera(
+            name=name,
+            pos=flip_yz(position),
+            quat=flip_yz_rotation(orientation),
+            fovy=vertical_fov(eye),
+        )

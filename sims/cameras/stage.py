@@ -172,6 +172,12 @@ class Stage:
         index = wide[..., 0] | wide[..., 1] << 8 | wide[..., 2] << 16
         return np.asarray(self._numbers_in_scene()[index], dtype=np.int32)
 
+    def move(self, qpos: Floats) -> None:
+        """Have `pose` tell of another state, at less cost than `look`; then look before drawing."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self._data)
+        mujoco.mj_camlight(self.model, self._data)
+
     def pose(self, camera_id: int) -> tuple[Vector3, Quaternion]:
         """Return a camera's optical pose in ``map``, at the state last looked at."""
         quat = np.empty(4)

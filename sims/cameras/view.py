@@ -87,6 +87,14 @@ class View:
         return seen
 
 
+def stacked(pieces: list[Drawn]) -> Drawn:
+    """Return bands of rows, from the top, as one image."""
+    if len(pieces) == 1:
+        return pieces[0]
+    colours, depth, numbers = zip(*pieces, strict=True)
+    return Drawn(*(None if p[0] is None else np.concatenate(p) for p in (colours, depth, numbers)))
+
+
 def looked_up(drawn: Drawn, columns: Maps, rows: Maps) -> Drawn:
     """Return images whose pixels lie at other places of the ones given.
 

@@ -97,7 +97,7 @@ def rgb(frame: Frame) -> npt.NDArray[np.uint8]:
 
 @pytest.mark.parametrize(
     ("velocity", "yaw_rate", "pixels"),
-    [((0.0, 10.0, 0.0), 0.0, 4.8), ((0.0, 0.0, 0.0), 4.0, 3.84), ((0.0, 0.1, 0.0), 0.0, 0.05)],
+    [((0.0, 10.0, 0.0), 0.0, 4.8), ((0.0, 0.0, 0.0), 4.0, 7.2), ((0.0, 0.1, 0.0), 0.0, 0.05)],
 )
 def test_an_open_shutter_sees_the_mean_of_the_motion(
     renderer: CameraRenderer,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,17 @@ from events import (
     DepthImage,
     Event,
     Image,
+    Imu,
+    Odometry,
     PoseStamped,
     PositionSetpoint,
     Takeoff,
     TransformStamped,
     VelocitySetpoint,
 )
+from events.poses import pose_matrix
 from runtime import Node, Output, on
+from runtime.errors import ConfigError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from runtime.units import Latency
 from sims.cameras import CameraSpec, optical_in_body
@@ -159,7 +164,7 @@ def smeared(result: NodeResult) -> dict[int, bool]:
 
 SHARP_AND_OPEN = [
     {"name": "sharp", "width": 64, "height": 48, "rate": 10},
-    {"name": "open", "width": 64, "height": 48, "rate": 10, "exposure": "90ms"},
+    {"name": "open", "width": 64, "height": 48, "rate": 10, "exposure": "90ms", "latency": "45ms"},
 ]
 
 
@@ -217,3 +222,165 @@ def test_mountings_are_said_once_at_the_start(free: NodeResult, vehicle: NodeRes
             assert transform.rotation == announced.orientation
     down = CameraSpec(name="down", orientation=(0.0, -90.0, 0.0))
     assert said[2].rotation == optical_in_body(down)[1]
+
+
+def sent(world: str, node: type[Node[Any]] = FreeCamera, **camera: Any) -> NodeResult:
+    """Run a node with a camera of 10 Hz that moves to the right and turns."""
+    entry = {"name": "c", "rate": 10, "images": ["rgb", "depth"]} | TINY | camera
+    config: dict[str, Any] = {"world": world, "cameras": [entry], "camera_processes": 1}
+    config["setpoint_timeout"] = "5s"
+    if node is FreeCamera:
+        config["rate"] = 10
+    move = VelocitySetpoint(
+        stamp=50 * MS, source="t", velocity=(0.0, 3.0, 0.0), frame_id="map", yaw_rate=0.5
+    )
+    return run_node(node, inputs=[move], config=config, duration=0.75, seed=3)
+
+
+def test_a_rolling_shutter_sends_the_poses_of_its_rows(world: str) -> None:
+    """Of the first, the middle and the last one, at their times, as the camera moves."""
+    result = sent(world, readout="20ms")
+    (said,) = result.of(CameraAnnouncement)
+    assert said.readout == 0.02
+    images = result.of(Image)
+    poses = [pose.stamp for pose in result.of(PoseStamped)]
+    assert poses == [image.stamp + off * MS for image in images for off in (-10, 0, 10)]
+    places = {pose.stamp: pose.position[1] for pose in result.of(PoseStamped)}
+    for image in images[3:]:
+        assert places[image.stamp + 10 * MS] - places[image.stamp] == pytest.approx(0.03, abs=2e-3)
+        assert places[image.stamp] - places[image.stamp - 10 * MS] == pytest.approx(0.03, abs=2e-3)
+
+
+def test_a_rolling_shutter_sees_the_true_states_of_a_vehicle(world: str) -> None:
+    """The poses of its rows are those that the ground truth has at these times."""
+    camera = {"name": "c", "rate": 20, "readout": "20ms", "latency": "10ms"} | TINY
+    config = {"world": world, "cameras": [camera], "camera_processes": 1, "imu_rate": 200}
+    orders = [
+        Takeoff(stamp=50 * MS, source="t", altitude=1.0),
+        VelocitySetpoint(
+            stamp=700 * MS, source="t", velocity=(0.0, 4.0, 0.0), frame_id="map", yaw_rate=2.0
+        ),
+    ]
+    result = run_node(Multirotor, inputs=orders, config=config, duration=1.6)
+    truth = {odometry.stamp: odometry for odometry in result.of(Odometry)}
+    (mount,) = result.of(TransformStamped)
+    compared = 0
+    for pose in result.of(PoseStamped):
+        if (state := truth.get(pose.stamp)) is None or not pose.stamp:
+            continue
+        expected = pose_matrix(state.position, state.orientation) @ pose_matrix(
+            mount.translation, mount.rotation
+        )
+        found = pose_matrix(pose.position, pose.orientation)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+        compared += 1
+    assert compared > 60
+    assert result.of(Image)[-1].stamp > 1500 * MS
+
+
+def test_the_eyes_of_a_stereo_rig_expose_together(world: str) -> None:
+    """From one state, and are sent together; the baseline between them is announced."""
+    result = sent(world, stereo={"baseline": 0.2}, readout="10ms", noise=2.0)
+    left, right = result.of(CameraAnnouncement)
+    assert (left.source, right.source) == ("node/c_left", "node/c_right")
+    assert (left.baseline, left.stereo) == (0.0, "")
+    assert (right.baseline, right.stereo) == (0.2, "node/c_left")
+    np.testing.assert_allclose(np.subtract(right.position, left.position), (0.0, 0.2, 0.0))
+    images = result.of(Image)
+    assert len(images) >= 12
+    for one, other in zip(images[::2], images[1::2], strict=True):
+        assert (one.source, other.source) == ("node/c_left", "node/c_right")
+        assert one.stamp == other.stamp
+        assert not np.array_equal(one.data, other.data)
+    poses = result.of(PoseStamped)
+    by_eye = [[p for p in poses if p.source == each.source] for each in (left, right)]
+    for one_pose, other_pose in zip(*by_eye, strict=True):
+        assert math.dist(one_pose.position, other_pose.position) == pytest.approx(0.2)
+        assert one_pose.stamp == other_pose.stamp
+
+
+def test_the_right_eye_may_be_triggered_later(world: str) -> None:
+    """Its stamps say so, and it sees what is true then; both still come together."""
+    result = sent(world, stereo={"baseline": 0.2, "offset": "5ms"})
+    images = result.of(Image)
+    for one, other in zip(images[::2], images[1::2], strict=True):
+        assert other.stamp - one.stamp == 5 * MS
+    places = {(p.source[-4:], p.stamp): p.position for p in result.of(PoseStamped)}
+    for image in images[6::2]:
+        here, there = places["left", image.stamp], places["ight", image.stamp + 5 * MS]
+        # The right eye is 0.2 m to the right, and has moved on for 5 ms at 3 m/s and 0.1 m/s.
+        assert math.dist(here, there) == pytest.approx(0.215, abs=2e-3)
+
+
+def test_stamps_are_late_as_the_clock_of_the_camera_is(world: str) -> None:
+    """All that is sent of an exposure has the same stamp; it comes when it would anyway."""
+    true = sent(world)
+    late = sent(world, time_offset="7ms", time_jitter="2ms")
+    (said,) = late.of(CameraAnnouncement)
+    assert (said.time_offset, said.time_jitter) == (0.007, 0.002)
+    for kind in (Image, DepthImage, PoseStamped):
+        errors = [
+            (one.stamp - other.stamp) / MS
+            for one, other in zip(late.of(kind), true.of(kind), strict=True)
+        ]
+        assert 5.0 <= min(errors) < 6.9
+        assert 7.1 < max(errors) <= 9.0
+        assert [e.stamp for e in late.of(kind)] == [e.stamp for e in late.of(Image)]
+    assert [o.stamp for o in late.of(Odometry)] == [o.stamp for o in true.of(Odometry)]
+    for one, other in zip(late.of(Image), true.of(Image), strict=True):
+        np.testing.assert_array_equal(one.data, other.data)
+    assert [e.stamp for e in sent(world, time_offset="7ms", time_jitter="2ms").of(Image)] == [
+        e.stamp for e in late.of(Image)
+    ]
+
+
+def test_images_without_distortion_come_beside_the_others(world: str) -> None:
+    """With the same stamps and a pinhole's announcement."""
+    lens = {"model": "plumb_bob", "coefficients": [-0.2, 0.05, 0.0, 0.0]}
+    result = sent(world, lens=lens, undistorted=True)
+    own, twin = result.of(CameraAnnouncement)
+    assert (twin.source, twin.undistorted) == ("node/c/undistorted", "node/c")
+    assert not own.info.is_pinhole
+    assert twin.info.is_pinhole
+    for kind in (Image, DepthImage, PoseStamped):
+        stamps = [
+            [e.stamp for e in result.of(kind) if e.source == each.source] for each in (own, twin)
+        ]
+        assert stamps[0] == stamps[1]
+        assert len(stamps[0]) >= 6
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"readout": "20ms", "latency": "5ms"}, "latency: expected at least the 10 ms"),
+        ({"readout": "200ms", "latency": "1s"}, "readout: expected at most the 33.33 ms"),
+        ({"exposure": "10ms", "latency": "0ms"}, "latency: expected at least the 5 ms"),
+        ({"time_jitter": "20ms"}, "time_jitter: expected at most the 16.67 ms"),
+        ({"stereo": {"baseline": 0.1, "offset": "50ms"}}, "stereo.offset: expected at most"),
+        ({"undistorted": True}, "undistorted: expected a lens that distorts"),
+    ],
+)
+def test_what_cannot_be_is_refused(settings: dict[str, Any], message: str) -> None:
+    """With the camera's name, what was expected and what was found."""
+    with pytest.raises(ConfigError, match=message):
+        run_node(FreeCamera, config={"cameras": [{"name": "c"} | settings]}, duration=0.1)
+
+
+def test_a_camera_that_does_not_divide_the_imu_exposes_at_its_own_rate(
+    world: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also one that is quicker; at equal intervals, and no stamp twice; the others are tied."""
+    cameras: list[dict[str, Any]] = [
+        {"name": f"at_{rate}", "rate": rate} | TINY for rate in (50, 70, 250)
+    ]
+    config = {"world": world, "cameras": cameras, "camera_processes": 1, "trigger": "imu"}
+    result = run_node(Multirotor, config=config, duration=0.5)
+    imu = {sample.stamp for sample in result.of(Imu)}
+    for rate in (50, 70, 250):
+        stamps = [e.stamp for e in result.of(Image) if e.source == f"node/at_{rate}"]
+        np.testing.assert_allclose(stamps, np.arange(len(stamps)) * 1e9 / rate, atol=1)
+        assert len(stamps) > 0.4 * rate
+        assert (set(stamps) <= imu) == (rate == 50)
+    warned = [r.getMessage() for r in caplog.records if "does not divide" in r.getMessage()]
+    assert [text.split(":")[0] for text in warned] == ["at_70", "at_250"]
