@@ -81,6 +81,7 @@ bench-quick: $(READY)  ## Run the quick benchmarks (under two minutes).
 
 images: demo $(READY)  ## Make the images of the documentation anew (needs Chromium for two of them; minutes).
 	$(BIN)/python tools/readme_images.py
+	$(BIN)/python tools/gallery.py
 	$(BIN)/python -m runtime run examples/rerun.toml
 	$(BIN)/python tools/viewer_image.py runs/rerun/flight.rrd docs/images/rerun.png
 	$(BIN)/python tools/monitor_images.py
