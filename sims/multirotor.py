@@ -32,7 +32,7 @@ from events.rotations import rotate_inverse
 from runtime import Output, Tick, every, on
 from sims.addressing import Addressee
 from sims.cameras import CameraSpec, add_camera, check_cameras
-from sims.sensors import SensorOutputs, SensorsConfig, SensorSuite, mount_imu
+from sims.sensors import SensorsConfig, SensorSuite, mount_imu
 from sims.shared_world import join_world
 from sims.simulator import Rate, Simulator
 from sims.vehicle import (
@@ -119,12 +119,7 @@ class Multirotor(Simulator[MultirotorConfig]):
             config.limits,
             setpoint_timeout=config.setpoint_timeout,
         )
-        outputs = SensorOutputs(
-            self.pressures, self.fixes, self.magnetic_fields, self.ranges, self.lidar_scans
-        )
-        self._suite = SensorSuite(
-            self, config, outputs, FRAME, self._physics, self._advance, self._world
-        )
+        self._suite = SensorSuite(self, config, FRAME, self._physics, self._advance, self._world)
         self._addressee = Addressee(self.name, self.siblings(Simulator), self.sources)
         self._pilots: list[PilotAnnouncement] = []
         self._touched: frozenset[str] = frozenset()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -56,6 +56,7 @@ class Barometer(Sensor[BarometerSpec]):
     """Pressure at the sensor's place."""
 
     port = "pressures"
+    announced = BarometerAnnouncement
 
     def __init__(self, spec: BarometerSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
@@ -75,12 +76,6 @@ class Barometer(Sensor[BarometerSpec]):
             variance=spec.noise**2,
         )
 
-    def announcement(self) -> BarometerAnnouncement:
-        """Return what the barometer will provide."""
-        return BarometerAnnouncement(
-            **self.mounting(),
-            noise=self.spec.noise,
-            altitude=self.place.origin[2],
-            drift=self.spec.drift,
-            drift_time=float(self.spec.drift_time),
-        )
+    def also_announced(self) -> dict[str, Any]:
+        """Return the altitude of the origin."""
+        return {"altitude": self.place.origin[2]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import exp
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,7 @@ class Gnss(Sensor[GnssSpec]):
     """Position and velocity of the antenna."""
 
     port = "fixes"
+    announced = NavSatAnnouncement
 
     def __init__(self, spec: GnssSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
@@ -78,21 +80,9 @@ class Gnss(Sensor[GnssSpec]):
             status=0 if shown <= spec.eph_min_3d else -1,
         )
 
-    def announcement(self) -> NavSatAnnouncement:
-        """Return what the receiver will provide."""
-        latitude, longitude, altitude = self.place.origin
-        return NavSatAnnouncement(
-            **self.mounting(),
-            latitude=latitude,
-            longitude=longitude,
-            altitude=altitude,
-            horizontal_noise=self.spec.horizontal_noise,
-            vertical_noise=self.spec.vertical_noise,
-            horizontal_drift=self.spec.horizontal_drift,
-            vertical_drift=self.spec.vertical_drift,
-            drift_time=float(self.spec.drift_time),
-            velocity_noise=self.spec.velocity_noise,
-        )
+    def also_announced(self) -> dict[str, Any]:
+        """Return the place of the origin."""
+        return dict(zip(("latitude", "longitude", "altitude"), self.place.origin, strict=True))
 
     def _uncertainty(self, seconds: float) -> float:
         """Return AirSim's eph (and epv): a first-order lag."""

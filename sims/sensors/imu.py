@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from events import ImuAnnouncement, Quaternion, Vector3
-from events.rotations import from_rpy, inverse, multiply, rotate, rotate_inverse, slerp
-from sims.sensors.sensor import NonNegative
+from events.rotations import inverse, multiply, rotate, rotate_inverse, slerp
+from sims.sensors.sensor import Mount, NonNegative
 
 _BLOCK = 512
 """Samples drawn at once: numpy's cost per call is that of a few hundred random numbers."""
@@ -40,7 +40,7 @@ class Vibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     harmonics: tuple[NonNegative, ...] = (1.0, 0.5)
 
 
-class ImuParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ImuParameters(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Errors of an IMU, named as in `events.ImuAnnouncement`; by default the noise of a usual MEMS.
 
     Attributes:
@@ -69,8 +69,6 @@ class ImuParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         vibration: Vibration by the rotors.
         sampling: ``instant``: a sample is the motion at its stamp. ``mean``: it is the mean since
             the sample before, as of IMUs that give delta angles and delta velocities.
-        position: Position on the body, metres forward, right, down of the centre of mass (FRD).
-        orientation: Roll, pitch, yaw in the body's frame, degrees, applied yaw first (Z-Y-X).
     """
 
     gyroscope_noise_density: NonNegative = 1.7e-4
@@ -93,20 +91,12 @@ class ImuParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     accelerometer_resolution: NonNegative = 0.0
     vibration: Vibration = Vibration()
     sampling: Literal["instant", "mean"] = "instant"
-    position: Vector3 = (0.0, 0.0, 0.0)
-    orientation: Vector3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         for field in ("gyroscope_matrix", "accelerometer_matrix"):
             if len(getattr(self, field)) not in (0, 9):
                 found = len(getattr(self, field))
                 raise ValueError(f"{field}: expected 9 numbers, row by row, found {found}")
-
-    @property
-    def rotation(self) -> Quaternion:
-        """Rotation from the IMU's frame to the body."""
-        roll, pitch, yaw = (math.radians(angle) for angle in self.orientation)
-        return from_rpy(roll, pitch, yaw)
 
     @property
     def mounted(self) -> bool:
@@ -210,7 +200,7 @@ class ImuModel:
         constants: np.random.Generator,
     ) -> None:
         if parameters.ideal:
-            silent: dict[str, Any] = dict.fromkeys(ImuParameters.__struct_fields__[:4], 0.0)
+            silent: dict[str, Any] = dict.fromkeys(NOISES, 0.0)
             kept = {name: getattr(parameters, name) for name in _NO_ERRORS}
             parameters = ImuParameters(**silent, **kept)
         self.parameters = p = parameters
@@ -349,6 +339,14 @@ def mean_between(
     halfway = slerp(before.orientation, after.orientation, 0.5)
     return (wx, wy, wz), rotate_inverse(halfway, (ax, ay, az - gravity))
 
+
+NOISES = (
+    "gyroscope_noise_density",
+    "gyroscope_random_walk",
+    "accelerometer_noise_density",
+    "accelerometer_random_walk",
+)
+"""Settings of the noise, all 0 of an ideal IMU."""
 
 _EYE = np.eye(3)
 _NO_ERRORS = ("sampling", "position", "orientation")

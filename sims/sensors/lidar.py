@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -118,17 +118,10 @@ def pattern_of(spec: LidarSpec, start: float) -> Pattern:
 class Lidar(Mounted[LidarSpec]):
     """A lidar on a body; its turns are scanned by `sims.sensors.scanner`."""
 
-    def announcement(self) -> LidarAnnouncement:
-        """Return what the lidar will provide."""
-        spec = self.spec
-        low, high = (math.radians(angle) for angle in spec.elevations)
-        return LidarAnnouncement(
-            **self.mounting(),
-            channels=spec.channels,
-            columns=spec.columns,
-            horizontal_fov=math.radians(spec.azimuths[1] - spec.azimuths[0]),
-            elevations=(low, high),
-            noise=spec.noise,
-            min_range=spec.min_range,
-            max_range=spec.max_range,
-        )
+    announced = LidarAnnouncement
+
+    def also_announced(self) -> dict[str, Any]:
+        """Return the field of view in radians."""
+        low, high = (math.radians(angle) for angle in self.spec.elevations)
+        first, last = (math.radians(angle) for angle in self.spec.azimuths)
+        return {"elevations": (low, high), "horizontal_fov": last - first}

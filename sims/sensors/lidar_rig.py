@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from events import LidarScan
 from runtime import Node, Tick, Worker
-from runtime.sender import Sender
 from sims.cameras.rig import DrawnWorld
 from sims.sensors.lidar import Lidar
 from sims.sensors.scanner import Scanner
@@ -26,10 +24,9 @@ class LidarRig:
     vehicle was meanwhile, and sent `latency` after its end, with the stamp of its first ray.
 
     Args:
-        node: The vehicle's node.
+        node: The vehicle's node, with the output ``lidar_scans``.
         lidars: Its lidars.
         physics: The vehicle.
-        scans: Where the scans go.
         advance: Steps the physics up to a tick, and returns the stamp of the state then.
     """
 
@@ -38,13 +35,11 @@ class LidarRig:
         node: Node[Any],
         lidars: list[Lidar],
         physics: Physics,
-        scans: Sender[LidarScan],
         advance: Callable[[Tick], int],
     ) -> None:
-        self._node = node
+        self._node: Any = node
         self._lidars = lidars
         self._physics = physics
-        self._scans = scans
         self._advance = advance
         self._scanner: Worker[Scanner] | None = None
         self._starts: dict[str, int] = {}
@@ -88,17 +83,7 @@ class LidarRig:
         due = end + round(lidar.spec.latency * 1e9)
         wait = max(due - self._node.clock.now(), 0) / 1e9
         try:
-            turn = await self._scanner.call_for(wait, Scanner.scan, lidar.spec.name, start, states)
+            scan = await self._scanner.call_for(wait, Scanner.scan, lidar.spec.name, start, states)
         finally:
             self._in_flight[lidar.source] -= 1
-        self._scans.send(
-            LidarScan(
-                stamp=start,
-                source=lidar.source,
-                frame_id=lidar.source,
-                points=turn.points,
-                intensities=turn.intensities,
-                times=turn.times,
-                rings=turn.rings,
-            )
-        )
+        self._node.lidar_scans.send(scan)

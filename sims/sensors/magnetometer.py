@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import acos, asin, atan, cos, radians, sin, sqrt, tan
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -68,6 +68,7 @@ class Magnetometer(Sensor[MagnetometerSpec]):
     """The field at the origin, the same in the whole world."""
 
     port = "magnetic_fields"
+    announced = MagnetometerAnnouncement
 
     def __init__(self, spec: MagnetometerSpec, place: Place, random: np.random.Generator) -> None:
         super().__init__(spec, place, random)
@@ -86,8 +87,6 @@ class Magnetometer(Sensor[MagnetometerSpec]):
             stamp=truth.stamp, source=self.source, frame_id=self.source, magnetic_field=(x, y, z)
         )
 
-    def announcement(self) -> MagnetometerAnnouncement:
-        """Return what the magnetometer will provide."""
-        return MagnetometerAnnouncement(
-            **self.mounting(), noise=self.spec.noise, field=self.field, bias=self.spec.bias
-        )
+    def also_announced(self) -> dict[str, Any]:
+        """Return the field."""
+        return {"field": self.field}

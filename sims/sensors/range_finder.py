@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -57,6 +57,7 @@ class RangeFinder(Sensor[RangeFinderSpec]):
     """Distance to the nearest surface in the cone."""
 
     port = "ranges"
+    announced = RangeAnnouncement
 
     def __init__(
         self, spec: RangeFinderSpec, place: Place, random: np.random.Generator, rays: Rays
@@ -89,15 +90,9 @@ class RangeFinder(Sensor[RangeFinderSpec]):
             max_range=spec.max_range,
         )
 
-    def announcement(self) -> RangeAnnouncement:
-        """Return what the range finder will provide."""
-        return RangeAnnouncement(
-            **self.mounting(),
-            noise=self.spec.noise,
-            min_range=self.spec.min_range,
-            max_range=self.spec.max_range,
-            field_of_view=math.radians(self.spec.field_of_view),
-        )
+    def also_announced(self) -> dict[str, Any]:
+        """Return the cone in radians."""
+        return {"field_of_view": math.radians(self.spec.field_of_view)}
 
 
 def _matrix(rotation: Quaternion) -> Floats:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgspec
 import mujoco
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from events import LidarScan
 from events.frames import flip_yz, flip_yz_rotation
 from sims.cameras.noise import generator
 from sims.cameras.renderer import model_from_bytes
@@ -26,15 +26,6 @@ _STEP = TIMESTEP_NS * 1e-9
 _ONLY_FIRST = np.array([1, 0, 0, 0, 0, 0], np.uint8)
 _DEFAULT = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 """Colour of a geom that has been given none, and so has its material's."""
-
-
-class Turn(msgspec.Struct, frozen=True, eq=False):
-    """The points of one turn; arrays as of `events.LidarScan`."""
-
-    points: npt.NDArray[np.float32]
-    intensities: npt.NDArray[np.float32]
-    times: npt.NDArray[np.float32]
-    rings: npt.NDArray[np.uint16]
 
 
 class Scanner:
@@ -60,6 +51,7 @@ class Scanner:
         self._rays = Rays(model, dynamics, f"{vehicle}/base_link")
         self._specs = {spec.name: spec for spec in specs}
         self._seed = seed
+        self._vehicle = vehicle
         pose = int(model.joint(f"{vehicle}/free").qposadr[0])
         self._pose = slice(pose, pose + 7)
         self._reflectivity = reflectivities(model)
@@ -69,7 +61,7 @@ class Scanner:
         bounded = (model.geom_bodyid == 0) & (model.geom_rbound > 0.0)
         self._radii = np.where(bounded, model.geom_rbound, np.inf)
 
-    def scan(self, name: str, start: int, states: Floats) -> Turn:
+    def scan(self, name: str, start: int, states: Floats) -> LidarScan:
         """Scan one turn.
 
         Args:
@@ -79,7 +71,7 @@ class Scanner:
                 (milliseconds, nq); the last for what comes later, too.
 
         Returns:
-            The points. The same arguments give the same bits.
+            The scan. The same arguments give the same bits.
         """
         spec = self._specs[name]
         directions, times = pattern_of(spec, start / 1e9)
@@ -165,7 +157,7 @@ class Scanner:
         times: Floats,
         distances: Floats,
         returned: Floats,
-    ) -> Turn:
+    ) -> LidarScan:
         """Return what the sensor makes of true distances; arrays of columns and channels."""
         intensities = np.clip(returned, 0.0, 1.0)
         intensities *= np.minimum(1.0, spec.full_range / np.maximum(distances, 1e-9)) ** 2
@@ -178,11 +170,15 @@ class Scanner:
         valid &= (distances >= spec.min_range) & (distances <= spec.max_range)
         column, channel = np.nonzero(valid)
         points = directions[valid] * distances[valid][:, None]
-        return Turn(
-            points.astype(np.float32),
-            intensities[valid].astype(np.float32),
-            times[column].astype(np.float32),
-            channel.astype(np.uint16),
+        source = f"{self._vehicle}/{spec.name}"
+        return LidarScan(
+            stamp=start,
+            source=source,
+            frame_id=source,
+            points=points.astype(np.float32),
+            intensities=intensities[valid].astype(np.float32),
+            times=times[column].astype(np.float32),
+            rings=channel.astype(np.uint16),
         )
 
 

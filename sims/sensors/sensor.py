@@ -12,28 +12,22 @@ import numpy as np
 
 from events import Event, Quaternion, SensorAnnouncement, Vector3
 from events.rotations import from_rpy
-from runtime.units import Latency
+from runtime.units import Duration, Latency
 
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Name = Annotated[str, msgspec.Meta(min_length=1, pattern="^[A-Za-z0-9_]+$")]
 
 
-class SensorSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of every sensor.
+class Mount(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a sensor is on its body.
 
     Attributes:
-        rate: Measurements per second (AirSim: ``UpdateFrequency``).
-        latency: Time from a measurement to its delivery (AirSim: ``UpdateLatency``).
-        startup_delay: Time from the start to the first measurement (AirSim: ``StartupDelay``).
-        position: Position on the body, metres forward, right, down (FRD).
+        position: Position on the body, metres forward, right, down (FRD) of its centre of mass.
         orientation: Roll, pitch, yaw of the sensor in the body's frame, degrees, applied yaw first
             (Z-Y-X). Positive pitch is upwards: -90 looks straight down.
     """
 
-    rate: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 50.0
-    latency: Latency = Latency(0)  # immutable
-    startup_delay: Latency = Latency(0)
     position: Vector3 = (0.0, 0.0, 0.0)
     orientation: Vector3 = (0.0, 0.0, 0.0)
 
@@ -42,6 +36,20 @@ class SensorSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         """Rotation from the sensor's frame to the body."""
         roll, pitch, yaw = (math.radians(angle) for angle in self.orientation)
         return from_rpy(roll, pitch, yaw)
+
+
+class SensorSpec(Mount, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of every sensor.
+
+    Attributes:
+        rate: Measurements per second (AirSim: ``UpdateFrequency``).
+        latency: Time from a measurement to its delivery (AirSim: ``UpdateLatency``).
+        startup_delay: Time from the start to the first measurement (AirSim: ``StartupDelay``).
+    """
+
+    rate: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 50.0
+    latency: Latency = Latency(0)  # immutable
+    startup_delay: Latency = Latency(0)
 
 
 class Truth(NamedTuple):
@@ -73,13 +81,16 @@ class Place(NamedTuple):
 S = TypeVar("S", bound=SensorSpec)
 
 
-class Mounted(ABC, Generic[S]):
+class Mounted(Generic[S]):
     """A sensor on a body.
 
     Args:
         spec: Its settings.
         place: Where it is.
     """
+
+    announced: ClassVar[type[SensorAnnouncement]]
+    """What announces it; the fields that its settings have, too, are theirs."""
 
     def __init__(self, spec: S, place: Place) -> None:
         self.spec = spec
@@ -90,25 +101,29 @@ class Mounted(ABC, Generic[S]):
         """Source of the measurements, and name of their frame."""
         return self.place.source
 
-    @abstractmethod
-    def announcement(self) -> SensorAnnouncement:
-        """Return what the sensor will provide."""
+    def also_announced(self) -> dict[str, Any]:
+        """Return those fields of the announcement that are not among the settings."""
+        return {}
 
-    def mounting(self) -> dict[str, Any]:
-        """Return the fields that all announcements have."""
-        return {
+    def announcement(self) -> Any:
+        """Return what the sensor will provide."""
+        fields = {
+            name: getattr(self.spec, name)
+            for name in self.announced.__struct_fields__
+            if hasattr(self.spec, name)
+        }
+        fields |= {k: float(v) for k, v in fields.items() if isinstance(v, Duration)}
+        fields |= {
             "stamp": 0,
             "source": self.source,
-            "rate": self.spec.rate,
-            "latency": float(self.spec.latency),
             "frame_id": self.source,
             "parent_frame_id": self.place.parent_frame_id,
-            "position": self.spec.position,
             "orientation": self.spec.rotation,
         }
+        return self.announced(**(fields | self.also_announced()))
 
 
-class Sensor(Mounted[S]):
+class Sensor(Mounted[S], ABC):
     """Model of one sensor: told the truth at its rate, it returns what it measures.
 
     Args:

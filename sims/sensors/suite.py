@@ -6,20 +6,8 @@ import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import msgspec
-
-from events import (
-    Announcement,
-    Event,
-    FluidPressure,
-    LidarScan,
-    MagneticField,
-    NavSatFix,
-    Range,
-    TransformStamped,
-)
+from events import Announcement, Event, TransformStamped
 from runtime import Node, Tick
-from runtime.sender import Sender
 from sims.cameras.rig import DrawnWorld
 from sims.sensors.barometer import Barometer
 from sims.sensors.gnss import Gnss
@@ -28,20 +16,10 @@ from sims.sensors.lidar_rig import LidarRig
 from sims.sensors.magnetometer import Magnetometer
 from sims.sensors.range_finder import RangeFinder
 from sims.sensors.rays import Rays
-from sims.sensors.sensor import Mounted, Place, Sensor, Truth, generator_of
+from sims.sensors.sensor import Mount, Mounted, Place, Sensor, Truth, generator_of
 from sims.sensors.settings import SensorsConfig
 from sims.sensors.vehicle_imu import VehicleImu
 from sims.vehicle import Physics
-
-
-class SensorOutputs(msgspec.Struct, frozen=True):
-    """Outputs of the node that carries the sensors."""
-
-    pressures: Sender[FluidPressure]
-    fixes: Sender[NavSatFix]
-    magnetic_fields: Sender[MagneticField]
-    ranges: Sender[Range]
-    lidar_scans: Sender[LidarScan]
 
 
 class SensorSuite:
@@ -51,9 +29,9 @@ class SensorSuite:
     sensor's random numbers depend on the run's seed, its node's name and its own only.
 
     Args:
-        node: The node that carries the sensors; a sensor's source is ``<node>/<sensor>``.
+        node: The node that carries the sensors, with their outputs; a sensor's source is
+            ``<node>/<sensor>``.
         config: Their settings.
-        outputs: Where the events go.
         frame_id: Frame of the body.
         physics: The vehicle, in a world that `mount_imu` has seen.
         advance: Steps the physics up to a tick, and returns the stamp of the state then.
@@ -64,17 +42,17 @@ class SensorSuite:
         self,
         node: Node[Any],
         config: SensorsConfig,
-        outputs: SensorOutputs,
         frame_id: str,
         physics: Physics,
         advance: Callable[[Tick], int],
         world: DrawnWorld,
     ) -> None:
         self._node = node
-        self._outputs = outputs
         self._physics = physics
         self._advance = advance
         self._world = world
+        self._config = config
+        self._frame_id = frame_id
         self.imu = VehicleImu(node, config, physics, frame_id)
         """The IMU, whose samples the vehicle's node takes and sends itself."""
 
@@ -97,7 +75,7 @@ class SensorSuite:
             self.sensors += [make(RangeFinder, s, s.name, rays) for s in config.range_finders]
         lidars = [Lidar(spec, place(spec.name)) for spec in config.lidars]
         self.mounted: list[Mounted[Any]] = [*self.sensors, *lidars]
-        self.lidars = LidarRig(node, lidars, physics, outputs.lidar_scans, advance)
+        self.lidars = LidarRig(node, lidars, physics, advance)
 
     async def start(self) -> None:
         """Have all sensors measure at their rates; call it in `on_startup`."""
@@ -114,15 +92,17 @@ class SensorSuite:
 
     def transforms(self) -> Iterable[TransformStamped]:
         """Return the pose of each sensor's frame in the body's, constant for the run."""
-        yield from self.imu.transforms(self._node.clock.now())
-        for sensor in self.mounted:
+        mounts: list[tuple[str, Mount]] = [(sensor.source, sensor.spec) for sensor in self.mounted]
+        if self.imu.mounted:
+            mounts.insert(0, (self.imu.source, self._config.imu))
+        for source, mount in mounts:
             yield TransformStamped(
                 stamp=self._node.clock.now(),
-                source=sensor.source,
-                frame_id=sensor.place.parent_frame_id,
-                child_frame_id=sensor.source,
-                translation=sensor.spec.position,
-                rotation=sensor.spec.rotation,
+                source=source,
+                frame_id=self._frame_id,
+                child_frame_id=source,
+                translation=mount.position,
+                rotation=mount.rotation,
                 static=True,
             )
 
@@ -134,7 +114,7 @@ class SensorSuite:
             self._send_later(sensor, sensor.measure(truth))
 
     def _send_later(self, sensor: Sensor[Any], event: Event) -> None:
-        send = getattr(self._outputs, sensor.port).send
+        send = getattr(self._node, sensor.port).send
         if not sensor.spec.latency:
             send(event)
             return

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import mujoco
 
-from events import Imu, ImuAnnouncement, TransformStamped
+from events import Imu, ImuAnnouncement
 from events.frames import flip_yz, flip_yz_rotation
 from events.rotations import rotate_inverse
 from runtime import Node
@@ -40,7 +39,7 @@ class VehicleImu:
         constants = generator_of(node.rng, "imu")
         self._model = ImuModel(config.imu, config.imu_rate, node.rng, constants)
         self._physics = physics
-        self._source = f"{node.name}/imu"
+        self.source = f"{node.name}/imu"
         self._body = frame_id
         self._before: tuple[int, Motion] | None = None
         self._frame_id = self.announcement().frame_id
@@ -64,26 +63,17 @@ class VehicleImu:
         rates, force = self._model.measure(rates, force, physics.thrusts)
         return Imu(
             stamp=stamp,
-            source=self._source,
+            source=self.source,
             frame_id=self._frame_id,
             angular_velocity=rates,
             linear_acceleration=force,
         )
 
+    @property
+    def mounted(self) -> bool:
+        """Whether it has a frame of its own."""
+        return self._model.parameters.mounted
+
     def announcement(self) -> ImuAnnouncement:
         """Return what the IMU will provide."""
-        return self._model.announcement(self._source, self._body)
-
-    def transforms(self, stamp: int) -> Iterable[TransformStamped]:
-        """Return the pose of its frame in the body's, if it has one of its own."""
-        if self._model.parameters.mounted:
-            announced = self.announcement()
-            yield TransformStamped(
-                stamp=stamp,
-                source=self._source,
-                frame_id=self._body,
-                child_frame_id=self._frame_id,
-                translation=announced.position,
-                rotation=announced.orientation,
-                static=True,
-            )
+        return self._model.announcement(self.source, self._body)

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from sims.sensors import Barometer, BarometerSpec
-from sims.sensors.barometer import altitude_at, pressure_at
+from sims.sensors.barometer import Barometer, BarometerSpec, altitude_at, pressure_at
 from tests.sims.sensors.truths import ORIGIN, PLACE, random, truth
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from events.geodesy import from_geodetic
-from sims.sensors import Gnss, GnssSpec
+from sims.sensors.gnss import Gnss, GnssSpec
 from tests.sims.sensors.truths import ORIGIN, PLACE, random, truth
 
 

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from events.rotations import from_rpy, multiply, rotate
-from sims.sensors import ImuModel, ImuNoise, ImuParameters, Vibration
-from sims.sensors.imu import Motion, mean_between, motion_at
+from sims.sensors import ImuModel, ImuNoise, ImuParameters
+from sims.sensors.imu import NOISES, Motion, Vibration, mean_between, motion_at
 
 REST = ((0.0, 0.0, 0.0), (0.0, 0.0, -9.81))
 RATE = 200.0
@@ -98,7 +98,7 @@ HOVER = (0.45, 0.45, 0.45, 0.45)
 
 def model_of(seed: int = 0, rate: float = RATE, **parameters: Any) -> ImuModel:
     """Return an IMU without noise, but with the errors asked for."""
-    silent = dict.fromkeys(ImuParameters.__struct_fields__[:4], 0.0)
+    silent = dict.fromkeys(NOISES, 0.0)
     noise, constants = np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1])
     return ImuModel(ImuParameters(**(silent | parameters)), rate, noise, constants)
 
@@ -159,7 +159,7 @@ def test_an_imu_that_is_worse_than_announced_is_found_by_its_allan_deviation() -
 
 
 def _noise_fields(parameters: ImuParameters) -> dict[str, Any]:
-    return {name: getattr(parameters, name) for name in ImuParameters.__struct_fields__[:4]}
+    return {name: getattr(parameters, name) for name in NOISES}
 
 
 def test_an_ideal_imu_tells_the_truth_whatever_else_its_settings_say() -> None:

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from events import LidarScan
 from sims.cameras import model_to_bytes
-from sims.sensors import LidarSpec, Scanner
-from sims.sensors.lidar import pattern_of
-from sims.sensors.scanner import Turn, solids
+from sims.sensors.lidar import LidarSpec, pattern_of
+from sims.sensors.scanner import Scanner, solids
 from sims.vehicle import attach_vehicle
 from sims.worlds import Dynamics, load_scene
 
@@ -61,7 +61,7 @@ def spec_of(**settings: Any) -> LidarSpec:
 
 def scan(
     states: Floats = STILL[None], seed: int = 1, dynamics: Dynamics = STATIC, **settings: Any
-) -> Turn:
+) -> LidarScan:
     scanner = Scanner(model_to_bytes(model()), dynamics, (spec_of(**settings),), "drone", seed)
     return scanner.scan("lidar", START, states)
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from events.rotations import from_rpy
-from sims.sensors import Magnetometer, MagnetometerSpec
-from sims.sensors.magnetometer import dipole_field, world_field
+from sims.sensors.magnetometer import Magnetometer, MagnetometerSpec, dipole_field, world_field
 from tests.sims.sensors.truths import ORIGIN, PLACE, random, truth
 
 

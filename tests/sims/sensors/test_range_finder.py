@@ -11,8 +11,8 @@ import pytest
 
 from events import Quaternion, Vector3
 from events.rotations import from_rpy
-from sims.sensors import RangeFinder, RangeFinderSpec, Rays
-from sims.sensors.range_finder import cone
+from sims.sensors.range_finder import RangeFinder, RangeFinderSpec, cone
+from sims.sensors.rays import Rays
 from sims.vehicle import attach_vehicle
 from sims.worlds import Dynamics
 from tests.sims.sensors.truths import PLACE, random, truth

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from events import Quaternion, Vector3
-from sims.sensors import Truth
-from sims.sensors.sensor import Place
+from sims.sensors.sensor import Place, Truth
 
 ORIGIN = (47.641468, -122.140165, 122.0)
 PLACE = Place("drone/sensor", "base_link", ORIGIN)
