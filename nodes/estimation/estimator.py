@@ -92,7 +92,7 @@ class Estimator(Node[C], ABC):
 
     The tracker gives poses of the optical camera (x right, y down, z forward) in the optical camera
     at its first image. What is sent is the pose of the body (FRD) that carries the camera, as a
-    `PoseEstimate`.
+    `PoseEstimate`; its stamp is on the clock of the IMU (`exposed_at`).
 
     **Frame and alignment.** The `frame_id` of the estimates, chosen once with the first pose, says
     what is known about their origin, and so how `nodes.evaluation` aligns them with the ground
@@ -120,6 +120,8 @@ class Estimator(Node[C], ABC):
 
     needs: frozenset[str] = frozenset()
     """Kinds of image that the camera must give, all of them; ``rgb`` serves for ``grey``, too."""
+    pinhole_only: bool = False
+    """Whether the images must be without distortion; see `refusal` for other conditions."""
     method: str = ""
     """Name of the method, for the report."""
     scale_free: bool = False
@@ -132,6 +134,7 @@ class Estimator(Node[C], ABC):
     camera: CameraAnnouncement | None = None
     _vehicles: tuple[VehicleAnnouncement, ...] = ()
     _cameras: tuple[str, ...] = ()
+    _refusals: tuple[str, ...] = ()
     _mount: Mount | None = None
     _lost = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
@@ -160,8 +163,21 @@ class Estimator(Node[C], ABC):
                 f"expected a camera with {', '.join(sorted(self.needs))} images, "
                 f"found none with {', '.join(sorted(lacking))}"
             )
+        if refusal := self.refusal(announcement):
+            self._refusals += (f"{announcement.source}: {refusal}",)
+            return
         self.camera = announcement
         self.narrow("frames", announcement.source)
+
+    def refusal(self, camera: CameraAnnouncement) -> str:
+        """Return why a camera's images are of no use here, in a sentence; empty if they are."""
+        if not self.pinhole_only or camera.info.is_pinhole:
+            return ""
+        coefficients = ", ".join(f"{value:g}" for value in camera.info.distortion)
+        return (
+            "expected images without distortion (a camera sends them as well with "
+            f"undistorted = true), found {camera.info.distortion_model} with {coefficients}"
+        )
 
     @on(Armed, TakenOff)
     def vehicle_events(self, event: VehicleEvent) -> None:
@@ -187,7 +203,16 @@ class Estimator(Node[C], ABC):
             self.log.fatal("%s", self._no_camera())
         return self.camera
 
+    def exposed_at(self, image: Image) -> int:
+        """Return when an image was exposed on the clock of IMU and ground truth (ns).
+
+        That is its stamp without the offset of the camera's clock, which was announced.
+        """
+        return image.stamp - round(self.the_camera().time_offset * 1e9)
+
     def _no_camera(self) -> str:
+        if self._refusals:
+            return "; ".join(self._refusals)
         named = self.sources.get("frames")
         called = f" called {named}" if named else ""
         found = ", ".join(self._cameras) or "none"
@@ -202,15 +227,14 @@ class Estimator(Node[C], ABC):
         Args:
             image: The image.
             result: What the tracker found in it.
-            origin: Stamp (ns) of the image at which the tracker's poses start; if `None`, that of
+            origin: When the image was exposed at which the tracker's poses start (ns); if `None`,
                 the first image that is published with a pose.
         """
+        stamp = self.exposed_at(image)
         if self.restarts and self._mount is None and not self._lost:
             self._lost = True
             reason = f"restarted: poses are in {self._odom()} from here on"
-            self.tracking_events.send(
-                TrackingLost(stamp=image.stamp, source=self.name, reason=reason)
-            )
+            self.tracking_events.send(TrackingLost(stamp=stamp, source=self.name, reason=reason))
         self.features.send(
             TrackedFeatures(
                 stamp=image.stamp,
@@ -223,16 +247,16 @@ class Estimator(Node[C], ABC):
         if result.lost and not self._lost:
             self.log.warning("lost: %s", result.reason or "no reason given")
             self.tracking_events.send(
-                TrackingLost(stamp=image.stamp, source=self.name, reason=result.reason)
+                TrackingLost(stamp=stamp, source=self.name, reason=result.reason)
             )
         elif self._lost and not result.lost:
             self.log.info("regained %s", result.reason)
-            self.tracking_events.send(TrackingRegained(stamp=image.stamp, source=self.name))
+            self.tracking_events.send(TrackingRegained(stamp=stamp, source=self.name))
         self._lost = result.lost
         if not result.lost:
             if self._mount is None:
-                self._mount = self._mounting(image.stamp if origin is None else origin)
-            self.estimates.send(self._mount.estimate(image.stamp, self.name, result.pose))
+                self._mount = self._mounting(stamp if origin is None else origin)
+            self.estimates.send(self._mount.estimate(stamp, self.name, result.pose))
 
     def _mounting(self, origin: int) -> Mount:
         """Return the mount for a tracker whose poses start at an image of this stamp."""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from events import (
     Announcement,
+    CameraAnnouncement,
     Collision,
     EstimatorAnnouncement,
     Image,
@@ -85,7 +86,8 @@ class Evaluation(Node[EvaluationConfig]):
         self._flights: dict[str, Flight] = {}  # by vehicle
         self._records: dict[str, EstimatorRecord] = {}
         self._live: dict[str, LiveErrors] = {}
-        self._frames: dict[str, array[int]] = {}  # stamps by camera
+        self._frames: dict[str, array[int]] = {}  # times of exposure by camera
+        self._late: dict[str, int] = {}  # offsets of the cameras' clocks
         self._album = Album(self.config.image_count)
         self._files: dict[str, GrowingFile] = {}
         self._closed = False
@@ -93,6 +95,8 @@ class Evaluation(Node[EvaluationConfig]):
     def on_announcement(self, announcement: Announcement) -> None:
         """Note vehicles and their cameras; expect estimators."""
         self._vehicles.announced(announcement)
+        if isinstance(announcement, CameraAnnouncement):
+            self._late[announcement.source] = round(announcement.time_offset * 1e9)
         if isinstance(announcement, EstimatorAnnouncement):
             record = EstimatorRecord(announcement.scale_free, announcement.method)
             self._records[announcement.source] = record
@@ -153,8 +157,9 @@ class Evaluation(Node[EvaluationConfig]):
     def images(self, event: Image) -> None:
         """Note that there was an image; hold it for a while: its features may follow."""
         stamps = self._frames.setdefault(event.source, array("q"))
-        if not stamps or event.stamp > stamps[-1]:
-            stamps.append(event.stamp)
+        exposed = event.stamp - self._late.get(event.source.removesuffix("/grey"), 0)
+        if not stamps or exposed > stamps[-1]:
+            stamps.append(exposed)
         self._album.add_image(event)
 
     @on(Collision)

@@ -17,8 +17,11 @@ Depth = npt.NDArray[np.float32]
 
 def refuse_distortion(info: CameraInfo) -> None:
     """Raise `ValueError` if a camera's images are distorted."""
-    if any(info.distortion):
-        raise ValueError(f"camera: expected images without distortion, found {info.distortion}")
+    if not info.is_pinhole:
+        raise ValueError(
+            f"camera: expected images without distortion, found {info.distortion_model} "
+            f"with {info.distortion}"
+        )
 
 
 def grey_image(info: CameraInfo, image: npt.NDArray[np.uint8]) -> Grey:

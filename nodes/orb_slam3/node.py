@@ -10,10 +10,17 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from events import Announcement, DepthImage, Image, Imu, ImuAnnouncement
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    Image,
+    Imu,
+    ImuAnnouncement,
+)
 from nodes.estimation import Estimator, EstimatorConfig
 from nodes.orb_slam3.process import OrbSlam3Process
-from nodes.orb_slam3.settings import Mode, OrbSettings, make_settings
+from nodes.orb_slam3.settings import Mode, OrbSettings, make_settings, unknown_lens
 from nodes.orb_slam3.vocabulary_file import find_vocabulary
 from runtime import Bundle, Duration, on
 from runtime.paths import InputPath
@@ -68,6 +75,10 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
             self._imu = announcement
             self.narrow("imu", announcement.source)
 
+    def refusal(self, camera: CameraAnnouncement) -> str:
+        """Return why ORB-SLAM3 has no model of a camera."""
+        return unknown_lens(self.config.mode, camera.info)
+
     def check(self) -> Iterable[str]:
         """Return the errors: no camera, or no vocabulary."""
         yield from super().check()
@@ -101,12 +112,13 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
                 if depth is None:
                     continue
                 depth = None
+            stamp = self.exposed_at(image)
             result = await self._slam.call(
                 OrbSlam3Process.track,
-                image.stamp,
+                stamp,
                 image.data,
                 None if depth is None else depth.data,
-                self._take_samples(image.stamp),
+                self._take_samples(stamp),
             )
             initialized = initialized or not result.lost
             if initialized:

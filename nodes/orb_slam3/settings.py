@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from events import CameraAnnouncement, ImuAnnouncement
+from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
 from events.poses import pose_matrix
 
 Mode = Literal["rgbd", "monocular", "rgbd_inertial", "monocular_inertial"]
@@ -85,14 +85,17 @@ def make_settings(
             f"mode {mode!r}: expected {camera.source} to give depth, "
             f"found {', '.join(camera.images)}"
         )
+    if unknown := unknown_lens(mode, info):
+        raise ValueError(f"{camera.source}: {unknown}")
+    fisheye = info.distortion_model == "equidistant"
     lines = [
         "%YAML:1.0",
-        'Camera.type: "PinHole"',
+        f'Camera.type: "{"KannalaBrandt8" if fisheye else "PinHole"}"',
         f"Camera.fx: {_real(info.fx)}",
         f"Camera.fy: {_real(info.fy)}",
         f"Camera.cx: {_real(info.cx)}",
         f"Camera.cy: {_real(info.cy)}",
-        *_distortion(info.distortion),
+        *_distortion(info),
         f"Camera.width: {info.width}",
         f"Camera.height: {info.height}",
         f"Camera.fps: {_real(camera.rate)}",
@@ -122,11 +125,27 @@ def make_settings(
     )
 
 
-def _distortion(plumb_bob: tuple[float, ...]) -> list[str]:
-    k1, k2, p1, p2, k3 = plumb_bob
-    if any(plumb_bob):
-        k1 = k1 or 1e-12  # at 0, ORB-SLAM3 takes it that there is no distortion at all
-    values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
+def unknown_lens(mode: Mode, info: CameraInfo) -> str:
+    """Return why ORB-SLAM3 cannot compute with a lens, in a sentence; empty if it can.
+
+    With depth it takes key points for those of a pinhole unless they have plumb_bob's distortion
+    (``Frame::UndistortKeyPoints`` and ``Frame::UnprojectStereo``).
+    """
+    if info.distortion_model == "rational_polynomial" and any(info.distortion):
+        return "expected plumb_bob or equidistant images, found rational_polynomial ones"
+    if info.distortion_model == "equidistant" and "rgbd" in mode:
+        return f"mode {mode!r}: expected plumb_bob images beside the depth, found equidistant ones"
+    return ""
+
+
+def _distortion(info: CameraInfo) -> list[str]:
+    if info.distortion_model == "equidistant":
+        values = dict(zip(("k1", "k2", "k3", "k4"), info.distortion, strict=True))
+    else:
+        k1, k2, p1, p2, k3 = info.distortion[:5]
+        if any(info.distortion):
+            k1 = k1 or 1e-12  # at 0, ORB-SLAM3 takes it that there is no distortion at all
+        values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
     return [f"Camera.{name}: {_real(value)}" for name, value in values.items()]
 
 

@@ -295,3 +295,54 @@ def test_whatever_happens_an_estimate_in_map_is_true(
         if estimate.frame_id not in frames[-1:]:
             frames.append(estimate.frame_id)
     assert len(set(frames)) == len(frames), "none is taken up again"
+
+
+class PinholeOnly(Scripted):
+    """Cannot compute with a lens."""
+
+    pinhole_only = True
+
+
+BARREL = CameraInfo(
+    width=8, height=6, fx=4.0, fy=4.0, cx=3.5, cy=2.5, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0)
+)
+FISHEYE = CameraInfo(
+    width=8, height=6, fx=4.0, fy=4.0, cx=3.5, cy=2.5,
+    distortion_model="equidistant", distortion=(0.0, 0.0, 0.0, 0.0),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("info", "found"),
+    [(BARREL, "plumb_bob with -0.2, 0.05, 0"), (FISHEYE, "equidistant with 0, 0, 0, 0")],
+)
+@pytest.mark.parametrize("inputs", [None, {"frames": "drone/front"}])
+def test_a_lens_that_it_cannot_compute_with_is_refused(
+    info: CameraInfo, found: str, inputs: dict[str, str] | None
+) -> None:
+    """In a sentence, with what was found and how to help; the file may name the camera or not."""
+    seen = camera("drone/front", "rgb", "depth", info=info)
+    refused = [spec(PinholeOnly, "est", inputs=inputs)]
+    with pytest.raises(NodeError, match=rf"drone/front: expected images without.*{found}"):
+        run_nodes(refused, inputs=[seen], duration=1.0)
+    assert track(vehicle(), seen, *rgbd(1)).of(PoseEstimate)  # others can
+
+
+def test_the_undistorted_twin_is_taken_where_there_is_one() -> None:
+    """It is announced after the camera's own images."""
+    own = camera("drone/front", "rgb", "depth", info=BARREL)
+    twin = camera("drone/front/undistorted", "rgb", "depth", undistorted="drone/front")
+    frames = [*rgbd(1), *rgbd(1, "drone/front/undistorted")]
+    nodes = [spec(PinholeOnly, "est")]
+    result = run_nodes(nodes, inputs=[vehicle(), own, twin, *frames], duration=1.0)
+    (features,) = result.of(TrackedFeatures)
+    assert features.frame_id == "drone/front/undistorted_optical"
+
+
+def test_estimates_are_on_the_clock_of_the_imu() -> None:
+    """The announced offset of the camera's clock is taken off; features keep the image's stamp."""
+    seen = camera("drone/front", "rgb", "depth", time_offset=0.03)
+    result = track(vehicle(), seen, *rgbd(100 * MS), *rgbd(200 * MS, dark=True))
+    assert [each.stamp for each in result.of(PoseEstimate)] == [70 * MS]
+    assert [each.stamp for each in result.of(TrackingLost)] == [170 * MS]
+    assert [each.stamp for each in result.of(TrackedFeatures)] == [100 * MS, 200 * MS]

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from events.camera_info import COEFFICIENTS, DistortionModel
 from nodes.orb_slam3.settings import Mode, OrbSettings, make_settings
 from tests.nodes.orb_slam3.scene import CAMERA, IMU, INFO
 
@@ -145,3 +146,30 @@ def test_what_a_mode_needs_must_have_been_announced() -> None:
 def test_settings_out_of_range_or_unknown_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(wrong, OrbSettings)
+
+
+def test_a_fisheye_is_kannala_brandts() -> None:
+    info = msgspec.structs.replace(
+        INFO, distortion_model="equidistant", distortion=(0.02, -0.005, 0.001, -0.0002)
+    )
+    text = make_settings("monocular", msgspec.structs.replace(CAMERA, info=info)).text
+    assert read(text).getNode("Camera.type").string() == "KannalaBrandt8"
+    found = tuple(number(text, f"Camera.k{k}") for k in (1, 2, 3, 4))
+    assert found == pytest.approx(info.distortion)
+
+
+@pytest.mark.parametrize(
+    ("mode", "model", "found"),
+    [
+        ("rgbd", "equidistant", "beside the depth, found equidistant"),
+        ("monocular", "rational_polynomial", "found rational_polynomial"),
+    ],
+)
+def test_a_lens_that_orb_slam3_does_not_know_is_refused(
+    mode: Mode, model: DistortionModel, found: str
+) -> None:
+    info = msgspec.structs.replace(
+        INFO, distortion_model=model, distortion=(0.1,) * COEFFICIENTS[model]
+    )
+    with pytest.raises(ValueError, match=found):
+        make_settings(mode, msgspec.structs.replace(CAMERA, info=info))
