@@ -21,6 +21,7 @@ from events.base import Quaternion, Vector3
 from events.poses import pose_matrix
 from sims.cameras.development import Development
 from sims.cameras.frame import Frame
+from sims.cameras.graphics import keep_memory
 from sims.cameras.lens import undistorted
 from sims.cameras.noise import generator, grey_of
 from sims.cameras.optics import moments
@@ -96,6 +97,7 @@ class CameraRenderer:
         dynamics: Changing | None = None,
     ) -> None:
         cameras = tuple(eye for spec in cameras for eye in eyes(spec))
+        keep_memory()
         model = model_from_bytes(model_bytes)
         self._model = model
         self._seed = seed
