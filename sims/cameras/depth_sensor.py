@@ -150,17 +150,16 @@ class DepthMeter:
         A pixel's ray meets the second image in the column ``x - disparity``. On one surface that
         rises with x; where a column further right falls left of it, that one's surface is nearer.
         """
-        columns = self._columns - inverse * np.float32(self._info.fx * self._sensor.baseline)
-        nearer = np.full_like(columns, np.inf)
-        nearer[:, :-1] = columns[:, 1:] - np.float32(0.5)  # the left edge of the pixel
-        step, largest = 1, float(inverse.max()) * self._info.fx * self._sensor.baseline
-        while step <= min(largest, self._info.width - 1):  # the least of 2, 4, 8 … pixels
-            np.minimum(nearer[:, :-step], nearer[:, step:], out=nearer[:, :-step])
-            step *= 2
-        hidden = columns > nearer
+        reach = self._info.fx * self._sensor.baseline
+        columns = self._columns - inverse * np.float32(reach)
+        farthest = min(int(float(inverse.max()) * reach) + 2, self._info.width)
+        nearer = np.asarray(cv2.erode(columns, np.ones((1, farthest), np.uint8), anchor=(0, 0)))
+        hidden = np.zeros(columns.shape, np.bool_)
+        # The left edge of a pixel is half a pixel before its middle.
+        np.greater(columns[:, :-1], nearer[:, 1:] - np.float32(0.5), out=hidden[:, :-1])
         if self._sensor.model == "stereo":
             hidden |= columns < -0.5
-        return np.asarray(hidden)
+        return hidden
 
     def _unmatched(self, inverse: Depths, colour: npt.NDArray[np.uint8] | None) -> Holes:
         """Return which pixels are aslant, at an edge, dark or without texture.
