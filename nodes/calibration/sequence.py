@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from events import DepthImage, Image, Imu, Odometry, PoseStamped
+from events import DepthImage, Image, Imu, Odometry
 from events.frames import flip_yz, rotation_to_nwu
 from nodes.dataset.images import ImageFile, in_16_bits, in_colour
 from nodes.dataset.recording import Recording
@@ -61,9 +61,6 @@ class VslamLab(Recording):
         convert = functools.partial(in_16_bits, factor=self.depth_factor)
         path = self.folder / name / f"{self.epoch + event.stamp}.png"
         return ImageFile(path, event.data, in_colour if kind == "rgb" else convert)
-
-    def pose(self, event: PoseStamped) -> None:
-        """Do nothing: the layout has the body's pose only."""
 
     def odometry(self, event: Odometry) -> None:
         """Note where the body is."""

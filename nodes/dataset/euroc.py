@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, PoseStamped, Vector3
+from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, Vector3
 from events.frames import flip_yz, rotation_to_nwu
 from events.poses import pose_matrix
 from events.rotations import rotate
@@ -89,9 +89,6 @@ class Euroc(Recording):
         """Note a depth image of one of the cameras."""
         convert = functools.partial(in_16_bits, factor=self.depth_factor)
         return self._note(self._depths, event, functools.partial(ImageFile, convert=convert))
-
-    def pose(self, event: PoseStamped) -> None:
-        """Do nothing: the cameras' mountings say where they are on the body."""
 
     def odometry(self, event: Odometry) -> None:
         """Note where the body is, and its velocity in the world."""

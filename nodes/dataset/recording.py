@@ -36,20 +36,19 @@ class Recording(ABC):
     def image(self, event: Image) -> ImageFile | None:
         """Note an image, and return what is left to write."""
 
-    @abstractmethod
-    def depth(self, event: DepthImage) -> ImageFile | None:
-        """Note a depth image, and return what is left to write."""
+    # What a layout has no place for is passed over.
 
-    @abstractmethod
-    def pose(self, event: PoseStamped) -> None:
+    def depth(self, event: DepthImage) -> ImageFile | None:  # noqa: ARG002
+        """Note a depth image, and return what is left to write."""
+        return None
+
+    def pose(self, event: PoseStamped) -> None:  # noqa: B027
         """Note where a camera is."""
 
-    @abstractmethod
-    def odometry(self, event: Odometry) -> None:
+    def odometry(self, event: Odometry) -> None:  # noqa: B027
         """Note where the body is."""
 
-    @abstractmethod
-    def imu(self, event: Imu) -> None:
+    def imu(self, event: Imu) -> None:  # noqa: B027
         """Note what the IMU measures."""
 
     def close(self) -> None:

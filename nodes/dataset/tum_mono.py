@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from events import CameraInfo, DepthImage, Image, Imu, Odometry, PoseStamped
+from events import CameraInfo, Image, PoseStamped
 from events.frames import flip_yz, rotation_to_nwu
 from events.photometry import response_light, vignette_map
 from nodes.dataset.images import ImageFile, in_grey
@@ -69,19 +69,10 @@ class TumMono(Recording):
         self._poses = {s: pose for s, pose in self._poses.items() if s > event.stamp}
         return ImageFile(self.folder / "images" / f"{number:05d}.png", event.data, in_grey)
 
-    def depth(self, event: DepthImage) -> None:
-        """Do nothing: the layout has no place for depth."""
-
     def pose(self, event: PoseStamped) -> None:
         """Note where the camera is, until its image comes."""
         if event.source == self._camera.source:
             self._poses[event.stamp] = event
-
-    def odometry(self, event: Odometry) -> None:
-        """Do nothing: the layout has no place for the body."""
-
-    def imu(self, event: Imu) -> None:
-        """Do nothing: the layout has no place for the IMU."""
 
 
 def _calibration(source: str, info: CameraInfo) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-from events import DepthImage, Image, Imu, Odometry, PoseStamped
+from events import DepthImage, Image, Imu, PoseStamped
 from events.frames import flip_yz, rotation_to_nwu
 from events.rotations import rotate
 from nodes.dataset.images import ImageFile, in_16_bits, in_colour
@@ -74,9 +74,6 @@ class TumRgbd(Recording):
         if event.source == self._camera.source:
             pose = flip_yz(event.position), rotation_to_nwu(event.orientation)
             self._files["groundtruth"].add(event.stamp, tum_row(self.epoch + event.stamp, *pose))
-
-    def odometry(self, event: Odometry) -> None:
-        """Do nothing: the layout has no place for the body."""
 
     def imu(self, event: Imu) -> None:
         """Note the accelerations."""
