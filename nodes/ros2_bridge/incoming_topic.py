@@ -55,7 +55,11 @@ class IncomingTopic:
             self.complain(f"not a {self.topic.type}", str(error))
             return None
         context = MessageContext(
-            source=self.source, now=now, stamps=stamps, frame_id=self.subscription.frame_id
+            source=self.source,
+            now=now,
+            stamps=stamps,
+            frame_id=self.subscription.frame_id,
+            vehicle=self.subscription.vehicle,
         )
         try:
             event = self._read(message, context)

@@ -16,10 +16,15 @@ from events import (
     DepthImage,
     EstimatorAnnouncement,
     Event,
+    FluidPressure,
     Image,
     Imu,
+    MagneticField,
+    NavSatFix,
     Odometry,
+    PilotAnnouncement,
     PoseEstimate,
+    Range,
     Setpoint,
 )
 from nodes.ros2_bridge.complaints import Complaints
@@ -66,6 +71,10 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     depth_images = Output(DepthImage)
     imu = Output(Imu)
     odometry = Output(Odometry)
+    ranges = Output(Range)
+    pressures = Output(FluidPressure)
+    magnetic_fields = Output(MagneticField)
+    fixes = Output(NavSatFix)
     mapped_events = Output(Event)
     """What mappings of the user's own make."""
 
@@ -150,9 +159,12 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             raise
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce the estimators and cameras that are in ROS."""
+        """Announce the estimators, cameras and pilots that are in ROS."""
         yield from self._cameras
         for incoming in self._incoming:
+            if incoming.subscription.use in {"velocity", "position", "pose"}:
+                vehicle = incoming.subscription.vehicle
+                yield PilotAnnouncement(stamp=0, source=incoming.source, vehicle=vehicle)
             if incoming.subscription.use == "estimate":
                 yield EstimatorAnnouncement(
                     stamp=0,
@@ -288,21 +300,15 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         )
 
     def _send(self, event: Event) -> None:
-        match event:
-            case PoseEstimate():
-                self.estimates.send(event)
-            case Setpoint():
-                self.setpoints.send(event)
-            case Image():
-                self.images.send(event)
-            case DepthImage():
-                self.depth_images.send(event)
-            case Imu():
-                self.imu.send(event)
-            case Odometry():
-                self.odometry.send(event)
-            case _:
-                self.mapped_events.send(event)
+        outputs = (
+            *((PoseEstimate, self.estimates), (Setpoint, self.setpoints)),
+            *((Image, self.images), (DepthImage, self.depth_images)),
+            *((Imu, self.imu), (Odometry, self.odometry), (Range, self.ranges)),
+            *((FluidPressure, self.pressures), (MagneticField, self.magnetic_fields)),
+            *((NavSatFix, self.fixes), (Event, self.mapped_events)),
+        )
+        sender: Any = next(out for kind, out in outputs if isinstance(event, kind))
+        sender.send(event)
 
     async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
         """Wait for a camera's calibration, and remember to announce it."""

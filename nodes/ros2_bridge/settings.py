@@ -23,11 +23,14 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         use: ``as`` in the file: what a message becomes. ``estimate`` (from PoseStamped,
             PoseWithCovarianceStamped or Odometry), ``odometry`` (Odometry), ``velocity`` (Twist,
             TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``, ``depth`` (Image),
-            ``imu`` (Imu), ``camera`` (CameraInfo; the run waits for the first one, and a camera
-            is announced).
+            ``imu`` (Imu), ``range`` (Range), ``pressure`` (FluidPressure), ``magnetic_field``
+            (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the run waits for the
+            first one, and a camera is announced).
         mapping: Instead: ``module:function``, which takes a message and a `MessageContext` and
             returns an event, or None.
         source: Of the events; if empty, the node's name and the topic.
+        vehicle: Which vehicle a ``velocity``, ``position`` or ``pose`` is for; empty for the only
+            one.
         frame_id: If set, the frame that events name, whatever the message says.
         scale_free: Whether an estimate's unit of length is its own.
         reliable: Quality of service, as ROS shows it.
@@ -43,6 +46,7 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     use: str = msgspec.field(name="as", default="")
     mapping: str = ""
     source: str = ""
+    vehicle: str = ""
     frame_id: str = ""
     scale_free: bool = False
     reliable: bool = True

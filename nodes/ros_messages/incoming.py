@@ -8,7 +8,7 @@ alike. World ENU becomes NED, body FLU FRD; optical axes stay. See `frames`. Ima
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 import msgspec
@@ -16,12 +16,16 @@ import numpy as np
 
 from events import (
     Event,
+    FluidPressure,
     Imu,
+    MagneticField,
+    NavSatFix,
     Odometry,
     PoseEstimate,
     PoseSetpoint,
     PositionSetpoint,
     Quaternion,
+    Range,
     Vector3,
     VelocitySetpoint,
 )
@@ -39,12 +43,14 @@ class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
         now: On the run's clock (ns).
         stamps: How times in messages become stamps.
         frame_id: If set, stands in the place of the message's own.
+        vehicle: Which a set-point is for.
     """
 
     source: str
     now: int
     stamps: Stamps = Stamps()
     frame_id: str = ""
+    vehicle: str = ""
 
     def stamp(self, header: Any) -> int:
         """Return the time of a message with a header.
@@ -111,6 +117,7 @@ def position(message: Any, context: MessageContext) -> Event:
     return PositionSetpoint(
         stamp=context.stamp(message.header),
         source=context.source,
+        vehicle=context.vehicle,
         position=place,
         yaw=yaw_of(orientation),
     )
@@ -122,6 +129,7 @@ def pose(message: Any, context: MessageContext) -> Event:
     return PoseSetpoint(
         stamp=context.stamp(message.header),
         source=context.source,
+        vehicle=context.vehicle,
         position=place,
         orientation=orientation,
     )
@@ -137,6 +145,63 @@ def imu(message: Any, context: MessageContext) -> Event:
         frame_id=frame_id,
         angular_velocity=convert_vector(axes, _vector(message.angular_velocity)),
         linear_acceleration=convert_vector(axes, _vector(message.linear_acceleration)),
+    )
+
+
+def distance(message: Any, context: MessageContext) -> Event:
+    """Read a Range; what is not within its limits is out of reach."""
+    least, most, found = (
+        float(value) for value in (message.min_range, message.max_range, message.range)
+    )
+    return Range(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=context.frame(message.header, "base_link"),
+        range=found if least <= found <= most else inf,
+        field_of_view=float(message.field_of_view),
+        min_range=least,
+        max_range=most,
+    )
+
+
+def pressure(message: Any, context: MessageContext) -> Event:
+    """Read a FluidPressure."""
+    return FluidPressure(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        fluid_pressure=float(message.fluid_pressure),
+        variance=float(message.variance),
+    )
+
+
+def magnetic_field(message: Any, context: MessageContext) -> Event:
+    """Read a MagneticField, without its covariance."""
+    frame_id = context.frame(message.header, "base_link")
+    return MagneticField(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=frame_id,
+        magnetic_field=convert_vector(axes_of(frame_id), _vector(message.magnetic_field)),
+    )
+
+
+def fix(message: Any, context: MessageContext) -> Event:
+    """Read a NavSatFix.
+
+    Raises:
+        ValueError: The receiver has no fix.
+    """
+    if message.status.status < 0:
+        raise ValueError("status: expected a fix, found none")
+    known = message.position_covariance_type != message.COVARIANCE_TYPE_UNKNOWN
+    covariance = convert_covariance("world", message.position_covariance) if known else np.empty(0)
+    return NavSatFix(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        latitude=float(message.latitude),
+        longitude=float(message.longitude),
+        altitude=float(message.altitude),
+        position_covariance=tuple(covariance.tolist()),
     )
 
 
@@ -168,6 +233,10 @@ READERS: dict[tuple[str, str], Reader] = {
     ("sensor_msgs/msg/Image", "image"): image,
     ("sensor_msgs/msg/Image", "depth"): depth,
     ("sensor_msgs/msg/Imu", "imu"): imu,
+    ("sensor_msgs/msg/Range", "range"): distance,
+    ("sensor_msgs/msg/FluidPressure", "pressure"): pressure,
+    ("sensor_msgs/msg/MagneticField", "magnetic_field"): magnetic_field,
+    ("sensor_msgs/msg/NavSatFix", "fix"): fix,
     ("sensor_msgs/msg/CameraInfo", "camera"): nothing,
 }
 """By type of message and use."""
@@ -195,6 +264,7 @@ def _velocity(twist: Any, stamp: int, frame_id: str, context: MessageContext) ->
     return VelocitySetpoint(
         stamp=stamp,
         source=context.source,
+        vehicle=context.vehicle,
         frame_id=frame_id,
         velocity=turned,
         yaw_rate=-_vector(twist.angular)[2],

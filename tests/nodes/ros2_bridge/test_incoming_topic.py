@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from events import Event
+from events import Event, FluidPressure, MagneticField, NavSatFix, Range
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.incoming_topic import IncomingTopic
 from nodes.ros2_bridge.settings import Ros2BridgeConfig, Subscription
@@ -69,6 +69,18 @@ def valid(type_: str) -> bytes:
                     make(type_)(header, orientation, zeros, vector, zeros, vector, zeros)
                 )
             )
+        case "Range":
+            event = Range(stamp=1, source="s", range=1.5, min_range=0.5, max_range=4.0)
+            return bytes(messages.range((3, 7), event))
+        case "FluidPressure":
+            pressure = FluidPressure(stamp=1, source="s", fluid_pressure=1e5)
+            return bytes(messages.pressure((3, 7), pressure))
+        case "MagneticField":
+            field = MagneticField(stamp=1, source="s", magnetic_field=(1e-5, 2e-5, 3e-5))
+            return bytes(messages.magnetic_field((3, 7), field))
+        case "NavSatFix":
+            fix = NavSatFix(stamp=1, source="s", latitude=47.0, longitude=8.0, altitude=400.0)
+            return bytes(messages.fix((3, 7), fix))
         case name:
             data = messages.odometry((3, 7), samples.odometry())
             odometry: Any = store.deserialize(bytes(data), "nav_msgs/msg/Odometry")

@@ -13,11 +13,16 @@ from hypothesis import strategies as st
 from events import (
     CameraInfo,
     Event,
+    FluidPressure,
     Imu,
+    MagneticField,
+    NavSatFix,
     Odometry,
     PoseEstimate,
     PoseSetpoint,
     PositionSetpoint,
+    Range,
+    Setpoint,
     VelocitySetpoint,
 )
 from events.rotations import normalize
@@ -166,6 +171,58 @@ def test_a_pose_becomes_a_place_with_a_heading() -> None:
     event = read(pose(), "pose")
     assert isinstance(event, PoseSetpoint)
     np.testing.assert_allclose(event.orientation, (S, 0, 0, S))
+
+
+def test_small_sensors_come_back_as_they_went() -> None:
+    messages = Messages(samples.store(), FrameNames())
+    covariance = (1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0)
+    common: dict[str, Any] = {"stamp": samples.STAMP, "source": "s"}
+    down = Range(
+        **common, frame_id="down", range=2.5, field_of_view=0.5, min_range=0.5, max_range=4.0
+    )
+    pressure = FluidPressure(**common, fluid_pressure=99_000.5, variance=9.0)
+    field = MagneticField(**common, magnetic_field=(2e-5, 1e-6, 4e-5))
+    fix = NavSatFix(
+        **common, latitude=47.5, longitude=8.5, altitude=450.0, position_covariance=covariance
+    )
+    cases: list[tuple[bytearray, str, str, Event]] = [
+        (messages.range((3, 7), down), "sensor_msgs/msg/Range", "range", down),
+        (
+            messages.pressure((3, 7), pressure),
+            "sensor_msgs/msg/FluidPressure",
+            "pressure",
+            pressure,
+        ),
+        (
+            messages.magnetic_field((3, 7), field),
+            "sensor_msgs/msg/MagneticField",
+            "magnetic_field",
+            field,
+        ),
+        (messages.fix((3, 7), fix), "sensor_msgs/msg/NavSatFix", "fix", fix),
+    ]
+    for data, type_, use, sent in cases:
+        message: Any = samples.store().deserialize(bytes(data), type_)
+        assert read(message, use) == sent
+    message.status.status = -1
+    with pytest.raises(ValueError, match="expected a fix, found none"):
+        read(message, "fix")
+    far: Any = samples.store().deserialize(
+        bytes(messages.range((3, 7), down)), "sensor_msgs/msg/Range"
+    )
+    far.range = 4.5
+    event = read(far, "range")
+    assert isinstance(event, Range)
+    assert event.range == np.inf
+
+
+def test_a_setpoint_is_for_the_vehicle_that_the_subscription_names() -> None:
+    context = MessageContext(source="ros", now=NOW, vehicle="drone2")
+    twist = make("geometry_msgs/msg/Twist", linear=vector(1, 0, 0), angular=vector(0, 0, 0))
+    for message, use in ((twist, "velocity"), (pose(), "position"), (pose(), "pose")):
+        event = READERS[message.__msgtype__, use](message, context)
+        assert isinstance(event, Setpoint)
+        assert event.vehicle == "drone2"
 
 
 def test_a_calibration_becomes_an_announcement() -> None:
