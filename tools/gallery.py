@@ -44,7 +44,7 @@ def main() -> None:
     if "worlds" in wanted:
         _write("worlds.jpg", {name: _seen(name) for name in WORLDS}, 3)
     if "sensors" in wanted:
-        _write("sensors.jpg", _sensed(), 3)
+        _write("sensors.jpg", _sensed(), 5)
 
 
 def _seen(name: str) -> Any:

@@ -28,22 +28,19 @@ DENSITY = 60.0
 STEMS, BRANCHES = 46, 2
 SUN = (0.40, -0.35, -0.85)
 Points = npt.NDArray[np.float64]
+GROUPS = 7
+SWING = np.repeat([[0.16, 0.16, 0.05], [0.07, 0.07, 0.03], [0.35, 0.35, 0.0]], GROUPS, axis=0)
+"""How far crowns, sprays of leaves and shadows move, in so many groups each, metres."""
 
 
 class Sway(NamedTuple):
-    """Leaves and shadows that the wind moves: each to and fro about its place, at its own pace.
+    """Leaves and shadows in the wind: some mocap bodies move to and fro, each at its own pace.
 
     Attributes:
-        places: Where they hang when there is no wind, metres, shape (n, 3).
-        phases: Radians, shape (n,).
-        swing: Greatest distance from there, metres, shape (n,).
-        first: Name of the first of n mocap bodies.
+        swing: Greatest distance from the place along x, y, z, metres, shape (n, 3).
     """
 
-    places: Points
-    phases: Points
     swing: Points
-    first: str
 
     @property
     def solid(self) -> bool:
@@ -51,17 +48,13 @@ class Sway(NamedTuple):
         return False
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
-        """Move the bodies; the movement repeats itself for nobody within a flight."""
-        first = int(model.body(self.first).mocapid[0])
-        slow = np.sin(1.9 * seconds + self.phases)
-        quick = np.sin(5.3 * seconds + 2.7 * self.phases)
-        offset = np.stack([0.7 * slow + 0.3 * quick, 0.6 * quick - 0.3 * slow, 0.2 * quick], axis=1)
-        rows = slice(first, first + len(self.places))
-        data.mocap_pos[rows] = self.places + self.swing[:, None] * offset
-        angle = 0.2 * slow + 0.1 * quick
-        data.mocap_quat[rows] = np.stack(
-            [np.cos(angle / 2), 0.6 * np.sin(angle / 2), 0.8 * np.sin(angle / 2), 0.0 * angle], 1
-        )
+        """Move the bodies ``sway_0`` and those after it."""
+        count = len(self.swing)
+        first = int(model.body("sway_0").mocapid[0])
+        phases = 2.4 * np.arange(count)
+        slow, quick = np.sin(1.9 * seconds + phases), np.sin(5.3 * seconds + 2.7 * phases)
+        offset = np.stack([0.7 * slow + 0.3 * quick, 0.6 * quick - 0.3 * slow, quick], axis=1)
+        data.mocap_pos[first : first + count] = self.swing * offset
 
 
 def forest(seed: int = 0, bare: bool = False) -> Scene:
@@ -70,8 +63,8 @@ def forest(seed: int = 0, bare: bool = False) -> Scene:
     b.spec.visual.headlight.ambient = [0.50, 0.55, 0.48]
     bark = b.material("bark", _bark, 96.0)
     green = b.material("leaves", lambda r: materials.leaves((512, 512), r, 96.0), 96.0)
-    ends = _stems(b, bark)
-    sway = _leaves(b, green, ends)
+    sways = [b.moving(f"sway_{number}") for number in range(len(SWING))]
+    _leaves(b, green, _stems(b, bark), sways)
     back = b.material("thicket", _thicket, 24.0)
     for number in range(24):
         angle = 15.0 * number
@@ -80,13 +73,13 @@ def forest(seed: int = 0, bare: bool = False) -> Scene:
         place = (float(-HALF * c), float(-HALF * s), 0.0)
         b.wall(f"thicket_{number}", back, size, place, angle, window=b.cut(back, *size))
     b.floor("ground", b.material("ground", _ground, DENSITY), (HALF, HALF), step=2.5)
-    shadows = _shadows(b)
+    _shadows(b, sways[2 * GROUPS :])
     add_sky(b.spec, b.random)
     b.light("sun", (0.0, 0.0, 20.0), (0.66, 0.62, 0.46), towards=SUN, sun=True)
     b.light("sky_light", (0.0, 0.0, 20.0), (0.12, 0.15, 0.17), towards=(-0.5, 0.5, -0.3), sun=True)
     b.spec.stat.center = [0.0, 0.0, 2.0]
     b.spec.stat.extent = 20.0
-    return Scene(b.spec, Dynamics((sway, shadows)))
+    return Scene(b.spec, Dynamics((Sway(SWING),)))
 
 
 def _free(point: Points, path: Points) -> float:
@@ -132,18 +125,14 @@ def _stems(b: Builder, bark: Material) -> list[Vector]:
     return ends
 
 
-def _leaves(b: Builder, green: Material, ends: list[Vector]) -> Sway:
+def _leaves(b: Builder, green: Material, ends: list[Vector], sways: list[Any]) -> None:
     """Hang a cluster of leaves at each end, all drawn alike but turned."""
-    sizes = {"spray": (20, 0.6, 0.17), "crown": (64, 2.1, 0.44)}
-    for name, (count, reach, size) in sizes.items():
-        b.mesh(name, _cluster(b, count, reach, size))
-    for number, (x, y, z) in enumerate(ends):
-        body = b.spec.worldbody.add_body(name=f"leaves_{number}", mocap=True, pos=(x, y, z))
-        mesh = "crown" if z > 5.0 else "spray"
-        b.hang(f"leaves_{number}", mesh, green, body, turn=37.0 * number)
-    phases = 2.4 * np.arange(len(ends), dtype=np.float64)
-    swing = np.where(np.array(ends)[:, 2] > 5.0, 0.16, 0.07)
-    return Sway(np.array(ends), phases, swing, "leaves_0")
+    b.mesh("crown", _cluster(b, 64, 2.1, 0.44))
+    b.mesh("spray", _cluster(b, 20, 0.6, 0.17))
+    for number, place in enumerate(ends):
+        high = place[2] > 5.0
+        body = sways[number % GROUPS + (0 if high else GROUPS)]
+        b.hang(f"leaves_{number}", "crown" if high else "spray", green, body, place, 37.0 * number)
 
 
 def _cluster(b: Builder, count: int, reach: float, size: float, *, flat: bool = False) -> Surface:
@@ -172,16 +161,14 @@ def _cluster(b: Builder, count: int, reach: float, size: float, *, flat: bool = 
     )
 
 
-def _shadows(b: Builder) -> Sway:
+def _shadows(b: Builder, sways: list[Any]) -> None:
     """Lay the crowns' moving shadows on the ground, last: they are drawn over it."""
     b.spec.add_material(name="shadow", rgba=[0.02, 0.03, 0.02, 0.30], specular=0.0)
-    fixed = np.random.default_rng(12)
-    places = np.column_stack([fixed.uniform(-11.0, 11.0, (18, 2)), np.full(18, 0.015)])
     b.mesh("shadow", _cluster(b, 40, 1.6, 0.36, flat=True))
-    for number, place in enumerate(places.tolist()):
-        body = b.spec.worldbody.add_body(name=f"shadow_{number}", mocap=True, pos=place)
-        b.hang(f"shadow_{number}", "shadow", Material("shadow", 1.0, 1.0), body, turn=0.0)
-    return Sway(places, 1.7 * np.arange(18.0), np.full(18, 0.35), "shadow_0")
+    places = np.random.default_rng(12).uniform(-11.0, 11.0, (18, 2)).tolist()
+    for number, (x, y) in enumerate(places):
+        body = sways[number % len(sways)]
+        b.hang(f"shadow_{number}", "shadow", Material("shadow", 1.0, 1.0), body, (x, y, 0.015))
 
 
 def _bark(random: np.random.Generator) -> Image:

@@ -130,6 +130,12 @@ class Model:
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
 
+    def moving(self, name: str) -> Any:
+        """Add a body that moves by itself, to hang surfaces on; it has no weight that matters."""
+        return self.spec.worldbody.add_body(
+            name=name, mocap=True, mass=1.0, inertia=[1.0, 1.0, 1.0], explicitinertial=True
+        )
+
     def hang(
         self,
         name: str,

@@ -81,21 +81,18 @@ def test_leaves_and_shadows_move_as_a_pure_function_of_time() -> None:
     built = load_scene("forest", bare=True)
     model: Any = built.spec.compile()
     data, again = mujoco.MjData(model), mujoco.MjData(model)
-    start = data.mocap_pos.copy()
-    for motion in built.dynamics.motions:
-        assert not motion.solid
-        assert pickle.loads(pickle.dumps(motion)).first == motion.first  # type: ignore[attr-defined]
+    motion = built.dynamics.motions[0]
+    assert not motion.solid
     built.dynamics.apply(model, data, 7.0)
     built.dynamics.apply(model, again, 3.0)
     moved = np.abs(again.mocap_pos - data.mocap_pos).max(axis=1)
-    assert (moved > 0.001).all()
-    built.dynamics.apply(model, again, 7.0)
+    assert (moved > 0.0005).all()
+    pickle.loads(pickle.dumps(motion)).apply(model, again, 7.0)
     np.testing.assert_array_equal(again.mocap_pos, data.mocap_pos)
-    np.testing.assert_array_equal(again.mocap_quat, data.mocap_quat)
     for seconds in np.linspace(0.0, 60.0, 100):
         built.dynamics.apply(model, data, float(seconds))
-        assert np.abs(data.mocap_pos - start).max() < 0.4
-        assert np.linalg.norm(data.mocap_quat, axis=1) == pytest.approx(1.0)
+        assert np.abs(data.mocap_pos).max() < 0.4
+        assert not data.mocap_pos[-7:, 2].any(), "shadows stay on the ground"
 
 
 @pytest.mark.slow
