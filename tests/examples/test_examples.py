@@ -96,6 +96,17 @@ def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(500)
+def test_the_figure_eight_is_flown_and_followed(tmp_path: Path) -> None:
+    """`figure_eight` excites the vehicle, flies at 3 m/s, and lands without a collision."""
+    summary = run("figure_eight", tmp_path, "report.figures=[]", "camera.rate=10")
+    assert summary["reason"] == "pilot: flight completed"
+    figures = summary["verdict"]["estimators"]["odometry"]
+    assert figures["collisions"] == 0
+    assert figures["ate_percent"] < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(500)
 def test_a_single_camera_keeps_within_two_percent(tmp_path: Path) -> None:
     """`monocular` at 30 instead of 70 images a second, for the sake of time."""
     summary = run("monocular", tmp_path, "camera.rate=30", "report.figures=[]")

@@ -13,8 +13,10 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
+from msgspec import convert
 
 from events.rotations import from_rpy
+from nodes.pilots import FigureEight
 from sims.cameras import CameraRenderer, model_to_bytes, pose_to_qpos
 from sims.worlds import CLEARANCE, TOURS, WORLDS, load_world, tour_length
 from tests.sims.cameras.scenes import CAMERAS, fresh, scene
@@ -80,6 +82,8 @@ def test_the_examples_fly_clear(probe: tuple[str, Probe]) -> None:
         nodes = tomllib.loads(file.read_text(encoding="utf-8"))["nodes"]
         world = next((n.get("world", "hall") for n in nodes if n["type"].startswith("sims.")), "")
         paths = [np.array(n["waypoints"]) for n in nodes if "waypoints" in n and world == name]
+        eights = [n["figure_eight"] for n in nodes if "figure_eight" in n and world == name]
+        paths += [convert(eight, FigureEight).places() for eight in eights]
         for start, end in itertools.chain(*(itertools.pairwise(path) for path in paths)):
             for share in np.linspace(0.0, 1.0, math.ceil(np.linalg.norm(end - start) / 0.3)):
                 place = tuple((start + (end - start) * share).tolist())
