@@ -54,12 +54,12 @@ class Scanner:
         self._vehicle = vehicle
         pose = int(model.joint(f"{vehicle}/free").qposadr[0])
         self._pose = slice(pose, pose + 7)
-        self._reflectivity = reflectivities(model)
-        own = model.body(f"{vehicle}/base_link").id
-        self._hidden = ~solids(model) | (model.geom_bodyid == own)
+        met = solids(model) & (model.geom_bodyid != model.body(f"{vehicle}/base_link").id)
+        greys = reflectivities(model)
+        order = _put_first(model, met)
+        self._hidden, self._reflectivity = ~met[order], greys[order]
         # Whatever may move, and planes, whose bound is 0, are always looked at.
-        bounded = (model.geom_bodyid == 0) & (model.geom_rbound > 0.0)
-        self._radii = np.where(bounded, model.geom_rbound, np.inf)
+        self._bounded = (model.geom_bodyid == 0) & (model.geom_rbound > 0.0)
 
     def scan(self, name: str, start: int, states: Floats) -> LidarScan:
         """Scan one turn.
@@ -87,25 +87,19 @@ class Scanner:
         groups = groups[borders]
         self._rays.look(states[0], start / 1e9)
         hidden = self._hidden | self._aside(origins[groups], rays, borders, spec.max_range)
-        distances = np.empty(rays.shape[:2])
-        geoms, normals = np.empty(rays.shape[:2], np.int32), np.empty_like(rays)
-        model = self._rays.model
+        flat, channels = rays.reshape(-1, 3), spec.channels
+        ends = [*borders[1:].tolist(), len(rays)]
+        model, hits = self._rays.model, []
         for group, begin, end, hide in zip(
-            groups.tolist(),
-            borders.tolist(),
-            [*borders[1:].tolist(), len(rays)],
-            hidden,
-            strict=True,
+            groups.tolist(), borders.tolist(), ends, hidden, strict=True
         ):
             self._rays.look(states[group], start / 1e9 + group * _STEP)
             model.geom_group[:] = hide  # 0 or 1: MuJoCo would look at each geom for each ray
-            part = rays[begin:end].reshape(-1, 3)
-            hits = self._rays.cast(origins[group], part, spec.max_range, _ONLY_FIRST)
-            size = (end - begin, spec.channels)
-            distances[begin:end] = hits.distances.reshape(size)
-            geoms[begin:end] = hits.geoms.reshape(size)
-            normals[begin:end] = hits.normals.reshape(*size, 3)
-        returned = -np.einsum("cki,cki->ck", normals, rays) * self._reflectivity[geoms]
+            part = flat[begin * channels : end * channels]
+            hits.append(self._rays.cast(origins[group], part, spec.max_range, _ONLY_FIRST))
+        distances, geoms, normals = map(np.concatenate, zip(*hits, strict=True))
+        returned = -np.einsum("ri,ri->r", normals, flat) * self._reflectivity[geoms]
+        distances, returned = (each.reshape(rays.shape[:2]) for each in (distances, returned))
         return self._measured(spec, start, directions, times, distances, returned)
 
     def _poses(self, spec: LidarSpec, states: Floats, times: Floats) -> tuple[Floats, Floats]:
@@ -127,27 +121,41 @@ class Scanner:
     ) -> npt.NDArray[np.bool_]:
         """Return which geoms no ray of a group can meet, shape (groups, geoms).
 
-        By their bounding spheres, and for each group of rays the cone around them and the plane
-        that they are near to, such as that of a spinning lidar's column.
+        Four planes through the group's origin have all its rays on one side; a geom whose box is
+        wholly on the other side of one of them, behind the origin or out of reach, is aside.
         """
         middle = rays[:, 0] + rays[:, rays.shape[1] // 2] + rays[:, -1]
-        sums = np.add.reduceat(middle, borders, axis=0)
-        axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-12)[:, None]
-        normals = np.cross(rays[borders, 0], rays[borders, -1])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+        ahead = _unit(np.add.reduceat(middle, borders, axis=0))
+        right = np.cross(rays[borders, 0], rays[borders, -1])  # across a spinning lidar's columns
+        right = _unit(
+            np.where((right**2).sum(axis=1, keepdims=True) > 1e-12, right, ahead[:, ::-1])
+        )
+        right = _unit(np.cross(ahead, np.cross(right, ahead)))
+        up = np.cross(ahead, right)
         counts = np.diff(borders, append=len(rays))
-        along = np.einsum("cki,ci->kc", rays, np.repeat(axes, counts, axis=0)).min(axis=0)
-        off = np.abs(np.einsum("cki,ci->kc", rays, np.repeat(normals, counts, axis=0))).max(axis=0)
-        half = np.arccos(np.clip(np.minimum.reduceat(along, borders), -1.0, 1.0))[:, None]
-        off = np.maximum.reduceat(off, borders)[:, None]
-        apart = self._rays.data.geom_xpos[None] - origins[:, None]
-        distances = np.sqrt(np.einsum("gni,gni->gn", apart, apart)) + 1e-9
-        radii = self._radii[None]
-        outside = distances > radii
-        angles = np.arccos(np.clip(np.einsum("gni,gi->gn", apart, axes) / distances, -1.0, 1.0))
-        wide = np.arcsin(np.where(outside, radii, 0.0) / distances)
-        beside = np.abs(np.einsum("gni,gi->gn", apart, normals)) > radii + off * distances
-        return np.asarray(outside & ((angles > half + wide) | beside | (distances - radii > reach)))
+        forwards, rightwards, upwards = (
+            np.einsum("cki,ci->kc", rays, np.repeat(axis, counts, axis=0))
+            for axis in (ahead, right, up)
+        )
+        narrow = np.minimum.reduceat(forwards.min(axis=0), borders) > 0.01
+        slopes = [
+            np.maximum.reduceat((part / np.maximum(forwards, 0.01)).max(axis=0), borders)[:, None]
+            for part in (rightwards, -rightwards, upwards, -upwards)
+        ]
+        nearest, farthest = self._extents(ahead, origins)
+        aside = (farthest < 0.0) | (nearest > reach)
+        for axis, slope in zip((right, -right, up, -up), slopes, strict=True):
+            aside |= self._extents(axis - slope * ahead, origins)[0] > 0.0
+        return np.asarray(aside & narrow[:, None] & self._bounded)
+
+    def _extents(self, normals: Floats, origins: Floats) -> tuple[Floats, Floats]:
+        """Return between which heights each geom's box is over planes, shape (planes, geoms)."""
+        data, aabb = self._rays.data, self._rays.model.geom_aabb
+        axes = data.geom_xmat.reshape(-1, 3, 3)
+        centres = data.geom_xpos + np.einsum("gij,gj->gi", axes, aabb[:, :3])
+        height = normals @ centres.T - (normals * origins).sum(axis=1)[:, None]
+        half = sum(np.abs(normals @ (axes[:, :, i] * aabb[:, 3 + i, None]).T) for i in range(3))
+        return height - half, height + half
 
     def _measured(
         self,
@@ -180,6 +188,29 @@ class Scanner:
             times=times[column].astype(np.float32),
             rings=channel.astype(np.uint16),
         )
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)[:, None])
+
+
+def _put_first(model: Any, met: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+    """Have MuJoCo forget those of the world's own geoms that light does not meet.
+
+    For each ray it goes through all geoms of a body, the first `body_geomnum` of its own.
+
+    Returns:
+        The old number of each geom; names lead to the old ones still.
+    """
+    order = np.arange(model.ngeom)
+    world = np.flatnonzero(model.geom_bodyid == 0)
+    order[world] = world[np.argsort(~met[world], kind="stable")]
+    for name in dir(model):
+        array = getattr(model, name)
+        if name.startswith("geom_") and len(array) == model.ngeom:
+            array[:] = array[order]
+    model.body_geomnum[0] = met[world].sum()
+    return order
 
 
 def solids(model: Any) -> npt.NDArray[np.bool_]:
