@@ -77,11 +77,7 @@ class Scanner:
         directions, times = pattern_of(spec, start / 1e9)
         origins, turns = self._poses(spec, states, times)
         # FRD to FLU, and from there to the world's NWU.
-        x, y, z = np.moveaxis(directions, -1, 0) * np.array([1.0, -1.0, -1.0])[:, None, None]
-        rays = np.empty_like(directions)
-        for axis in range(3):
-            a, b, c = turns[:, axis].T[:, :, None]
-            rays[..., axis] = a * x + b * y + c * z
+        rays = (directions * (1.0, -1.0, -1.0)) @ turns.transpose(0, 2, 1)
         groups = np.minimum(np.rint(times / _STEP).astype(np.intp), len(states) - 1)
         borders = np.flatnonzero(np.diff(groups, prepend=-1))
         groups = groups[borders]
