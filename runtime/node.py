@@ -145,6 +145,7 @@ class Node(Generic[C]):
         clock: The run's clock; the only time that a node should know.
         log: The node's logger (trace, debug, info, warning, error, fatal).
         rng: Random numbers that depend on the run's seed and the node's name only.
+        seed: The run's, for random numbers that nodes share.
         out: Folder for files, or `None` if the run writes none.
         sources: Ports narrowed to a source, by the file or by `narrow`.
         restarts: How often this node was brought up before in this run, in this process or in one
@@ -165,6 +166,7 @@ class Node(Generic[C]):
     clock: Clock
     log: NodeLogger
     rng: np.random.Generator
+    seed: int
     out: Path | None
     sources: dict[str, str]
     restarts: int
@@ -361,6 +363,7 @@ def make_node(
     node.clock = host.clock
     node.log = NodeLogger(name)
     node.rng = np.random.default_rng([host.seed, zlib.crc32(name.encode())])
+    node.seed = host.seed
     node.out = host.out
     node.sources = dict(sources or {})
     node.restarts = restarts

@@ -14,7 +14,10 @@ from runtime import Node
 from runtime.node import Sibling
 from sims.cameras import model_to_bytes
 from sims.vehicle import Simulation
+from sims.vehicle.air import Air
+from sims.vehicle.simulation import Influence
 from sims.worlds import Dynamics, Scene, WorldError, load_scene
+from sims.worlds.wind import WindSpec
 
 Floats = npt.NDArray[np.float64]
 
@@ -38,6 +41,11 @@ class Inhabitant:
             config: The node's settings.
         """
 
+    @classmethod
+    def wind_of(cls, config: Any) -> WindSpec | None:  # noqa: ARG003
+        """Return the wind that a node of this class brings; `None` for most."""
+        return None
+
 
 class SharedWorld:
     """A compiled world, its physics, and what of it is to be handed to renderers.
@@ -47,24 +55,30 @@ class SharedWorld:
     Args:
         inhabitants: The nodes that have something in it, in file order.
         bare: Whether images are left out, since nobody is to see them.
+        seed: Of the turbulence.
 
     Attributes:
         name: Name or path of the world.
         model: The compiled world.
         dynamics: What moves in it by itself.
         simulation: Its physics, which all vehicles share. `None` if there is no vehicle.
+        air: Its wind; `None` if there is none, or no vehicle.
+        vehicles: Names of the vehicles.
     """
 
     model: Any
     dynamics: Dynamics
     simulation: Simulation | None
+    air: Air | None
 
-    def __init__(self, inhabitants: tuple[Sibling, ...], bare: bool) -> None:
+    def __init__(self, inhabitants: tuple[Sibling, ...], bare: bool, seed: int) -> None:
         named = [each for each in inhabitants if each.config.world]
         self.name = named[0].config.world if named else "hall"
         self.named_by = named[0].name if named else ""
         self._inhabitants = inhabitants
+        self.vehicles = [each.name for each in inhabitants if each.node.vehicle]  # type: ignore[attr-defined]
         self._bare = bare
+        self._seed = seed
         self._built = False
         self._building = asyncio.Lock()
 
@@ -107,17 +121,29 @@ class SharedWorld:
         self.simulation.advance_to(stamp_ns)
         return self.simulation.history.at(stamp_ns)[0].copy()
 
+    def geoms_of(self, body: str) -> tuple[int, ...]:
+        """Return the numbers of a body's geoms, which are those in segmentation images."""
+        return tuple(np.flatnonzero(self.model.geom_bodyid == self.model.body(body).id).tolist())
+
     def _build(self) -> None:
         spec, dynamics = load_scene(self.name, bare=self._bare)
-        vehicles = False
+        wind = None
         for each in self._inhabitants:
-            added = each.node.populate(Scene(spec, dynamics), each.name, each.config)  # type: ignore[attr-defined]
-            dynamics = Dynamics(dynamics.motions + added.motions)
-            vehicles |= each.node.vehicle  # type: ignore[attr-defined]
+            node: type[Inhabitant] = each.node  # type: ignore[assignment]
+            added = node.populate(Scene(spec, dynamics), each.name, each.config)
+            dynamics = dynamics.joined(added)
+            wind = node.wind_of(each.config) or wind
         self.model = spec.compile()
         self.__dict__.pop("model_bytes", None)
         self.dynamics = dynamics
-        self.simulation = Simulation(self.model, dynamics.solid.motions) if vehicles else None
+        self.simulation = self.air = None
+        if self.vehicles:
+            influences: list[Influence] = list(dynamics.solid.motions)
+            if wind is not None and not wind.still:
+                random = np.random.default_rng([self._seed, *b"wind"])
+                self.air = Air(self.model, wind, self.vehicles, random)
+                influences.append(self.air)
+            self.simulation = Simulation(self.model, influences)
 
 
 async def join_world(node: Any) -> SharedWorld:
@@ -136,7 +162,7 @@ async def join_world(node: Any) -> SharedWorld:
             "expected all that is in one world in one process, found "
             f"{', '.join(absent)} in another one: name them together after --only"
         )
-    world: SharedWorld = node.share(key, lambda: SharedWorld(inhabitants, node.checking))
+    world: SharedWorld = node.share(key, lambda: SharedWorld(inhabitants, node.checking, node.seed))
     if node.config.world not in ("", world.name):
         raise WorldError(
             f'world: expected "{world.name}", in which {world.named_by} is, since all vehicles of '

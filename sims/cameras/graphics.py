@@ -56,3 +56,13 @@ def open_context(width: int, height: int, threads: int) -> Any:
             "(or libosmesa6, and MUJOCO_GL=osmesa in the environment)"
         ) from error
     return context
+
+
+def set_fog(start: float, end: float) -> None:
+    """Set the distances (metres) between which the present context's fog grows to its full.
+
+    MuJoCo sets them once, when a model enters a context.
+    """
+    gl = importlib.import_module("OpenGL.GL")
+    gl.glFogf(gl.GL_FOG_START, start)
+    gl.glFogf(gl.GL_FOG_END, end)

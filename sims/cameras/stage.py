@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from events.base import Quaternion, Vector3
 from events.frames import flip_yz, flip_yz_rotation
-from sims.cameras.graphics import open_context
+from sims.cameras.graphics import open_context, set_fog
 
 Floats = npt.NDArray[np.float64]
 Colours = npt.NDArray[np.uint8]
@@ -37,6 +37,10 @@ LOOK = ".look"
 
 class Changing(Protocol):
     """What a stage must know of what moves in a world by itself."""
+
+    @property
+    def fog(self) -> bool:
+        """Whether there is fog."""
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:
         """Make the world as it is at a time."""
@@ -78,6 +82,7 @@ class Stage:
         self._scene.flags[:] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
         self._scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = 1
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = dynamics is not None and dynamics.fog
         self._option = _surfaces_only()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -108,6 +113,9 @@ class Stage:
         data.qpos[:] = qpos
         if self._dynamics is not None:
             self._dynamics.apply(model, data, seconds)
+            if self._dynamics.fog:
+                fog, extent = model.vis.map, model.stat.extent
+                set_fog(fog.fogstart * extent, fog.fogend * extent)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)  # lights that track something ask for it
         mujoco.mj_camlight(model, data)

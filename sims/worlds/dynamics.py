@@ -39,9 +39,15 @@ class Dynamics(NamedTuple):
 
     Attributes:
         motions: In the order in which they are applied.
+        fog: Whether the world is drawn with fog, as MuJoCo's settings of it say.
     """
 
     motions: tuple[Motion, ...] = ()
+    fog: bool = False
+
+    def joined(self, other: Dynamics) -> Dynamics:
+        """Return these and what moves or changes besides."""
+        return Dynamics(self.motions + other.motions, self.fog or other.fog)
 
     @property
     def solid(self) -> Dynamics:

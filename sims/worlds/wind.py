@@ -1,0 +1,196 @@
+"""Wind: a mean, discrete gusts, and turbulence after Dryden. Pure functions and filters.
+
+After MIL-F-8785C, "Flying Qualities of Piloted Airplanes" (1980), section 3.7, the low-altitude
+model. Everything here is in SI units and NED.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+
+from events import Vector3
+from runtime.units import Duration
+
+FOOT = 0.3048
+KNOT = 0.514444
+W20 = {"none": 0.0, "light": 15 * KNOT, "moderate": 30 * KNOT, "severe": 45 * KNOT}
+"""Wind at a height of 20 feet, m/s, by the strength of the turbulence that it makes."""
+
+LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT
+"""Heights between which the model holds, metres; it is used beyond with these."""
+
+SLOWEST = 1.0
+"""Metres per second through the air below which turbulence is met as at this speed: at 0 it would
+stand still."""
+
+
+class Gust(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One discrete gust of the shape 1 - cos, in addition to the mean wind.
+
+    Attributes:
+        velocity: What it adds at its strongest, m/s north, east, down.
+        start: When it begins.
+        rise: Time in which it rises, and in which it falls again.
+        hold: Time for which it is at its strongest in between.
+        period: Time from its beginning to its next one; 0 if it comes once.
+    """
+
+    velocity: Vector3
+    start: Duration = Duration(0)  # immutable
+    rise: Duration = Duration(1.0)
+    hold: Duration = Duration(0)
+    period: Duration = Duration(0)
+
+    def __post_init__(self) -> None:
+        if not self.rise:
+            raise ValueError("rise: expected a time above 0, found 0")
+        if 0 < self.period < 2 * self.rise + self.hold:
+            raise ValueError(
+                f"period: expected at least the {2 * self.rise + self.hold:g} s that the gust "
+                f"takes, found {self.period:g} s"
+            )
+
+    def share(self, seconds: float) -> float:
+        """Return how strong it is at a time, 0 to 1."""
+        since = seconds - self.start
+        if since <= 0.0:
+            return 0.0
+        if self.period:
+            since %= self.period
+        rise = min(since, 2 * self.rise + self.hold - since) / self.rise
+        return 0.5 * (1.0 - math.cos(math.pi * min(max(rise, 0.0), 1.0)))
+
+
+class WindSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the wind.
+
+    Attributes:
+        velocity: Mean velocity of the air, m/s north, east, down: [5, 0, 0] blows to the north.
+        gusts: Discrete gusts.
+        turbulence: Strength of the turbulence after Dryden (MIL-F-8785C, low altitude): ``none``,
+            ``light``, ``moderate``, ``severe``, or the wind at a height of 20 feet, m/s, which
+            makes it. Its scale depends on a vehicle's height above the world's zero, and how
+            quickly it is met on the vehicle's speed through the air.
+    """
+
+    velocity: Vector3 = (0.0, 0.0, 0.0)
+    gusts: tuple[Gust, ...] = ()
+    turbulence: (
+        Literal["none", "light", "moderate", "severe"] | Annotated[float, msgspec.Meta(ge=0)]
+    ) = "none"
+
+    @property
+    def w20(self) -> float:
+        """Wind at 20 feet by which the turbulence is given, m/s."""
+        return W20[self.turbulence] if isinstance(self.turbulence, str) else self.turbulence
+
+    @property
+    def still(self) -> bool:
+        """Whether there is no wind at all."""
+        return not (any(self.velocity) or self.gusts or self.w20)
+
+
+def scales(height: float, w20: float) -> tuple[Vector3, Vector3]:
+    """Return the turbulence's intensities (m/s) and lengths (m) along, across, vertical.
+
+    Args:
+        height: Above the ground, metres.
+        w20: Wind at a height of 20 feet, m/s.
+    """
+    height = min(max(height, LOWEST), HIGHEST)
+    shape = 0.177 + 0.000823 * height / FOOT
+    vertical = 0.1 * w20
+    flat = vertical / shape**0.4
+    length = height / shape**1.2
+    return (flat, flat, vertical), (length, length, height)
+
+
+def spectrum(axis: int, omega: float, speed: float, height: float, w20: float) -> float:
+    """Return the model's one-sided power spectrum, (m/s)² per rad/s, whose integral is sigma².
+
+    Args:
+        axis: 0 along the mean wind, 1 across, 2 vertical.
+        omega: Angular frequency, rad/s.
+        speed: Through the air, m/s.
+        height: Above the ground, metres.
+        w20: Wind at a height of 20 feet, m/s.
+    """
+    sigma, length = (each[axis] for each in scales(height, w20))
+    x = (length * omega / speed) ** 2
+    if axis == 0:
+        return 2 * sigma**2 * length / (math.pi * speed) / (1 + x)
+    return sigma**2 * length / (math.pi * speed) * (1 + 3 * x) / (1 + x) ** 2
+
+
+class Turbulence:
+    """The Dryden filters, driven by white noise and discretised exactly, for one place in the air.
+
+    Their states have no unit: what they are at a height is them times that height's intensity, so
+    that a change of height or speed changes nothing suddenly but the velocity's scale.
+
+    Args:
+        start: Five numbers, normally distributed, from which the states are drawn.
+    """
+
+    NUMBERS = 5
+    """Random numbers that each step takes."""
+
+    def __init__(self, start: list[float]) -> None:
+        u, v1, v2, w1, w2 = start
+        # Stationary: variances 1/2 and 1/4 of the two states, covariance 1/4.
+        half, quarter = math.sqrt(0.5), math.sqrt(0.125)
+        self._u = u
+        self._v = (half * v1, quarter * (v1 + v2))
+        self._w = (half * w1, quarter * (w1 + w2))
+
+    def step(
+        self, seconds: float, speed: float, height: float, w20: float, noise: list[float]
+    ) -> Vector3:
+        """Go on in time, and return the velocity along, across and vertical, m/s.
+
+        Args:
+            seconds: Since the last step.
+            speed: Through the air, m/s.
+            height: Above the ground, metres.
+            w20: Wind at a height of 20 feet, m/s.
+            noise: Five numbers, normally distributed.
+        """
+        sigma, length = scales(height, w20)
+        way = max(speed, SLOWEST) * seconds
+        keep = math.exp(-way / length[0])
+        self._u = keep * self._u + math.sqrt(1.0 - keep * keep) * noise[0]
+        self._v = _second_order(self._v, way / length[1], noise[1], noise[2])
+        self._w = _second_order(self._w, way / length[2], noise[3], noise[4])
+        return sigma[0] * self._u, sigma[1] * _output(self._v), sigma[2] * _output(self._w)
+
+
+def _second_order(
+    state: tuple[float, float], d: float, first: float, second: float
+) -> tuple[float, float]:
+    """Step x1' = -x1 + n, x2' = -x2 + x1 by d, with white noise n of intensity 1."""
+    x1, x2 = state
+    keep, gone = math.exp(-d), math.exp(-2.0 * d)
+    q11 = 0.5 * (1.0 - gone)
+    q12 = 0.25 * (1.0 - gone * (1.0 + 2.0 * d))
+    q22 = 0.25 * (1.0 - gone * (1.0 + 2.0 * d + 2.0 * d * d))
+    l11 = math.sqrt(q11)
+    l21 = q12 / l11
+    l22 = math.sqrt(max(q22 - l21 * l21, 0.0))
+    return keep * x1 + l11 * first, keep * (d * x1 + x2) + l21 * first + l22 * second
+
+
+def _output(state: tuple[float, float]) -> float:
+    """Return (1 + √3 s) / (1 + s)² of the noise: of variance 1."""
+    root = math.sqrt(3.0)
+    return root * state[0] + (1.0 - root) * state[1]
+
+
+def turned(velocity: Vector3, mean: Vector3) -> Vector3:
+    """Return a velocity along, across and vertical in ``map``; along north if there is no mean."""
+    along, across, down = velocity
+    flat = math.hypot(mean[0], mean[1])
+    c, s = (mean[0] / flat, mean[1] / flat) if flat > 1e-9 else (1.0, 0.0)
+    return c * along - s * across, s * along + c * across, down
