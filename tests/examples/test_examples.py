@@ -216,3 +216,33 @@ def test_two_machines_start_in_either_order(tmp_path: Path, clock: str, first: i
     assert one["events"]["PoseEstimate"] > 30
     if clock == "lockstep":
         assert one["digest"] == run("two_machines", tmp_path / "alone", *changes)["digest"]
+
+
+@pytest.mark.slow
+def test_an_odometry_takes_the_undistorted_images_of_a_fisheye(tmp_path: Path) -> None:
+    """`fisheye` keeps its way; each exposure gives two images."""
+    summary = run("fisheye", tmp_path, "run.duration=6s", "report.figures=[]")
+    figures = summary["verdict"]["estimators"]["odometry"]
+    assert figures["lost_seconds"] == 0.0
+    assert figures["ate_rmse_m"] < 0.02
+    assert summary["events"]["Image"] == 2 * summary["events"]["PoseEstimate"]
+
+
+@pytest.mark.slow
+def test_a_rolling_shutter_makes_an_odometry_worse(tmp_path: Path) -> None:
+    """`rolling_shutter` has the same flight seen twice."""
+    summary = run("rolling_shutter", tmp_path, "run.duration=7s", "report.figures=[]")
+    figures = summary["verdict"]["estimators"]
+    assert figures["of_rolling"]["rot_rmse_deg"] > 2.0 * figures["of_global"]["rot_rmse_deg"]
+
+
+@pytest.mark.slow
+def test_a_stereo_rig_becomes_a_data_set_of_two_cameras(tmp_path: Path) -> None:
+    """`stereo_inertial` writes pairs with equal stamps, which are 3 ms later than the IMU's."""
+    run("stereo_inertial", tmp_path, "run.duration=3s")
+    folders = [tmp_path / "euroc" / "mav0" / camera for camera in ("cam0", "cam1")]
+    left, right = ({int(p.stem) for p in (f / "data").glob("*.png")} for f in folders)
+    assert left == right
+    assert len(left) >= 58
+    rows = (tmp_path / "euroc/mav0/imu0/data.csv").read_text().splitlines()[1:]
+    assert {stamp - 3_000_000 for stamp in left} <= {int(row.partition(",")[0]) for row in rows}
