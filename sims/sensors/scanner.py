@@ -28,6 +28,25 @@ _DEFAULT = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 """Colour of a geom that has been given none, and so has its material's."""
 
 
+class _Boxes:
+    """The boxes around a world's geoms, as they are at the start."""
+
+    def __init__(self, rays: Rays) -> None:
+        rays.look(rays.model.qpos0, 0.0)
+        aabb, axes = rays.model.geom_aabb, rays.data.geom_xmat.reshape(-1, 3, 3)
+        centres = rays.data.geom_xpos + np.einsum("gij,gj->gi", axes, aabb[:, :3])
+        self._centres = np.ascontiguousarray(centres.T)
+        self._edges = [
+            np.ascontiguousarray((axes[:, :, i] * aabb[:, 3 + i, None]).T) for i in range(3)
+        ]
+
+    def extents(self, normals: Floats, origins: Floats) -> tuple[Floats, Floats]:
+        """Return between which heights each box is over planes, shape (planes, geoms)."""
+        height = normals @ self._centres - (normals * origins).sum(axis=1)[:, None]
+        half = sum(np.abs(normals @ edges) for edges in self._edges)
+        return height - half, height + half
+
+
 class Scanner:
     """Scans turns of the lidars of one body.
 
@@ -60,6 +79,7 @@ class Scanner:
         self._hidden, self._reflectivity = ~met[order], greys[order]
         # Whatever may move, and planes, whose bound is 0, are always looked at.
         self._bounded = (model.geom_bodyid == 0) & (model.geom_rbound > 0.0)
+        self._boxes = _Boxes(self._rays)
 
     def scan(self, name: str, start: int, states: Floats) -> LidarScan:
         """Scan one turn.
@@ -138,20 +158,11 @@ class Scanner:
             np.maximum.reduceat((part / np.maximum(forwards, 0.01)).max(axis=0), borders)[:, None]
             for part in (rightwards, -rightwards, upwards, -upwards)
         ]
-        nearest, farthest = self._extents(ahead, origins)
+        nearest, farthest = self._boxes.extents(ahead, origins)
         aside = (farthest < 0.0) | (nearest > reach)
         for axis, slope in zip((right, -right, up, -up), slopes, strict=True):
-            aside |= self._extents(axis - slope * ahead, origins)[0] > 0.0
+            aside |= self._boxes.extents(axis - slope * ahead, origins)[0] > 0.0
         return np.asarray(aside & narrow[:, None] & self._bounded)
-
-    def _extents(self, normals: Floats, origins: Floats) -> tuple[Floats, Floats]:
-        """Return between which heights each geom's box is over planes, shape (planes, geoms)."""
-        data, aabb = self._rays.data, self._rays.model.geom_aabb
-        axes = data.geom_xmat.reshape(-1, 3, 3)
-        centres = data.geom_xpos + np.einsum("gij,gj->gi", axes, aabb[:, :3])
-        height = normals @ centres.T - (normals * origins).sum(axis=1)[:, None]
-        half = sum(np.abs(normals @ (axes[:, :, i] * aabb[:, 3 + i, None]).T) for i in range(3))
-        return height - half, height + half
 
     def _measured(
         self,
