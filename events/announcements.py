@@ -63,7 +63,8 @@ class CameraAnnouncement(Announcement):
             ground truth: what is stamped t was exposed at ``t - time_offset``. (Kalibr's
             ``timeshift_cam_imu`` is its negative.)
         time_jitter: Greatest random error of the stamps besides, seconds, either way.
-        noise: Standard deviation of the images' noise at middle grey (128), grey levels.
+        noise: Standard deviation of the images' noise at middle grey (128), grey levels; at gain 1
+            if the camera chooses it.
         full_well: Electrons of a white pixel at gain 1, whose number has a Poisson distribution
             (shot noise); 0 if the noise is the same at all grey levels.
         reference_exposure: Exposure time, seconds, at which an image of gain 1 is as bright as its
