@@ -108,23 +108,6 @@ def scales(height: float, w20: float) -> tuple[Vector3, Vector3]:
     return (flat, flat, vertical), (length, length, height)
 
 
-def spectrum(axis: int, omega: float, speed: float, height: float, w20: float) -> float:
-    """Return the model's one-sided power spectrum, (m/s)² per rad/s, whose integral is sigma².
-
-    Args:
-        axis: 0 along the mean wind, 1 across, 2 vertical.
-        omega: Angular frequency, rad/s.
-        speed: Through the air, m/s.
-        height: Above the ground, metres.
-        w20: Wind at a height of 20 feet, m/s.
-    """
-    sigma, length = (each[axis] for each in scales(height, w20))
-    x = (length * omega / speed) ** 2
-    if axis == 0:
-        return 2 * sigma**2 * length / (math.pi * speed) / (1 + x)
-    return sigma**2 * length / (math.pi * speed) * (1 + 3 * x) / (1 + x) ** 2
-
-
 class Turbulence:
     """The Dryden filters, driven by white noise and discretised exactly, for one place in the air.
 

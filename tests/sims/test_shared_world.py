@@ -203,6 +203,25 @@ def test_a_vehicle_that_is_brought_up_again_is_where_it_was_left(world: str) -> 
     assert places(result, "b")[-1] == pytest.approx((0.0, 4.0, -1.1), abs=0.1)
 
 
+def test_physics_that_diverged_are_made_anew_for_all(world: str) -> None:
+    class Wild(Multirotor):
+        @every(hz="control_rate")
+        def control(self, tick: Any) -> None:
+            if self.name == "a" and not self.restarts and tick.stamp > SECOND:
+                self._physics.data.qpos[:3] = np.nan
+                self._physics.simulation.changed()
+            super().control(tick)
+
+    nodes = [
+        spec(Wild, name, {"world": world, "position": [0.0, east]}, on_error="restart")
+        for name, east in (("a", 0.0), ("b", 4.0))
+    ]
+    orders = [takeoff(name, stamp=stamp) for stamp in (0, 3 * SECOND) for name in ("a", "b")]
+    result = fly(*nodes, inputs=orders, duration=6.0)
+    for name, east in (("a", 0.0), ("b", 4.0)):
+        assert places(result, name)[-1] == pytest.approx((0.0, east, -1.1), abs=0.1)
+
+
 def test_all_of_one_world_are_in_one_process(world: str) -> None:
     host = NoHost()
     nodes = (drone("a", 0.0, world), drone("b", 4.0, world))

@@ -11,7 +11,24 @@ from hypothesis import strategies as st
 from scipy.signal import welch
 
 from runtime.units import Duration
-from sims.worlds.wind import FOOT, Gust, Turbulence, WindSpec, scales, spectrum, turned
+from sims.worlds.wind import FOOT, Gust, Turbulence, WindSpec, scales, turned
+
+
+def spectrum(axis: int, omega: float, speed: float, height: float, w20: float) -> float:
+    """Return the standard's one-sided power spectrum, (m/s)² per rad/s, whose integral is sigma².
+
+    Args:
+        axis: 0 along the mean wind, 1 across, 2 vertical.
+        omega: Angular frequency, rad/s.
+        speed: Through the air, m/s.
+        height: Above the ground, metres.
+        w20: Wind at a height of 20 feet, m/s.
+    """
+    sigma, length = (each[axis] for each in scales(height, w20))
+    x = (length * omega / speed) ** 2
+    if axis == 0:
+        return 2 * sigma**2 * length / (math.pi * speed) / (1 + x)
+    return sigma**2 * length / (math.pi * speed) * (1 + 3 * x) / (1 + x) ** 2
 
 
 def series(
