@@ -126,10 +126,11 @@ def render(
 
 
 def _written(plot: Plot, folder: Path, formats: Sequence[str]) -> dict[str, str]:
-    return _embedded(plot.write(folder, formats), plot.title, plot.caption, plot.photo)
+    return embedded(plot.write(folder, formats), plot.title, plot.caption, plot.photo)
 
 
-def _embedded(path: Path, title: str, caption: str, photo: bool) -> dict[str, str]:
+def embedded(path: Path, title: str, caption: str, photo: bool) -> dict[str, str]:
+    """Return a figure for a page that holds it whole: its title, caption and source."""
     data, kind = path.read_bytes(), "png"
     if photo:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

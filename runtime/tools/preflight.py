@@ -49,10 +49,12 @@ class Findings(msgspec.Struct, frozen=True):
     Attributes:
         errors: With any of these the run cannot do what the file says: a line each.
         warnings: What is odd, and may be meant.
+        announcements: What the nodes announced, if they were brought up.
     """
 
     errors: list[str]
     warnings: list[str]
+    announcements: tuple[Announcement, ...] = ()
 
 
 def of_file(config: Config, only: Collection[str] = ()) -> Findings:
@@ -80,11 +82,11 @@ def of_nodes(config: Config) -> Findings:
     errors: list[str] = []
     loop = make_loop(config.run)
     with asyncio.Runner(loop_factory=lambda: loop) as runner, _warnings() as warnings:
-        runner.run(_rehearse(config, errors, warnings))
-    return Findings(errors, warnings)
+        announced = runner.run(_rehearse(config, errors, warnings))
+    return Findings(errors, warnings, tuple(announced))
 
 
-async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> None:
+async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> list[Announcement]:
     loop = asyncio.get_running_loop()
     task_factory.install(loop)
     clock = make_clock(config.run, loop)
@@ -99,12 +101,13 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> N
     runners = [NodeRunner(spec, create) for spec in config.nodes]
     cut_short: set[str] = set()
     uncertain = False
+    everything: list[Announcement] = []
 
     async def start(runner: NodeRunner) -> None:
         await runner.start_up(host, config.run.startup_limit)
 
     async def exchange(announced: Announced) -> list[Announcement]:
-        everything = [each for of_node in announced.values() for each in of_node]
+        everything.extend(each for of_node in announced.values() for each in of_node)
         errors.extend(_announced_twice(announced))
         warnings.extend(_unknown_sources(config.nodes, everything))
         return everything
@@ -138,6 +141,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> N
         del warnings[before:]  # that nothing came is no news
         host.executor.shutdown(wait=False, cancel_futures=True)
         clock.close()
+    return everything
 
 
 class _NoWorkerError(VisnavError):

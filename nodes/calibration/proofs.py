@@ -1,0 +1,375 @@
+"""The six proofs: what a rig sent in the calibration room, held against what it announced.
+
+Pure functions on what `Collector` has kept. Each returns figures with what is allowed of them, and
+a sentence of what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from events import CameraAnnouncement, Imu, ImuAnnouncement
+from events.poses import pose_matrix
+from nodes.calibration.collector import Collector
+from nodes.calibration.formats import FORMATS, GRAVITY, write_files
+from nodes.calibration.motion import Floats, Motion
+from nodes.calibration.readers import read
+from nodes.calibration.room import NEAREST, hits, spheres
+from nodes.dataset.rig import Rig
+
+INTEGRATED = 5.0
+"""Seconds over which the IMU is integrated."""
+
+_POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.01, 0.1, 0.3, 0.005, 1e-5
+"""Metres; pixels, global and rolling shutter; metres; pixels."""
+
+_MOST = 0.99
+"""Share of points, and of depths, that has to be within its limit; no point may be beyond three
+times of it, and none may be missing."""
+
+_LATE, _PLACE, _TURN = 2e-4, 5e-4, 5e-4
+"""Seconds, metres and radians by which stamps and poses may be off."""
+
+
+class Figure(msgspec.Struct, frozen=True):
+    """One number of a proof.
+
+    Attributes:
+        subject: Whose.
+        name: What.
+        value: Measured.
+        limit: Greatest that is allowed; None if nothing is.
+        unit: Of both.
+        remark: What is wrong, or cannot be shown, in a sentence.
+    """
+
+    subject: str
+    name: str
+    value: float
+    limit: float | None = None
+    unit: str = ""
+    remark: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is within its limit; NaN is not."""
+        return self.limit is None or self.value <= self.limit
+
+
+class Points(msgspec.Struct, frozen=True, eq=False):
+    """Discs of a camera's images: where they are, where they should be, and how they move.
+
+    Attributes:
+        pixels: Expected centroids, columns and rows, shape (n, 2).
+        off: Measured less expected, shape (n, 2).
+        flow: Pixels per second, shape (n, 2).
+    """
+
+    pixels: Floats
+    off: Floats
+    flow: Floats
+
+
+def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, begin: int) -> Figure:
+    """Return how far the ideal IMU, integrated, gets from the truth: proof 1.
+
+    Rotation by the exponential of the mean of two angular velocities, velocity by the trapezoidal
+    rule on the rotated specific forces, position likewise; of an IMU that averages, by its sample.
+    """
+    used = [s for s in samples if begin <= s.stamp <= begin + round(INTEGRATED * 1e9)]
+    stamps = np.array([s.stamp for s in used], np.int64)
+    rates = np.array([s.angular_velocity for s in used])
+    forces = np.array([s.linear_acceleration for s in used])
+    places, turns = motion.mounted(stamps, imu.position, imu.orientation)
+    near = 1_000_000
+    a, b = (motion.mounted(stamps[:1] + d, imu.position, imu.orientation)[0] for d in (-near, near))
+    turn, place, velocity = turns[0], places[0].copy(), (b[0] - a[0]) / (2e-9 * near)
+    gravity = np.array([0.0, 0.0, GRAVITY])
+    for index, step in enumerate(np.diff(stamps) / 1e9, 1):
+        rate = rates[index] if imu.averaged else (rates[index - 1] + rates[index]) / 2.0
+        after = turn * Rotation.from_rotvec(rate * step)
+        if imu.averaged:
+            middle = turn * Rotation.from_rotvec(rate * step / 2.0)
+            force = middle.apply(forces[index])
+        else:
+            force = (turn.apply(forces[index - 1]) + after.apply(forces[index])) / 2.0
+        place += velocity * step + 0.5 * step**2 * (force + gravity)
+        velocity = velocity + step * (force + gravity)
+        turn = after
+    off = float(np.linalg.norm(place - places[-1]))
+    seconds = (stamps[-1] - stamps[0]) / 1e9
+    remark = "" if off <= _POSITION else (
+        f"the ideal IMU, integrated over {seconds:.2f} s, ends {off:.3f} m from the truth: its "
+        "samples, their stamps or its mounting are not what is announced"
+    )  # fmt: skip
+    return Figure(imu.source, f"position after {seconds:.2f} s", off, _POSITION, "m", remark)
+
+
+def discs(camera: CameraAnnouncement, kept: Collector, motion: Motion, angle: float) -> Points:
+    """Return where a camera's discs are and should be, all that are seen whole and alone."""
+    info, found = camera.info, []
+    grid = np.stack(np.meshgrid(np.arange(info.width), np.arange(info.height)), axis=-1)
+    rays = info.unproject(grid.reshape(-1, 2)).reshape(*grid.shape[:2], 3)
+    balls, radii = spheres(angle)
+    for stamp, image in kept.images[camera.source].items():
+        if stamp < kept.taken_off:
+            continue
+        places, turns = motion.rows_of(camera, stamp)
+        later, turned = motion.rows_of(camera, stamp + 1_000_000)
+        into, then = (each.as_matrix().transpose(0, 2, 1) for each in (turns, turned))
+        own = kept.own[camera.source].get(stamp)
+        boxes = list(_boxes(camera, balls, radii, places, into))
+        for ball, (left, top, right, bottom) in boxes:
+            left, top, right, bottom = left - 4, top - 4, right + 4, bottom + 4
+            alone = all(
+                other == ball or x0 > right or x1 < left or y0 > bottom or y1 < top
+                for other, (x0, y0, x1, y1) in boxes
+            )
+            inside = left >= 0 and top >= 0 and right < info.width and bottom < info.height
+            window = np.s_[top : bottom + 1, left : right + 1]
+            if not (alone and inside) or (own is not None and own[window].any()):
+                continue
+            rows = np.arange(top, bottom + 1)
+            towards = np.einsum("rij,rj->ri", into[rows], balls[ball] - places[rows])
+            distance = np.linalg.norm(towards, axis=1)
+            # Radians by which each pixel lies within the sphere's outline.
+            cosine = np.einsum("rcj,rj->rc", rays[window], towards / distance[:, None])
+            within = np.arcsin(radii[ball] / distance)[:, None] - np.arccos(np.clip(cosine, -1, 1))
+            if not np.isfinite(within).all():
+                continue
+            pixels, measured = grid[window], image[window].astype(np.float64)
+            half = ((measured > 20.0) & (measured < 235.0)).astype(np.uint8)
+            if cv2.erode(half, np.ones((3, 3), np.uint8)).any():
+                continue  # behind the vehicle's turning rotors, of which depth knows nothing
+            if np.isin(measured, (0.0, 255.0)).all():  # a pixel shows what its centre's ray meets
+                expected = (within > 0.0).astype(np.float64)
+            else:
+                slope = np.maximum(np.hypot(*np.gradient(within)), 1e-12)
+                expected = np.clip(0.5 + within / slope, 0.0, 1.0)
+            if measured.sum() < 0.3 * 255.0 * expected.sum():
+                centre = np.array([np.nan, np.nan])  # there is no disc
+            else:
+                centre = np.tensordot(measured, pixels, 2) / measured.sum()
+            should = np.tensordot(expected, pixels, 2) / expected.sum()
+            row = int(np.clip(np.rint(should[1]), 0, info.height - 1))
+            ends = [
+                info.project(back[row] @ (balls[ball] - where[row]))[0]
+                for where, back in ((places, into), (later, then))
+            ]
+            found.append((should, centre - should, (ends[1] - ends[0]) / 1e-3))
+    columns: Floats = np.array(found, np.float64).reshape(-1, 3, 2)
+    return Points(columns[:, 0], columns[:, 1], columns[:, 2])
+
+
+def projection(camera: CameraAnnouncement, points: Points) -> Figure:
+    """Return how far known points are beside their pixels: proof 3."""
+    limit = _ROLLING if camera.readout else _GLOBAL
+    distance = np.linalg.norm(points.off, axis=1)
+    worst = float(np.quantile(distance, _MOST)) if len(distance) else float("nan")
+    wild = float(np.nanmax(distance, initial=0.0))
+    worst = wild if wild > 3.0 * limit else worst
+    remark = ""
+    if not len(distance):
+        remark = f"{camera.source}: no sphere of the room was seen whole, so nothing is proven"
+    elif not worst <= limit:
+        gone = int(np.isnan(distance).sum())
+        remark = (
+            f"{camera.source}: points fall up to {wild:.2f} px beside their "
+            f"pixels{f', and {gone} are missing' if gone else ''}{_likely(camera, points)}"
+        )
+    name = f"{_MOST:.0%} of {len(distance)} points beside their pixels"
+    return Figure(camera.source, name, worst, limit, "px", remark)
+
+
+def depth(camera: CameraAnnouncement, kept: Collector, motion: Motion, angle: float) -> Figure:
+    """Return how far a camera's depth is from the true surfaces: proof 4."""
+    off: list[Floats] = []
+    ratio: list[Floats] = []
+    for stamp, samples in kept.depths[camera.source].items():
+        if stamp < kept.taken_off:
+            continue
+        places, turns = motion.rows_of(camera, stamp)
+        rows = samples[:, 1].astype(int)
+        met = []
+        for shift in ((0.0, 0.0), (2.5, 0.0), (-2.5, 0.0), (0.0, 2.5), (0.0, -2.5)):
+            rays = camera.info.unproject(samples[:, :2] + shift)
+            seen = np.asarray(np.isfinite(rays).all(axis=1))
+            turned = turns[rows].apply(np.where(seen[:, None], rays, [0.0, 0.0, 1.0]))
+            along, what = hits(angle, places[rows], turned)
+            met.append((rays[:, 2] * along, np.where(seen, what, -99)))
+        # Not at edges, nor where the vehicle itself may be.
+        same = np.array([what == met[0][1] for _, what in met])
+        clear = same.all(axis=0) & (met[0][1] > -99)
+        clear &= np.isfinite(samples[:, 2]) & (samples[:, 2] > NEAREST)
+        off.append(samples[clear, 2] - met[0][0][clear])
+        ratio.append(samples[clear, 2] / met[0][0][clear])
+    errors = np.abs(np.concatenate(off)) if off else np.zeros(0)
+    worst = float(np.quantile(errors, _MOST)) if len(errors) else float("nan")
+    remark = ""
+    if not len(errors):
+        remark = f"{camera.source}: no depth came, so nothing is proven"
+    elif worst > _DEPTH:
+        remark = (
+            f"{camera.source}: depth is up to {1e3 * worst:.1f} mm beside the true surfaces: its "
+            f"median is {float(np.median(np.concatenate(ratio))):.4f} times the truth"
+        )
+    name = f"{_MOST:.0%} of {len(errors)} depths beside the surfaces"
+    return Figure(camera.source, name, worst, _DEPTH, "m", remark)
+
+
+def exported(rig: Rig, folder: Path) -> Iterator[Figure]:
+    """Yield by how much each format's files, read back, project differently: proof 5."""
+    generator = np.random.default_rng(5)
+    for name in FORMATS:
+        try:
+            files = write_files(rig, name)
+        except ValueError as error:
+            yield Figure(rig.body, name, 0.0, None, "px", f"not written: {error}")
+            continue
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        for file, text in files.items():
+            (folder / name / file).write_text(text, encoding="utf-8")
+        yield read_back(rig, name, folder / name, generator)
+
+
+def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator) -> Figure:
+    """Return by how much a format's files in a folder project differently than announced."""
+    worst = 0.0
+    body = np.eye(4) if rig.imu is None else pose_matrix(rig.imu.position, rig.imu.orientation)
+    for camera, found in zip(rig.cameras, read(name, folder), strict=False):
+        if rig.imu is None and name == "orbslam3":
+            continue  # whose file has no transform without an IMU
+        size = (camera.info.width - 1, camera.info.height - 1)
+        rays = camera.info.unproject(generator.uniform((0, 0), size, (400, 2)))
+        rays = rays[np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.05)]
+        rays *= generator.uniform(1.0, 20.0, (len(rays), 1))
+        pose = np.linalg.inv(body) @ pose_matrix(camera.position, camera.orientation)
+        pixels = found.project(rays @ pose[:3, :3].T + pose[:3, 3])
+        off = float(np.abs(pixels - camera.info.project(rays)).max(initial=0.0))
+        worst = max(worst, off if np.isfinite(off) else float("inf"))
+    remark = "" if worst <= _EXPORT else (
+        f"the files for {name} project up to {worst:.3g} px beside what is announced"
+    )  # fmt: skip
+    return Figure(rig.body, name, worst, _EXPORT, "px", remark)
+
+
+def stamps(
+    camera: CameraAnnouncement, kept: Collector, motion: Motion, points: Points | None
+) -> Iterator[Figure]:
+    """Yield whether image, depth, pose and IMU of one exposure agree: proof 6."""
+    source = camera.source
+    shot = set(kept.images[source]) | set(kept.depths[source])
+    for name, have in (("images", kept.images), ("depth images", kept.depths)):
+        if have[source]:
+            lonely = len(shot - set(have[source]))
+            remark = f"{source}: {lonely} exposures have no {name[:-1]} of their stamp"
+            yield Figure(source, f"exposures without {name}", lonely, 0, "", remark * (lonely > 0))
+    half = round(camera.readout * 5e8)
+    wanted = {s + d for s in shot for d in ({0, half, -half} if half else {0})}
+    poses = kept.poses[source]
+    missing = sum(not any(s + d in poses for d in (0, 1, -1)) for s in wanted)
+    remark = f"{source}: {missing} poses of rows are missing, or bear other stamps"
+    yield Figure(source, "poses of rows missing", missing, 0, "", remark * (missing > 0))
+    times = np.array(sorted(s for s in poses if s >= kept.taken_off), np.int64)
+    true = times - round(camera.time_offset * 1e9)
+    times, true = times[true <= motion.stamps[-1]], true[true <= motion.stamps[-1]]
+    if len(times):
+        places, turns = motion.mounted(true, camera.position, camera.orientation)
+        off = np.array([poses[s].position for s in times.tolist()]) - places
+        sent = [poses[s].orientation for s in times.tolist()]
+        angle = (turns.inv() * Rotation.from_quat(sent, scalar_first=True)).magnitude()
+        for name, value, limit, unit in (
+            ("camera poses beside odometry and mounting", np.linalg.norm(off, axis=1), _PLACE, "m"),
+            ("camera poses turned against them", angle, _TURN, "rad"),
+        ):
+            worst = float(value.max())
+            remark = f"{source}: {name} by {worst:.2g} {unit}: stamps or mounting are not true"
+            yield Figure(source, name, worst, limit, unit, remark * (worst > limit))
+    if points is not None and len(points.off):
+        yield _late(f"{source}", "images", points.flow, points.off)
+
+
+def lateness(imu: ImuAnnouncement, kept: Collector, motion: Motion) -> Figure:
+    """Return by how much the IMU's samples are off their stamps, in proof 6 too."""
+    at = np.array([sample.stamp for sample in kept.imu], np.int64)
+    flying = (at > kept.taken_off) & (at < motion.stamps[-1] - 1_000_000)
+    turn = Rotation.from_quat(imu.orientation, scalar_first=True)
+    rates = turn.apply([sample.angular_velocity for sample in kept.imu])[flying]
+    # A mean belongs to the middle of its period.
+    then = at[flying] - (0.5e9 / imu.rate if imu.averaged else 0.0)
+    true = np.column_stack([np.interp(then, motion.stamps, each) for each in motion.rates.T])
+    return _late(imu.source, "IMU samples", np.gradient(true, then / 1e9, axis=0), rates - true)
+
+
+def _late(source: str, what: str, flow: Floats, off: Floats) -> Figure:
+    """Return by how long something is late that changes at a rate and is off by so much."""
+    fine = np.isfinite(off).all(axis=1)
+    moved = float((flow[fine] ** 2).sum())
+    late = -float((off[fine] * flow[fine]).sum()) / moved if moved else 0.0
+    remark = (
+        f"{source}: {what} show what was {abs(1e3 * late):.2f} ms "
+        f"{'before' if late > 0 else 'after'} the time that their stamps say"
+    )
+    value = abs(late)
+    return Figure(source, f"{what} off their stamps", value, _LATE, "s", remark * (value > _LATE))
+
+
+def _boxes(
+    camera: CameraAnnouncement, balls: Floats, radii: Floats, places: Floats, into: Floats
+) -> Iterator[tuple[int, tuple[int, int, int, int]]]:
+    """Yield the spheres that may be seen, and the pixels that each takes up."""
+    info = camera.info
+    middle = info.height // 2
+    turn = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    rough = info.project((balls - places[middle]) @ into[middle].T)
+    for number in np.flatnonzero(np.isfinite(rough).all(axis=1)):
+        row = int(np.clip(rough[number, 1], 0, info.height - 1))
+        centre = into[row] @ (balls[number] - places[row])
+        away = centre / np.linalg.norm(centre)
+        side = np.cross(away, [1.0, 0.0, 0.0] if abs(away[0]) < 0.9 else [0.0, 1.0, 0.0])
+        side /= np.linalg.norm(side)
+        ring = np.outer(np.cos(turn), side) + np.outer(np.sin(turn), np.cross(away, side))
+        outline = info.project(centre + radii[number] * 1.02 * ring)
+        if np.isfinite(outline).all():
+            low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0))
+            yield int(number), (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+
+def _likely(camera: CameraAnnouncement, points: Points) -> str:
+    """Say which one announced number would explain the errors best, if one does."""
+    info = camera.info
+    fine = np.isfinite(points.off).all(axis=1)
+    off, pixels, flow = points.off[fine], points.pixels[fine], points.flow[fine]
+    if len(off) < 10:
+        return ""
+    offset = pixels - (info.cx, info.cy)
+    share = (pixels[:, 1] / max(info.height - 1, 1) - 0.5)[:, None]
+    one, none = np.ones(len(off)), np.zeros(len(off))
+    causes: Mapping[str, tuple[npt.NDArray[np.float64], float, float, str]] = {
+        "fx and fy": (offset, info.fx, info.fx, "px"),
+        "fx": (np.column_stack([offset[:, 0], none]), info.fx, info.fx, "px"),
+        "fy": (np.column_stack([none, offset[:, 1]]), info.fy, info.fy, "px"),
+        "cx": (np.column_stack([one, none]), info.cx, 1.0, "px"),
+        "cy": (np.column_stack([none, one]), info.cy, 1.0, "px"),
+        "time_offset": (-flow, 1e3 * camera.time_offset, 1e3, "ms"),
+        "readout": (flow * share, 1e3 * camera.readout, 1e3, "ms"),
+    }
+    left = {}
+    for name, (change, _, _, _) in causes.items():
+        scale = float((off * change).sum() / max((change**2).sum(), 1e-12))
+        left[name] = (float(((off - scale * change) ** 2).sum()), scale)
+    name = min(left, key=lambda key: left[key][0])
+    rest, scale = left[name]
+    if rest > 0.25 * float((off**2).sum()):
+        return ""
+    _, announced, factor, unit = causes[name]
+    return (
+        f": as if {name} were {announced + scale * factor:.4g} {unit}, not {announced:.4g} {unit}"
+    )

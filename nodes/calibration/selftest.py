@@ -1,0 +1,245 @@
+"""The rig of a file, flown alone in the calibration room, and held against what it announced."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from events import CameraAnnouncement, Image, ImuAnnouncement, Odometry
+from events.rotations import from_rpy
+from nodes.calibration import proofs
+from nodes.calibration.allan import Curve, needed, noise
+from nodes.calibration.collector import Collector
+from nodes.calibration.motion import Motion
+from nodes.calibration.proofs import Figure, Points
+from nodes.calibration.room import CENTRE, mjcf
+from nodes.dataset.rig import choose
+from nodes.trajectory.formats import tum_row
+from runtime.config.model import Config, NodeSpec, to_builtins
+from runtime.config.reading import parse
+from runtime.errors import ConfigError
+from runtime.execute import execute
+from runtime.supervisor import Supervisor
+from runtime.tools import preflight
+
+TITLES = {
+    1: "The ideal IMU integrates to the truth",
+    2: "The IMU's Allan deviation is as announced",
+    3: "Known points fall on their pixels",
+    4: "Depth lies on true surfaces",
+    5: "Exported calibrations project the same",
+    6: "Stamps of image, depth, pose and IMU agree",
+}
+
+_KEPT = {
+    "name",
+    "images",
+    "width",
+    "height",
+    "fov",
+    "intrinsics",
+    "lens",
+    "rate",
+    "position",
+    "orientation",
+    "latency",
+    "readout",
+    "stereo",
+    "time_offset",
+    "undistorted",
+}
+"""Settings of a camera that say where and when it looks; what blurs a measurement is at its
+default, which is off."""
+
+_SECONDS, _RATE = 9.0, 8.0
+"""Length of the flight; images a second, about."""
+
+
+class Result(msgspec.Struct, eq=False):
+    """What was proven of one vehicle.
+
+    Attributes:
+        vehicle: Its name.
+        figures: By number of the proof.
+        notes: What was switched off, or cannot be shown.
+        curves: Allan deviations.
+        points: By source of the camera.
+    """
+
+    vehicle: str
+    figures: dict[int, list[Figure]]
+    notes: list[str]
+    curves: list[Curve]
+    points: dict[str, Points]
+
+    def passed(self) -> bool:
+        """Whether every figure is within its limit."""
+        return all(figure.passed for figures in self.figures.values() for figure in figures)
+
+
+def subjects(config: Config) -> list[NodeSpec]:
+    """Return the nodes of a file that carry sensors through a world: simulators, by their ports.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    found = [
+        spec
+        for spec in config.nodes
+        if {Image, Odometry} <= {output.event for output in spec.node.declared.outputs.values()}
+        and "world" in spec.config.__struct_fields__
+    ]
+    if not found:
+        names = ", ".join(spec.type_name for spec in config.nodes)
+        raise ConfigError(f"expected a node that simulates a vehicle or a camera, found {names}")
+    return found
+
+
+def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Result:
+    """Fly one vehicle of a file, and return what that proves.
+
+    Args:
+        config: The file.
+        spec: The vehicle's node.
+        folder: For the room, the exported files and a free camera's path.
+        standing: Seconds of simulated time that the IMU may stand for proof 2, at most.
+
+    Raises:
+        ConfigError: The file cannot be flown.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    table = _alone(config, spec)
+    announced = _announced(table, config, folder, 0.05)
+    cameras = [each for each in announced if isinstance(each, CameraAnnouncement)]
+    focal = min((each.info.fx for each in cameras), default=256.0)
+    angle = float(np.clip(13.0 / focal, 0.035, 0.08))
+    (folder / "room.xml").write_text(mjcf(angle), encoding="utf-8")
+    notes = [
+        f"Each camera takes about {_RATE:g} images a second, without noise, blur and what else is "
+        "not geometry or time; the error of its depth is switched off, too."
+    ]
+    kept = _run(_flight(table, folder), config)
+    motion = Motion(kept.odometry)
+    result = Result(spec.name, {number: [] for number in TITLES}, notes, [], {})
+    figures = result.figures
+    imu = next((each for each in announced if isinstance(each, ImuAnnouncement)), None)
+    if imu is None or kept.imu_announced is None:
+        notes.append(f"{spec.name} has no IMU: proofs 1 and 2 do not apply.")
+    else:
+        begin = kept.imu[0].stamp + 50_000_000
+        figures[1].append(proofs.integration(kept.imu_announced, kept.imu, motion, begin))
+        seconds = needed(imu, standing)
+        still = _run(_standing(table, seconds), config)
+        samples = {
+            "gyroscope": np.array([sample.angular_velocity for sample in still.imu]),
+            "accelerometer": np.array([sample.linear_acceleration for sample in still.imu]),
+        }
+        for curve, found in noise(imu, samples):
+            result.curves.append(curve)
+            figures[2] += found
+    for camera in kept.cameras.values():
+        points = None
+        if kept.images[camera.source]:
+            points = proofs.discs(camera, kept, motion, angle)
+            result.points[camera.source] = points
+            figures[3].append(proofs.projection(camera, points))
+        if "depth" in camera.images:
+            figures[4].append(proofs.depth(camera, kept, motion, angle))
+        figures[6] += proofs.stamps(camera, kept, motion, points)
+    if imu is not None and kept.imu_announced is not None:
+        figures[6].append(proofs.lateness(kept.imu_announced, kept, motion))
+    if kept.cameras:
+        rig = choose([*kept.cameras.values(), *([imu] if imu else [])], spec.name)
+        figures[5] += proofs.exported(rig, folder / "calibration")
+    return result
+
+
+def _alone(config: Config, spec: NodeSpec) -> dict[str, Any]:
+    """Return the vehicle's own table, at the centre of the room, with nothing that listens."""
+    (table,) = (each for each in to_builtins(config)["nodes"] if each["name"] == spec.name)
+    for key in ("inputs", "links", "barometer", "gnss", "magnetometer", "range_finders", "lidars"):
+        table.pop(key, None)
+    for camera in table.get("cameras", ()):
+        for key in set(camera) - _KEPT:
+            del camera[key]
+        camera["rate"] /= max(math.ceil(camera["rate"] / _RATE - 1e-9), 1)
+        images = set(camera["images"]) | {"depth"}
+        camera["images"] = sorted(images if images & {"rgb", "grey"} else images | {"rgb"})
+    if "trajectory" in spec.config.__struct_fields__:
+        table["rate"] /= max(math.ceil(table["rate"] / _RATE - 1e-9), 1)
+    else:
+        table |= {"position": [0.0, 0.0], "height": 0.0}
+    return table  # type: ignore[no-any-return]
+
+
+def _announced(table: dict[str, Any], config: Config, folder: Path, angle: float) -> Sequence[Any]:
+    (folder / "room.xml").write_text(mjcf(angle), encoding="utf-8")
+    table["world"] = str(folder.resolve() / "room.xml")
+    found = preflight.of_nodes(_config([table], config, 1.0))
+    if found.errors:
+        raise ConfigError("; ".join(found.errors))
+    return found.announcements
+
+
+def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
+    """Return the nodes of the flight: still, then up, then moving about all axes."""
+    excitation = {"duration": "6s", "amplitude": 0.35, "frequency": 0.4, "yaw": 60.0}
+    collector = {"name": "collector", "type": f"{Collector.__module__}:Collector"}
+    if "trajectory" in table:
+        path = folder.resolve() / "path.tum"
+        path.write_text("".join(_path()), encoding="utf-8")
+        return [table | {"trajectory": str(path)}, collector]
+    pilot = {
+        "name": "selftest_pilot",
+        "type": "nodes.pilots:WaypointFollower",
+        "start_delay": "0.1s",
+        "waypoints": [[0.0, 0.0, float(CENTRE[2])], [0.4, 0.0, float(CENTRE[2])]],
+        "heading": "fixed",
+        "excitation": excitation,
+    }
+    if "imu" in table:
+        table = table | {"imu": table["imu"] | {"ideal": True}}
+    return [table, pilot, collector]
+
+
+def _standing(table: dict[str, Any], seconds: float) -> list[dict[str, Any]]:
+    """Return the nodes of a vehicle that stands, with nothing but its IMU."""
+    still = table | {"cameras": [], "control_rate": 20}
+    collector = {"name": "collector", "type": f"{Collector.__module__}:Collector"}
+    return [still | {"_seconds": seconds}, collector]
+
+
+def _path() -> Iterator[str]:
+    """Yield a smooth path about all axes for a free camera, as rows of a TUM file."""
+    for millisecond in range(round(_SECONDS * 1e3) + 1):
+        t = millisecond / 1e3
+        x, y, z = (0.4 * math.sin(w * t) for w in (2.5, 3.2, 2.0))
+        yaw, pitch, roll = (a * math.sin(w * t) for a, w in ((0.8, 1.1), (0.3, 1.9), (0.3, 2.3)))
+        place = (float(CENTRE[0]) + x, float(CENTRE[1]) + y, float(CENTRE[2]) + z)
+        yield tum_row(millisecond * 1_000_000, place, from_rpy(roll, pitch, yaw))
+
+
+def _config(nodes: list[dict[str, Any]], config: Config, seconds: float) -> Config:
+    run = {"seed": config.run.seed, "duration": seconds, "digest": False, "log": "warning"}
+    return parse({"run": run, "nodes": nodes}, "selftest")
+
+
+def _run(nodes: list[dict[str, Any]], config: Config) -> Collector:
+    """Run nodes, and return the last of them."""
+    seconds = nodes[0].pop("_seconds", _SECONDS)
+    kept: list[Supervisor] = []
+
+    @contextlib.contextmanager
+    def watch(supervisor: Supervisor) -> Iterator[None]:
+        kept.append(supervisor)
+        yield
+
+    execute(_config(nodes, config, seconds), watch=watch)
+    (found,) = (node for node in kept[0].state.all_nodes if isinstance(node, Collector))
+    return found
