@@ -27,8 +27,8 @@ _SAMPLES = 1500
 """Pixels of a depth image that are kept."""
 
 
-class Collector(Node):
-    """Keeps images in grey, samples of depth images, poses and IMU samples in memory."""
+class _Collector(Node):
+    """Keeps what sensors send, in memory, images in grey; no node to be listed for a file."""
 
     def __init__(self) -> None:
         self.cameras: dict[str, CameraAnnouncement] = {}

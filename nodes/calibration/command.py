@@ -64,3 +64,39 @@ def selftest(
     write_page(page, settings.run.name, results)
     print(page)
     leave_behind(0 if all(result.passed() for result in results) else 1)
+
+
+def lint(
+    config: ConfigFile,
+    overrides: Overrides = None,
+    ignore: Annotated[
+        list[str] | None,
+        typer.Option(metavar="RULE", help="Leave a rule out; may be repeated."),
+    ] = None,
+) -> None:
+    """Say what a careful colleague would about a rig: a line for each finding.
+
+    Nothing flies; the nodes are brought up as by check. A rule says what is odd and what to change:
+    baselines, exposures, rates, lenses, latencies, missing noise and mountings, stamps that cannot
+    match, estimators that lack a sensor. What is meant is accepted in the file, by
+    [run] accept = ["rule"] or ["rule:drone/camera"]. Ends with 0, with 1 if there is a finding,
+    with 2 if the file is wrong.
+    """
+    import sys
+
+    from runtime.config.reading import load
+    from runtime.tools import lint as rules
+    from runtime.tools import preflight
+    from runtime.tools.cli.run import leave_behind
+
+    settings = load(config, overrides or [])
+    brought_up = preflight.of_nodes(settings)
+    errors = brought_up.errors
+    found = [] if errors else rules.lint(settings, brought_up.announcements, ignore or [])
+    for finding in found:
+        print(finding)
+    for error in errors:
+        print(f"error: {config.name}: {error}", file=sys.stderr)
+    if not found and not errors:
+        print(f"{config}: nothing to say")
+    leave_behind(2 if errors else 1 if found else 0)

@@ -1,6 +1,6 @@
 """The six proofs: what a rig sent in the calibration room, held against what it announced.
 
-Pure functions on what `Collector` has kept. Each returns figures with what is allowed of them, and
+Pure functions on what `_Collector` has kept. Each returns figures with what is allowed of them, and
 a sentence of what is wrong.
 """
 
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Imu, ImuAnnouncement
 from events.poses import pose_matrix
-from nodes.calibration.collector import Collector
+from nodes.calibration.collector import _Collector
 from nodes.calibration.formats import FORMATS, GRAVITY, write_files
 from nodes.calibration.motion import Floats, Motion
 from nodes.calibration.readers import read
@@ -112,7 +112,7 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
     return Figure(imu.source, f"position after {seconds:.2f} s", off, _POSITION, "m", remark)
 
 
-def discs(camera: CameraAnnouncement, kept: Collector, motion: Motion, angle: float) -> Points:
+def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Points:
     """Return where a camera's discs are and should be, all that are seen whole and alone."""
     info, found = camera.info, []
     grid = np.stack(np.meshgrid(np.arange(info.width), np.arange(info.height)), axis=-1)
@@ -188,7 +188,7 @@ def projection(camera: CameraAnnouncement, points: Points) -> Figure:
     return Figure(camera.source, name, worst, limit, "px", remark)
 
 
-def depth(camera: CameraAnnouncement, kept: Collector, motion: Motion, angle: float) -> Figure:
+def depth(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Figure:
     """Return how far a camera's depth is from the true surfaces: proof 4."""
     off: list[Floats] = []
     ratio: list[Floats] = []
@@ -261,7 +261,7 @@ def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator)
 
 
 def stamps(
-    camera: CameraAnnouncement, kept: Collector, motion: Motion, points: Points | None
+    camera: CameraAnnouncement, kept: _Collector, motion: Motion, points: Points | None
 ) -> Iterator[Figure]:
     """Yield whether image, depth, pose and IMU of one exposure agree: proof 6."""
     source = camera.source
@@ -296,7 +296,7 @@ def stamps(
         yield _late(f"{source}", "images", points.flow, points.off)
 
 
-def lateness(imu: ImuAnnouncement, kept: Collector, motion: Motion) -> Figure:
+def lateness(imu: ImuAnnouncement, kept: _Collector, motion: Motion) -> Figure:
     """Return by how much the IMU's samples are off their stamps, in proof 6 too."""
     at = np.array([sample.stamp for sample in kept.imu], np.int64)
     flying = (at > kept.taken_off) & (at < motion.stamps[-1] - 1_000_000)

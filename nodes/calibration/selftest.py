@@ -15,7 +15,7 @@ from events import CameraAnnouncement, Image, ImuAnnouncement, Odometry
 from events.rotations import from_rpy
 from nodes.calibration import proofs
 from nodes.calibration.allan import Curve, needed, noise
-from nodes.calibration.collector import Collector
+from nodes.calibration.collector import _Collector
 from nodes.calibration.motion import Motion
 from nodes.calibration.proofs import Figure, Points
 from nodes.calibration.room import CENTRE, mjcf
@@ -190,7 +190,7 @@ def _announced(table: dict[str, Any], config: Config, folder: Path, angle: float
 def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     """Return the nodes of the flight: still, then up, then moving about all axes."""
     excitation = {"duration": "6s", "amplitude": 0.35, "frequency": 0.4, "yaw": 60.0}
-    collector = {"name": "collector", "type": f"{Collector.__module__}:Collector"}
+    collector = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
     if "trajectory" in table:
         path = folder.resolve() / "path.tum"
         path.write_text("".join(_path()), encoding="utf-8")
@@ -211,7 +211,7 @@ def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
 def _standing(table: dict[str, Any], seconds: float) -> list[dict[str, Any]]:
     """Return the nodes of a vehicle that stands, with nothing but its IMU."""
     still = table | {"cameras": [], "control_rate": 20}
-    collector = {"name": "collector", "type": f"{Collector.__module__}:Collector"}
+    collector = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
     return [still | {"_seconds": seconds}, collector]
 
 
@@ -230,7 +230,7 @@ def _config(nodes: list[dict[str, Any]], config: Config, seconds: float) -> Conf
     return parse({"run": run, "nodes": nodes}, "selftest")
 
 
-def _run(nodes: list[dict[str, Any]], config: Config) -> Collector:
+def _run(nodes: list[dict[str, Any]], config: Config) -> _Collector:
     """Run nodes, and return the last of them."""
     seconds = nodes[0].pop("_seconds", _SECONDS)
     kept: list[Supervisor] = []
@@ -241,5 +241,5 @@ def _run(nodes: list[dict[str, Any]], config: Config) -> Collector:
         yield
 
     execute(_config(nodes, config, seconds), watch=watch)
-    (found,) = (node for node in kept[0].state.all_nodes if isinstance(node, Collector))
+    (found,) = (node for node in kept[0].state.all_nodes if isinstance(node, _Collector))
     return found

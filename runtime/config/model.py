@@ -32,6 +32,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         progress_limit: Real seconds without progress after which the log says who is waited for,
             and again after twice, four times… as long; 0 for never.
         log: Least level that is logged: trace, debug, info, warning, error or fatal.
+        accept: Findings of ``lint`` that are meant: names of rules, or ``rule:source``.
     """
 
     name: str = "run"
@@ -45,6 +46,7 @@ class RunConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     shutdown_limit: Duration = Duration(10)
     progress_limit: Duration = Duration(5)
     log: Literal["trace", "debug", "info", "warning", "error", "fatal"] = "info"
+    accept: tuple[str, ...] = ()
 
 
 class NetworkConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

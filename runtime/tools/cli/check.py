@@ -15,18 +15,20 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     whether it finds what it needs. Checked are, among others, names of nodes, cameras, inputs and
     files; that no input is without a sender or a reader; that no two nodes write the same file;
     and that start and waypoints are in free space. Nothing is rendered, written or sent. Ends
-    with 0, or with 2 if there is a mistake; what may be meant is a warning.
+    with 0, or with 2 if there is a mistake; what may be meant, as what lint finds, is a warning.
     """
     from runtime.config.reading import load
     from runtime.graph import edges
     from runtime.tools import preflight
     from runtime.tools.cli.run import leave_behind
+    from runtime.tools.lint import lint
 
     settings = load(config, overrides or [])
     found = preflight.of_file(settings)
     if not found.errors:
         nodes = preflight.of_nodes(settings)
-        found = preflight.Findings(nodes.errors, found.warnings + nodes.warnings)
+        odd = [] if nodes.errors else [str(e) for e in lint(settings, nodes.announcements)]
+        found = preflight.Findings(nodes.errors, found.warnings + nodes.warnings + odd)
     errors = found.errors
     for warning in found.warnings:
         warn(warning)

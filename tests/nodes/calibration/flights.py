@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Imu, Odometry, PoseStamped, Vector3
-from nodes.calibration.collector import Collector
+from nodes.calibration.collector import _Collector
 from nodes.calibration.motion import Floats, Motion
 from nodes.calibration.room import CENTRE, hits
 from tests.nodes.calibration.samples import IMU
@@ -34,9 +34,9 @@ def twist(seconds: Floats, step: float = 1e-4) -> tuple[Floats, Floats, Floats]:
     return (after - before) / (2 * step), (after - 2 * now + before) / step**2, rates
 
 
-def flown(*cameras: CameraAnnouncement, length: float = 6.0, images: int = 4) -> Collector:
+def flown(*cameras: CameraAnnouncement, length: float = 6.0, images: int = 4) -> _Collector:
     """Return what cameras and an ideal IMU send on that motion, as they announce it."""
-    kept = Collector()
+    kept = _Collector()
     seconds = np.arange(0.0, length, 0.005)
     places, turns = true_motion(seconds)
     velocities, accelerations, rates = twist(seconds)
@@ -67,7 +67,7 @@ def flown(*cameras: CameraAnnouncement, length: float = 6.0, images: int = 4) ->
     return kept
 
 
-def expose(kept: Collector, camera: CameraAnnouncement, motion: Motion, stamp: int) -> None:
+def expose(kept: _Collector, camera: CameraAnnouncement, motion: Motion, stamp: int) -> None:
     """Add an image, its depth and the poses of its rows."""
     info = camera.info
     columns, rows = np.meshgrid(np.arange(info.width), np.arange(info.height))

@@ -17,7 +17,7 @@ from events.frames import OPTICAL_TO_FRD
 from events.rotations import from_rpy, multiply
 from nodes.calibration import proofs
 from nodes.calibration.allan import noise, trials, variances
-from nodes.calibration.collector import Collector
+from nodes.calibration.collector import _Collector
 from nodes.calibration.motion import Motion
 from nodes.calibration.room import HIGH, LOW, hits, mjcf, spheres
 from nodes.dataset.rig import Rig
@@ -49,7 +49,7 @@ def seen(lens: str = "pinhole", **more: object) -> CameraAnnouncement:
     return msgspec.structs.replace(camera(), info=info, orientation=looks, **more)
 
 
-def lying(kept: Collector, **more: object) -> CameraAnnouncement:
+def lying(kept: _Collector, **more: object) -> CameraAnnouncement:
     """Have the camera of a flight announce something else than it sends."""
     (source,) = kept.cameras
     info = {k: v for k, v in more.items() if k in CameraInfo.__struct_fields__}
@@ -64,24 +64,24 @@ def lying(kept: Collector, **more: object) -> CameraAnnouncement:
 
 
 @pytest.fixture(scope="module")
-def plain() -> Collector:
+def plain() -> _Collector:
     return flown(seen())
 
 
 @pytest.fixture(scope="module")
-def rolling() -> Collector:
+def rolling() -> _Collector:
     return flown(seen(readout=0.02))
 
 
 @pytest.fixture
-def kept(plain: Collector) -> Collector:
+def kept(plain: _Collector) -> _Collector:
     """Return a flight that may be changed."""
-    own = Collector()
+    own = _Collector()
     vars(own).update({k: v.copy() if isinstance(v, dict) else v for k, v in vars(plain).items()})
     return own
 
 
-def judged(kept: Collector, announced: CameraAnnouncement) -> dict[int, list[proofs.Figure]]:
+def judged(kept: _Collector, announced: CameraAnnouncement) -> dict[int, list[proofs.Figure]]:
     motion = Motion(kept.odometry)
     points = proofs.discs(announced, kept, motion, ANGLE)
     return {
@@ -95,7 +95,7 @@ def judged(kept: Collector, announced: CameraAnnouncement) -> dict[int, list[pro
     }
 
 
-def remarks(kept: Collector, announced: CameraAnnouncement, number: int) -> str:
+def remarks(kept: _Collector, announced: CameraAnnouncement, number: int) -> str:
     """Return what a proof says is wrong."""
     figures = judged(kept, announced)[number]
     assert not all(figure.passed for figure in figures), figures
@@ -113,17 +113,17 @@ def test_a_true_camera_passes(lens: str, readout: float) -> None:
     assert int(found[3][0].name.split()[2]) > 8
 
 
-def test_a_wrong_focal_length_is_named(kept: Collector) -> None:
+def test_a_wrong_focal_length_is_named(kept: _Collector) -> None:
     said = remarks(kept, lying(kept, fx=120.0 * 1.05), 3)
     assert "drone/left: points fall up to" in said
     assert "as if fx were 12" in said
 
 
-def test_a_wrong_principal_point_is_named(kept: Collector) -> None:
+def test_a_wrong_principal_point_is_named(kept: _Collector) -> None:
     assert "as if cy were 68.5 px, not 69.5 px" in remarks(kept, lying(kept, cy=69.5), 3)
 
 
-def test_a_wrong_readout_is_named(rolling: Collector) -> None:
+def test_a_wrong_readout_is_named(rolling: _Collector) -> None:
     wrong = msgspec.structs.replace(rolling.cameras["drone/left"], readout=0.01)
     said = remarks(rolling, wrong, 3)
     assert re.search(r"as if readout were (19|2[01])[. ]", said)
@@ -131,7 +131,7 @@ def test_a_wrong_readout_is_named(rolling: Collector) -> None:
     assert "poses of rows are missing, or bear other stamps" in remarks(rolling, wrong, 6)
 
 
-def test_a_shifted_stamp_is_named_with_its_time(kept: Collector) -> None:
+def test_a_shifted_stamp_is_named_with_its_time(kept: _Collector) -> None:
     announced = kept.cameras["drone/left"]
     late = 5_000_000  # as if stamps were those of the delivery
     stores: tuple[dict[str, Any], ...] = (kept.images, kept.depths, kept.own, kept.poses)
@@ -144,20 +144,20 @@ def test_a_shifted_stamp_is_named_with_its_time(kept: Collector) -> None:
     assert "camera poses beside odometry and mounting by" in said
 
 
-def test_one_image_without_its_depth_is_named(kept: Collector) -> None:
+def test_one_image_without_its_depth_is_named(kept: _Collector) -> None:
     kept.depths.update({"drone/left": dict(list(kept.depths["drone/left"].items())[1:])})
     said = remarks(kept, kept.cameras["drone/left"], 6)
     assert said == "drone/left: 1 exposures have no depth image of their stamp"
 
 
-def test_scaled_depth_is_named(kept: Collector) -> None:
+def test_scaled_depth_is_named(kept: _Collector) -> None:
     scaled = {s: rows * [1.0, 1.0, 1.01] for s, rows in kept.depths["drone/left"].items()}
     kept.depths.update({"drone/left": scaled})
     said = remarks(kept, kept.cameras["drone/left"], 4)
     assert "its median is 1.0100 times the truth" in said
 
 
-def test_images_of_nothing_prove_nothing(kept: Collector) -> None:
+def test_images_of_nothing_prove_nothing(kept: _Collector) -> None:
     black = {s: np.zeros_like(each) for s, each in kept.images["drone/left"].items()}
     kept.images.update({"drone/left": black})
     figure = judged(kept, kept.cameras["drone/left"])[3][0]
@@ -169,7 +169,7 @@ def test_images_of_nothing_prove_nothing(kept: Collector) -> None:
     assert "nothing is proven" in figure.remark
 
 
-def test_an_imu_that_lies_does_not_integrate(kept: Collector) -> None:
+def test_an_imu_that_lies_does_not_integrate(kept: _Collector) -> None:
     kept.imu = [
         msgspec.structs.replace(
             s, linear_acceleration=tuple(1.01 * a for a in s.linear_acceleration)
@@ -181,7 +181,7 @@ def test_an_imu_that_lies_does_not_integrate(kept: Collector) -> None:
     assert "the ideal IMU, integrated over 5.00 s, ends" in said
 
 
-def test_imu_samples_with_late_stamps_are_named(kept: Collector) -> None:
+def test_imu_samples_with_late_stamps_are_named(kept: _Collector) -> None:
     kept.imu = [msgspec.structs.replace(s, stamp=s.stamp + 3_000_000) for s in kept.imu[:-1]]
     said = remarks(kept, kept.cameras["drone/left"], 6)
     assert "drone/imu: IMU samples show what was 3.0" in said

@@ -1,0 +1,227 @@
+"""The rules of ``lint`` about rigs: sensors that fit neither each other nor who reads them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    EstimatorAnnouncement,
+    Imu,
+    ImuAnnouncement,
+)
+from runtime.config.model import Config, NodeSpec
+from runtime.tools.lint import Finding
+
+Announced = Sequence[Announcement]
+
+
+def baseline(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
+    """Of a stereo pair too close together nothing has depth; too far apart, nothing is in both."""
+    for right in cameras(announced):
+        for left in cameras(announced):
+            if right.stereo != left.source:
+                continue
+            apart = math.dist(left.position, right.position)
+            if not 0.02 <= apart <= 1.0:
+                yield Finding(
+                    right.source, f"its baseline is {apart:.3g} m", "0.05 to 0.5 m is usual"
+                )
+            elif abs(apart - right.baseline) > 1e-3:
+                yield Finding(
+                    right.source,
+                    f"it is {apart:.3f} m from {left.source}, and announces {right.baseline:.3f} m",
+                    "announce the distance between both positions",
+                )
+
+
+def square_pixels(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
+    """Pixels are square: fx and fy of a real camera differ by less than a percent."""
+    for camera in cameras(announced):
+        fx, fy = camera.info.fx, camera.info.fy
+        if abs(fx / fy - 1.0) > 0.01:
+            found = f"fx is {fx:.4g} px and fy {fy:.4g} px"
+            yield Finding(camera.source, found, "take the same focal length for both")
+
+
+def exposure(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
+    """Before the next exposure the shutter is closed, and all rows are read out."""
+    for camera in cameras(announced):
+        period, taken = 1.0 / camera.rate, camera.exposure + camera.readout
+        if taken > period * (1.0 + 1e-9):
+            found = f"exposure and readout take {1e3 * taken:.3g} ms of {1e3 * period:.3g} ms"
+            yield Finding(camera.source, found, "expose for a shorter time, or lower the rate")
+
+
+def imu_rate(config: Config, announced: Announced) -> Iterator[Finding]:
+    """Between two images an inertial estimator wants some ten IMU samples."""
+    for camera, imu in inertial_pairs(config, announced):
+        if imu.rate < 10.0 * camera.rate:
+            yield Finding(
+                camera.source,
+                f"{imu.source} gives {imu.rate / camera.rate:.3g} samples for each of its images",
+                f"raise imu_rate to {10 * camera.rate:g} Hz, or lower the camera's rate",
+            )
+
+
+def rates_divide(config: Config, announced: Announced) -> Iterator[Finding]:
+    """Images between two IMU samples have to be interpolated to by an inertial estimator."""
+    for camera, imu in inertial_pairs(config, announced):
+        share = imu.rate / camera.rate
+        if not math.isclose(share, round(share), rel_tol=1e-9):
+            lower = imu.rate / math.ceil(share)
+            yield Finding(
+                camera.source,
+                f"{camera.rate:g} Hz does not divide the {imu.rate:g} Hz of {imu.source}",
+                f"take a rate that does, such as {lower:.4g} Hz",
+            )
+
+
+def extrinsics(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
+    """Who fuses two sensors has to know where both are, on one body."""
+    for camera in cameras(announced):
+        for imu in (each for each in announced if isinstance(each, ImuAnnouncement)):
+            if body_of(imu.source) != body_of(camera.source):
+                continue
+            if imu.parent_frame_id != camera.parent_frame_id:
+                yield Finding(
+                    camera.source,
+                    f"it is mounted on {camera.parent_frame_id}, {imu.source} on "
+                    f"{imu.parent_frame_id}",
+                    "announce both in the frame of one body",
+                )
+        nowhere = camera.position == (0.0, 0.0, 0.0) and camera.parent_frame_id != "map"
+        if nowhere and camera.orientation == (1.0, 0.0, 0.0, 0.0):
+            found = "its pose on the body is none, as if nobody had measured it"
+            yield Finding(camera.source, found, "give its position and orientation")
+
+
+def monotonic(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
+    """Where distortion turns back, two directions fall on one pixel, and none on others."""
+    for camera in cameras(announced):
+        info = camera.info
+        across, down = np.linspace(0, info.width - 1, 41), np.linspace(0, info.height - 1, 41)
+        rim = [(u, v) for u in across for v in (0, info.height - 1)]
+        rim += [(u, v) for v in down for u in (0, info.width - 1)]
+        blind = ~np.isfinite(info.unproject(rim)).all(axis=1)
+        if blind.any():
+            yield Finding(
+                camera.source,
+                f"{blind.mean():.0%} of its image's rim shows nothing: the lens's polynomial turns "
+                f"back {math.degrees(info.widest_angle()):.0f}° off the axis",
+                "take a narrower field of view, or other coefficients",
+            )
+
+
+def latency(config: Config, announced: Announced) -> Iterator[Finding]:
+    """Images are skipped by an estimator that takes longer than a period, one at a time."""
+    rate = max((camera.rate for camera in cameras(announced)), default=0.0)
+    for spec in estimators(config, announced):
+        taken = float(getattr(spec.config, "latency", 0.0))
+        if rate and taken > 1.0 / rate * (1.0 + 1e-9):
+            yield Finding(
+                spec.name,
+                f"its latency is {1e3 * taken:.3g} ms, and images come every {1e3 / rate:.3g} ms",
+                "lower the latency or the camera's rate, or mean it to skip images",
+            )
+
+
+def zero_noise(config: Config, announced: Announced) -> Iterator[Finding]:
+    """Without noise an estimator is better than it will ever be."""
+    if not any("thresholds" in spec.config.__struct_fields__ for spec in config.nodes):
+        return  # nobody is judged
+    if any(isinstance(each, EstimatorAnnouncement) for each in announced):
+        for camera in cameras(announced):
+            if not camera.noise and not camera.undistorted and {"rgb", "grey"} & {*camera.images}:
+                yield Finding(camera.source, "its images have no noise", "noise = 2.0 is usual")
+    for _, imu in inertial_pairs(config, announced):
+        if not imu.gyroscope_noise_density or not imu.accelerometer_noise_density:
+            found = "a noise density of it is 0"
+            yield Finding(imu.source, found, "take the densities of a data sheet")
+
+
+def stamps(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
+    """Both eyes of a stereo pair are matched by their stamps."""
+    for right in cameras(announced):
+        for left in cameras(announced):
+            if right.stereo != left.source:
+                continue
+            for name in ("rate", "time_offset"):
+                one, other = getattr(left, name), getattr(right, name)
+                if one != other:
+                    found = f"its {name} is {other:g}, that of {left.source} {one:g}"
+                    yield Finding(right.source, found, "take the same, or stamps cannot match")
+            if left.time_jitter or right.time_jitter:
+                found = f"its stamps and those of {left.source} have a jitter"
+                yield Finding(right.source, found, "take it out, or match them by nearest stamps")
+
+
+def needs(config: Config, announced: Announced) -> Iterator[Finding]:
+    """Kinds of image that an estimator takes, and its IMU, have to be given by a sensor."""
+    given = {kind for camera in cameras(announced) for kind in camera.images}
+    given |= {"grey"} if "rgb" in given else set()
+    for spec in config.nodes:
+        wants: Any = getattr(spec.node, "needs", frozenset())
+        if lacking := sorted(wants - given if isinstance(wants, frozenset) else ()):
+            found = f"it needs {', '.join(lacking)}, which no camera gives"
+            yield Finding(spec.name, found, "add it to the camera's images")
+        inertial = "inertial" in str(getattr(spec.config, "mode", ""))
+        if inertial and not any(isinstance(each, ImuAnnouncement) for each in announced):
+            yield Finding(spec.name, "it needs an IMU, which nobody announces", "add one")
+
+
+RULES = [
+    baseline,
+    square_pixels,
+    exposure,
+    imu_rate,
+    rates_divide,
+    extrinsics,
+    monotonic,
+    latency,
+    zero_noise,
+    stamps,
+    needs,
+]
+
+
+def cameras(announced: Announced) -> list[CameraAnnouncement]:
+    """Return the cameras."""
+    return [each for each in announced if isinstance(each, CameraAnnouncement)]
+
+
+def estimators(config: Config, announced: Announced) -> list[NodeSpec]:
+    """Return the nodes that announce themselves as estimators."""
+    names = {a.source.partition("/")[0] for a in announced if isinstance(a, EstimatorAnnouncement)}
+    return [spec for spec in config.nodes if spec.name in names]
+
+
+def inertial_pairs(
+    config: Config, announced: Announced
+) -> Iterator[tuple[CameraAnnouncement, ImuAnnouncement]]:
+    """Yield cameras with the IMU of their body, if an estimator of the file fuses both."""
+    fused = any(
+        "inertial" in str(getattr(spec.config, "mode", "inertial")) and _reads_imu(spec)
+        for spec in estimators(config, announced)
+    )
+    imus = [each for each in announced if isinstance(each, ImuAnnouncement) and fused]
+    for camera in cameras(announced):
+        for imu in imus:
+            if body_of(imu.source) == body_of(camera.source):
+                yield camera, imu
+
+
+def body_of(source: str) -> str:
+    """Return the source of the body that carries a sensor: ``drone`` for ``drone/front``."""
+    return source.rpartition("/")[0] or source
+
+
+def _reads_imu(spec: NodeSpec) -> bool:
+    from runtime.graph import input_types
+
+    return any(Imu in events for events in input_types(spec.node).values())
