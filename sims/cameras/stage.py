@@ -31,6 +31,14 @@ RANGE = 500.0
 """Depth beyond this (metres) is ``inf``. MuJoCo's sky is a cube of half width 0.53 · FAR and writes
 depth; at the rim of the widest view (170°) that is a planar depth of some 600 m."""
 
+_OUT_OF_VIEW = mujoco.mjNGROUP - 1
+"""Group of the geoms that an image cannot show; groups from 3 on are not drawn."""
+
+_SPARE = 1.001
+"""Factor on the size of boxes, so that rounding never leaves out what is just in view."""
+
+_PLAIN = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
+
 LOOK = ".look"
 """A geom `<name>.look` is the image of the geom `<name>`, and is numbered as that one is."""
 
@@ -78,6 +86,8 @@ class Stage:
         self._data = mujoco.MjData(model)
         _set_quality(model, width, height)
         self._numbers = _object_numbers(model)
+        self._groups = model.geom_group.copy()
+        self._nobody = mujoco.MjvPerturb()
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
         self._scene.flags[:] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
@@ -158,7 +168,7 @@ class Stage:
         buffer = np.empty(size, np.float32) if depth else None
         if rgb is None and buffer is None:
             return None, None
-        self._draw(size, rgb, buffer)
+        self._draw(size, rgb, buffer, plain=not colour and self._opaque())
         # GL counts rows from the bottom.
         return (
             None if rgb is None else np.ascontiguousarray(rgb[::-1]),
@@ -168,14 +178,7 @@ class Stage:
     def segmentation(self, size: Size) -> npt.NDArray[np.int32]:
         """Draw object numbers."""
         code = np.empty((*size, 3), np.uint8)
-        flags = self._scene.flags
-        saved = flags.copy()
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
-        flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
-        try:
-            self._draw(size, code, None)
-        finally:
-            flags[:] = saved
+        self._draw(size, code, None, plain=True)
         wide = code[::-1].astype(np.int32)
         index = wide[..., 0] | wide[..., 1] << 8 | wide[..., 2] << 16
         return np.asarray(self._numbers_in_scene()[index], dtype=np.int32)
@@ -207,10 +210,58 @@ class Stage:
             self._gl.free()
             self._gl = None
 
-    def _draw(self, size: Size, rgb: Colours | None, depth: Depths | None) -> None:
+    def _draw(
+        self, size: Size, rgb: Colours | None, depth: Depths | None, plain: bool = False
+    ) -> None:
+        """Draw what is in view, and read it, from the bottom row upwards.
+
+        Args:
+            size: Of the image.
+            rgb: Where to read colours into.
+            depth: Where to read the depth buffer into.
+            plain: Draw every object in a colour that is its number, without texture, lights and
+                sky: the same depth at less than half the cost.
+        """
+        self.model.geom_group[:] = np.where(self._in_view(size), self._groups, _OUT_OF_VIEW)
+        scene, category = self._scene, mujoco.mjtCatBit.mjCAT_ALL
+        scene.ngeom = 0
+        mujoco.mjv_addGeoms(self.model, self._data, self._option, self._nobody, category, scene)
+        scene.flags[_PLAIN] = plain
+        scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = not plain
         viewport = mujoco.MjrRect(0, 0, size[1], size[0])
-        mujoco.mjr_render(viewport, self._scene, self._context)
+        mujoco.mjr_render(viewport, scene, self._context)
         mujoco.mjr_readPixels(rgb, depth, viewport, self._context)
+
+    def _opaque(self) -> bool:
+        """Return whether nothing is transparent: what is does not hide, but has a number."""
+        model = self.model
+        return bool((model.geom_rgba[:, 3] >= 1.0).all() and (model.mat_rgba[:, 3] >= 1.0).all())
+
+    def _in_view(self, size: Size) -> npt.NDArray[np.bool_]:
+        """Return which geoms may be seen: those whose boxes are not beyond an edge of the view."""
+        model, data, camera = self.model, self._data, self._scene.camera[0]
+        near, up = camera.frustum_near, np.array(camera.up, np.float64)
+        ahead = np.array(camera.forward, np.float64)
+        half = camera.frustum_width or (
+            0.5 * (camera.frustum_top - camera.frustum_bottom) * size[1] / size[0]
+        )
+        right, up, ahead = np.cross(ahead, up) * near, up * near, ahead
+        # Each edge and the camera span a plane; these are their normals, to the inside.
+        normals = np.array(
+            [
+                right - (camera.frustum_center - half) * ahead,
+                (camera.frustum_center + half) * ahead - right,
+                up - camera.frustum_bottom * ahead,
+                camera.frustum_top * ahead - up,
+            ]
+        )
+        eye = 0.5 * (np.array(camera.pos) + self._scene.camera[1].pos)
+        axes = data.geom_xmat.reshape(-1, 3, 3)
+        boxes = model.geom_aabb.reshape(-1, 2, 3)  # centre and half sizes, in the geom's axes
+        middle = data.geom_xpos - eye + (axes @ boxes[:, 0, :, None])[..., 0]
+        reach = (np.abs(normals @ axes) @ boxes[:, 1, :, None])[..., 0]
+        inside = (middle @ normals.T + reach * _SPARE >= 0.0).all(axis=1)
+        return np.asarray(inside | (model.geom_rbound <= 0.0))  # a plane has no box
 
     def _numbers_in_scene(self) -> npt.NDArray[np.int32]:
         """Return the object number of each drawn colour: colour 0 is nothing, n is segid n-1."""
@@ -227,9 +278,11 @@ def metric_depth(buffer: Depths) -> Depths:
     With reversed z the projection writes ``d = near (far - z) / (z (far - near))``, which is 1 at
     the near plane and 0 at the far one; solved for z. Exact to float32.
     """
-    depth = np.float32(NEAR * FAR) / (buffer * np.float32(FAR - NEAR) + np.float32(NEAR))
+    depth = buffer * np.float32(FAR - NEAR)
+    depth += np.float32(NEAR)
+    np.divide(np.float32(NEAR * FAR), depth, out=depth)
     depth[depth > RANGE] = np.inf
-    return np.asarray(depth, dtype=np.float32)
+    return depth
 
 
 def _set_quality(model: Any, width: int, height: int) -> None:
