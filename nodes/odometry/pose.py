@@ -13,7 +13,6 @@ import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from nodes.odometry.images import Floats
 
@@ -74,39 +73,44 @@ def solve_pose(
         depth_noise: Standard deviation of inverse depth, 1/m.
     """
     fx, fy, cx, cy = intrinsics(matrix)
-    pose = start.copy()
-    target = (seen.pixels - (cx, cy)) / (fx, fy)
-    a, b = fx / pixel_noise, fy / pixel_noise
-    c = np.where(seen.measured, 1.0 / depth_noise, 0.0)
-    jacobian = np.zeros((len(target), 3, 6))
+    pose, count = start.copy(), len(seen.pixels)
+    # In rows of contiguous memory: coordinates, and derivatives of each by the six motions.
+    landmarks = np.ascontiguousarray(seen.landmarks.T)
+    target = np.stack([(seen.pixels[:, 0] - cx) / fx, (seen.pixels[:, 1] - cy) / fy, seen.inverse])
+    scale = np.empty((3, count))
+    scale[0], scale[1] = fx / pixel_noise, fy / pixel_noise
+    scale[2] = np.where(seen.measured, 1.0 / depth_noise, 0.0)
+    jacobian = np.zeros((6, 3, count))
+    image, errors = np.empty((3, count)), np.empty((2, count))
     for _ in range(_STEPS):
-        p = seen.landmarks @ pose[:3, :3].T + pose[:3, 3]
-        ahead = p[:, 2] > 0.01
-        inverse = 1.0 / np.where(ahead, p[:, 2], 1.0)
-        x, y = p[:, 0] * inverse, p[:, 1] * inverse
-        residuals = np.stack(
-            [a * (x - target[:, 0]), b * (y - target[:, 1]), c * (inverse - seen.inverse)], axis=1
-        )
+        p = pose[:3, :3] @ landmarks + pose[:3, 3:]
+        ahead = p[2] > 0.01
+        image[2] = 1.0 / np.where(ahead, p[2], 1.0)
+        image[:2] = p[:2] * image[2]
+        residuals = scale * (image - target)
         # By a small motion of the camera's frame: translation, then rotation (left perturbation).
-        jacobian[:, 0] = a * np.stack([inverse, 0 * x, -x * inverse, -x * y, 1 + x * x, -y], axis=1)
-        jacobian[:, 1] = b * np.stack([0 * x, inverse, -y * inverse, -1 - y * y, x * y, x], axis=1)
-        slope = -c * inverse * inverse
-        jacobian[:, 2, 2:5] = np.stack([slope, slope * p[:, 1], -slope * p[:, 0]], axis=1)
-        errors = np.hypot(residuals[:, 0], residuals[:, 1])
-        depth_errors = np.abs(residuals[:, 2])
-        weights = np.stack([_huber(errors), _huber(errors), _huber(depth_errors)], axis=1)
-        weights *= ahead[:, None]
-        weighted = (jacobian * weights[..., None]).reshape(-1, 6)
-        flat = jacobian.reshape(-1, 6)
-        normal = weighted.T @ flat + 1e-9 * np.eye(6)
-        step = -np.linalg.solve(normal, weighted.T @ residuals.reshape(-1))
-        turn = Rotation.from_rotvec(step[3:]).as_matrix()
+        (x, y, inverse), by = image, jacobian
+        by[0, 0] = by[1, 1] = inverse
+        np.multiply(image, -inverse, out=by[2])
+        by[4, 1] = x * y
+        by[3, 0] = -by[4, 1]
+        by[3, 1], by[4, 0] = -1.0 - y * y, 1.0 + x * x
+        by[3, 2], by[4, 2] = -y * inverse, x * inverse
+        by[5, 0], by[5, 1] = -y, x
+        by *= scale
+        np.hypot(residuals[0], residuals[1], out=errors[0])
+        np.abs(residuals[2], out=errors[1])
+        weights = _huber(errors) * ahead
+        weighted = (by * weights[[0, 0, 1]]).reshape(6, -1)
+        normal = weighted @ by.reshape(6, -1).T + 1e-9 * np.eye(6)
+        step = -np.linalg.solve(normal, weighted @ residuals.reshape(-1))
+        turn = cv2.Rodrigues(step[3:])[0]
         pose[:3, :3] = turn @ pose[:3, :3]
         pose[:3, 3] = turn @ pose[:3, 3] + step[:3]
         if np.abs(step).max() < _SMALL:
             break
-    errors[~ahead] = np.inf
-    return Solution(pose, errors)
+    errors[0, ~ahead] = np.inf
+    return Solution(pose, errors[0])
 
 
 def _huber(errors: Floats) -> Floats:

@@ -9,7 +9,9 @@ are in `landmarks`, `patches`, `surfaces`, and in `nodes.odometry`.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections import deque
 from typing import Annotated, Any
 
 import cv2
@@ -36,10 +38,12 @@ from nodes.visual_odometry.patches import Rows, find_patches, half_width
 from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
 
 _FLOW_WINDOW = 15
+_LARGE = 320
+"""Side (pixels) of images that are halved before corners are followed."""
 _AGREES = 4.0
 """Standard deviations up to which a landmark agrees with a pose."""
 _FEW = 120
-"""Corners that suffice for an approximate pose."""
+"""Corners that suffice for an approximate pose, at most."""
 _SEARCHED = 20
 """Newest key frames by which a lost camera is relocalized."""
 _SEARCHED_PER_IMAGE = 2
@@ -98,12 +102,37 @@ class Keyframe(msgspec.Struct, frozen=True, eq=False):
     Attributes:
         image: Grey.
         pose: World to camera, shape (4, 4).
-        described: Points for relocalization.
     """
 
     image: Grey
     pose: Floats
-    described: DescribedPoints
+
+
+class Described:
+    """A key frame's points for relocalization, described when a lost camera first asks for them.
+
+    Args:
+        frame: The key frame.
+        inverse_of: Its inverse depth, as `inverse_depth` gives it; released once described.
+        matrix: K, shape (3, 3).
+        noise: Standard deviation of inverse depth, 1/m.
+    """
+
+    def __init__(self, frame: Keyframe, inverse_of: Depth, matrix: Floats, noise: float) -> None:
+        self._source: tuple[Keyframe, Depth] | None = frame, inverse_of
+        self._matrix = matrix
+        self._noise = noise
+
+    @functools.cached_property
+    def points(self) -> DescribedPoints:
+        """The points, in the world."""
+        assert self._source is not None
+        (frame, inverse_of), self._source = self._source, None
+        pixels, descriptors = detect_and_describe(frame.image, _ORB_POINTS)
+        seen = surfaces_at(inverse_of, pixels, self._noise)
+        continuous, back = seen.continuous, inverse(frame.pose)
+        points = rays(pixels[continuous], self._matrix) / seen.inverse[continuous, None]
+        return DescribedPoints(points @ back[:3, :3].T + back[:3, 3], descriptors[continuous])
 
 
 class MapMatch(msgspec.Struct, frozen=True, eq=False):
@@ -142,6 +171,8 @@ class FeatureTracker:
         self._info = info
         self._settings = settings or FeatureSettings()
         self._matrix = info.matrix()
+        large = self._settings.levels and min(info.width, info.height) >= _LARGE
+        self._reduction = 2 if large else 1
         self._pose = np.eye(4)  # world (the first camera) to camera
         self._lost_since: int | None = None
         self._count = 0  # images so far
@@ -171,7 +202,7 @@ class FeatureTracker:
         noise = self._settings.depth_noise
         read = surfaces_at(inverse_of, match.pixels[agree], noise)
         self._map.fuse(self._pose, rows[agree], read, _READING * noise)
-        self._before = grey, rows[agree], match.pixels[agree]
+        self._before = self._reduced(grey), rows[agree], match.pixels[agree]
         if self._is_far(rows[agree]):
             self._add_keyframe(grey, inverse_of, rows[agree], match.pixels[agree])
         return TrackingResult(
@@ -189,9 +220,7 @@ class FeatureTracker:
             return match
         pixels, descriptors = detect_and_describe(grey, _ORB_POINTS)
         for frame in self._next_searched():
-            found = relocalize(
-                pixels, descriptors, frame.described, self._matrix, cv2.SOLVEPNP_AP3P
-            )
+            found = relocalize(pixels, descriptors, frame.points, self._matrix, cv2.SOLVEPNP_AP3P)
             if found is not None:
                 self._near = None
                 match = self._find(grey, inverse_of, found)
@@ -202,9 +231,9 @@ class FeatureTracker:
         self._near = None
         return None
 
-    def _next_searched(self) -> list[Keyframe]:
+    def _next_searched(self) -> list[Described]:
         """Return the key frames to try with this image: each time further back in time."""
-        frames = list(self._keyframes.values())[: -_SEARCHED - 1 : -1]
+        frames = list(reversed(self._newest))
         start, self._searched = self._searched % len(frames), self._searched + _SEARCHED_PER_IMAGE
         return frames[start : start + _SEARCHED_PER_IMAGE]
 
@@ -215,22 +244,23 @@ class FeatureTracker:
         brick would find the next brick.
         """
         image, rows, pixels = self._before
-        few = slice(None, None, max(len(rows) // _FEW, 1))
+        few = slice(None, None, max(-(-len(rows) // _FEW), 1))
         rows, pixels = rows[few], pixels[few]
         no_guess: Any = None
         there, arrived, _ = cv2.calcOpticalFlowPyrLK(
             image,
-            grey,
-            pixels.astype(np.float32).reshape(-1, 1, 2),
+            self._reduced(grey),
+            (pixels / self._reduction).astype(np.float32).reshape(-1, 1, 2),
             no_guess,
             winSize=(_FLOW_WINDOW, _FLOW_WINDOW),
-            maxLevel=self._settings.levels,
+            maxLevel=self._settings.levels - (self._reduction > 1),
             criteria=FLOW_CRITERIA,
         )
         good = arrived.ravel() == 1
         if good.sum() < self._settings.min_inliers:
             return None
-        places, there = self._map.places[rows[good]], there.reshape(-1, 2)[good].astype(np.float64)
+        places = self._map.places[rows[good]]
+        there = self._reduction * there.reshape(-1, 2)[good].astype(np.float64)
         solution = self._solve(places, there, self._pose)
         if (solution.errors < 2 * _AGREES).mean() > 0.6:
             return solution.pose
@@ -246,6 +276,10 @@ class FeatureTracker:
         if not found:
             return None
         return from_rotation_vector(rotation, translation)
+
+    def _reduced(self, grey: Grey) -> Grey:
+        """Return the image in which corners are followed: half as large, if it is large."""
+        return np.asarray(cv2.pyrDown(grey), np.uint8) if self._reduction > 1 else grey
 
     def _find(self, grey: Grey, inverse_of: Depth, expected: Floats) -> MapMatch | None:
         """Find the map in an image that was taken near an expected pose."""
@@ -324,22 +358,15 @@ class FeatureTracker:
             np.concatenate([rows, new]),
             np.concatenate([pixels, corners[seen.continuous]]),
         )
-        self._keyframes[number] = Keyframe(grey, self._pose, self._describe(grey, inverse_of))
+        self._keyframes[number] = frame = Keyframe(grey, self._pose)
+        self._newest.append(Described(frame, inverse_of, self._matrix, settings.depth_noise))
         self._at_keyframe = len(rows)
         self._near = None
         if len(self._keyframes) > settings.keyframes:
             del self._keyframes[next(iter(self._keyframes))]
             gone = self._map.forget_before(next(iter(self._keyframes)))
             pixels, rows = pixels[rows >= gone], rows[rows >= gone] - gone
-        self._before = grey, rows, pixels
-
-    def _describe(self, grey: Grey, inverse_of: Depth) -> DescribedPoints:
-        """Return points of an image, which was taken at the present pose, for relocalization."""
-        pixels, descriptors = detect_and_describe(grey, _ORB_POINTS)
-        seen = surfaces_at(inverse_of, pixels, self._settings.depth_noise)
-        continuous, back = seen.continuous, inverse(self._pose)
-        points = rays(pixels[continuous], self._matrix) / seen.inverse[continuous, None]
-        return DescribedPoints(points @ back[:3, :3].T + back[:3, 3], descriptors[continuous])
+        self._before = self._reduced(grey), rows, pixels
 
     def _images(self) -> dict[int, Grey]:
         return {number: frame.image for number, frame in self._keyframes.items()}
@@ -347,6 +374,7 @@ class FeatureTracker:
     def _clear_map(self) -> None:
         self._map = Landmarks(self._matrix)
         self._keyframes: dict[int, Keyframe] = {}
+        self._newest: deque[Described] = deque(maxlen=min(_SEARCHED, self._settings.keyframes))
         self._at_keyframe = 0
         self._near = None
         self._near_until = 0

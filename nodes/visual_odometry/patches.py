@@ -7,7 +7,6 @@ accumulates, and it is warped, so that neither distance nor slant shifts it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import cv2
 import msgspec
@@ -82,19 +81,15 @@ def _cut_warped(patches: Patches, images: Mapping[int, Grey], centre: Floats, ha
     offset = (centre - patches.expected).astype(np.float32)
     # Where in the old image a square's pixel (x, y) lies: pixels + back @ (offset + (x, y)).
     origin = patches.pixels.astype(np.float32) + (back @ offset[:, :, None])[:, :, 0]
-    grid = (
-        origin[:, None, None]
-        + back[:, None, None, :, 0] * steps[None, None, :, None]
-        + back[:, None, None, :, 1] * steps[None, :, None, None]
-    )
-    no_second: Any = None  # the maps are of two channels
+    across = origin.T[:, :, None] + back[:, :, 0].T[:, :, None] * steps
+    columns, rows = across[:, :, None] + (back[:, :, 1].T[:, :, None] * steps)[..., None]
     cut = np.empty((len(centre), side, side), np.uint8)
     for number in np.unique(patches.source).tolist():
-        rows = np.flatnonzero(patches.source == number)
-        cut[rows] = cv2.remap(
+        here = np.flatnonzero(patches.source == number)
+        cut[here] = cv2.remap(
             images[number],
-            grid[rows].reshape(-1, side, 2),
-            no_second,
+            columns[here].reshape(-1, side),
+            rows[here].reshape(-1, side),
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         ).reshape(-1, side, side)

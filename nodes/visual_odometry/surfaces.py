@@ -50,8 +50,12 @@ class Surfaces(msgspec.Struct, frozen=True, eq=False):
 
 def inverse_depth(depth: Depth) -> Depth:
     """Return inverse depth in 1/m, the mean of 3×3 pixels; below zero by holes, shape (h, w)."""
-    known = np.isfinite(depth) & (depth > NEAREST)
-    return np.asarray(cv2.blur(np.where(known, 1.0 / np.where(known, depth, 1.0), _HOLE), (3, 3)))
+    with np.errstate(divide="ignore"):
+        inverse = np.reciprocal(depth)
+    unknown = ~((depth > NEAREST) & (depth < np.inf))
+    if unknown.any():
+        inverse[unknown] = _HOLE
+    return np.asarray(cv2.blur(inverse, (3, 3)))
 
 
 def surfaces_at(inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
