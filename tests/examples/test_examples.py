@@ -246,3 +246,25 @@ def test_a_stereo_rig_becomes_a_data_set_of_two_cameras(tmp_path: Path) -> None:
     assert len(left) >= 58
     rows = (tmp_path / "euroc/mav0/imu0/data.csv").read_text().splitlines()[1:]
     assert {stamp - 3_000_000 for stamp in left} <= {int(row.partition(",")[0]) for row in rows}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(500)
+def test_two_drones_fly_in_one_world_each_by_its_own_pilot(tmp_path: Path) -> None:
+    summary = run("two_drones", tmp_path, "report.figures=[]", "alpha.camera_processes=1")
+    assert summary["reason"] == "alpha_pilot: flight completed"
+    assert summary["outputs"]["alpha.vehicle_events"] == 4  # no collision among them
+    assert summary["outputs"]["beta.vehicle_events"] == 4
+    assert summary["verdict"]["estimators"]["odometry"]["ate_percent"] < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(500)
+@pytest.mark.parametrize("example", ["windy", "moving"])
+def test_a_flight_in_wind_or_among_things_that_move(example: str, tmp_path: Path) -> None:
+    summary = run(example, tmp_path, "report.figures=[]", "camera.rate=10")
+    assert summary["reason"] == "pilot: flight completed"
+    sent = summary["outputs"]
+    assert sent["world.wind" if example == "windy" else "world.body_poses"] > 200
+    assert sent["drone.vehicle_events"] == 4
+    assert summary["verdict"]["estimators"]["odometry"]["ate_percent"] < 0.5
