@@ -161,15 +161,18 @@ def test_the_truth_between_imu_samples_is_the_one_that_a_fast_imu_tells() -> Non
 
 @pytest.mark.slow
 def test_an_imu_may_trigger_the_cameras(caplog: pytest.LogCaptureFixture) -> None:
-    """Then every exposure has the stamp of an IMU sample; unequal intervals are warned of."""
+    """Then every exposure has the stamp of an IMU sample, unless the rates do not fit."""
     caplog.set_level(logging.WARNING, "visnav.drone")
     cameras = [CAMERA | {"rate": 30}, CAMERA | {"name": "even", "rate": 40}]
     result = fly(cameras=cameras, camera_processes=1, trigger="imu", duration=0.5)
     samples = {e.stamp for e in result.of(Imu)}
-    assert {e.stamp for e in result.of(Odometry)} == samples
-    stamps = [e.stamp for e in result.of(Image) if e.source == "drone/front"]
-    assert set(stamps) <= samples
-    assert {b - a for a, b in pairwise(stamps)} == {30 * SECOND // 1000, 35 * SECOND // 1000}
+    even, free = (
+        [e.stamp for e in result.of(Image) if e.source == f"drone/{name}"]
+        for name in ("even", "front")
+    )
+    assert set(even) <= samples
+    assert {e.stamp for e in result.of(Odometry)} >= samples | set(free)
+    assert {(b - a) // 1000 for a, b in pairwise(free)} == {33_333}
     (said,) = [r.getMessage() for r in caplog.records]
     assert said.startswith("front: 30 Hz does not divide the 200 Hz of the IMU")
 
@@ -177,10 +180,6 @@ def test_an_imu_may_trigger_the_cameras(caplog: pytest.LogCaptureFixture) -> Non
 @pytest.mark.parametrize(
     ("config", "said"),
     [
-        (
-            {"trigger": "imu", "imu_rate": 20, "cameras": [CAMERA | {"rate": 30}]},
-            r"front: rate: expected at most the 20 Hz .* found 30 Hz",
-        ),
         ({"cameras": [CAMERA | {"rate": 1001}]}, r"rate.*1000"),
         ({"cameras": [CAMERA, CAMERA]}, r"front: expected a name of its own"),
         (

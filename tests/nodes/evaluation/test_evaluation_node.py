@@ -358,3 +358,25 @@ def test_an_evaluation_that_was_restarted_fails_and_what_was_written_stays(tmp_p
     stamps = read_tum(tmp_path / "trajectories" / "est.tum").stamps
     assert stamps[0] == 0
     assert len(stamps) >= 90
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_images_count_at_the_time_of_their_exposure(tmp_path: Path, told: bool) -> None:
+    """Stamps that are 30 ms late still belong to the poses, if the offset is announced."""
+    eye = msgspec.structs.replace(camera_of("drone"), time_offset=0.03 if told else 0.0)
+    stamps = range(0, 10 * SECOND, 100 * MS)
+    images: list[Event] = [
+        Image(
+            stamp=stamp + 30 * MS,
+            source="drone/eye",
+            frame_id="drone/eye_optical",
+            encoding="mono8",
+            data=np.zeros((60, 80), np.uint8),
+        )
+        for stamp in stamps
+    ]
+    poses: list[Event] = [estimate(stamp) for stamp in stamps]
+    verdict = judged(tmp_path, [*announced(), eye], truth(10.0), images, poses)
+    figures = verdict["estimators"]["est"]
+    assert figures["ate_rmse_m"] < 1e-3
+    assert (figures["frame_coverage_percent"] > 95.0) == told

@@ -224,17 +224,15 @@ def test_mountings_are_said_once_at_the_start(free: NodeResult, vehicle: NodeRes
     assert said[2].rotation == optical_in_body(down)[1]
 
 
-def sent(world: str, node: type[Node[Any]] = FreeCamera, **camera: Any) -> NodeResult:
-    """Run a node with a camera of 10 Hz that moves to the right and turns."""
+def sent(world: str, processes: int = 1, **camera: Any) -> NodeResult:
+    """Run a free camera of 10 Hz that moves to the right and turns."""
     entry = {"name": "c", "rate": 10, "images": ["rgb", "depth"]} | TINY | camera
-    config: dict[str, Any] = {"world": world, "cameras": [entry], "camera_processes": 1}
-    config["setpoint_timeout"] = "5s"
-    if node is FreeCamera:
-        config["rate"] = 10
+    config = {"world": world, "cameras": [entry], "rate": 10, "setpoint_timeout": "5s"}
+    config["camera_processes"] = processes
     move = VelocitySetpoint(
         stamp=50 * MS, source="t", velocity=(0.0, 3.0, 0.0), frame_id="map", yaw_rate=0.5
     )
-    return run_node(node, inputs=[move], config=config, duration=0.75, seed=3)
+    return run_node(FreeCamera, inputs=[move], config=config, duration=0.75, seed=3)
 
 
 def test_a_rolling_shutter_sends_the_poses_of_its_rows(world: str) -> None:
@@ -297,6 +295,19 @@ def test_the_eyes_of_a_stereo_rig_expose_together(world: str) -> None:
     for one_pose, other_pose in zip(*by_eye, strict=True):
         assert math.dist(one_pose.position, other_pose.position) == pytest.approx(0.2)
         assert one_pose.stamp == other_pose.stamp
+
+
+def test_a_rolling_stereo_rig_is_the_same_whatever_renders(world: str) -> None:
+    """In one process or two, quickly or slowly: to the byte, in the same order."""
+    rig = {"stereo": {"baseline": 0.2, "offset": "2ms"}, "readout": "10ms", "exposure": "4ms"}
+    more: dict[str, Any] = rig | {"time_jitter": "3ms", "jitter": "120ms", "noise": 2.0}
+    one = sent(world, **more)
+    for other in (sent(world, processes=2, **more), sent(world, render_time="15ms", **more)):
+        assert other.of(PoseStamped) == one.of(PoseStamped)
+        assert len(other.of(Image)) == len(one.of(Image)) >= 8
+        for a, b in zip(other.of(Image), one.of(Image), strict=True):
+            assert (a.stamp, a.source) == (b.stamp, b.source)
+            np.testing.assert_array_equal(a.data, b.data)
 
 
 def test_the_right_eye_may_be_triggered_later(world: str) -> None:
