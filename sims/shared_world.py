@@ -168,5 +168,10 @@ async def join_world(node: Any) -> SharedWorld:
             f'world: expected "{world.name}", in which {world.named_by} is, since all vehicles of '
             f'a run share one world, found "{node.config.world}"'
         )
+    origins = {each.config.origin for each in inhabitants if hasattr(each.config, "origin")}
+    if len(origins) > 1:
+        raise WorldError(
+            f"origin: expected one for all vehicles of a world, found {sorted(origins)}"
+        )
     await world.build(node)
     return world

@@ -146,6 +146,12 @@ def test_all_are_in_the_world_that_one_of_them_names(world: str) -> None:
         fly(drone("a", 0.0, world), other, duration=0.01)
 
 
+def test_a_world_is_at_one_place_of_the_earth(world: str) -> None:
+    there = drone("b", 4.0, world, origin=[48.0, 11.0, 500.0])
+    with pytest.raises(NodeError, match=r"^a: origin: expected one for all .*48\.0, 11\.0"):
+        fly(drone("a", 0.0, world), there, duration=0.01)
+
+
 def test_a_check_goes_through_all_of_it(world: str) -> None:
     nodes = (drone("a", 0.0, world), drone("b", 4.0, world))
     found = of_nodes(Config(run=RunConfig(duration=Duration(1.0)), nodes=nodes))
