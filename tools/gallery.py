@@ -5,8 +5,6 @@ The worlds are seen from a place each; the sensors are those of one flight, `too
 
 from __future__ import annotations
 
-import math
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +12,10 @@ import cv2
 import numpy as np
 
 from events import DepthImage, Event, Image, Imu, LidarScan, SegmentationImage
-from events.rotations import from_rpy
 from runtime.config.reading import load
-from runtime.testing import run_nodes
-from sims.cameras import (
-    CameraRenderer,
-    CameraSpec,
-    add_free_camera,
-    model_to_bytes,
-    pose_to_qpos,
-)
-from sims.worlds import WORLDS, load_scene
+from runtime.testing import run_nodes, spec
+from sims.computer_vision import FreeCamera
+from sims.worlds import WORLDS
 
 DOCS = Path("docs/images")
 SIZE = (384, 288)
@@ -40,27 +31,17 @@ VIEWS = {  # north, east, down, metres; roll, pitch, yaw, degrees
 
 def main() -> None:
     """Make both images."""
-    wanted = sys.argv[1:] or ["worlds", "sensors"]
-    if "worlds" in wanted:
-        _write("worlds.jpg", {name: _seen(name) for name in WORLDS}, 3)
-    if "sensors" in wanted:
-        _write("sensors.jpg", _sensed(), 5)
+    _write("worlds.jpg", {name: _seen(name) for name in WORLDS}, 3)
+    _write("sensors.jpg", _sensed(), 5)
 
 
 def _seen(name: str) -> Any:
     """Return what a camera sees of a world, BGR."""
-    spec, dynamics = load_scene(name, 1)
-    camera = CameraSpec(name="camera", images=("rgb",), width=SIZE[0], height=SIZE[1],
-                        position=(0.0, 0.0, 0.0))  # fmt: skip
-    prefix = add_free_camera(spec, "free", (camera,))
-    renderer = CameraRenderer(model_to_bytes(spec.compile()), (camera,), prefix, 0, 2, dynamics)
-    north, east, down, *angles = VIEWS[name]
-    roll, pitch, yaw = map(math.radians, angles)
-    state = pose_to_qpos((north, east, down), from_rpy(roll, pitch, yaw))
-    frame = renderer.render(3_000_000_000, state, ("camera",))["camera"]
-    renderer.close()
-    assert frame.rgb is not None
-    return frame.rgb[..., ::-1]
+    camera = {"name": "camera", "images": ["rgb"], "width": SIZE[0], "height": SIZE[1]}
+    place, angles = VIEWS[name][:3], VIEWS[name][3:]
+    settings = {"world": name, "position": place, "orientation": angles, "cameras": [camera]}
+    result = run_nodes([spec(FreeCamera, "free", {**settings, "rate": 1})], duration=1.5)
+    return result.of(Image)[-1].data[..., ::-1]
 
 
 def _sensed() -> dict[str, Any]:

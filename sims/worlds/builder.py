@@ -8,6 +8,7 @@ geoms: `<name>` is the solid (a primitive, group 3, not drawn), `<name>.look` th
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -16,6 +17,17 @@ from sims.worlds.model import Material, Model, Vector
 from sims.worlds.shapes import FACES, STEP, Window, arch, blob, box, cylinder, face_size, quad
 
 WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
+
+
+def sides(
+    half: tuple[float, float], middle: tuple[float, float] = (0.0, 0.0)
+) -> Iterator[tuple[str, tuple[float, float], float, float]]:
+    """Yield name, place of the foot, direction that it faces and width of a room's four walls."""
+    (x, y), (u, v) = half, middle
+    yield "wall_north", (u + x, v), 180.0, 2.0 * y
+    yield "wall_south", (u - x, v), 0.0, 2.0 * y
+    yield "wall_east", (u, v - y), 90.0, 2.0 * x
+    yield "wall_west", (u, v + y), -90.0, 2.0 * x
 
 
 class Builder(Model):

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from sims.worlds import materials
-from sims.worlds.builder import WHOLE, Builder
+from sims.worlds.builder import WHOLE, Builder, sides
 from sims.worlds.model import Material
 from sims.worlds.patterns import Colour, Image, shade, smooth, specks
 
@@ -44,15 +44,10 @@ def corridor(seed: int = 0, bare: bool = False) -> Any:
     long, short = (0.0, 0.0, NORTH - 2.0, 1.0), (0.0, 0.0, WEST - 2.0, 1.0)
     b.box("block", wall, inner, (0.0, middle, 0.0), hidden=("top", "bottom"),
           windows={"front": short, "back": short, "left": long, "right": long})  # fmt: skip
-    for name, place, facing, modules in (
-        ("wall_north", (half_x, middle, 0.0), 180.0, WEST),
-        ("wall_south", (-half_x, middle, 0.0), 0.0, WEST),
-        ("wall_east", (0.0, middle - half_y, 0.0), 90.0, NORTH),
-        ("wall_west", (0.0, middle + half_y, 0.0), -90.0, NORTH),
-    ):
-        b.wall(name, wall, (modules * MODULE, HEIGHT), place, facing,
-               window=(0.0, 0.0, float(modules), 1.0))  # fmt: skip
     half, window = (half_x, half_y), (0.0, 0.0, float(WEST), float(NORTH))
+    for name, place, facing, width in sides(half, (0.0, middle)):
+        b.wall(name, wall, (width, HEIGHT), (*place, 0.0), facing,
+               window=(0.0, 0.0, float(round(width / MODULE)), 1.0))  # fmt: skip
     b.floor("floor", b.material("floor", _floor, DENSITY), half, middle=(0.0, middle),
             window=window)  # fmt: skip
     b.ceiling("ceiling", b.material("ceiling", _ceiling, DENSITY, glow=0.25), half, HEIGHT,

@@ -61,17 +61,16 @@ def forest(seed: int = 0, bare: bool = False) -> Scene:
     """Return the wood and what moves in it; every seed has its own bark, ground and leaves."""
     b = Builder("forest", seed, bare)
     b.spec.visual.headlight.ambient = [0.50, 0.55, 0.48]
-    bark = b.material("bark", _bark, 96.0)
+    bark = b.material("bark", lambda r: materials.bark((768, 192), r, 96.0, 0.05), 96.0)
     green = b.material("leaves", lambda r: materials.leaves((512, 512), r, 96.0), 96.0)
     sways = [b.moving(f"sway_{number}") for number in range(len(SWING))]
     _leaves(b, green, _stems(b, bark), sways)
     back = b.material("thicket", _thicket, 24.0)
+    size = (2.0 * HALF * math.tan(math.pi / 24) + 0.05, 24.0)
     for number in range(24):
-        angle = 15.0 * number
-        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-        size = (2.0 * HALF * math.tan(math.pi / 24) + 0.05, 24.0)
-        place = (float(-HALF * c), float(-HALF * s), 0.0)
-        b.wall(f"thicket_{number}", back, size, place, angle, window=b.cut(back, *size))
+        angle = math.radians(15.0 * number)
+        place = (-HALF * math.cos(angle), -HALF * math.sin(angle), 0.0)
+        b.wall(f"thicket_{number}", back, size, place, 15.0 * number, window=b.cut(back, *size))
     b.floor("ground", b.material("ground", _ground, DENSITY), (HALF, HALF), step=2.5)
     _shadows(b, sways[2 * GROUPS :])
     add_sky(b.spec, b.random)
@@ -111,8 +110,8 @@ def _stems(b: Builder, bark: Material) -> list[Vector]:
             turn, tilt = float(fixed.uniform(0, 360)), float(fixed.uniform(50, 78))
             length, low = float(fixed.uniform(1.2, 2.4)), float(fixed.uniform(1.2, 4.0))
             t, r = math.radians(tilt), math.radians(turn)
-            way = np.array([math.sin(t) * math.cos(r), math.sin(t) * math.sin(r), math.cos(t)])
-            line = np.array([x, y, low]) + way * np.linspace(0.0, length, 12)[:, None]
+            way = (math.sin(t) * math.cos(r), math.sin(t) * math.sin(r), math.cos(t))
+            line = np.array([x, y, low]) + np.outer(np.linspace(0.0, length, 12), way)
             if min(_free(point, path) for point in line) < 0.95:
                 continue
             at: Vector = tuple(((line[0] + line[-1]) / 2.0).tolist())
@@ -169,13 +168,6 @@ def _shadows(b: Builder, sways: list[Any]) -> None:
     for number, (x, y) in enumerate(places):
         body = sways[number % len(sways)]
         b.hang(f"shadow_{number}", "shadow", Material("shadow", 1.0, 1.0), body, (x, y, 0.015))
-
-
-def _bark(random: np.random.Generator) -> Image:
-    image = materials.planks((192, 768), random, 96.0, width=0.05, palette=(
-        (0.36, 0.30, 0.24), (0.30, 0.18, 0.21), (0.42, 0.36, 0.29),
-    ))  # fmt: skip
-    return np.ascontiguousarray(image.transpose(1, 0, 2))
 
 
 def _ground(random: np.random.Generator) -> Image:

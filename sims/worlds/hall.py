@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sims.worlds import decals, hall_surfaces, materials
-from sims.worlds.builder import Builder
+from sims.worlds.builder import Builder, sides
 from sims.worlds.hall_surfaces import (
     BARRELS,
     CEILING_DENSITY,
@@ -126,12 +126,7 @@ def _shelf(b: Builder, wood: Material, crates: Material) -> None:
 def _shell(b: Builder, posters: Material) -> None:
     """Add floor and walls; last, so that what stands before them is drawn first."""
     count = 0
-    for name, place, facing, width in (
-        ("wall_north", (NORTH, 0.0), 180.0, 2 * WEST),
-        ("wall_south", (-NORTH, 0.0), 0.0, 2 * WEST),
-        ("wall_east", (0.0, -WEST), 90.0, 2 * NORTH),
-        ("wall_west", (0.0, WEST), -90.0, 2 * NORTH),
-    ):
+    for name, place, facing, width in sides((NORTH, WEST)):
         inward = np.array([np.cos(np.radians(facing)), np.sin(np.radians(facing))])
         along = np.array([-inward[1], inward[0]])
         for offset in np.arange(-width / 2 + 1.7, width / 2 - 1.0, 2.9):

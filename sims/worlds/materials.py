@@ -59,10 +59,12 @@ def brick(
     return mix(mix(wall, (0.20, 0.17, 0.16), soot), (0.86, 0.83, 0.78), chalk)
 
 
-def paint(shape: tuple[int, int], random: np.random.Generator, colour: Colour) -> Image:
+def paint(
+    shape: tuple[int, int], random: np.random.Generator, colour: Colour, grain: float = 0.005
+) -> Image:
     """Return smooth paint, with a grain of half a percent: next to no texture."""
     coat = np.full((*shape, 3), colour, np.float32)
-    return shade(coat, 0.005 * random.standard_normal(shape, dtype=np.float32))
+    return shade(coat, grain * random.standard_normal(shape, dtype=np.float32))
 
 
 def concrete(
@@ -102,6 +104,16 @@ def planks(
     wear = fractal(shape, random, coarse=density, fine=12)
     wood = mix(wood, (0.66, 0.61, 0.54), smooth(0.8, 2.4, wear) * 0.45)
     return mix(wood, (0.10, 0.07, 0.05), 1.0 - smooth(0.3, 1.7, layout.edge))
+
+
+def bark(
+    shape: tuple[int, int], random: np.random.Generator, density: float, width: float
+) -> Image:
+    """Return the bark of a trunk, in upright ridges of a width in metres."""
+    image = planks(shape[::-1], random, density, width=width, palette=(
+        (0.40, 0.31, 0.23), (0.33, 0.26, 0.20), (0.46, 0.38, 0.29),
+    ))  # fmt: skip
+    return np.ascontiguousarray(image.transpose(1, 0, 2))
 
 
 def tiles(

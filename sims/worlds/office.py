@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from sims.worlds import materials
-from sims.worlds.builder import Builder
+from sims.worlds.builder import Builder, sides
 from sims.worlds.model import Material
-from sims.worlds.patterns import Colour, Image, shade
+from sims.worlds.patterns import Colour, Image
 
 NORTH, WEST, HEIGHT = 8.0, 6.0, 2.9
 DESKS = (  # x, y, turn
@@ -41,8 +41,8 @@ def office(seed: int = 0, bare: bool = False) -> Any:
         _desk(b, f"desk_{number}", (x, y, turn), (wood, grey, dark, blue))
     for number, (x, y) in enumerate(COLUMNS):
         b.box(f"column_{number}", white, (0.4, 0.4, HEIGHT), (x, y, 0.0), hidden=("top", "bottom"))
-    for number, (x, turn) in enumerate(((-6.9, 0.0), (-5.8, 0.0), (-4.7, 0.0), (-3.6, 0.0))):
-        b.box(f"cabinet_{number}", white, (1.08, 0.45, 1.25), (x, 5.75, 0.0), turn=turn)
+    for number, x in enumerate((-6.9, -5.8, -4.7, -3.6)):
+        b.box(f"cabinet_{number}", white, (1.08, 0.45, 1.25), (x, 5.75, 0.0))
     b.box("sofa/seat", blue, (0.8, 2.0, 0.42), (7.5, 0.6, 0.0))
     b.box("sofa/back", blue, (0.25, 2.0, 0.4), (7.8, 0.6, 0.42), hidden=())
     b.box("board", white, (0.05, 2.2, 1.2), (-7.95, 1.6, 0.9), hidden=("bottom",))
@@ -77,18 +77,16 @@ def _desk(b: Builder, name: str, at: tuple[float, float, float], of: tuple[Mater
 
 
 def _shell(b: Builder, white: Material, window: Material, frame: Material) -> None:
-    for name, place, facing, width in (
-        ("wall_north", (NORTH, 0.0, 0.0), 180.0, 2 * WEST),
-        ("wall_south", (-NORTH, 0.0, 0.0), 0.0, 2 * WEST),
-        ("wall_east", (0.0, -WEST, 0.0), 90.0, 2 * NORTH),
-        ("wall_west", (0.0, WEST, 0.0), -90.0, 2 * NORTH),
-    ):
-        b.wall(name, white, (width, HEIGHT), place, facing)
+    for name, place, facing, width in sides((NORTH, WEST)):
+        b.wall(name, white, (width, HEIGHT), (*place, 0.0), facing)
     for number, x in enumerate(np.arange(-7.0, 8.0, 2.0).tolist()):
         b.box(f"mullion_{number}", frame, (0.06, 0.06, 1.7), (x - 0.88, -5.97, 0.9), hidden=())
         b.panel(f"pane_{number}", window, (0.0, 0.0, 0.4, 0.4), (1.7, 1.6), (x, -5.98, 1.75), 90.0)
-    window_half = (0.0, 0.0, 8.0, 6.0)
-    b.floor("floor", b.material("carpet", _carpet, 64.0), (NORTH, WEST), window=window_half)
+    grain = 0.03  # the carpet's pile
+    pile = b.material(
+        "carpet", lambda r: materials.paint((128, 128), r, (0.42, 0.44, 0.47), grain), 64.0
+    )
+    b.floor("floor", pile, (NORTH, WEST), window=(0.0, 0.0, 8.0, 6.0))
     tiles = b.material("tiles", _tiles, 64.0, glow=0.3)
     b.ceiling("ceiling", tiles, (NORTH, WEST), HEIGHT, window=(0.0, 0.0, 4.0, 5.0))
 
@@ -103,12 +101,6 @@ def _glazing(b: Builder, frame: Material) -> None:
     for number, (dx, dy) in enumerate(((-1.7, 1.5), (1.65, 1.5), (-1.7, -1.45), (0.0, 1.5))):
         b.box(f"post_{number}", frame, (0.08, 0.08, HEIGHT), (x + dx, y + dy, 0.0))
     b.box("table", frame, (1.6, 0.9, 0.74), (x, y, 0.0))
-
-
-def _carpet(random: np.random.Generator) -> Image:
-    """Return 2 x 2 m of carpet, grey, with a fine pile."""
-    pile = 0.03 * random.standard_normal((128, 128), dtype=np.float32)
-    return shade(np.full((128, 128, 3), (0.42, 0.44, 0.47), np.float32), pile)
 
 
 def _tiles(random: np.random.Generator) -> Image:

@@ -145,7 +145,7 @@ def _furniture(b: Builder, wood: Material, cast: Material) -> None:
 
 
 def _trees(b: Builder) -> None:
-    bark = b.material("bark", _bark, 96.0)
+    bark = b.material("bark", lambda r: materials.bark((384, 192), r, 96.0, 0.07), 96.0)
     green = b.material("leaves", lambda r: materials.leaves((512, 768), r, 72.0), 72.0)
     for number, (x, y, height, radius) in enumerate(TREES):
         b.cylinder(f"tree_{number}/trunk", bark, 0.17, height, (x, y, 0.0))
@@ -158,13 +158,6 @@ def _trees(b: Builder) -> None:
         top = height + 1.6 * flat
         b.crown(f"tree_{number}/top", green, (small, small, 0.8 * small),
                 (x + float(off[0]), y + float(off[1]), top))  # fmt: skip
-
-
-def _bark(random: np.random.Generator) -> Image:
-    image = materials.planks((192, 384), random, 96.0, width=0.07, palette=(
-        (0.40, 0.31, 0.23), (0.33, 0.26, 0.20), (0.46, 0.38, 0.29),
-    ))  # fmt: skip
-    return np.ascontiguousarray(image.transpose(1, 0, 2))
 
 
 def _stone(random: np.random.Generator) -> Image:
