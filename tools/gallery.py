@@ -12,10 +12,17 @@ import cv2
 import numpy as np
 
 from events import DepthImage, Event, Image, Imu, LidarScan, SegmentationImage
+from events.rotations import from_rpy
 from runtime.config.reading import load
-from runtime.testing import run_nodes, spec
-from sims.computer_vision import FreeCamera
-from sims.worlds import WORLDS
+from runtime.testing import run_nodes
+from sims.cameras import (
+    CameraRenderer,
+    CameraSpec,
+    add_free_camera,
+    model_to_bytes,
+    pose_to_qpos,
+)
+from sims.worlds import WORLDS, load_scene
 
 DOCS = Path("docs/images")
 SIZE = (384, 288)
@@ -37,11 +44,17 @@ def main() -> None:
 
 def _seen(name: str) -> Any:
     """Return what a camera sees of a world, BGR."""
-    camera = {"name": "camera", "images": ["rgb"], "width": SIZE[0], "height": SIZE[1]}
-    place, angles = VIEWS[name][:3], VIEWS[name][3:]
-    settings = {"world": name, "position": place, "orientation": angles, "cameras": [camera]}
-    result = run_nodes([spec(FreeCamera, "free", {**settings, "rate": 1})], duration=1.5)
-    return result.of(Image)[-1].data[..., ::-1]
+    world, dynamics = load_scene(name, 1)
+    camera = CameraSpec(name="camera", images=("rgb",), width=SIZE[0], height=SIZE[1])
+    prefix = add_free_camera(world, "free", (camera,))
+    renderer = CameraRenderer(model_to_bytes(world.compile()), (camera,), prefix, 0, 2, dynamics)
+    north, east, down, *angles = VIEWS[name]
+    roll, pitch, yaw = np.radians(angles).tolist()
+    state = pose_to_qpos((north, east, down), from_rpy(roll, pitch, yaw))
+    image = renderer.render(3_000_000_000, state, ("camera",))["camera"].rgb
+    renderer.close()
+    assert image is not None
+    return image[..., ::-1]
 
 
 def _sensed() -> dict[str, Any]:
