@@ -38,8 +38,8 @@ def corridor(seed: int = 0, bare: bool = False) -> Any:
     middle = half_y - MODULE / 2.0
     _pilasters(b, trim, half_x, half_y, middle)
     for corner, (x, y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        place = (x * (half_x - 0.3), middle + y * (half_y - 0.3), 0.0)
-        b.cylinder(f"bin_{corner}", red, 0.17, 0.7, place, top=WHOLE, side=WHOLE)
+        foot = (x * (half_x - 0.3), middle + y * (half_y - 0.3), 0.0)
+        b.cylinder(f"bin_{corner}", red, 0.17, 0.7, foot, top=WHOLE, side=WHOLE)
     inner = (2.0 * half_x - 2.0 * MODULE, 2.0 * half_y - 2.0 * MODULE, HEIGHT)
     long, short = (0.0, 0.0, NORTH - 2.0, 1.0), (0.0, 0.0, WEST - 2.0, 1.0)
     b.box("block", wall, inner, (0.0, middle, 0.0), hidden=("top", "bottom"),
