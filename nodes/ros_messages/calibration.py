@@ -16,7 +16,7 @@ from events.frames import OPTICAL_TO_FRD
 def projection_matrix(camera: CameraAnnouncement) -> npt.NDArray[np.float64]:
     """Return P, shape (3, 4): K, and of a stereo rig's right camera -fx times its baseline."""
     info = camera.info
-    return np.column_stack([info.matrix(), [-info.fx * camera.baseline, 0.0, 0.0]])
+    return np.column_stack([info.matrix(), [0.0 - info.fx * camera.baseline, 0.0, 0.0]])
 
 
 def camera_announcement(
