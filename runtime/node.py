@@ -119,6 +119,9 @@ class Host(Protocol):
     def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         """Put a verdict into the summary."""
 
+    def note_environment(self, name: str, value: str) -> None:
+        """Put what the run depends on into the summary."""
+
     def after_run(self, call: Callable[[Path], Any]) -> None:
         """Call a function once the summary is written."""
 
@@ -336,6 +339,10 @@ class Node(Generic[C]):
             )
         found = {str(name): plain(each, f"{where}: {name}") for name, each in figures.items()}
         self._host.conclude(str(subject), found, None if passed is None else bool(passed))
+
+    def note_environment(self, name: str, value: str) -> None:
+        """Put something of this machine on which figures depend beside the summary's versions."""
+        self._host.note_environment(name, value)
 
     def after_run(self, call: Callable[[Path], Any]) -> None:
         """Have a function called with the run's folder once its summary is written.

@@ -139,6 +139,10 @@ class NodeHost:
         """Run a function of a node in a thread."""
         return self._executor.submit(self.instruments.offloaded(node.name, call))
 
+    def note_environment(self, name: str, value: str) -> None:
+        """Put what the run depends on into the summary."""
+        self.state.environment[name] = value
+
     def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         """Note a verdict for the summary."""
         self.state.conclusions[subject] = {"passed": passed, **figures}

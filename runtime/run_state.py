@@ -45,6 +45,7 @@ class RunState:
         tickers: By ``node.method``.
         links: All links of the nodes that there are, by ``node.port``.
         conclusions: What nodes concluded, by what they judged.
+        environment: What nodes found of the machine on which figures depend.
         costs: What workers cost, by ``node.Factory``.
         after_run: What is called with the run's folder at the very end.
     """
@@ -66,6 +67,7 @@ class RunState:
     tickers: dict[str, Ticker] = field(default_factory=dict)
     links: dict[str, Link] = field(default_factory=dict)
     conclusions: dict[str, dict[str, Any]] = field(default_factory=dict)
+    environment: dict[str, str] = field(default_factory=dict)
     costs: dict[str, Costs] = field(default_factory=dict)
     after_run: list[Callable[[Path], Any]] = field(default_factory=list)
 

@@ -286,7 +286,12 @@ def summarise(
         announcements=[
             {"type": type(a).__name__, **plain(a, a.source)} for a in state.announcements
         ],
-        environment={**environment(), "command": command_line(), "commit": commit()},
+        environment={
+            **environment(),
+            **state.environment,
+            "command": command_line(),
+            "commit": commit(),
+        },
         workers={name: WorkerSummary.of(each) for name, each in state.costs.items()},
     )
 

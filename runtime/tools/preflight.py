@@ -194,6 +194,9 @@ class _DryHost:
     def stop(self, reason: str) -> None:
         pass
 
+    def note_environment(self, name: str, value: str) -> None:
+        pass
+
     def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         pass
 

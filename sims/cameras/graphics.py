@@ -58,6 +58,12 @@ def open_context(width: int, height: int, threads: int) -> Any:
     return context
 
 
+def gl_renderer() -> str:
+    """Return the name of the present context's renderer: ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
+    gl = importlib.import_module("OpenGL.GL")
+    return bytes(gl.glGetString(gl.GL_RENDERER)).decode(errors="replace")
+
+
 def set_fog(start: float, end: float) -> None:
     """Set the distances (metres) between which the present context's fog grows to its full.
 

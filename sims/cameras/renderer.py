@@ -21,7 +21,7 @@ from events.base import Quaternion, Vector3
 from events.poses import pose_matrix
 from sims.cameras.development import Development
 from sims.cameras.frame import Frame
-from sims.cameras.graphics import keep_memory
+from sims.cameras.graphics import gl_renderer, keep_memory
 from sims.cameras.lens import undistorted
 from sims.cameras.noise import generator, grey_of
 from sims.cameras.optics import moments
@@ -153,6 +153,11 @@ class CameraRenderer:
             # In real time, and not on the run's clock: it stands for a slow renderer.
             time.sleep(max(due - time.monotonic(), 0.0))
         return tuple(frames)
+
+    def graphics(self) -> str:
+        """Return the name of what draws, as GL knows it: a graphics card, or ``llvmpipe``."""
+        self._stage.enter()
+        return gl_renderer()
 
     def close(self) -> None:
         """Give the GL context back. Further calls do nothing."""

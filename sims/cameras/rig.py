@@ -141,6 +141,11 @@ class CameraRig:
             world.dynamics,
             processes=self._processes,
         )
+        if self._node.checking:
+            return
+        graphics = await self._renderer.call_for(0.0, CameraRenderer.graphics)
+        self._node.log.info("images are drawn by %s", graphics)
+        self._node.note_environment("graphics", graphics)
 
     def change(self, specs: tuple[CameraSpec, ...]) -> None:
         """Take over latency, jitter and loss of these, from the next exposure on."""

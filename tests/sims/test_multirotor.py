@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any
@@ -292,7 +293,8 @@ def test_it_runs_in_real_time() -> None:
     assert 0.9 * SECOND < stamps[-1] <= end
 
 
-def test_cameras_announce_themselves_and_deliver() -> None:
+def test_cameras_announce_themselves_and_deliver(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
     camera = {"name": "front", "width": 32, "height": 24, "rate": 20, "latency": "40ms"}
     result = fly(cameras=[camera], camera_processes=1, duration=0.3)
     (announced,) = result.of(CameraAnnouncement)
@@ -304,6 +306,7 @@ def test_cameras_announce_themselves_and_deliver() -> None:
     assert {(e.source, e.frame_id, e.data.shape) for e in images} == {
         ("drone/front", announced.frame_id, (24, 32, 3))
     }
+    assert re.search(r"images are drawn by \w+", caplog.text)
 
 
 def test_a_world_that_is_not_there_is_named() -> None:
