@@ -118,13 +118,17 @@ def lockstep(
     seconds: Annotated[float, typer.Option(min=1.0, help="Simulated, of each run.")] = 30.0,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 5,
 ) -> None:
-    """Measure simulated seconds a second, with and without cameras, beside a bare loop."""
+    """Measure simulated seconds a second beside a bare loop, and where a frame's time goes."""
+    from bench import parts
     from bench.lockstep import measure
-    from bench.tables import lockstep_table
+    from bench.tables import lockstep_table, parts_table
 
     with _status() as say:
         rows = measure(seconds=seconds, repeats=repeats, progress=say)
-    _finish(lockstep_table(rows), json, rows)
+        say("parts of a frame")
+        shares = parts.measure(seconds=seconds / 3, repeats=repeats)
+    _finish(lockstep_table(rows), None, rows)
+    _finish(parts_table(shares), json, [*rows, *shares])
 
 
 @app.command()

@@ -161,6 +161,11 @@ def _lockstep(results: Results) -> Iterator[str]:
         share = "" if r.share is None else f"{r.share:.0%}"
         yield f"| {r.case} | {r.speed:.1f} | {share} |"
     yield ""
+    if results.parts:
+        yield "Processor time of a frame (all processes; RGB-D with noise, odometry, evaluation):\n"
+        yield "| part | ms | share |\n|---|--:|--:|"
+        yield from (f"| {p.part} | {p.ms:.1f} | {p.share:.0%} |" for p in results.parts)
+        yield ""
 
 
 def _throughput(results: Results) -> Iterator[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from bench import bridge, flood, idle, lockstep, recording, ros_images, stall, throughput
+from bench import bridge, flood, idle, lockstep, parts, recording, ros_images, stall, throughput
 from bench.driver import Outcome, Row, measure_all
 from bench.results import environment
 from bench.system import NODES, CaseName
@@ -23,6 +23,7 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
     throughput: list[throughput.ThroughputRow]
     idle: idle.IdleRow
     lockstep: list[lockstep.LockstepRow]
+    parts: list[parts.PartRow] = []
     bridge: list[bridge.BridgeRow] = []
     ros_images: list[ros_images.RosImageRow] = []
     recording: list[recording.RecordingRow] = []
@@ -75,6 +76,7 @@ def measure(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> 
         throughput=through,
         idle=idling,
         lockstep=lockstep.measure(repeats=2 if quick else 5, progress=progress),
+        parts=parts.measure(repeats=1 if quick else 5),
         **beside(quick=quick, progress=progress),
         missing={k: v for outcome in outcomes for k, v in outcome.missing.items()},
         versions={k: v for outcome in outcomes for k, v in outcome.versions.items()},

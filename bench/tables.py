@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from bench.flood import FloodRow
     from bench.idle import IdleRow
     from bench.lockstep import LockstepRow
+    from bench.parts import PartRow
     from bench.recording import RecordingRow
     from bench.ros_images import RosImageRow
     from bench.stall import StallRow
@@ -105,6 +106,14 @@ def lockstep_table(rows: Sequence[LockstepRow]) -> Table:
     for row in rows:
         share = "" if row.share is None else f"{row.share:.0%}"
         table.add_row(row.case, f"{row.speed:.1f}", share)
+    return table
+
+
+def parts_table(rows: Sequence[PartRow]) -> Table:
+    """Return where the processor time of a frame goes."""
+    table = _table("processor time of a frame, by part", "part", "ms", "share")
+    for row in rows:
+        table.add_row(row.part, f"{row.ms:.1f}", f"{row.share:.0%}")
     return table
 
 

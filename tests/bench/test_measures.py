@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import idle, lockstep, stall, throughput
+from bench import idle, lockstep, parts, stall, throughput
 
 
 @pytest.mark.slow
@@ -73,3 +73,12 @@ def test_throughput_covers_handlers_streams_and_workers() -> None:
     ]
     assert all(row.per_event_us > 0 for row in rows)
     assert [row.bytes_per_second > 0 for row in rows] == [False] * 5 + [True] * 3
+
+
+@pytest.mark.slow
+def test_the_parts_of_a_frame_add_up() -> None:
+    """To the whole; each that is measured by itself takes some time, and none takes it all."""
+    rows = {row.part: row for row in parts.measure(seconds=2, repeats=1)}
+    assert list(rows)[-2:] == ["rest", "all"]
+    assert sum(row.ms for row in rows.values()) == pytest.approx(2 * rows["all"].ms)
+    assert all(0 < rows[part].share < 1 for part in ("noise", "copies", "odometry", "hashing"))
