@@ -76,6 +76,9 @@ class NoHost:
     def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         raise NotImplementedError
 
+    def note_environment(self, name: str, value: str) -> None:
+        raise NotImplementedError
+
     def after_run(self, call: Callable[[Path], Any]) -> None:
         raise NotImplementedError
 
