@@ -56,6 +56,7 @@ def corners(image: Any) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_opposite_places_of_the_corridor_look_alike() -> None:
     """From the other side of the block the image is the same to 2 grey levels, but for bins."""
     views = [(place, heading) for place, heading in places("corridor", 12)]
@@ -66,6 +67,7 @@ def test_opposite_places_of_the_corridor_look_alike() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_the_office_shows_few_corners_and_the_night_is_dark() -> None:
     """Against hall and yard: a sixth of the corners, a fifth of the light."""
     images = {n: greys(n, places(n, 12)) for n in ("hall", "office", "yard", "night")}
@@ -96,6 +98,7 @@ def test_leaves_and_shadows_move_as_a_pure_function_of_time() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_they_cost_at_most_half_as_much_again_as_the_others() -> None:
     """Processor time of colour and depth at 512 x 512, outdoors against the yard, else the hall."""
     built = {name: scene(name) for name in ("hall", "yard", *HARD)}
