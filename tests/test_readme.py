@@ -25,6 +25,7 @@ SHORTER = {
         *("--set", "drone.camera_processes=1"),
     ],
     "sweep": ["--set", "run.duration=1s", "--set", "report.figures=[]"],
+    "selftest": ["--standing", "10s"],
     "bench": ["--help"],
 }
 """What is added to a command so that it takes a second."""
@@ -48,9 +49,9 @@ def done(words: str, tmp_path: Path, a_run: Path | None = None) -> CompletedProc
     parts = [str(tmp_path / part) if part.endswith(".png") else part for part in parts]
     parts = [str(a_run) if part == A_RUN else part for part in parts]
     parts += SHORTER.get(parts[0], [])
-    if parts[0] in {"run", "sweep", "export"}:
+    if parts[0] in {"run", "sweep", "export", "selftest"}:
         parts += ["--out", str(tmp_path)]
-    if parts[0] in {"run", "sweep"}:
+    if parts[0] in {"run", "sweep", "selftest"}:
         return command(*parts, folder=ROOT, limit=500)
     return command_here(*parts, folder=ROOT)
 
@@ -74,7 +75,7 @@ def test_the_run_leaves_a_summary(a_run: Path) -> None:
     "words",
     [
         pytest.param(c, marks=[pytest.mark.slow, pytest.mark.timeout(600)])
-        if c.startswith("sweep") or c in FLIGHTS or A_RUN in c
+        if c.startswith(("sweep", "selftest")) or c in FLIGHTS or A_RUN in c
         else c
         for c in COMMANDS
         if c != FLIGHTS[0]

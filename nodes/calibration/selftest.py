@@ -57,7 +57,7 @@ _KEPT = {
 """Settings of a camera that say where and when it looks; what blurs a measurement is at its
 default, which is off."""
 
-_SECONDS, _RATE = 9.0, 8.0
+_SECONDS, _RATE = 9.0, 5.0
 """Length of the flight; images a second, about."""
 
 
@@ -189,7 +189,7 @@ def _announced(table: dict[str, Any], config: Config, folder: Path, angle: float
 
 def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     """Return the nodes of the flight: still, then up, then moving about all axes."""
-    excitation = {"duration": "6s", "amplitude": 0.35, "frequency": 0.4, "yaw": 60.0}
+    excitation = {"duration": "6s", "amplitude": 0.3, "frequency": 0.4, "yaw": 45.0}
     collector = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
     if "trajectory" in table:
         path = folder.resolve() / "path.tum"
