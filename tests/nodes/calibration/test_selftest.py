@@ -22,9 +22,9 @@ CAMERA: dict[str, Any] = {"name": "camera", "width": 200, "height": 150, "rate":
 STEREO = {
     "name": "eye",
     "images": ["grey"],
-    "width": 240,
-    "height": 180,
-    "intrinsics": [120.0, 120.0, 119.0, 90.5],
+    "width": 160,
+    "height": 120,
+    "intrinsics": [85.0, 85.0, 79.0, 60.5],
     "lens": {"model": "equidistant", "coefficients": [0.02, -0.005, 0.001, 0.0]},
     "stereo": {"baseline": 0.12},
     "readout": "15ms",
