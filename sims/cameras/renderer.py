@@ -26,7 +26,7 @@ from sims.cameras.lens import undistorted
 from sims.cameras.noise import generator, grey_of
 from sims.cameras.optics import moments
 from sims.cameras.shot import Shot
-from sims.cameras.shutter import image_speeds, row_bands, row_time, small_camera
+from sims.cameras.shutter import FINER_FOR_DEPTH, image_speeds, row_bands, row_time, small_camera
 from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain
 from sims.cameras.stage import Changing, Colours, Depths, Floats, Stage
 from sims.cameras.view import Drawn, View, looked_up, stacked
@@ -177,7 +177,8 @@ class CameraRenderer:
         times = [0.0]
         if exposure + readout > 0.0:
             speeds = self._speeds(shot, spec, number, exposure + readout)
-            bands = row_bands(spec.height, float(speeds.max()) * readout)
+            finer = FINER_FOR_DEPTH if "depth" in kinds else 1.0
+            bands = row_bands(spec.height, float(speeds.max()) * readout * finer)
             times = moments(exposure, float(np.quantile(speeds, 0.9)) * exposure)
         poses = [
             self._pose(shot, number, moment)

@@ -18,6 +18,9 @@ Floats = npt.NDArray[np.float64]
 OFF = 0.25
 """Pixels by which a row may be off because it is drawn at the time of another one."""
 
+FINER_FOR_DEPTH = 2.5
+"""Times as many bands where depth is wanted: on a slanted floor a pixel is some centimetres."""
+
 MOST_BANDS = 128
 """Bands of one image, at most; beyond 64 pixels of motion in a readout, rows are farther off."""
 
