@@ -98,7 +98,7 @@ def test_the_closed_loop_flies_its_path_on_estimates(tmp_path: Path) -> None:
 @pytest.mark.timeout(500)
 def test_the_figure_eight_is_flown_and_followed(tmp_path: Path) -> None:
     """`figure_eight` excites the vehicle, flies at 3 m/s, and lands without a collision."""
-    summary = run("figure_eight", tmp_path, "report.figures=[]", "camera.rate=10")
+    summary = run("figure_eight", tmp_path, "report.figures=[]")
     assert summary["reason"] == "pilot: flight completed"
     figures = summary["verdict"]["estimators"]["odometry"]
     assert figures["collisions"] == 0
