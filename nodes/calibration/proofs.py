@@ -198,7 +198,7 @@ def depth(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: f
         places, turns = motion.rows_of(camera, stamp)
         rows = samples[:, 1].astype(int)
         met = []
-        for shift in ((0.0, 0.0), (2.5, 0.0), (-2.5, 0.0), (0.0, 2.5), (0.0, -2.5)):
+        for shift in ((0.0, 0.0), (4.0, 0.0), (-4.0, 0.0), (0.0, 4.0), (0.0, -4.0)):
             rays = camera.info.unproject(samples[:, :2] + shift)
             seen = np.asarray(np.isfinite(rays).all(axis=1))
             turned = turns[rows].apply(np.where(seen[:, None], rays, [0.0, 0.0, 1.0]))
@@ -210,7 +210,7 @@ def depth(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: f
         clear &= np.isfinite(samples[:, 2]) & (samples[:, 2] > NEAREST)
         wrong = samples[:, 2] - met[0][0]
         if camera.readout:  # rows may be as far off as proof 3 allows
-            slope = sum(np.abs(met[k][0] - met[k + 1][0]) / 5.0 for k in (1, 3))
+            slope = sum(np.abs(met[k][0] - met[k + 1][0]) / 8.0 for k in (1, 3))
             wrong = np.sign(wrong) * np.maximum(np.abs(wrong) - _ROLLING * slope, 0.0)
         off.append(wrong[clear])
         ratio.append(samples[clear, 2] / met[0][0][clear])

@@ -94,7 +94,7 @@ def test_a_simulator_that_lies_fails_with_sentences(tmp_path: Path) -> None:
     result = proven({"type": f"{__name__}:WrongFocal", "cameras": [CAMERA]}, tmp_path)
     said = missed(result)
     assert {2, 3} <= set(said)
-    assert "accelerometer_noise_density is 0.002 by its Allan deviation" in said[2][0]
+    assert "by its Allan deviation, announced 0.003" in said[2][0]
     assert "as if fx were 100 px, not 103 px" in said[3][0]
     assert not result.passed()
 
