@@ -145,7 +145,8 @@ class CameraInfo(msgspec.Struct, frozen=True, kw_only=True):
             start = np.where(np.isfinite(share)[:, None], uv * share[:, None], uv)
             xy = _undistort(self.distortion, uv, start)
             rays = np.column_stack([xy, np.ones(len(xy))])
-            rays /= np.linalg.norm(rays, axis=1)[:, None]
+            with np.errstate(invalid="ignore"):  # where Newton's method went to infinity
+                rays /= np.linalg.norm(rays, axis=1)[:, None]
         off = np.linalg.norm(
             self.project(rays) - (uv * (self.fx, self.fy) + (self.cx, self.cy)), axis=1
         )

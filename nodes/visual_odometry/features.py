@@ -4,12 +4,11 @@ A few corners, followed from the previous image, give an approximate pose. Then 
 stored key frames are looked for as they should look from there, each by its patch in the key frame
 in which it was first seen: so the error grows with new landmarks and not with images, and not at
 all where the camera returns soon enough. A landmark's depth is the mean of all readings. The parts
-are in `landmarks`, `patches`, `surfaces`, and in `nodes.odometry`.
+are in `keyframes`, `landmarks`, `patches`, `surfaces`, and in `nodes.odometry`.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from collections import deque
 from typing import Annotated, Any
@@ -28,11 +27,11 @@ from nodes.odometry.pose import (
     Observations,
     Solution,
     from_rotation_vector,
-    rays,
     solve_pose,
 )
-from nodes.odometry.relocalization import DescribedPoints, detect_and_describe, relocalize
+from nodes.odometry.relocalization import detect_and_describe, relocalize
 from nodes.visual_odometry.corners import find_corners, squares
+from nodes.visual_odometry.keyframes import ORB_POINTS, Described, Keyframe
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import Rows, find_patches, half_width
 from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
@@ -59,8 +58,6 @@ _READING = 0.5
 
 A reading is the mean of many pixels, but not of an exact plane.
 """
-_ORB_POINTS = 500
-"""Points by which a key frame is described."""
 
 
 class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -94,45 +91,6 @@ class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     keyframe_shift: Annotated[float, msgspec.Meta(gt=0)] = 40.0
     min_inliers: Annotated[int, msgspec.Meta(ge=6)] = 15
     reset_timeout: Annotated[float, msgspec.Meta(ge=0)] = 1.0
-
-
-class Keyframe(msgspec.Struct, frozen=True, eq=False):
-    """An image in which landmarks were first seen.
-
-    Attributes:
-        image: Grey.
-        pose: World to camera, shape (4, 4).
-    """
-
-    image: Grey
-    pose: Floats
-
-
-class Described:
-    """A key frame's points for relocalization, described when a lost camera first asks for them.
-
-    Args:
-        frame: The key frame.
-        inverse_of: Its inverse depth, as `inverse_depth` gives it; released once described.
-        matrix: K, shape (3, 3).
-        noise: Standard deviation of inverse depth, 1/m.
-    """
-
-    def __init__(self, frame: Keyframe, inverse_of: Depth, matrix: Floats, noise: float) -> None:
-        self._source: tuple[Keyframe, Depth] | None = frame, inverse_of
-        self._matrix = matrix
-        self._noise = noise
-
-    @functools.cached_property
-    def points(self) -> DescribedPoints:
-        """The points, in the world."""
-        assert self._source is not None
-        (frame, inverse_of), self._source = self._source, None
-        pixels, descriptors = detect_and_describe(frame.image, _ORB_POINTS)
-        seen = surfaces_at(inverse_of, pixels, self._noise)
-        continuous, back = seen.continuous, inverse(frame.pose)
-        points = rays(pixels[continuous], self._matrix) / seen.inverse[continuous, None]
-        return DescribedPoints(points @ back[:3, :3].T + back[:3, 3], descriptors[continuous])
 
 
 class MapMatch(msgspec.Struct, frozen=True, eq=False):
@@ -218,7 +176,7 @@ class FeatureTracker:
         match = None if expected is None else self._find(grey, inverse_of, expected)
         if match is not None or self._lost_since is None:
             return match
-        pixels, descriptors = detect_and_describe(grey, _ORB_POINTS)
+        pixels, descriptors = detect_and_describe(grey, ORB_POINTS)
         for frame in self._next_searched():
             found = relocalize(pixels, descriptors, frame.points, self._matrix, cv2.SOLVEPNP_AP3P)
             if found is not None:

@@ -63,21 +63,21 @@ def test_mistakes_in_the_run(tmp_path: Path, line: str, expected: str, found: st
 
 
 IN_DRONE = [
-    ("wrld = 1", "expected one of world, cameras, ", "'wrld' (did you mean 'world'?)"),
+    ("wrld = 1", "expected one of world, origin, cameras, ", "'wrld' (did you mean 'world'?)"),
     ("world = 1", "world: expected a text", "found 1"),
     ("position = [1]", "position: expected a list of length 2", "found [1]"),
     ('position = [1, "a"]', "position[1]: expected a number", 'found "a"'),
     ("control_rate = 0", "control_rate: expected a number > 0", "found 0"),
     ("camera_processes = true", "camera_processes: expected a whole number", "found true"),
     ("imu = 3", "imu: expected a table", "found 3"),
-    ("imu = { gyro = 3 }", "imu: expected one of gyroscope_noise_density, ", "key 'gyro'"),
+    ("imu = { gyro = 3 }", "imu: expected one of position, orientation, gyroscope_noise_density, ", "key 'gyro'"),
     ("gains = { x = 3 }", "gains: expected one of ", "unknown key 'x'"),
     ("limits = { x = 3 }", "limits: expected one of ", "unknown key 'x'"),
     ('setpoint_timeout = "x"', "setpoint_timeout: expected a duration such as", 'found "x"'),
     ("cameras = 3", "cameras: expected a list", "found 3"),
     (CAMERAS + 'rate = "x"', "cameras[1].rate: expected a number", 'found "x"'),
     (CAMERAS + "rte = 3", "cameras[1]: expected one of name, ", "(did you mean 'rate'?)"),
-    (CAMERAS + "fov = 200", "cameras[1].fov: expected a number <= 170", "found 200"),
+    (CAMERAS + "fov = 200", "cameras[1]: fov: expected at most 170 degrees ", "found 200 degrees"),
     (CAMERAS + 'images = ["red"]', 'cameras[1].images[0]: expected "rgb" or', 'found "red"'),
     (CAMERAS + "images = []", "cameras[1]: images: expected one or more", "found none"),
     ("[[nodes.cameras]]\nrate = 3", 'cameras[0]: expected a setting "name"', "found none"),
@@ -100,7 +100,7 @@ OF_NODES = [
     ('name = "run"\ntype = "a:B"', "nodes[0].name: expected any name but those"),
     ('name = "x"\ntype = "a"', 'nodes[0] (x): type: expected "module:Class", found "a"'),
     ('name = "x"\ntype = "..a:B"', 'nodes[0] (x): type: expected "module:Class", found "..a:B"'),
-    ('name = "x"\ntype = "nodes.flightlog:A"', '"nodes.flightlog" (did you mean \'nodes.flight_'),
+    ('name = "x"\ntype = "nodes.rerunview:A"', '"nodes.rerunview" (did you mean \'nodes.rerun_'),
     ('name = "x"\ntype = "nodes.pilots:Teleob"', "found \"Teleob\" (did you mean 'Teleop'?)"),
     (
         'name = "x"\ntype = "nodes.pilots.pilot:Node"',
