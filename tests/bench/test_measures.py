@@ -13,6 +13,7 @@ from bench import idle, lockstep, parts, stall, throughput
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(180)
 def test_an_inline_camera_delays_ticks_and_a_worker_fetches_as_much(tmp_path: Path) -> None:
     """The command writes a row a mode; inline, a tick waits for a whole image."""
     out = tmp_path / "stall.json"
@@ -49,7 +50,7 @@ def test_stall_rows_are_statistics_of_what_was_collected() -> None:
 @pytest.mark.slow
 def test_lockstep_is_compared_with_a_bare_loop() -> None:
     """Both fly; the run takes longer than the bare loop, and cameras longer than none."""
-    bare, run, cameras = lockstep.measure(seconds=5, repeats=1)
+    bare, run, cameras = lockstep.measure(seconds=5, repeats=3)  # medians, as one may be held up
     assert bare.speed > run.speed > cameras.speed > 0
     assert run.share is not None
     assert 0 < run.share < 1

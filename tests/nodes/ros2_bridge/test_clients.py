@@ -38,6 +38,7 @@ TOPICS = {
     "/drone/path": "nav_msgs/msg/Path",
     "/drone/pressure": "sensor_msgs/msg/FluidPressure",
     "/drone/range": "sensor_msgs/msg/Range",
+    "/drone/vel": "geometry_msgs/msg/TwistStamped",
     "/mapper/points": "sensor_msgs/msg/PointCloud2",
     "/scores/vo/ate": "std_msgs/msg/Float64",
     "/slam/pose": "geometry_msgs/msg/PoseStamped",

@@ -70,7 +70,7 @@ IN_DRONE = [
     ("control_rate = 0", "control_rate: expected a number > 0", "found 0"),
     ("camera_processes = true", "camera_processes: expected a whole number", "found true"),
     ("imu = 3", "imu: expected a table", "found 3"),
-    ("imu = { gyro = 3 }", "imu: expected one of position, orientation, gyroscope_noise_density, ", "key 'gyro'"),
+    ("imu = { gyro = 3 }", "imu: expected one of position, orientation, gyro", "key 'gyro'"),
     ("gains = { x = 3 }", "gains: expected one of ", "unknown key 'x'"),
     ("limits = { x = 3 }", "limits: expected one of ", "unknown key 'x'"),
     ('setpoint_timeout = "x"', "setpoint_timeout: expected a duration such as", 'found "x"'),
