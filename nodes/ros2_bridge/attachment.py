@@ -6,6 +6,7 @@ A ROS process that gets a malformed attachment ends, so there is one place that 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import NamedTuple
 
 import xxhash
@@ -28,6 +29,28 @@ class Attachment(NamedTuple):
     sequence: int
     stamp: int
     gid: bytes
+
+
+class Message(NamedTuple):
+    """A message that has come; its bytes are not copied before they are asked for.
+
+    Attributes:
+        size: Bytes.
+        read: Returns them.
+        attached: Returns those of its attachment; none if it has none.
+    """
+
+    size: int
+    read: Callable[[], bytes]
+    attached: Callable[[], bytes] = bytes
+
+    @property
+    def attachment(self) -> Attachment | None:
+        """Return its attachment; ``None`` if there is none, or what came is none."""
+        try:
+            return unpack(self.attached())
+        except ValueError:
+            return None
 
 
 def gid(token: str) -> bytes:

@@ -13,6 +13,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+from nodes.ros2_bridge.attachment import Message
+
 BUDGET = 0.0005
 """Seconds for which one turn of the loop may be held."""
 
@@ -54,22 +56,16 @@ class Inbox:
         self._woken = False
         self.wake_ups = 0
 
-    def take(self, size: int, read: Callable[[], bytes]) -> None:
-        """Take a message, in any thread; never waits.
-
-        Args:
-            size: Bytes.
-            read: Returns them.
-        """
-        if size > self._max_size:
-            self._complain(
-                "message too large", f"expected {self._max_size} bytes or less, found {size}"
-            )
+    def take(self, message: Message) -> None:
+        """Take a message, in any thread; never waits."""
+        if message.size > self._max_size:
+            found = f"expected {self._max_size} bytes or less, found {message.size}"
+            self._complain("message too large", found)
             return
         if not self._within_rate():
             self._complain("too many messages", f"expected {self._max_rate:g} a second or less")
             return
-        data = read()
+        data = message.read()
         with self._lock:
             full = len(self._waiting) == self._depth
             if full:

@@ -6,11 +6,11 @@ otherwise (`ros2dds_key`). Nothing here talks to Zenoh.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import msgspec
 
-from nodes.ros_messages.topics import Topic, dds_type
+from nodes.ros_messages.topics import Qos, Topic, dds_type, ros_type
 
 Kind = Literal["NN", "MP", "MS", "SS", "SC"]
 """Node, publisher, subscription, service server, service client."""
@@ -30,6 +30,62 @@ class NodeName(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     namespace: str = "/"
     domain_id: int = 0
+
+
+class Token(msgspec.Struct, frozen=True, kw_only=True):
+    """What a liveliness token says of a node or of one of its endpoints.
+
+    Attributes:
+        key: The token itself; `attachment.gid` of it stands in its owner's messages.
+        kind: What it is of.
+        node: Whose.
+        zid: The session's id as text.
+        node_id: The node's number in the session.
+        id: Its own number in the session.
+        topic: Its topic or service; ``None`` for a node.
+        extra: What follows; newer releases say there which buffers an endpoint can share.
+    """
+
+    key: str
+    kind: Kind
+    node: NodeName
+    zid: str
+    node_id: int
+    id: int
+    topic: Topic | None = None
+    extra: tuple[str, ...] = ()
+
+
+def parse_token(key: str) -> Token:
+    """Read a liveliness token.
+
+    Raises:
+        ValueError: It is none that `rmw_zenoh_cpp` would declare.
+    """
+    parts = key.split("/")
+    try:
+        space, domain, zid, node_id, id_, kind, _, namespace, name, *rest = parts
+        if space != ADMIN_SPACE or kind not in get_args(Kind) or "" in parts:
+            raise ValueError(f"expected {ADMIN_SPACE}, one of {get_args(Kind)}, no empty part")
+        topic = None
+        if kind != "NN":
+            topic_, type_, hash_, qos, *rest = rest
+            plain = {"name": topic_.replace("%", "/"), "type": ros_type(type_), "hash": hash_}
+            topic = Topic(**plain, qos=Qos.parse(qos))
+        return Token(
+            key=key,
+            kind=kind,  # type: ignore[arg-type]
+            node=NodeName(name=name, namespace=namespace.replace("%", "/"), domain_id=int(domain)),
+            zid=zid,
+            node_id=int(node_id),
+            id=int(id_),
+            topic=topic,
+            extra=tuple(rest),
+        )
+    except ValueError as error:
+        raise ValueError(
+            f"expected a liveliness token of ROS, found {key!r:.200}: {error}"
+        ) from None
 
 
 def mangle(name: str) -> str:
@@ -69,9 +125,9 @@ def endpoint_token(
     return f"{head}/{mangle(topic.name)}/{dds_type(topic.type)}/{topic.hash}/{topic.qos.text()}"
 
 
-def graph_key(domain_id: int) -> str:
-    """Return the key expression that all tokens of a domain match."""
-    return f"{ADMIN_SPACE}/{domain_id}/**"
+def endpoints_key(domain_id: int, kind: Kind, topic_name: str) -> str:
+    """Return the key expression that the tokens of a topic's endpoints match, and no others."""
+    return f"{ADMIN_SPACE}/{domain_id}/*/*/*/{kind}/*/*/*/{mangle(topic_name)}/**"
 
 
 def _token(node: NodeName, zid: str, node_id: int, id_: int, kind: Kind) -> str:

@@ -27,6 +27,7 @@ from events import (
     Range,
     Setpoint,
 )
+from nodes.ros2_bridge.attachment import Message
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.inbox import Inbox
 from nodes.ros2_bridge.incoming_topic import IncomingTopic
@@ -315,11 +316,11 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         timeout, topic = incoming.subscription.timeout, incoming.topic
         images, frame_id = self._images_of(incoming.source), incoming.subscription.frame_id
 
-        def read(size: int, data: Callable[[], bytes]) -> CameraAnnouncement | None:
+        def read(found: Message) -> CameraAnnouncement | None:
             try:
-                if size > (most := self.config.max_message_size):
-                    raise ValueError(f"expected {most} bytes or less, found {size}")
-                message = self._store.deserialize(data(), topic.type)
+                if found.size > (most := self.config.max_message_size):
+                    raise ValueError(f"expected {most} bytes or less, found {found.size}")
+                message = self._store.deserialize(found.read(), topic.type)
                 return camera_announcement(message, incoming.source, images, frame_id)
             except ValueError as error:
                 incoming.complain("calibration refused", str(error))

@@ -15,16 +15,27 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import msgspec
 import zenoh
 
-from nodes.ros2_bridge.attachment import Attachment, gid, pack
-from nodes.ros2_bridge.keys import NodeName, data_key, endpoint_token, node_token, ros2dds_key
+from nodes.ros2_bridge.attachment import Attachment, Message, gid, pack
+from nodes.ros2_bridge.keys import (
+    Kind,
+    NodeName,
+    Token,
+    data_key,
+    endpoint_token,
+    endpoints_key,
+    node_token,
+    parse_token,
+    ros2dds_key,
+)
 from nodes.ros_messages.topics import Topic
 
 T = TypeVar("T")
 
-Take = Callable[[int, Callable[[], bytes]], None]
-"""Called in a thread with a message's size and what returns its bytes."""
+Take = Callable[[Message], None]
+"""Called in a thread with each message."""
 
 WAIT_BEFORE_DROP = 300
 """Microseconds that a put waits for a peer that does not read; Zenoh's default is 1000."""
@@ -100,28 +111,41 @@ class Session:
         if keys == "rmw_zenoh":
             self._keep(node_token(node, self.zid, 0))
 
-    def publisher(self, topic: Topic) -> Publisher:
-        """Declare a publisher, and show it to ROS."""
+    def publisher(self, topic: Topic, *, held: bool = False) -> Publisher:
+        """Declare a publisher, and show it to ROS.
+
+        Args:
+            topic: Its topic.
+            held: Whether every message must arrive: it is reliable, keeps all, and a put waits for
+                a peer that reads slowly rather than drop a message.
+        """
+        if held:
+            qos = msgspec.structs.replace(topic.qos, reliable=True, keep_all=True)
+            topic = msgspec.structs.replace(topic, qos=qos)
+        qos, key, control = topic.qos, self._key(topic), zenoh.CongestionControl
         token = endpoint_token(self._node, self.zid, 0, next(self._ids), "MP", topic)
         options: dict[str, Any] = {
-            "congestion_control": zenoh.CongestionControl.DROP,
+            "congestion_control": (
+                control.BLOCK if qos.reliable and qos.keep_all else control.DROP
+            ),
             "reliability": (
-                zenoh.Reliability.RELIABLE if topic.qos.reliable else zenoh.Reliability.BEST_EFFORT
+                zenoh.Reliability.RELIABLE if qos.reliable else zenoh.Reliability.BEST_EFFORT
             ),
         }
-        if topic.qos.transient_local:
-            declared: Any = zenoh.ext.declare_advanced_publisher(
+        plain = self._session.declare_publisher(key, **options)
+        declared: Any = plain
+        if qos.transient_local:
+            declared = zenoh.ext.declare_advanced_publisher(
                 self._session,
-                self._key(topic),
-                cache=zenoh.ext.CacheConfig(max_samples=topic.qos.depth),
+                key,
+                cache=zenoh.ext.CacheConfig(max_samples=qos.depth),
                 publisher_detection=True,
                 **options,
             )
-        else:
-            declared = self._session.declare_publisher(self._key(topic), **options)
         if self._keys == "rmw_zenoh":
             self._keep(token)
-        return Publisher(topic, declared, gid(token) if self._keys == "rmw_zenoh" else None)
+        owner = gid(token) if self._keys == "rmw_zenoh" else None
+        return Publisher(topic, declared, owner, plain)
 
     def subscribe(self, topic: Topic, take: Take) -> None:
         """Declare a subscription, and show it to ROS."""
@@ -135,9 +159,31 @@ class Session:
         if self._keys == "rmw_zenoh":
             self._keep(endpoint_token(self._node, self.zid, 0, next(self._ids), "MS", topic))
 
-    def first(
-        self, topic: Topic, seconds: float, read: Callable[[int, Callable[[], bytes]], T | None]
-    ) -> T | None:
+    def watch(self, topic_name: str, kind: Kind, changed: Callable[[bool, Token], None]) -> None:
+        """Be told which endpoints of other sessions a topic has, at once and whenever that changes.
+
+        Those of a process that ended, in whatever way, disappear as soon as its connection does.
+        What ROS cannot have declared is left out. zenoh-plugin-ros2dds has no such tokens.
+
+        Args:
+            topic_name: With its leading slash.
+            kind: Of the endpoints: ``MP`` for publishers, ``MS`` for subscriptions.
+            changed: Called in any thread with whether one is there (else it is gone), and which.
+        """
+
+        def tell(sample: zenoh.Sample) -> None:
+            try:
+                token = parse_token(str(sample.key_expr))
+            except ValueError:
+                return
+            if token.zid != self.zid:
+                changed(sample.kind == zenoh.SampleKind.PUT, token)
+
+        key = endpoints_key(self._node.domain_id, kind, topic_name)
+        liveliness = self._session.liveliness()
+        self._kept.append(liveliness.declare_subscriber(key, tell, history=True))
+
+    def first(self, topic: Topic, seconds: float, read: Callable[[Message], T | None]) -> T | None:
         """Wait in the caller's thread for a message of which `read` makes something.
 
         Args:
@@ -150,7 +196,7 @@ class Session:
         try:
             while True:
                 while (sample := subscriber.try_recv()) is not None:
-                    found = read(len(sample.payload), sample.payload.to_bytes)
+                    found = read(_message(sample))
                     if found is not None:
                         return found
                 if time.monotonic() >= end or self._given_up.wait(5 * PAUSE):
@@ -200,11 +246,18 @@ class Publisher:
         failed: How many did not, since the session is closed.
     """
 
-    def __init__(self, topic: Topic, declared: Any, gid_: bytes | None) -> None:
+    def __init__(self, topic: Topic, declared: Any, gid_: bytes | None, plain: Any) -> None:
         self.topic = topic
         self.sent = self.failed = 0
         self._put = declared.put
         self._gid = gid_
+        self._plain = plain
+        """What Zenoh tells the match of, which it does not of an advanced publisher."""
+
+    def matched(self) -> bool:
+        """Tell whether somebody subscribes to the topic."""
+        matching: bool = self._plain.matching_status.matching
+        return matching
 
     def put(self, message: bytearray) -> None:
         """Put a message; its bytes may be overwritten afterwards."""
@@ -225,11 +278,20 @@ def _read(subscriber: Any, take: Take) -> None:
         sample = subscriber.recv()
         while True:
             while sample is not None:
-                payload = sample.payload
-                take(len(payload), payload.to_bytes)
+                take(_message(sample))
                 sample = subscriber.try_recv()
             time.sleep(PAUSE)
             sample = subscriber.recv()
+
+
+def _message(sample: zenoh.Sample) -> Message:
+    payload = sample.payload
+
+    def attached() -> bytes:
+        found = sample.attachment
+        return b"" if found is None else found.to_bytes()
+
+    return Message(len(payload), payload.to_bytes, attached)
 
 
 def _configuration(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
+from nodes.ros2_bridge.attachment import Message
 from nodes.ros2_bridge.session import Take
 from nodes.ros_messages.topics import Topic
 from tests.nodes.ros_messages import samples
@@ -47,13 +49,13 @@ class TakingSession:
         self.taken: list[Taken] = []
         self.said = said
 
-    def publisher(self, topic: Topic) -> Any:
+    def publisher(self, topic: Topic, *, held: bool = False) -> Any:
         self.taken.append(Taken(topic))
         return self.taken[-1]
 
     def subscribe(self, topic: Topic, take: Take) -> None:
         for message in self.said:
-            take(len(message), lambda message=message: message)  # type: ignore[misc]
+            take(Message(len(message), functools.partial(bytes, message)))
 
     def close(self) -> bool:
         return True

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+from typing import get_args
+
 import pytest
 import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
 
 from nodes.ros2_bridge.attachment import SIZE, Attachment, gid, pack, unpack
 from nodes.ros2_bridge.keys import (
+    Kind,
     NodeName,
+    Token,
     data_key,
     endpoint_token,
-    graph_key,
+    endpoints_key,
     node_token,
+    parse_token,
     ros2dds_key,
 )
 from nodes.ros_messages.topics import Qos, Topic, dds_type, ros_name, topic_name
@@ -50,7 +58,6 @@ def test_slashes_within_a_component_become_percent_signs() -> None:
     assert endpoint_token(node, "z", 1, 2, "MP", topic) == (
         "@ros2_lv/7/z/1/2/MP/%/%fleet%one/eye/%fleet%one%image/a::msg::dds_::B_/h/::,10:,:,:,,"
     )
-    assert graph_key(7) == "@ros2_lv/7/**"
 
 
 @pytest.mark.parametrize(
@@ -60,10 +67,104 @@ def test_slashes_within_a_component_become_percent_signs() -> None:
         (Qos(reliable=False, depth=5), "2::,5:,:,:,,"),
         (Qos(transient_local=True, depth=1), ":1:,1:,:,:,,"),
         (Qos(depth=42), "::,:,:,:,,"),
+        (Qos(keep_all=True), "::2,10:,:,:,,"),
     ],
 )
 def test_quality_of_service_names_only_what_is_not_default(qos: Qos, text: str) -> None:
     assert qos.text() == text
+    assert Qos.parse(text) == qos
+
+
+NAMES = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,9}", fullmatch=True)
+PATHS = st.lists(NAMES, min_size=1, max_size=3).map(lambda parts: "/" + "/".join(parts))
+TOPICS = st.builds(
+    Topic,
+    name=PATHS,
+    type=st.tuples(NAMES, st.sampled_from(["msg", "srv", "action"]), NAMES).map("/".join),
+    hash=st.just("TypeHashNotSupported") | NAMES.map("RIHS01_".__add__),
+    qos=st.builds(
+        Qos,
+        reliable=st.booleans(),
+        transient_local=st.booleans(),
+        depth=st.integers(0, 10**6),
+        keep_all=st.booleans(),
+    ),
+)
+NODES = st.builds(
+    NodeName, name=NAMES, namespace=st.just("/") | PATHS, domain_id=st.integers(0, 232)
+)
+NUMBERS = st.integers(0, 2**31)
+EXTRA = st.lists(st.text("abc:,=;%.0", min_size=1), max_size=2).map(tuple)
+
+
+@given(NODES, st.from_regex(r"[0-9a-f]{1,32}", fullmatch=True), NUMBERS, NUMBERS, TOPICS, EXTRA)
+def test_a_token_is_read_as_it_was_written_and_what_follows_it_is_kept(
+    node: NodeName, zid: str, node_id: int, id_: int, topic: Topic, extra: tuple[str, ...]
+) -> None:
+    for kind in get_args(Kind):
+        is_node = kind == "NN"
+        written = (
+            node_token(node, zid, node_id)
+            if is_node
+            else endpoint_token(node, zid, node_id, id_, kind, topic)
+        )
+        key = "/".join([written, *extra])
+        assert parse_token(key) == Token(
+            key=key,
+            kind=kind,
+            node=node,
+            zid=zid,
+            node_id=node_id,
+            id=node_id if is_node else id_,
+            topic=None if is_node else topic,
+            extra=extra,
+        )
+
+
+TALKERS = f"@ros2_lv/0/{TALKER}/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/{STRING}"
+
+
+@given(st.text(max_size=60) | st.text("@ros2_lv/0MPNS%:,2", max_size=60))
+def test_no_text_makes_reading_a_token_fail_otherwise(key: str) -> None:
+    for wrong in (key, f"{TALKERS}/{key}"):
+        with contextlib.suppress(ValueError):
+            assert parse_token(wrong).key == wrong
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *(
+            "",
+            "@ros2_lv",
+            TALKERS,
+            f"{TALKERS}/",
+            f"{TALKERS}/::,10:,:,:",
+            f"{TALKERS}/::,x:,:,:,,",
+        ),
+        f"{TALKERS}/::,10:,:,:,,/",
+        TALKERS.replace("@ros2_lv", "@ros3_lv") + "/::,10:,:,:,,",
+        TALKERS.replace("/0/10", "/zero/10") + "/::,10:,:,:,,",
+        TALKERS.replace("/MP/", "/PP/") + "/::,10:,:,:,,",
+        TALKERS.replace("dds_::", "") + "/::,10:,:,:,,",
+    ],
+)
+def test_a_token_with_something_missing_or_else_is_refused(wrong: str) -> None:
+    with pytest.raises(ValueError, match="expected a liveliness token of ROS, found"):
+        parse_token(wrong)
+
+
+@given(TOPICS, EXTRA)
+def test_the_key_of_a_topic_s_endpoints_matches_theirs_only(
+    topic: Topic, extra: tuple[str, ...]
+) -> None:
+    watched = zenoh.KeyExpr(endpoints_key(7, "MS", topic.name))
+    kinds: tuple[tuple[int, Kind], ...] = ((7, "MS"), (8, "MS"), (7, "MP"))
+    for domain, kind in kinds:
+        node = NodeName(name="eye", namespace="/fleet", domain_id=domain)
+        token = endpoint_token(node, "1f", 0, 3, kind, topic)
+        found = zenoh.KeyExpr("/".join([token, *extra]))
+        assert watched.intersects(found) == (domain == 7 and kind == "MS")
 
 
 def test_the_key_of_a_topic_is_what_ros_puts_images_on() -> None:

@@ -112,7 +112,7 @@ def test_only_who_may_is_heard(tmp_path: Path) -> None:
     session = Session(NODE, connect=(), file=str(file))
     heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     try:
-        session.subscribe(STEER, lambda _, read: heard.put(read()))
+        session.subscribe(STEER, lambda message: heard.put(message.read()))
         odom, static = session.publisher(ODOM), session.publisher(STATIC)
         static.put(bytearray(b"kept"))
         for name in ("guest", "pilot"):
