@@ -36,6 +36,8 @@ __all__ = [
     "Changeable",
     "Clock",
     "Duration",
+    "Hold",
+    "HoldConfig",
     "Input",
     "Node",
     "NodeConfig",

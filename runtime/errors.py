@@ -21,6 +21,7 @@
     ├── UncheckableError       what a node will announce is known in a run only, not to `check`
     ├── PeerError              another process of the run is missing, gone, or of another mind
     ├── WireError              bytes from elsewhere that are no event, or an event that cannot leave
+    ├── MissingAnswerError     a system outside the process did not answer, or is gone
     └── WorkerError
         ├── WorkerDiedError    the process ended: name, exit code and last output
         └── WorkerTimeoutError the process did not answer in time
@@ -138,6 +139,10 @@ class PeerError(VisnavError):
 
 class WireError(VisnavError):
     """Bytes are not an event that this process knows, or an event cannot be made into bytes."""
+
+
+class MissingAnswerError(VisnavError):
+    """A system outside the process did not answer a frame in time, or is gone."""
 
 
 class WorkerError(VisnavError):

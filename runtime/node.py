@@ -33,6 +33,7 @@ from events import Announcement
 from runtime.bundles import Matcher
 from runtime.clock import Clock
 from runtime.declarations import Declared, read_declarations
+from runtime.hold import Hold, HoldConfig
 from runtime.json_values import plain
 from runtime.logs import NodeLogger
 from runtime.schedule import SECOND, Tick, Ticker
@@ -106,6 +107,9 @@ class Host(Protocol):
         self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
     ) -> Worker[W]:
         """Make a worker that ends with the node."""
+
+    def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:
+        """Make the hold of an outside system, which ends with the node."""
 
     def offload(
         self, node: Node[Any], call: functools.partial[Any]
@@ -299,6 +303,19 @@ class Node(Generic[C]):
             WorkerError: The process died or hung; or whatever making the object raised.
         """
         return await self._host.worker(self, factory, args, **options)
+
+    def hold(self, name: str, config: HoldConfig, latency: float) -> Hold[Any]:
+        """Hold simulated time for the answers of a system outside the process; see `runtime.hold`.
+
+        Args:
+            name: Of the system, in summary and report.
+            config: How long is waited, and what if nothing comes.
+            latency: Seconds of the run's clock from a frame to its answer.
+
+        Raises:
+            ConfigError: There are no latencies in the file that `config` names.
+        """
+        return self._host.hold(self, name, config, latency)
 
     def start(self, coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine beside `run`, as part of this node; it is cancelled with it."""

@@ -14,7 +14,9 @@ from typing import Any
 
 from typing_extensions import TypeVar
 
+from runtime.answers import Answers
 from runtime.config.model import Config
+from runtime.hold import Hold, HoldConfig
 from runtime.instruments import Instruments
 from runtime.node import Node, Sibling
 from runtime.node_runner import Create, NodeRunner
@@ -132,6 +134,18 @@ class NodeHost:
         await worker.ready()
         self.instruments.on_worker(worker)
         return worker
+
+    def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:
+        """Make the hold of an outside system, which ends with the node."""
+        known = self.state.outside.get(name)
+        answers = self.state.outside.setdefault(name, Answers())
+        hold: Hold[Any] = Hold(
+            name, self.clock, config, latency, answers=answers, log=node.log.warning
+        )
+        self.state.runners[node.name].holds.append(hold)
+        if known is None:
+            self.state.after_run.append(lambda folder: answers.write(folder, name))
+        return hold
 
     def offload(
         self, node: Node[Any], call: functools.partial[Any]

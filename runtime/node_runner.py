@@ -17,6 +17,7 @@ from events import Announcement
 from runtime import code_location
 from runtime.config.model import NodeSpec
 from runtime.errors import NodeError, NodeTimeoutError, RefusedError, VisnavError
+from runtime.hold import Hold
 from runtime.json_values import plain
 from runtime.links import Link
 from runtime.node import Host, Node, make_node, streams
@@ -49,6 +50,7 @@ class NodeRunner:
         self.tasks: dict[asyncio.Task[None], None] = {}  # in the order in which they were made
         self.tickers: list[Ticker] = []
         self.workers: list[Worker[Any]] = []
+        self.holds: list[Hold[Any]] = []
         self.links: dict[str, Link] = {}
         self.started = False
         self.starts = 0
@@ -182,6 +184,9 @@ class NodeRunner:
         workers = [asyncio.create_task(asyncio.to_thread(worker.close)) for worker in self.workers]
         wrong += await self._end_by(limit, "its workers", workers)
         self.workers.clear()
+        for hold in self.holds:
+            hold.close()
+        self.holds.clear()
         self.started = False
         for link in self.links.values():
             link.close()

@@ -35,7 +35,7 @@ def prepare(out: Path, config: Config) -> None:
         claim(out)
         for name in ("summary.json", "report.html"):
             (out / name).unlink(missing_ok=True)
-        for name in ("evaluation", "trajectories", "frames", "plots"):
+        for name in ("evaluation", "trajectories", "frames", "plots", "answers"):
             shutil.rmtree(out / name, ignore_errors=True)
         write(out / "config.toml", tomli_w.dumps(to_builtins(config)).encode())
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from events import Announcement
+from runtime.answers import Answers
 from runtime.clock import Clock
 from runtime.config.model import Config
 from runtime.links import Link
@@ -47,6 +48,7 @@ class RunState:
         conclusions: What nodes concluded, by what they judged.
         environment: What nodes found of the machine on which figures depend.
         costs: What workers cost, by ``node.Factory``.
+        outside: What became of the frames for systems outside the process, by their names.
         after_run: What is called with the run's folder at the very end.
     """
 
@@ -69,6 +71,7 @@ class RunState:
     conclusions: dict[str, dict[str, Any]] = field(default_factory=dict)
     environment: dict[str, str] = field(default_factory=dict)
     costs: dict[str, Costs] = field(default_factory=dict)
+    outside: dict[str, Answers] = field(default_factory=dict)
     after_run: list[Callable[[Path], Any]] = field(default_factory=list)
 
     def note_error(self, error: Exception) -> None:

@@ -13,10 +13,11 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 
+from runtime.answers import Answers, Outcome, Wrong
 from runtime.digest import Digest, combined
 from runtime.json_values import plain
 from runtime.node import matchers, senders, streams
@@ -119,6 +120,89 @@ WORKER_COLUMNS = (
 )
 
 
+class OutsideSummary(msgspec.Struct, frozen=True):
+    """How a system outside the process answered what it was sent.
+
+    Attributes:
+        latency_ms: Declared, on the run's clock; `None` if it differs by frame.
+        sent: Frames that went out.
+        received: Frames that the system confirmed; `None` if it cannot say.
+        answered: Frames with an answer.
+        empty: Frames with an answer that held nothing, such as no pose.
+        initialising: Frames without an answer, from before the first one, as was allowed.
+        skipped: Frames that the system left out, as a later answer says.
+        lost: Frames for which none came in time.
+        open: Frames on their way when the run ended.
+        late: Answers to frames that were given up.
+        repeated: Second answers to a frame.
+        unknown: Answers whose stamp is no frame's.
+        initialisation_s: From the first frame to the first that was answered.
+        wall_p50_ms: Real time from a frame to its answer: median.
+        wall_p99_ms: 99th percentile.
+        inputs: Digest of all that the system was sent; equal if it got the same.
+        reproducible: Whether an equal run gives the same, if the system answers the same.
+        why_not: Why it may not.
+    """
+
+    latency_ms: float | None
+    sent: int
+    received: int | None
+    answered: int
+    empty: int
+    initialising: int
+    skipped: int
+    lost: int
+    open: int
+    late: int
+    repeated: int
+    unknown: int
+    initialisation_s: float | None
+    wall_p50_ms: float | None
+    wall_p99_ms: float | None
+    inputs: str | None
+    reproducible: bool
+    why_not: list[str]
+
+    @classmethod
+    def of(cls, answers: Answers) -> OutsideSummary:
+        """Sum up what there is."""
+        counts = {name: answers.counts[name] for name in (*get_args(Outcome), *get_args(Wrong))}
+        p50, p99 = answers.latency_quantiles(0.5, 0.99)
+        return cls(
+            latency_ms=None if answers.latency is None else round(answers.latency * 1e3, 6),
+            sent=answers.sent,
+            received=answers.received,
+            open=answers.sent - sum(counts[name] for name in get_args(Outcome)),
+            initialisation_s=answers.initialisation,
+            wall_p50_ms=None if p50 is None else p50 * 1e3,
+            wall_p99_ms=None if p99 is None else p99 * 1e3,
+            inputs=answers.inputs(),
+            reproducible=not answers.why_not,
+            why_not=list(answers.why_not),
+            **counts,
+        )
+
+    def row(self) -> list[str]:
+        """Return it as a table shows it, under `OUTSIDE_COLUMNS`."""
+        return [
+            *(f"{self.sent}", "–" if self.received is None else f"{self.received}"),
+            *(str(each) for each in (self.answered, self.empty, self.initialising, self.skipped)),
+            *(str(each) for each in (self.lost, self.late, self.repeated, self.unknown)),
+            *(
+                "–" if each is None else f"{each:.3g}"
+                for each in (self.initialisation_s, self.latency_ms, self.wall_p50_ms)
+            ),
+            "yes" if self.reproducible else f"no: {'; '.join(self.why_not)}",
+        ]
+
+
+OUTSIDE_COLUMNS = (
+    *("sent", "received", "answered", "empty", "initialising", "skipped"),
+    *("lost", "late", "repeated", "of no frame"),
+    *("initialised s", "latency ms", "real p50 ms", "reproducible"),
+)
+
+
 class Verdict(msgspec.Struct, frozen=True):
     """How those did whom the run was about.
 
@@ -181,6 +265,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         environment: Machine and versions; the command line, and the commit of the current folder.
         processes: Where which nodes ran, if not all in one process.
         workers: What workers cost, by ``node.Factory``.
+        outside: How systems outside the process answered, by name.
     """
 
     name: str
@@ -206,6 +291,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     environment: dict[str, str]
     processes: list[ProcessSummary] = []
     workers: dict[str, WorkerSummary] = {}
+    outside: dict[str, OutsideSummary] = {}
 
 
 def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
@@ -273,8 +359,8 @@ def summarise(
         wall_seconds=round(ended - (state.first_update or ended), 6),
         digest=digest.hexdigest() if digest else None,
         digests=digest.outputs() if digest else {},
-        not_deterministic=sorted({n.name for n in state.all_nodes if not n.deterministic}),
-        verdict=_verdict(state.conclusions),
+        not_deterministic=_not_deterministic(state),
+        verdict=_verdict(state.conclusions | _losses(state.outside)),
         events=dict(sorted(by_type.items())),
         outputs=dict(by_output),
         drops={port: s.dropped for port, s in by_input.items()},
@@ -293,7 +379,27 @@ def summarise(
             "commit": commit(),
         },
         workers={name: WorkerSummary.of(each) for name, each in state.costs.items()},
+        outside={name: OutsideSummary.of(each) for name, each in state.outside.items()},
     )
+
+
+def _not_deterministic(state: RunState) -> list[str]:
+    nodes = {node.name for node in state.all_nodes if not node.deterministic}
+    held = state.outside.items() if state.clock.kind == "lockstep" else ()
+    return sorted(nodes | {name for name, answers in held if answers.why_not})
+
+
+def _losses(outside: dict[str, Answers]) -> dict[str, dict[str, Any]]:
+    """Return a verdict on each system that has lost more frames than it may."""
+    return {
+        f"{name} (answers)": {
+            "passed": False,
+            "lost_frames": lost,
+            "failed": [f"lost_frames: expected at most {most}, found {lost}"],
+        }
+        for name, answers in outside.items()
+        if (lost := answers.counts["lost"]) > (most := answers.lost_allowed)
+    }
 
 
 def _verdict(found: dict[str, dict[str, Any]]) -> Verdict | None:
@@ -335,7 +441,10 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
         stalls=dict(stalls),
         longest_stalls=of_all("longest_stalls"),
         processes=processes,
-        **{f: of_all(f) for f in ("outputs", "drops", "streams", "links", "ticks", "workers")},
+        **{
+            field: of_all(field)
+            for field in ("outputs", "drops", "streams", "links", "ticks", "workers", "outside")
+        },
     )
 
 

@@ -12,7 +12,13 @@ import numpy.typing as npt
 from nodes.evaluation.coverage import Interval
 from nodes.evaluation.judging import Errors
 from nodes.trajectory import Trajectory
-from runtime.summary import LinkSummary, StreamSummary, TickSummary, WorkerSummary
+from runtime.summary import (
+    LinkSummary,
+    OutsideSummary,
+    StreamSummary,
+    TickSummary,
+    WorkerSummary,
+)
 
 
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
@@ -33,6 +39,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     links: dict[str, LinkSummary] = {}
     ticks: dict[str, TickSummary] = {}
     workers: dict[str, WorkerSummary] = {}
+    outside: dict[str, OutsideSummary] = {}
     stalls: dict[str, int] = {}
     announcements: list[dict[str, Any]] = []
     environment: dict[str, str] = {}

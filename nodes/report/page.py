@@ -25,7 +25,7 @@ from nodes.report.folder import read_run
 from nodes.report.frames import draw_frames
 from nodes.report.style import Plot, drawing
 from nodes.report.trajectories import draw_trajectories
-from runtime.summary import WORKER_COLUMNS
+from runtime.summary import OUTSIDE_COLUMNS, WORKER_COLUMNS
 
 PAGE = "report.html"
 PLOTS = "plots"
@@ -116,6 +116,8 @@ def render(
         sensors=tables.sensors(run),
         ticks=tables.ticks(run),
         workers=tables.workers(run),
+        outside=tables.outside(run),
+        outside_columns=("system", *OUTSIDE_COLUMNS),
         worker_columns=("worker", *WORKER_COLUMNS),
         outputs=tables.outputs(run),
         curves=curves,

@@ -140,6 +140,7 @@ def facts(run: Run) -> list[tuple[str, str]]:
         rows.append(("error", f.error))
     if f.name is not None:
         rows.append(("digest", _digest(f)))
+    rows += [(f"digest of what {k} was sent", o.inputs) for k, o in f.outside.items() if o.inputs]
     rows += [(f"dropped at {port}", str(s.dropped)) for port, s in f.streams.items() if s.dropped]
     rows += [
         (f"unmatched sets at {port}", _counts(s.missed))
@@ -215,6 +216,11 @@ def ticks(run: Run) -> list[list[str]]:
 def workers(run: Run) -> list[list[str]]:
     """Return what estimators (and all else in processes of its own) cost."""
     return [[name, *worker.row()] for name, worker in sorted(run.facts.workers.items())]
+
+
+def outside(run: Run) -> list[list[str]]:
+    """Return how systems outside the process answered what they were sent."""
+    return [[name, *each.row()] for name, each in sorted(run.facts.outside.items())]
 
 
 def outputs(run: Run) -> list[list[str]]:

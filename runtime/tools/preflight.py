@@ -31,6 +31,7 @@ from runtime.config.model import Config, NodeSpec
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
 from runtime.execute import make_clock, make_loop
 from runtime.graph import input_types, unconnected
+from runtime.hold import Hold, HoldConfig
 from runtime.node import Node
 from runtime.node_host import siblings
 from runtime.node_runner import NodeRunner
@@ -190,6 +191,9 @@ class _DryHost:
 
     async def worker(self, *_: Any, **__: Any) -> Any:
         return _Absent()
+
+    def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:  # noqa: ARG002
+        return Hold(name, self.clock, config, latency)
 
     def stop(self, reason: str) -> None:
         pass

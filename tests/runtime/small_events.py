@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from events import Event
 from runtime.clock import Clock
+from runtime.hold import Hold, HoldConfig
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.node import Node, NodeConfig, Sibling, make_node
 from runtime.schedule import Tick, Ticker
@@ -64,6 +65,9 @@ class NoHost:
         self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
     ) -> Worker[W]:
         raise NotImplementedError
+
+    def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:
+        return Hold(name, self.clock, config, latency)
 
     def offload(
         self, node: Node[Any], call: functools.partial[Any]

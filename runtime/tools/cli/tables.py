@@ -46,6 +46,15 @@ def run_tables(summary: Summary) -> Iterator[Table]:
         workers.add_row(name, *(row[k] for k in columns))
     if workers.row_count:
         yield _numbers(workers)
+    # The eight of its columns for which a terminal has room.
+    title = "systems outside the process: frames"
+    names = ("system", "sent", "answered", "init", "skipped", "lost", "late", "ms", "reproducible")
+    outside = Table(*names, title=title)
+    for name, system in sorted(summary.outside.items()):
+        row = system.row()
+        outside.add_row(name, *(row[k] for k in (0, 2, 4, 5, 6, 7, 12, 13)))
+    if outside.row_count:
+        yield _numbers(outside)
     stalls = Table("node", "times", "longest ms", "where", title="the loop stood still")
     for node, count in sorted(summary.stalls.items()):
         worst = summary.longest_stalls[node]
