@@ -1,0 +1,398 @@
+"""The run's side of the native interface: a socket, shared memory with slots, one program.
+
+Threads and no asyncio: one accepts, one for each connection reads; the caller's thread sends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import mmap
+import os
+import socket
+import stat
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events.poses import inverse
+from nodes.link import client as wire
+from nodes.link.answers import LinkAnswer, LinkError, read_done, read_pose
+from runtime.workers.shared_memory import anonymous_file
+
+GREETING_TIME = 10.0
+"""Real seconds that a connection has for HELLO."""
+
+ALIGNMENT = 64
+"""Images begin at multiples of this (bytes); a slot has room for the gaps between 16 of them."""
+
+
+class _Program:
+    """A connection, and the frames that it has not answered yet."""
+
+    def __init__(self, connection: socket.socket, slots: int) -> None:
+        self.connection = connection
+        self.sending = threading.Lock()
+        self.name = ""
+        self.pose_of: str | None = None  # until READY
+        self.sequence = 0
+        self.owed: dict[int, tuple[int, int]] = {}  # sequence: stamp, slot
+        self.free = list(range(slots))
+        self.origin: npt.NDArray[np.float64] | None = None  # inverse of its first pose
+        self.gone = False
+
+    def send(self, kind: int, *parts: bytes) -> bool:
+        """Send a message, or return False: the program is gone."""
+        with self.sending, contextlib.suppress(OSError):  # the reader notices, too
+            self.connection.sendall(wire.message(kind, *parts))
+            return True
+        return False
+
+
+class Endpoint:
+    """Where one program at a time connects to a run.
+
+    Everything that a program sends is checked; one that sends something else is disconnected. When
+    a program is gone, another may connect: `wait` for it again. Its frames are numbered from 0.
+
+    Args:
+        path: The socket; at most 107 bytes.
+        description: What the program is told: see `describe`.
+        slots: Frames that the program may have without having answered them.
+        slot_bytes: Size of a frame's images, of which there are 16 at most.
+        answered: Called with each answer, in the thread that reads.
+        gone: Called once when the program is gone or is disconnected, with the reason; in the
+            thread that reads. Not after `close`.
+        logged: Called with each line for the log, in the thread that reads.
+        skips: Whether an answer frees the slots of all frames before its own, too.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        description: Mapping[str, Any],
+        *,
+        slots: int,
+        slot_bytes: int,
+        answered: Callable[[LinkAnswer], None],
+        gone: Callable[[str], None],
+        logged: Callable[[str], None],
+        skips: bool = False,
+    ) -> None:
+        self._path = path
+        self._description = msgspec.json.encode(description)
+        self._body_from_camera = np.array(description["cameras"][0]["body_from_camera"])
+        self._slots = slots
+        self._slot_bytes = slot_bytes + 16 * ALIGNMENT
+        self._slot_bytes += -self._slot_bytes % mmap.PAGESIZE
+        self._answered, self._gone, self._logged = answered, gone, logged
+        self._skips = skips
+        self._changed = threading.Condition()
+        self._program: _Program | None = None
+        self._problem = ""
+        self._closed = False
+        self._listener: socket.socket | None = None
+        self._threads: list[threading.Thread] = []
+        self._file = anonymous_file()
+        os.ftruncate(self._file, slots * self._slot_bytes)
+        self._memory = mmap.mmap(self._file, slots * self._slot_bytes)
+
+    def listen(self) -> None:
+        """Make the socket, in the place of one that a dead run has left.
+
+        Raises:
+            LinkError: The path is a living run's, or another file's, or no socket can be made.
+        """
+        self._listener = _bound(self._path)
+        self._start(self._accept)
+
+    def wait(self, seconds: float) -> str:
+        """Wait for a program that is ready for frames, and return its name.
+
+        Raises:
+            LinkError: None came within `seconds` (real time), or one came and was refused.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._ready() or self._problem or self._closed, seconds)
+            program = self._program
+            if program is not None and self._ready():
+                return program.name
+            problem, self._problem = self._problem, ""
+        if self._closed:
+            raise LinkError(f"{self._path}: closed before a program was ready")
+        if not problem and program is not None:
+            problem = f"{program.name} connected, but did not say READY within {seconds:g} s"
+        raise LinkError(
+            f"{self._path}: expected a program, {problem or f'found none within {seconds:g} s'}"
+        )
+
+    def send_imu(self, samples: npt.NDArray[Any]) -> bool:
+        """Send a row of IMU samples (of type `SAMPLE`), and return whether a program is there.
+
+        Blocks while the program reads nothing and the connection is full.
+        """
+        program = self._program
+        if samples.dtype != wire.SAMPLE or samples.ndim != 1:
+            raise ValueError(f"expected a row of {wire.SAMPLE}, found {samples.dtype}")
+        return program is not None and program.send(wire.IMU, samples.tobytes())
+
+    def send_frame(
+        self, stamp: int, images: Sequence[tuple[int, str, npt.NDArray[Any]]], wait: bool = True
+    ) -> bool:
+        """Send a frame; always in the same thread.
+
+        Blocks while all slots are taken, until one is answered, the program is gone, or `close`.
+
+        Args:
+            stamp: Time of the exposure (ns).
+            images: Index of the camera in the description, kind, and pixels of each.
+            wait: Whether to wait for a free slot.
+
+        Returns:
+            Whether it was sent: not if there is no program, or no slot without waiting.
+
+        Raises:
+            ValueError: An image is not as its kind, or all do not fit into a slot.
+        """
+        entries, size = [], 0
+        for camera, kind, image in images:
+            entries.append((camera, kind, image, size))
+            _check(kind, image)
+            size += -(-image.nbytes // ALIGNMENT) * ALIGNMENT
+        if size > self._slot_bytes:
+            raise ValueError(f"expected images of {self._slot_bytes} bytes, found {size}")
+        with self._changed:
+            program = self._program
+            if program is None or program.pose_of is None:
+                return False
+            if wait:
+                self._changed.wait_for(lambda: program.free or program.gone or self._closed)
+            if not program.free or program.gone or self._closed:
+                return False
+            slot = program.free.pop(0)
+            sequence, program.sequence = program.sequence, program.sequence + 1
+            program.owed[sequence] = stamp, slot
+        parts = [wire.FRAME_HEAD.pack(sequence, stamp, len(entries), 0)]
+        for camera, kind, image, start in entries:
+            offset = slot * self._slot_bytes + start
+            place = np.ndarray(image.shape, image.dtype, self._memory, offset)
+            np.copyto(place, image)
+            head = camera, wire.KINDS[kind][0], *image.shape[:2], place.strides[0], 0, offset
+            parts.append(wire.IMAGE_HEAD.pack(*head))
+        return program.send(wire.FRAME, *parts)
+
+    def close(self) -> None:
+        """Say BYE, disconnect, and remove the socket; takes two seconds at most."""
+        with self._changed:
+            if self._closed:
+                return
+            self._closed = True
+            program = self._program
+            self._changed.notify_all()
+        if self._listener is not None:
+            self._path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                self._listener.shutdown(socket.SHUT_RDWR)
+            self._listener.close()
+        if program is not None:
+            if program.sending.acquire(timeout=0.5):
+                with contextlib.suppress(OSError):
+                    program.connection.send(wire.HEADER.pack(0, wire.BYE), socket.MSG_DONTWAIT)
+                program.sending.release()
+            _shut_down(program.connection)
+        deadline = time.monotonic() + 1.5
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(max(deadline - time.monotonic(), 0.0))
+        os.close(self._file)
+
+    def _ready(self) -> bool:
+        return self._program is not None and self._program.pose_of is not None
+
+    def _start(self, run: Callable[[], None]) -> None:
+        self._threads = [thread for thread in self._threads if thread.is_alive()]
+        self._threads.append(threading.Thread(target=run, name=f"link {self._path}", daemon=True))
+        self._threads[-1].start()
+
+    def _accept(self) -> None:
+        assert self._listener is not None
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                connection, _ = self._listener.accept()
+                self._start(functools.partial(self._serve, connection))
+
+    def _serve(self, connection: socket.socket) -> None:
+        program = _Program(connection, self._slots)
+        reason = "its connection has ended"
+        with connection:
+            try:
+                self._greet(program)
+                self._read(program)
+            except LinkError as error:
+                reason = str(error)
+                self._leave(program, reason)
+                connection.settimeout(1.0)
+                if program.pose_of is None:
+                    head = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
+                    program.send(wire.REFUSED, head, reason.encode())
+                else:
+                    program.send(wire.BYE, reason.encode())
+            except EOFError as error:
+                reason = str(error) or reason
+            except TimeoutError:
+                reason = f"no HELLO came within {GREETING_TIME:g} s"
+            except OSError as error:
+                reason = f"{reason}: {error}"
+            self._leave(program, reason)
+
+    def _greet(self, program: _Program) -> None:
+        """Read HELLO, take the program if there is no other, and send WELCOME."""
+        program.connection.settimeout(GREETING_TIME)
+        kind, body = wire.read_message(program.connection)
+        if kind != wire.HELLO or len(body) < wire.GREETING.size:
+            raise LinkError(f"expected HELLO, found type {kind} with {len(body)} bytes")
+        magic, version, _ = wire.GREETING.unpack_from(body)
+        if magic != wire.MAGIC:
+            raise LinkError(f"HELLO.magic: expected {wire.MAGIC!r}, found {magic!r}")
+        program.name = wire.text_of(body[wire.GREETING.size :]) or "a program without a name"
+        if version != wire.VERSION:
+            raise LinkError(f"expected version {wire.VERSION} of the protocol, found {version}")
+        with self._changed:
+            if self._closed:
+                raise LinkError("the run has ended")
+            if self._program is not None:
+                raise LinkError(f"another program is connected: {self._program.name}")
+            self._program, self._problem = program, ""
+        program.connection.settimeout(None)
+        size = wire.MEMORY.pack(self._slots * self._slot_bytes)
+        greeting = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
+        welcome = wire.message(wire.WELCOME, greeting, size, self._description)
+        socket.send_fds(program.connection, [welcome[:8]], [self._file])
+        program.connection.sendall(welcome[8:])
+
+    def _read(self, program: _Program) -> None:
+        """Read until the program is gone."""
+        while True:
+            kind, body = wire.read_message(program.connection)
+            if kind == wire.BYE:
+                raise EOFError(
+                    f"it said goodbye: {wire.text_of(body)}" if body else "it said goodbye"
+                )
+            if kind == wire.LOG:
+                self._logged(wire.text_of(body))
+            elif kind == wire.READY and program.pose_of is None:
+                self._take_ready(program, body)
+            elif kind in (wire.POSE, wire.DONE) and program.pose_of is not None:
+                answer = read_done(body) if kind == wire.DONE else read_pose(body)
+                self._take(program, answer)
+            else:
+                raise LinkError(f"expected LOG, POSE, DONE or BYE, found type {kind}")
+
+    def _take_ready(self, program: _Program, body: bytearray) -> None:
+        codes = {code: name for name, code in wire.POSE_OF.items()}
+        number = int.from_bytes(body[:4], "little")
+        if len(body) != 8 or number not in codes:
+            raise LinkError(f"READY.pose_of: expected one of {[*codes]}, found {bytes(body)!r}")
+        with self._changed:
+            program.pose_of = codes[number]
+            self._changed.notify_all()
+
+    def _take(self, program: _Program, answer: LinkAnswer) -> None:
+        """Pass an answer on, and free the slot of its frame."""
+        with self._changed:
+            if answer.sequence >= program.sequence:
+                raise LinkError(
+                    f"sequence: expected below {program.sequence}, found {answer.sequence}"
+                )
+            stamp, _ = program.owed.get(answer.sequence, (answer.stamp, None))
+            if stamp != answer.stamp:
+                raise LinkError(
+                    f"stamp: expected {stamp} of frame {answer.sequence}, found {answer.stamp}"
+                )
+            earlier = [n for n in program.owed if n < answer.sequence] if self._skips else []
+            for sequence in (*earlier, answer.sequence):
+                if sequence in program.owed:
+                    program.free.append(program.owed.pop(sequence)[1])
+            self._changed.notify_all()
+        if answer.pose is not None:
+            pose = answer.pose
+            if program.pose_of == "body":
+                pose = pose @ self._body_from_camera
+            if program.origin is None:
+                program.origin = inverse(pose)
+            answer = msgspec.structs.replace(answer, pose=program.origin @ pose)
+        self._answered(answer)
+
+    def _leave(self, program: _Program, reason: str) -> None:
+        """Let go of a program, and say so."""
+        with self._changed:
+            if program.gone:
+                return
+            program.gone = True
+            if self._program is program:
+                self._program = None
+            if program.pose_of is None and program.name:
+                self._problem = f"found {program.name}: {reason}"
+            elif program.pose_of is None and not reason.startswith("its connection"):
+                self._problem = f"found something else: {reason}"
+            tell = program.pose_of is not None and not self._closed
+            self._changed.notify_all()
+        if tell:
+            self._gone(f"{program.name}: {reason}")
+
+
+def _bound(path: Path) -> socket.socket:
+    """Return a socket that listens at `path`; only this user may connect."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        try:
+            listener.bind(str(path))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            if not stat.S_ISSOCK(path.lstat().st_mode):
+                raise LinkError(f"{path}: expected a socket or nothing, found a file") from None
+            if _alive(path):
+                raise LinkError(f"{path}: another run listens there") from None
+            path.unlink(missing_ok=True)
+            listener.bind(str(path))
+        path.chmod(0o600)
+        listener.listen(4)
+    except OSError as error:  # the folder is missing, or the path is too long
+        listener.close()
+        raise LinkError(f"{path}: {error}") from None
+    except LinkError:
+        listener.close()
+        raise
+    return listener
+
+
+def _alive(path: Path) -> bool:
+    """Return whether anybody listens at a socket."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        return probe.connect_ex(str(path)) != errno.ECONNREFUSED
+
+
+def _shut_down(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # it has ended already
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+def _check(kind: str, image: npt.NDArray[Any]) -> None:
+    """Raise a `ValueError` where an image is not as its kind."""
+    if kind not in wire.KINDS:
+        raise ValueError(f"expected one of {', '.join(wire.KINDS)}, found {kind!r}")
+    _, dtype, pixel = wire.KINDS[kind]
+    if image.dtype != dtype or image.shape[2:] != pixel or image.ndim != 2 + len(pixel):
+        raise ValueError(
+            f"{kind}: expected {dtype} of shape (height, width{', 3' * bool(pixel)}), "
+            f"found {image.dtype} of {image.shape}"
+        )
