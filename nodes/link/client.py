@@ -283,7 +283,7 @@ class Link:
         try:
             return read_message(self._socket, head)
         except (EOFError, OSError) as error:
-            raise ProtocolError(f"the run is gone: {error!s or 'without BYE'}") from None
+            raise ProtocolError(f"the run is gone: {str(error) or 'without BYE'}") from None
 
 
 def message(kind: int, *parts: bytes) -> bytes:
