@@ -10,7 +10,7 @@ Read the core in this order:
 - A run: `node_runner`, `node_host`, `startup`, `run_state`, `supervisor`, `execute`, `event_loop`.
 - What a run leaves: `digest`, `summary`, `results`, `logs`.
 - `config`: the file; `units` and `paths` are types of settings.
-- `workers`: objects in processes of their own.
+- `workers`: objects in processes of their own. `hold`, `answers`: systems that are outside.
 - `watchdogs`, `code_location`: who blocks the loop or holds up the run.
 - `parameter_server`: settings that change in a run. `instruments`: hooks for who looks on.
 - `wire` and `peers`: events as bytes, and a run in several processes.
@@ -24,6 +24,7 @@ from runtime.bundles import Bundle
 from runtime.clock import Clock
 from runtime.config.parameters import Changeable
 from runtime.errors import RefusedError, VisnavError
+from runtime.hold import Hold, HoldConfig, Owed
 from runtime.node import Node, NodeConfig
 from runtime.ports import Input, Output, every, on
 from runtime.schedule import Tick
@@ -42,6 +43,7 @@ __all__ = [
     "Node",
     "NodeConfig",
     "Output",
+    "Owed",
     "RefusedError",
     "Stream",
     "Tick",
