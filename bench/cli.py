@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from bench.system import CaseName
 
 app = typer.Typer(
@@ -78,23 +76,21 @@ def stall(
 ) -> None:
     """Measure how late a 400 Hz tick is without a camera, with one inline and beside the loop."""
     from bench.stall import measure
-    from bench.tables import stall_table
 
     with _status() as say:
         rows = measure(seconds=seconds, repeats=repeats, rate=rate, size=size, progress=say)
-    _finish(stall_table(rows), json, rows, seconds=seconds, repeats=repeats, rate=rate, size=size)
+    _finish(json, stall=rows)
 
 
 @app.command()
 def throughput(json: Json = None) -> None:
     """Measure events and images a second, through handlers, streams and workers."""
-    from bench.tables import throughput_table
     from bench.throughput import measure
 
     with _status() as say:
         say("throughput")
         rows = measure()
-    _finish(throughput_table(rows), json, rows)
+    _finish(json, throughput=rows)
 
 
 @app.command()
@@ -104,12 +100,11 @@ def idle(
 ) -> None:
     """Measure the processor time of one 100 Hz timer node."""
     from bench.idle import measure
-    from bench.tables import idle_table
 
     with _status() as say:
         say("idle")
         row = measure(seconds)
-    _finish(idle_table(row), json, [row])
+    _finish(json, idle=[row])
 
 
 @app.command()
@@ -121,14 +116,12 @@ def lockstep(
     """Measure simulated seconds a second beside a bare loop, and where a frame's time goes."""
     from bench import parts
     from bench.lockstep import measure
-    from bench.tables import lockstep_table, parts_table
 
     with _status() as say:
         rows = measure(seconds=seconds, repeats=repeats, progress=say)
         say("parts of a frame")
         shares = parts.measure(seconds=seconds / 3, repeats=repeats)
-    _finish(lockstep_table(rows), None, rows)
-    _finish(parts_table(shares), json, [*rows, *shares])
+    _finish(json, lockstep=rows, parts=shares)
 
 
 @app.command()
@@ -142,14 +135,12 @@ def bridge(
     """Measure what crosses between two processes beside raw Zenoh, and ROS images' encoding."""
     from bench.bridge import measure
     from bench.ros_images import measure as measure_ros
-    from bench.tables import bridge_table, ros_images_table
 
     with _status() as say:
         rows = measure(samples, say)
         say("images for ROS")
         ros = measure_ros(repeats)
-    _finish(bridge_table(rows), None, rows)
-    _finish(ros_images_table(ros), json, [*rows, *ros])
+    _finish(json, bridge=rows, ros_images=ros)
 
 
 @app.command()
@@ -161,11 +152,10 @@ def recording(
 ) -> None:
     """Measure how late a 400 Hz tick is while a run is recorded, and while it is not."""
     from bench.recording import measure
-    from bench.tables import recording_table
 
     with _status() as say:
         rows = measure(seconds=seconds, repeats=repeats, rate=rate, progress=say)
-    _finish(recording_table(rows), json, rows)
+    _finish(json, recording=rows)
 
 
 @app.command()
@@ -178,11 +168,10 @@ def flood(
 ) -> None:
     """Measure how late a 400 Hz tick is while ROS 2 messages flood in."""
     from bench.flood import measure
-    from bench.tables import flood_table
 
     with _status() as say:
         rows = measure(windows=windows, rate=rate, progress=say)
-    _finish(flood_table(rows), json, rows)
+    _finish(json, flood=rows)
 
 
 @app.command("all")
@@ -212,12 +201,12 @@ def compare(
     from rich.console import Console
 
     from bench.compare import compare as changes_between
-    from bench.tables import changes_table
+    from bench.tables import TABLES
 
     changes = changes_between(before, after)
     real = [change for change in changes if change.real]
     if real:
-        Console().print(changes_table(real))
+        Console().print(TABLES["changes"].terminal(real))
     print(f"{len(real)} of {len(changes)} figures changed beyond the noise")
 
 
@@ -231,9 +220,12 @@ def _latency(
     only: list[str] | None,
     plots: Path | None,
 ) -> None:
+    from rich.console import Console
+
     from bench.driver import measure_all
-    from bench.plots import plot_boxes, plot_scaling
-    from bench.tables import latency_table, missing_lines
+    from bench.plots import draw
+    from bench.results import write_json
+    from bench.tables import latency
 
     counts = _counts(nodes)
     with _status() as say:
@@ -246,16 +238,14 @@ def _latency(
             only=only or (),
             progress=say,
         )
-    if plots is not None and outcome.rows:
-        plots.mkdir(parents=True, exist_ok=True)
-        plot_scaling(outcome.rows, case, plots / f"{case}-scaling.png")
-        for n in counts:
-            rows = [row for row in outcome.rows if row.nodes == n]
-            if rows:
-                plot_boxes(rows, f"{case}, {n} nodes", plots / f"{case}-{n}.png")
-    more = {"missing": outcome.missing, "versions": outcome.versions}
-    _finish(latency_table(outcome.rows), json, outcome.rows, **more)
-    print("\n".join(missing_lines(outcome.missing)))
+    if plots is not None:
+        draw(outcome.rows, plots, counts)
+    table, rows = latency(outcome.rows)
+    Console().print(table.terminal(rows))
+    for system, reason in outcome.missing.items():
+        print(f"not measured: {system}: {reason}")
+    if json is not None:
+        write_json(json, outcome.rows, missing=outcome.missing, versions=outcome.versions)
 
 
 def _counts(nodes: str) -> list[int]:
@@ -281,11 +271,14 @@ def _status() -> Iterator[Callable[..., None]]:
         )
 
 
-def _finish(table: Table, json: Path | None, rows: list[Any], **more: Any) -> None:
+def _finish(json: Path | None, **measured: list[Any]) -> None:
+    """Show the tables of what was measured, and write all rows to a file if one is given."""
     from rich.console import Console
 
     from bench.results import write_json
+    from bench.tables import TABLES
 
-    Console().print(table)
+    for name, rows in measured.items():
+        Console().print(TABLES[name].terminal(rows))
     if json is not None:
-        write_json(json, rows, **more)
+        write_json(json, [row for rows in measured.values() for row in rows])

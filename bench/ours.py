@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 
-from bench.messages import Ping, Pong
-from bench.system import Case, Samples, System
+from bench.system import Case, Ping, Pong, Samples, System
 from bench.systems.parts import payloads
 from runtime import Input, Node, NodeConfig, Output, on, task_factory
 from runtime.config.model import Config, RunConfig

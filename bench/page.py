@@ -9,9 +9,9 @@ from pathlib import Path
 import msgspec
 
 from bench.driver import Row
-from bench.plots import plot_boxes, plot_scaling
+from bench.plots import draw
 from bench.suite import Results
-from bench.tables import number
+from bench.tables import TABLES, latency
 
 CAVEATS = """\
 # Results
@@ -50,25 +50,39 @@ def write(results: Results, out: Path, page_path: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     encoded = msgspec.json.format(msgspec.json.encode(results), indent=1)
     (out / "results.json").write_bytes(encoded + b"\n")
-    plots = _plots(results.rows, out)
+    plots = draw(results.rows, out, (2, 128))
     folder = os.path.relpath(out, page_path.parent)
     page_path.write_text(page(results, plots, folder), encoding="utf-8")
 
 
 def page(results: Results, plots: Mapping[str, Sequence[str]], folder: str) -> str:
     """Return the whole page as Markdown; the plots of each case are in `folder`."""
-    parts = [CAVEATS, "\n".join(_goals(results)), "\n".join(_stall(results))]
-    parts += ["\n".join(_lockstep(results)), "\n".join(_throughput(results))]
-    if results.bridge:
-        parts.append("\n".join(_beside(results)))
+    sections = [
+        _goals(results),
+        _section(results, "Stalls", "stall"),
+        _section(
+            results,
+            "Simulated time",
+            "lockstep",
+            "parts",
+            before="1 kHz physics, 400 Hz control, 200 Hz IMU; a camera of 512×512 RGB-D at 30 Hz.",
+        ),
+        _section(results, "Throughput", "throughput"),
+        _section(
+            results,
+            "Between processes, and beside the loop",
+            *("bridge", "ros_images", "recording", "flood"),
+            before="Each of these tables is a run of its own, whose sides were measured in turns.",
+        ),
+    ]
     for case, title in (
         ("small", "Small message"),
         ("large", "Large message (4.67 MB), copied"),
         ("large-shared", "Large message, by reference or shared memory"),
     ):
-        parts.append("\n".join(_latency(results.rows, case, title, plots.get(case, ()), folder)))
-    parts.append("\n".join(_measured(results)))
-    return "\n".join(parts).rstrip() + "\n"
+        sections.append(_latency(results.rows, case, title, plots.get(case, ()), folder))
+    sections.append(_measured(results))
+    return "\n".join([CAVEATS, *("\n".join(each) for each in sections)]).rstrip() + "\n"
 
 
 def _median(rows: Iterable[Row], case: str, system: str, mode: str, nodes: int) -> float | None:
@@ -137,107 +151,28 @@ def _goals(results: Results) -> Iterator[str]:
     yield ""
 
 
-def _stall(results: Results) -> Iterator[str]:
-    yield "## Stalls: lateness of a 400 Hz tick while a 512×512 RGB-D camera runs at 10 Hz\n"
-    columns = ("camera", "late p50 µs", "p99 µs", "max µs", "between ticks: mean ms", "median")
-    yield f"| {' | '.join((*columns, 'sd', 'missed', 'fetch ms'))} |"
-    yield "|---|--:|--:|--:|--:|--:|--:|--:|--:|"
-    for r in results.stall:
-        fetch = f"{r.fetch_ms_median:.1f}" if r.frames else ""
-        yield (
-            f"| {r.mode} | {r.late_p50_us:.0f} | {r.late_p99_us:.0f} | {r.late_max_us:.0f} "
-            f"| {r.update_mean_ms:.2f} | {r.update_median_ms:.2f} | {r.update_sd_ms:.2f} "
-            f"| {r.missed} | {fetch} |"
-        )
-    yield ""
-
-
-def _lockstep(results: Results) -> Iterator[str]:
-    yield "## Simulated time\n"
-    yield "1 kHz physics, 400 Hz control, 200 Hz IMU; the camera is 512×512 RGB-D at 30 Hz.\n"
-    yield "| case | simulated seconds a second | the runtime's own share of the time |"
-    yield "|---|--:|--:|"
-    for r in results.lockstep:
-        share = "" if r.share is None else f"{r.share:.0%}"
-        yield f"| {r.case} | {r.speed:.1f} | {share} |"
-    yield ""
-    if results.parts:
-        yield "Processor time of a frame (all processes; RGB-D with noise, odometry, evaluation):\n"
-        yield "| part | ms | share |\n|---|--:|--:|"
-        yield from (f"| {p.part} | {p.ms:.1f} | {p.share:.0%} |" for p in results.parts)
-        yield ""
-
-
-def _throughput(results: Results) -> Iterator[str]:
-    yield "## Throughput\n"
-    yield "| what | at once | µs each | a second | MB a second |"
-    yield "|---|--:|--:|--:|--:|"
-    for r in results.throughput:
-        size = f"{r.bytes_per_second / 1e6:,.0f}" if r.bytes_per_second else ""
-        yield (
-            f"| {r.case} | {r.batch} | {number(r.per_event_us)} "
-            f"| {r.events_per_second:,.0f} | {size} |"
-        )
-    yield ""
-
-
-def _beside(results: Results) -> Iterator[str]:
-    yield "## Between processes, and beside the loop\n"
-    yield "Each of these tables is a run of its own, whose sides were measured in turns.\n"
-    yield "A run in two processes on one machine, beside bare Zenoh sessions in the same two:\n"
-    yield "| event | bytes | round trip µs | Zenoh's | ratio | a second | Zenoh's |"
-    yield "|---|--:|--:|--:|--:|--:|--:|"
-    for b in results.bridge:
-        yield (
-            f"| {b.case} | {b.bytes:,} | {number(b.ours_us)} | {number(b.zenoh_us)} "
-            f"| {b.ratio:.2f} | {b.ours_per_second:,.0f} | {b.zenoh_per_second:,.0f} |"
-        )
-    yield "\nAn image as a message of ROS 2, by the bridge and by rosbags' `serialize_cdr`:\n"
-    yield "| image | bytes | µs | rosbags' | ratio |"
-    yield "|---|--:|--:|--:|--:|"
-    for i in results.ros_images:
-        yield (
-            f"| {i.case} | {i.bytes:,} | {number(i.ours_us)} | {number(i.rosbags_us)} "
-            f"| {i.ratio:.2f} |"
-        )
-    yield "\nLateness of a 400 Hz tick while a run with 512×512 RGB-D at 30 Hz is recorded:\n"
-    yield "| run | late p50 µs | p99 µs | max µs | pairs' ratio of p99 | MB | dropped |"
-    yield "|---|--:|--:|--:|--:|--:|--:|"
-    for r in results.recording:
-        yield (
-            f"| {r.case} | {r.late_p50_us:.0f} | {r.late_p99_us:.0f} | {r.late_max_us:.0f} "
-            f"| {r.ratio_p99:.2f} | {r.megabytes:.0f} | {r.dropped} |"
-        )
-    yield "\nThe same while messages of ROS 2 come from another process:\n"
-    yield "| window | messages a second | late p50 µs | p99 µs | pairs' ratio of p99 |"
-    yield "|---|--:|--:|--:|--:|"
-    for f in results.flood:
-        yield (
-            f"| {f.case} | {f.messages_per_second:,.0f} | {f.late_p50_us:.0f} "
-            f"| {f.late_p99_us:.0f} | {f.ratio_p99:.2f} |"
-        )
-    yield ""
+def _section(results: Results, title: str, *names: str, before: str = "") -> Iterator[str]:
+    """Yield a heading and the tables of what was measured, each under its own title."""
+    yield f"## {title}\n"
+    if before:
+        yield f"{before}\n"
+    for name in names:
+        if rows := getattr(results, name):
+            if TABLES[name].title != title:
+                yield f"{TABLES[name].title}:\n"
+            yield from TABLES[name].markdown(rows)
 
 
 def _latency(
     rows: Sequence[Row], case: str, title: str, plots: Sequence[str], folder: str
 ) -> Iterator[str]:
     yield f"## {title}: median round trip, µs\n"
-    for place in ("one process", "processes"):
+    for place, where in (("one process", "one process"), ("processes", "processes of their own")):
         own = [r for r in rows if r.case == case and r.place == place]
-        if not own:
-            continue
-        nodes = sorted({r.nodes for r in own})
-        yield f"Nodes in {'one process' if place == 'one process' else 'processes of their own'}:\n"
-        yield f"| system | mode | {' | '.join(map(str, nodes))} |"
-        yield f"|---|---|{'--:|' * len(nodes)}"
-        by_system: dict[tuple[str, str], dict[int, float]] = {}
-        for r in own:
-            by_system.setdefault((r.system, r.mode), {})[r.nodes] = r.median_us
-        for (system, mode), medians in sorted(by_system.items(), key=lambda s: min(s[1].values())):
-            cells = " | ".join(number(medians.get(n)) for n in nodes)
-            yield f"| {system} | {mode} | {cells} |"
-        yield ""
+        if own:
+            yield f"Nodes in {where}:\n"
+            table, cells = latency(own)
+            yield from table.markdown(cells)
     for plot in plots:
         yield f"![{plot.removesuffix('.png')}]({folder}/{plot})\n"
 
@@ -254,20 +189,3 @@ def _measured(results: Results) -> Iterator[str]:
         for system, reason in results.missing.items():
             yield f"- {system}: {reason}"
     yield ""
-
-
-def _plots(rows: Sequence[Row], out: Path) -> dict[str, list[str]]:
-    """Draw each case's plots and return their names."""
-    drawn: dict[str, list[str]] = {}
-    for case in dict.fromkeys(row.case for row in rows):
-        own = [row for row in rows if row.case == case]
-        names = drawn.setdefault(case, [])
-        if len({row.nodes for row in own}) > 1:
-            names.append(f"{case}-scaling.png")
-            plot_scaling(own, f"{case} message", out / names[-1])
-        for n in (2, 128):
-            boxed = [row for row in own if row.nodes == n]
-            if boxed:
-                names.append(f"{case}-{n}.png")
-                plot_boxes(boxed, f"{case} message, {n} nodes", out / names[-1])
-    return drawn

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,29 @@ from matplotlib.figure import Figure
 from bench.driver import Row
 
 OURS = "visnav"
+
+
+def draw(rows: Sequence[Row], out: Path, boxes: Iterable[int]) -> dict[str, list[str]]:
+    """Draw the plots of each case into a folder, made if missing; return their names by case.
+
+    Args:
+        rows: What was measured.
+        out: Where to.
+        boxes: Numbers of nodes that get a box plot, where there are rows with so many.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    drawn: dict[str, list[str]] = {}
+    for case in dict.fromkeys(row.case for row in rows):
+        own = [row for row in rows if row.case == case]
+        names = drawn.setdefault(case, [])
+        if len({row.nodes for row in own}) > 1:
+            names.append(f"{case}-scaling.png")
+            plot_scaling(own, f"{case} message", out / names[-1])
+        for n in boxes:
+            if boxed := [row for row in own if row.nodes == n]:
+                names.append(f"{case}-{n}.png")
+                plot_boxes(boxed, f"{case} message, {n} nodes", out / names[-1])
+    return drawn
 
 
 def label(row: Row) -> str:

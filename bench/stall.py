@@ -49,6 +49,7 @@ class StallRow(msgspec.Struct, frozen=True, kw_only=True):
         late_p50_us: Median lateness of the 400 Hz tick, microseconds.
         late_p99_us: Its 99th percentile.
         late_max_us: Its maximum.
+        ratio_p99: Of the 99th percentile, to that of the first mode.
         missed: Ticks left out because an earlier one came too late.
         update_mean_ms: Mean time from one tick to the next, milliseconds.
         update_median_ms: Its median.
@@ -68,6 +69,7 @@ class StallRow(msgspec.Struct, frozen=True, kw_only=True):
     update_sd_ms: float
     frames: int
     fetch_ms_median: float
+    ratio_p99: float = 1.0
 
 
 class _Samples(msgspec.Struct):
@@ -243,7 +245,11 @@ def measure(
             for mode in order:
                 progress(f"round {round_ + 1} of {repeats}: {mode}")
                 execute(parse(_settings(mode, seconds, rate, size, port), "bench stall"))
-    return [_row(mode, _collected[mode]) for mode in modes]
+    rows = [_row(mode, _collected[mode]) for mode in modes]
+    return [
+        msgspec.structs.replace(row, ratio_p99=row.late_p99_us / rows[0].late_p99_us)
+        for row in rows
+    ]
 
 
 def _settings(mode: Mode, seconds: float, rate: float, size: int, port: int) -> dict[str, Any]:

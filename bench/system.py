@@ -8,11 +8,13 @@ from just before the send to the arrival of the reply. Pings never overlap.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+
+from events import Event
 
 CaseName = Literal["small", "large", "large-shared"]
 Mode = Literal["handler", "stream", "routed"]
@@ -80,3 +82,27 @@ class System(msgspec.Struct, frozen=True, kw_only=True):
 def large_array() -> npt.NDArray[np.float32]:
     """Return the array that large pings carry."""
     return np.arange(np.prod(LARGE_SHAPE), dtype=np.float32).reshape(LARGE_SHAPE)
+
+
+class Ping(Event):
+    """What node 1 says to all.
+
+    Attributes:
+        receiver: Number of the node that is to reply.
+        number: Of the ping.
+        payload: An array, or `None`.
+    """
+
+    receiver: int
+    number: int
+    payload: Any = None
+
+
+class Pong(Event):
+    """What the receiver replies to node 1.
+
+    Attributes:
+        number: Of the ping.
+    """
+
+    number: int

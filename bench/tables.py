@@ -1,216 +1,204 @@
-"""Benchmarks' figures as tables for the terminal."""
+"""Benchmarks' figures as tables: each is described once, and shown in the terminal and the page."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
-
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from bench.bridge import BridgeRow
-    from bench.compare import Change
+    from rich.table import Table as TerminalTable
+
     from bench.driver import Row
-    from bench.flood import FloodRow
-    from bench.idle import IdleRow
-    from bench.lockstep import LockstepRow
-    from bench.parts import PartRow
-    from bench.recording import RecordingRow
-    from bench.ros_images import RosImageRow
-    from bench.stall import StallRow
-    from bench.throughput import ThroughputRow
 
 
-def _table(title: str, *columns: str, texts: int = 1) -> Table:
-    """Return a table whose columns after the first `texts` hold numbers."""
-    table = Table(
-        *columns, title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
-    for column in table.columns[texts:]:
-        column.justify = "right"
-    return table
+class Column(NamedTuple):
+    """One column.
+
+    Attributes:
+        heading: Above it.
+        key: Attribute of a row, or key of a row that is a dictionary.
+        spec: As of `format`; ``us``: a time with three significant figures; with ``?`` before it,
+            nothing stands where the figure is 0.
+    """
+
+    heading: str
+    key: str
+    spec: str = ""
+
+    def cell(self, row: Any) -> str:
+        """Return what stands in a row; nothing if the row has no such figure."""
+        value = row.get(self.key) if isinstance(row, dict) else getattr(row, self.key)
+        if value is None or (self.spec.startswith("?") and not value):
+            return ""
+        spec = self.spec.removeprefix("?")
+        return number(value) if spec == "us" else format(value, spec)
 
 
-def latency_table(rows: Sequence[Row]) -> Table:
-    """Return medians by system and number of nodes, the quickest first."""
-    nodes = sorted({row.nodes for row in rows})
+class Table(NamedTuple):
+    """What a table shows.
+
+    Attributes:
+        title: What is measured, as a sentence without its end.
+        columns: From the left.
+        texts: How many of them hold words; the others hold numbers.
+    """
+
+    title: str
+    columns: Sequence[Column]
+    texts: int = 1
+
+    def terminal(self, rows: Sequence[Any]) -> TerminalTable:
+        """Return the table for a terminal."""
+        from rich.box import SIMPLE_HEAD
+        from rich.table import Table as TerminalTable
+
+        headings = [column.heading for column in self.columns]
+        table = TerminalTable(
+            *headings, title=self.title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+        )
+        for column in table.columns[self.texts :]:
+            column.justify = "right"
+        for row in rows:
+            table.add_row(*(column.cell(row) for column in self.columns))
+        return table
+
+    def markdown(self, rows: Sequence[Any]) -> Iterator[str]:
+        """Yield the lines of the table in Markdown, and an empty one."""
+        yield f"| {' | '.join(column.heading for column in self.columns)} |"
+        yield f"|{'---|' * self.texts}{'--:|' * (len(self.columns) - self.texts)}"
+        for row in rows:
+            yield f"| {' | '.join(column.cell(row) for column in self.columns)} |"
+        yield ""
+
+
+_LATE = (
+    Column("p50 µs", "late_p50_us", ".0f"),
+    Column("p99 µs", "late_p99_us", ".0f"),
+    Column("max µs", "late_max_us", ".0f"),
+    Column("ratio of p99", "ratio_p99", ".2f"),
+)
+
+TABLES = {
+    "stall": Table(
+        "Lateness of a 400 Hz tick while a 512×512 RGB-D camera runs at 10 Hz; ms between ticks",
+        (
+            Column("camera", "mode"),
+            *_LATE,
+            Column("mean ms", "update_mean_ms", ".2f"),
+            Column("median", "update_median_ms", ".2f"),
+            Column("sd", "update_sd_ms", ".2f"),
+            Column("missed", "missed"),
+            Column("frames", "frames"),
+            Column("fetch ms", "fetch_ms_median", "?.1f"),
+        ),
+    ),
+    "throughput": Table(
+        "Throughput",
+        (
+            Column("what", "case"),
+            Column("at once", "batch"),
+            Column("µs each", "per_event_us", "us"),
+            Column("a second", "events_per_second", ",.0f"),
+            Column("MB a second", "megabytes_per_second", "?,.0f"),
+        ),
+    ),
+    "idle": Table(
+        "One timer node",
+        (
+            Column("Hz", "hz", "g"),
+            Column("seconds", "seconds", ".1f"),
+            Column("ticks", "ticks"),
+            Column("% of a core", "cpu_percent", ".2f"),
+        ),
+        texts=0,
+    ),
+    "lockstep": Table(
+        "Simulated time",
+        (
+            Column("case", "case"),
+            Column("simulated seconds a second", "speed", ".1f"),
+            Column("the runtime's own share of the time", "share", ".0%"),
+        ),
+    ),
+    "parts": Table(
+        "Processor time of a frame (all processes; RGB-D with noise, odometry, evaluation)",
+        (Column("part", "part"), Column("ms", "ms", ".1f"), Column("share", "share", ".0%")),
+    ),
+    "bridge": Table(
+        "A run in two processes on one machine, beside bare Zenoh sessions in the same two",
+        (
+            Column("event", "case"),
+            Column("bytes", "bytes", ","),
+            Column("round trip µs", "ours_us", "us"),
+            Column("Zenoh's", "zenoh_us", "us"),
+            Column("ratio", "ratio", ".2f"),
+            Column("a second", "ours_per_second", ",.0f"),
+            Column("Zenoh's", "zenoh_per_second", ",.0f"),
+            Column("p99 µs", "ours_p99_us", "us"),
+            Column("Zenoh's", "zenoh_p99_us", "us"),
+        ),
+    ),
+    "ros_images": Table(
+        "An image as a message of ROS 2, by the bridge and by rosbags' `serialize_cdr`",
+        (
+            Column("image", "case"),
+            Column("bytes", "bytes", ","),
+            Column("µs", "ours_us", "us"),
+            Column("rosbags'", "rosbags_us", "us"),
+            Column("ratio", "ratio", ".2f"),
+            Column("p99 µs", "ours_p99_us", "us"),
+            Column("rosbags'", "rosbags_p99_us", "us"),
+        ),
+    ),
+    "recording": Table(
+        "Lateness of a 400 Hz tick while a run with 512×512 RGB-D at 30 Hz is recorded",
+        (
+            Column("run", "case"),
+            *_LATE,
+            Column("frames", "frames"),
+            Column("MB", "megabytes", ".0f"),
+            Column("dropped", "dropped"),
+        ),
+    ),
+    "flood": Table(
+        "Lateness of a 400 Hz tick while messages of ROS 2 come from another process",
+        (
+            Column("window", "case"),
+            Column("messages a second", "messages_per_second", ",.0f"),
+            *_LATE,
+            Column("of p50", "ratio_p50", ".2f"),
+        ),
+    ),
+    "changes": Table(
+        "Changes",
+        (
+            Column("what", "what"),
+            Column("before µs", "before_us", "us"),
+            Column("after µs", "after_us", "us"),
+            Column("ratio", "ratio", ".2f"),
+            Column("noise", "noise", ".2f"),
+        ),
+    ),
+}
+"""By what is measured, as `bench.suite.Results` names it."""
+
+
+def latency(rows: Sequence[Row]) -> tuple[Table, list[dict[str, Any]]]:
+    """Return the table of medians by system and number of nodes, and its rows, quickest first."""
+    by_system: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        known = by_system.setdefault(
+            (row.system, row.mode), {"system": row.system, "mode": row.mode, "least": row.median_us}
+        )
+        known[str(row.nodes)] = row.median_us
+        known["least"] = min(known["least"], row.median_us)
+    nodes = [Column(str(n), str(n), "us") for n in sorted({row.nodes for row in rows})]
     case = rows[0].case if rows else "nothing"
-    table = _table(
-        f"{case}: median round trip (µs) by number of nodes",
-        *("system", "mode", *map(str, nodes)),
-        texts=2,
-    )
-    by_system: dict[tuple[str, str], dict[int, float]] = {}
-    for row in rows:
-        by_system.setdefault((row.system, row.mode), {})[row.nodes] = row.median_us
-    for (system, mode), medians in sorted(by_system.items(), key=lambda s: min(s[1].values())):
-        table.add_row(system, mode, *(number(medians.get(n)) for n in nodes))
-    return table
+    columns = [Column("system", "system"), Column("mode", "mode"), *nodes]
+    table = Table(f"{case}: median round trip (µs) by number of nodes", columns, texts=2)
+    return table, sorted(by_system.values(), key=lambda system: system["least"])
 
 
-def missing_lines(missing: Mapping[str, str]) -> Iterator[str]:
-    """Return a line for each system that was not measured."""
-    for system, reason in missing.items():
-        yield f"not measured: {system}: {reason}"
-
-
-def stall_table(rows: Sequence[StallRow]) -> Table:
-    """Return lateness by mode, with ratios to the first row."""
-    table = _table(
-        "lateness of a 400 Hz tick (µs; ratio of p99), time between ticks (ms), fetch (ms)",
-        *("camera", "p50", "p99", "max", "ratio", "missed", "mean", "median", "sd"),
-        *("frames", "fetch"),
-    )
-    for row in rows:
-        table.add_row(
-            row.mode,
-            f"{row.late_p50_us:.0f}",
-            f"{row.late_p99_us:.0f}",
-            f"{row.late_max_us:.0f}",
-            f"{row.late_p99_us / rows[0].late_p99_us:.2f}",
-            f"{row.missed}",
-            f"{row.update_mean_ms:.2f}",
-            f"{row.update_median_ms:.2f}",
-            f"{row.update_sd_ms:.2f}",
-            f"{row.frames}",
-            f"{row.fetch_ms_median:.1f}" if row.frames else "",
-        )
-    return table
-
-
-def throughput_table(rows: Sequence[ThroughputRow]) -> Table:
-    """Return what gets through."""
-    table = _table("throughput", "what", "at once", "µs each", "per second", "MB per second")
-    for row in rows:
-        table.add_row(
-            row.case,
-            f"{row.batch}",
-            number(row.per_event_us),
-            f"{row.events_per_second:,.0f}",
-            f"{row.bytes_per_second / 1e6:,.0f}" if row.bytes_per_second else "",
-        )
-    return table
-
-
-def idle_table(row: IdleRow) -> Table:
-    """Return what idling costs."""
-    table = _table("one timer node", "Hz", "seconds", "ticks", "% of a core", texts=0)
-    table.add_row(f"{row.hz:g}", f"{row.seconds:.1f}", f"{row.ticks}", f"{row.cpu_percent:.2f}")
-    return table
-
-
-def lockstep_table(rows: Sequence[LockstepRow]) -> Table:
-    """Return the speeds of simulated time."""
-    table = _table("lockstep", "case", "simulated s per s", "runtime's share")
-    for row in rows:
-        share = "" if row.share is None else f"{row.share:.0%}"
-        table.add_row(row.case, f"{row.speed:.1f}", share)
-    return table
-
-
-def parts_table(rows: Sequence[PartRow]) -> Table:
-    """Return where the processor time of a frame goes."""
-    table = _table("processor time of a frame, by part", "part", "ms", "share")
-    for row in rows:
-        table.add_row(row.part, f"{row.ms:.1f}", f"{row.share:.0%}")
-    return table
-
-
-def bridge_table(rows: Sequence[BridgeRow]) -> Table:
-    """Return what a run in two processes adds to Zenoh."""
-    table = _table(
-        "between two processes: median round trip (µs), events a second",
-        *("event", "bytes", "ours", "zenoh", "ratio", "p99", "zenoh's", "per second", "zenoh's"),
-    )
-    for row in rows:
-        table.add_row(
-            row.case,
-            f"{row.bytes:,}",
-            number(row.ours_us),
-            number(row.zenoh_us),
-            f"{row.ratio:.2f}",
-            number(row.ours_p99_us),
-            number(row.zenoh_p99_us),
-            f"{row.ours_per_second:,.0f}",
-            f"{row.zenoh_per_second:,.0f}",
-        )
-    return table
-
-
-def ros_images_table(rows: Sequence[RosImageRow]) -> Table:
-    """Return what encoding images for ROS costs."""
-    table = _table(
-        "encoding for ROS 2 (µs)", "image", "bytes", "ours", "rosbags", "ratio", "p99", "rosbags'"
-    )
-    for row in rows:
-        table.add_row(
-            row.case,
-            f"{row.bytes:,}",
-            number(row.ours_us),
-            number(row.rosbags_us),
-            f"{row.ratio:.2f}",
-            number(row.ours_p99_us),
-            number(row.rosbags_p99_us),
-        )
-    return table
-
-
-def flood_table(rows: Sequence[FloodRow]) -> Table:
-    """Return lateness with and without a flood."""
-    table = _table(
-        "lateness of a 400 Hz tick (µs), and its ratio to the quiet second before",
-        *("window", "messages per second", "p50", "p99", "max", "ratio of p50", "of p99"),
-    )
-    for row in rows:
-        table.add_row(
-            row.case,
-            f"{row.messages_per_second:,.0f}",
-            f"{row.late_p50_us:.0f}",
-            f"{row.late_p99_us:.0f}",
-            f"{row.late_max_us:.0f}",
-            f"{row.ratio_p50:.2f}",
-            f"{row.ratio_p99:.2f}",
-        )
-    return table
-
-
-def recording_table(rows: Sequence[RecordingRow]) -> Table:
-    """Return lateness with and without a recorder."""
-    table = _table(
-        "lateness of a 400 Hz tick (µs), and the pairs' ratio of p99",
-        *("run", "p50", "p99", "max", "ratio", "frames", "MB", "dropped"),
-    )
-    for row in rows:
-        table.add_row(
-            row.case,
-            f"{row.late_p50_us:.0f}",
-            f"{row.late_p99_us:.0f}",
-            f"{row.late_max_us:.0f}",
-            f"{row.ratio_p99:.2f}",
-            f"{row.frames}",
-            f"{row.megabytes:.0f}",
-            f"{row.dropped}",
-        )
-    return table
-
-
-def changes_table(changes: Sequence[Change]) -> Table:
-    """Return what changed."""
-    table = _table("changes", "what", "before µs", "after µs", "ratio", "noise")
-    for change in changes:
-        table.add_row(
-            change.what,
-            number(change.before_us),
-            number(change.after_us),
-            f"{change.ratio:.2f}",
-            f"{change.noise:.2f}",
-        )
-    return table
-
-
-def number(value: float | None) -> str:
+def number(value: float) -> str:
     """Return a time with three significant figures."""
-    if value is None:
-        return ""
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 
-from bench.messages import Ping
+from bench.system import Ping
 from events import Event, Image, PoseEstimate, Quaternion, Vector3
 from runtime import task_factory
 from runtime.real_clock import RealClock
@@ -38,6 +38,11 @@ class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
     per_event_us: float
     events_per_second: float
     bytes_per_second: float
+
+    @property
+    def megabytes_per_second(self) -> float:
+        """Return the same in megabytes."""
+        return self.bytes_per_second / 1e6
 
 
 BATCH = 256

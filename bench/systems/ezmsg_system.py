@@ -19,8 +19,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from bench.messages import Ping, Pong
-from bench.system import Case, Samples, System
+from bench.system import Case, Ping, Pong, Samples, System
 from bench.systems.children import ALL, TIMEOUT, PeerError
 from bench.systems.parts import needs, payloads, versions
 

@@ -29,7 +29,7 @@ NAMES = [system.name for _, system in SYSTEMS]
 # The names of the third-party modules that importing a module brings in, as a script.
 IMPORTED = """
 import sys
-import bench.system, bench.messages, uvloop, subprocess, multiprocessing
+import bench.system, uvloop, subprocess, multiprocessing
 before = set(sys.modules)
 import {module}
 new = {{name.partition(".")[0] for name in set(sys.modules) - before}}

@@ -1,0 +1,147 @@
+"""One queue a node and one task around each: what asyncio, anyio and trio themselves offer.
+
+asyncio has `asyncio.Queue`, measured on its own loop and on uvloop; anyio has memory object streams
+(on uvloop), and trio memory channels, on its own loop. All are unbounded and filled at once:
+``put_nowait`` and ``send_nowait`` pass no checkpoint, as ``await send()`` would, which is the
+quickest way of each. So node 1 wakes all receivers before any runs; trio runs what is ready in an
+order of chance, and node 1, woken by the reply, after all of them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import math
+import platform
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any
+
+import numpy as np
+import uvloop
+
+from bench.system import Case, Ping, Pong, Samples, System
+from bench.systems.parts import needs, payloads, versions
+
+Put = Callable[[Any], None]
+
+
+async def _exchange(case: Case, puts: Sequence[Put], receive: Callable[[], Awaitable[Any]]) -> Any:
+    """Return the samples of node 1, which puts each ping to all others and awaits the reply."""
+    payload = payloads(case)
+    now = time.perf_counter_ns
+    taken = np.empty(case.warm_up + case.samples, np.int64)
+    for number in range(len(taken)):
+        begin = now()
+        ping = Ping(stamp=begin, source="1", receiver=case.nodes, number=number, payload=payload())
+        for put in puts:
+            put(ping)
+        await receive()
+        taken[number] = now() - begin
+    return taken[case.warm_up :]
+
+
+def _answer(number: int, ping: Ping, put: Put) -> None:
+    if ping.receiver == number:
+        put(Pong(stamp=ping.stamp, source="n", number=ping.number))
+
+
+async def _listen_queue(number: int, pings: asyncio.Queue[Ping], put: Put) -> None:
+    while True:
+        _answer(number, await pings.get(), put)
+
+
+async def _listen_stream(number: int, pings: Any, put: Put) -> None:
+    async for ping in pings:
+        _answer(number, ping, put)
+
+
+async def _by_queues(case: Case) -> Samples:
+    pongs: asyncio.Queue[Pong] = asyncio.Queue()
+    queues: list[asyncio.Queue[Ping]] = [asyncio.Queue() for _ in range(case.nodes - 1)]
+    async with asyncio.TaskGroup() as group:
+        tasks = [
+            group.create_task(_listen_queue(number, queue, pongs.put_nowait))
+            for number, queue in enumerate(queues, start=2)
+        ]
+        await asyncio.sleep(0)
+        samples: Samples = await _exchange(case, [q.put_nowait for q in queues], pongs.get)
+        for task in tasks:
+            task.cancel()
+    return samples
+
+
+async def _by_streams(
+    case: Case, new: Callable[[float], tuple[Any, Any]], new_group: Callable[[], Any]
+) -> Samples:
+    """Exchange by pairs of ends, which `new` makes, within a group of tasks, as `new_group`'s."""
+    reply, replies = new(math.inf)
+    streams = [new(math.inf) for _ in range(case.nodes - 1)]
+    async with new_group() as group:
+        for number, (_, stream) in enumerate(streams, start=2):
+            group.start_soon(_listen_stream, number, stream, reply.send_nowait)
+        puts = [output.send_nowait for output, _ in streams]
+        samples: Samples = await _exchange(case, puts, replies.receive)
+        group.cancel_scope.cancel()
+    for end in (reply, replies, *(end for ends in streams for end in ends)):
+        end.close()
+    return samples
+
+
+def _measure_on(new_loop: Callable[[], asyncio.AbstractEventLoop]) -> Callable[[Case], Samples]:
+    def measure(case: Case) -> Samples:
+        with asyncio.Runner(loop_factory=new_loop) as runner:
+            return runner.run(_by_queues(case))
+
+    return measure
+
+
+def measure_anyio(case: Case) -> Samples:
+    """Measure round trips through memory object streams."""
+    anyio: Any = importlib.import_module("anyio")
+    ends, group = anyio.create_memory_object_stream, anyio.create_task_group
+    samples: Samples = anyio.run(
+        _by_streams, case, ends, group, backend="asyncio", backend_options={"use_uvloop": True}
+    )
+    return samples
+
+
+def measure_trio(case: Case) -> Samples:
+    """Measure round trips through memory channels."""
+    trio: Any = importlib.import_module("trio")
+    samples: Samples = trio.run(_by_streams, case, trio.open_memory_channel, trio.open_nursery)
+    return samples
+
+
+SYSTEMS = (
+    System(
+        name="asyncio.Queue (asyncio)",
+        modes=("stream",),
+        slowness=10,
+        version=lambda: f"Python {platform.python_version()}",
+        measure=_measure_on(asyncio.new_event_loop),
+    ),
+    System(
+        name="asyncio.Queue (uvloop)",
+        modes=("stream",),
+        slowness=5,
+        version=versions("uvloop"),
+        measure=_measure_on(uvloop.new_event_loop),
+    ),
+    System(
+        name="anyio streams (uvloop)",
+        modes=("stream",),
+        slowness=6,
+        missing=needs(anyio="anyio", uvloop="uvloop"),
+        version=versions("anyio", "uvloop"),
+        measure=measure_anyio,
+    ),
+    System(
+        name="trio channels",
+        modes=("stream",),
+        slowness=12,
+        missing=needs(trio="trio"),
+        version=versions("trio"),
+        measure=measure_trio,
+    ),
+)
