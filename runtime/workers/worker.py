@@ -31,6 +31,7 @@ from runtime.clock import Clock
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.schedule import SECOND
 from runtime.workers.costs import Costs
+from runtime.workers.output import Output, how_it_ended
 from runtime.workers.shared_memory import SharedPipe, anonymous_file
 
 W = TypeVar("W")
@@ -213,7 +214,6 @@ class _Process:
     ) -> None:
         self.name = name
         self._timeout = timeout
-        self._printed = printed
         self._died = died
         self._costs = costs
         self._looked = -math.inf  # at its memory, on `time.monotonic`
@@ -223,7 +223,7 @@ class _Process:
         self._lock = threading.Lock()
         self._closing = False
         self._error: WorkerError | None = None
-        self._tail: collections.deque[str] = collections.deque(maxlen=20)
+        self._lines = Output(printed)
         ours, theirs = socket.socketpair()
         limit = min(timeout, _LONGEST)
         ours.setsockopt(
@@ -346,22 +346,19 @@ class _Process:
 
     def _exit(self) -> str:
         try:
-            code = self._child.wait(_GRACE)
+            return how_it_ended(self._child.wait(_GRACE))
         except subprocess.TimeoutExpired:
             return "closed its connection"
-        return f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
     def _story(self, what: str) -> str:
         self._output.join(_GRACE)
-        tail = "; its last output:\n" + "\n".join(self._tail) if self._tail else "; it said nothing"
-        return f"worker {self.name}: {what}{tail}"
+        return self._lines.story(f"worker {self.name}: {what}")
 
     def _read_output(self) -> None:
         """Read what the process prints until it ends, even if others could still write there."""
         assert self._child.stdout is not None
         readable = select.poll()
         readable.register(self._child.stdout, select.POLLIN)
-        begun = b""
         with self._child.stdout as output:
             while True:
                 ended = self._child.poll() is not None
@@ -372,16 +369,8 @@ class _Process:
                 read = os.read(output.fileno(), 1 << 16)
                 if not read:
                     break
-                *lines, begun = (begun + read).split(b"\n")
-                for line in lines:
-                    self._keep_line(line)
-        if begun:
-            self._keep_line(begun)
-
-    def _keep_line(self, line: bytes) -> None:
-        text = line.decode(errors="replace").rstrip()
-        self._tail.append(text)
-        self._printed(text)
+                self._lines.take(read)
+        self._lines.end()
 
     def close(self) -> None:
         """Tell the process to end."""
