@@ -188,8 +188,12 @@ class LockstepLoop(asyncio.SelectorEventLoop):
                 due = timer
             if due < self.now:
                 due = self.now
-            if self.gate is not None and not self.gate.may_go(self._key(due, timer, held)):
-                return wait(None)
+            if self.gate is not None:
+                may_go = self.gate.may_go(self._key(due, timer, held))
+                if ready:  # by what the gate has done
+                    return []
+                if not may_go:
+                    return wait(None)
             if due == self.now:
                 pass
             elif due == _NEVER:

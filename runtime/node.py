@@ -38,6 +38,7 @@ from runtime.json_values import plain
 from runtime.logs import NodeLogger
 from runtime.schedule import SECOND, Tick, Ticker
 from runtime.sender import Sender
+from runtime.stepping import Stepping
 from runtime.streams import Stream
 from runtime.workers.worker import Worker
 
@@ -88,6 +89,7 @@ class Host(Protocol):
     Attributes:
         siblings: All nodes of the run, in file order.
         shared: What nodes of this process share, by name.
+        stepping: Pauses and steps simulated time.
     """
 
     seed: int
@@ -96,6 +98,7 @@ class Host(Protocol):
     checking: bool
     siblings: tuple[Sibling, ...]
     shared: dict[str, Any]
+    stepping: Stepping
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as part of a node."""
@@ -150,6 +153,7 @@ class Node(Generic[C]):
         name: As in the file.
         config: The node's settings.
         clock: The run's clock; the only time that a node should know.
+        stepping: Pauses and steps simulated time.
         log: The node's logger (trace, debug, info, warning, error, fatal).
         rng: Random numbers that depend on the run's seed and the node's name only.
         seed: The run's, for random numbers that nodes share.
@@ -171,6 +175,7 @@ class Node(Generic[C]):
     name: str
     config: C
     clock: Clock
+    stepping: Stepping
     log: NodeLogger
     rng: np.random.Generator
     seed: int
@@ -385,6 +390,7 @@ def make_node(
     node.name = name
     node.config = config
     node.clock = host.clock
+    node.stepping = host.stepping
     node.log = NodeLogger(name)
     node.rng = np.random.default_rng([host.seed, zlib.crc32(name.encode())])
     node.seed = host.seed

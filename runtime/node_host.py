@@ -23,6 +23,7 @@ from runtime.node_runner import Create, NodeRunner
 from runtime.parameter_server import ParameterServer
 from runtime.run_state import RunState
 from runtime.schedule import Tick, Ticker
+from runtime.stepping import Stepping
 from runtime.streams import Stream
 from runtime.workers.costs import Costs
 from runtime.workers.worker import Worker
@@ -63,6 +64,7 @@ class NodeHost:
         self.clock = state.clock
         self.siblings = siblings(state.config, state.runners)
         self.shared: dict[str, Any] = {}
+        self.stepping = Stepping(state.clock, over=lambda: bool(state.reason))
         self.instruments = instruments
         self.parameters = parameters
         self.stop = stop

@@ -64,6 +64,7 @@ class Supervisor:
         state: What is known of the run.
         instruments: What looks at the run.
         parameters: Changes settings of nodes.
+        stepping: Pauses and steps simulated time.
         peers: The other processes of the run, if there are any.
     """
 
@@ -84,6 +85,7 @@ class Supervisor:
         self._host = NodeHost(
             self.state, out, self.instruments, self.parameters, self._own, self.stop, self.fault
         )
+        self.stepping = self._host.stepping
         self._taps = tuple(taps)
         self.peers: Peers | None = None
         if several:

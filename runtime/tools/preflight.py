@@ -39,6 +39,7 @@ from runtime.paths import written
 from runtime.schedule import Tick, Ticker
 from runtime.sender import Listener
 from runtime.startup import Announced, Phase, start_up
+from runtime.stepping import Stepping
 
 RUN_FILES = ("config.toml", "log.txt", "summary.json")
 """What the run itself writes into its folder."""
@@ -172,6 +173,7 @@ class _DryHost:
         self.clock = clock
         self.siblings = siblings(config, {spec.name for spec in config.nodes})
         self.shared: dict[str, Any] = {}
+        self.stepping = Stepping(clock)
         self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
         )

@@ -23,6 +23,7 @@ from runtime import code_location
 from runtime.errors import NodeTimeoutError
 from runtime.lockstep import LockstepLoop
 from runtime.run_state import RunState
+from runtime.stepping import Stepping
 from runtime.watchdogs.loop import idle
 
 log = logging.getLogger("visnav.runtime")
@@ -175,9 +176,11 @@ class ProgressWatchdog:
 
 def _explain_time(loop: LockstepLoop, run: RunState) -> str:
     """Describe what simulated time waits for."""
-    if loop.gate is not None:
-        paused = getattr(loop.gate, "paused", False)
-        return "" if paused else "the other processes of the run"
+    if isinstance(loop.gate, Stepping):
+        if loop.gate.state == "paused":
+            return ""
+    elif loop.gate is not None:
+        return "the other processes of the run"
     if (wait := loop.waits_for()) is None:
         return "busy"
     if not isinstance(wait, asyncio.Future):

@@ -14,6 +14,7 @@ from runtime.hold import Hold, HoldConfig
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.node import Node, NodeConfig, Sibling, make_node
 from runtime.schedule import Tick, Ticker
+from runtime.stepping import Stepping
 from runtime.workers.worker import Worker
 
 N = TypeVar("N", bound=Node[Any])
@@ -54,6 +55,7 @@ class NoHost:
         self.checking = False
         self.siblings: tuple[Sibling, ...] = ()
         self.shared: dict[str, Any] = {}
+        self.stepping = Stepping(self.clock)
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         raise NotImplementedError

@@ -32,7 +32,6 @@ from runtime.tools.monitor.snapshot import (
     Snapshot,
     TickState,
 )
-from runtime.tools.monitor.timekeeping import Timekeeper
 
 
 class Observer:
@@ -49,7 +48,6 @@ class Observer:
         self._state = supervisor.state
         self._config = config
         self._records = records
-        self._keeper = Timekeeper(self._state.clock, over=lambda: bool(self._state.reason))
         self._meter: Meter | None = None
         self._recent = RecentSamples(self._sample())
         self._settings: dict[str, tuple[NodeConfig, dict[str, str]]] = {}
@@ -89,9 +87,9 @@ class Observer:
                 now=now / SECOND,
                 duration=float(self._config.run.duration),
                 speed=self._recent.run / self._recent.real,
-                target_speed=self._keeper.target_speed,
-                paused=self._keeper.paused,
-                fixed=self._keeper.fixed(),
+                target_speed=self._supervisor.stepping.target_speed,
+                paused=self._supervisor.stepping.state != "running",
+                fixed=self._supervisor.stepping.fixed(),
             ),
             nodes=[self._node(runner) for runner in state.runners.values()],
             outputs=self._outputs(sample),
@@ -224,22 +222,19 @@ class Observer:
         Raises:
             VisnavError: It cannot be carried out; the message says why.
         """
-        keeper = self._keeper
+        stepping = self._supervisor.stepping
         match command:
             case Pause():
-                keeper.pause()
+                stepping.pause()
                 return "paused"
             case Resume():
-                keeper.resume()
+                stepping.resume()
                 return "runs"
-            case Step(seconds=None):
-                keeper.step(None)
-                return "one step"
             case Step(seconds=seconds):
-                keeper.step(seconds)
-                return f"runs for {seconds:g} s"
+                stepping.step(None if seconds is None else max(round(seconds * SECOND), 1))
+                return "one step" if seconds is None else f"runs for {seconds:g} s"
             case Speed(factor=factor):
-                keeper.pace(factor)
+                stepping.pace(factor)
                 return "as fast as it can" if factor is None else f"{factor:g} × real time"
             case Stop():
                 self._supervisor.stop("stopped by hand")

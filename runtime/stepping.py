@@ -1,11 +1,16 @@
 """Pauses and steps simulated time, and sets its speed.
 
-None of this is possible in real time: sensors and vehicles do not wait.
+None of this is possible in real time: sensors and vehicles do not wait. Time stands between two
+instants: all that is due up to the instant at which it stands has been done, that instant
+included, and all that is due later has not. What happens is therefore the same, in the same order,
+in a run that is paused and stepped and in one that is not: they have equal digests.
 """
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
+from typing import Literal
 
 from runtime.clock import Clock
 from runtime.errors import CommandError
@@ -13,8 +18,10 @@ from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.schedule import SECOND
 
 
-class Timekeeper:
+class Stepping:
     """Controls a run's clock; it is the loop's `runtime.lockstep.Gate` while time is paused.
+
+    All of its methods are called on the run's loop.
 
     Args:
         clock: The run's clock.
@@ -26,6 +33,8 @@ class Timekeeper:
         self._loop = clock._loop if isinstance(clock, LockstepClock) else None
         self._limit = 0
         """The time (ns) up to which the loop may go while this is its gate."""
+        self._steps: list[tuple[int, asyncio.Future[int]]] = []
+        """When each step that goes on now began (ns), and who waits for it."""
 
     def fixed(self) -> str:
         """Return why time cannot be controlled; empty if it can."""
@@ -36,9 +45,11 @@ class Timekeeper:
         return ""
 
     @property
-    def paused(self) -> bool:
-        """Whether time is paused, or will be after the current step."""
-        return self._loop is not None and self._loop.gate is self
+    def state(self) -> Literal["running", "stepping", "paused"]:
+        """Whether time runs, runs for a step, or stands."""
+        if self._loop is None or self._loop.gate is not self or self._over():
+            return "running"
+        return "stepping" if self._steps else "paused"
 
     @property
     def target_speed(self) -> float | None:
@@ -49,10 +60,18 @@ class Timekeeper:
 
     def may_go(self, key: tuple[int, int, int]) -> bool:
         """Tell whether the loop may go on to what is due next."""
-        return key[0] <= self._limit or self._over()
+        if self._over():
+            self._end_steps()
+            return True
+        if key[0] <= self._limit:
+            return True
+        assert self._loop is not None
+        self._loop.now = max(self._loop.now, self._limit)  # nothing need be due there
+        self._end_steps()
+        return False
 
     def pause(self) -> None:
-        """Pause time.
+        """Let time stand once all that is due by now is done; a step ends.
 
         Raises:
             CommandError: Time cannot be controlled.
@@ -62,7 +81,7 @@ class Timekeeper:
         loop.gate = self
 
     def resume(self) -> None:
-        """Resume time.
+        """Let time run; a step ends.
 
         Raises:
             CommandError: Time cannot be controlled.
@@ -70,24 +89,33 @@ class Timekeeper:
         loop = self._checked()
         loop.gate = None
         loop._wall_origin = None  # else it would hurry to make up for the pause
+        self._end_steps()
 
-    def step(self, seconds: float | None) -> None:
-        """Let time run a little, and then pause.
+    def step(self, ns: int | None = None) -> asyncio.Future[int]:
+        """Let time run a little, and then stand.
 
         Args:
-            seconds: How far; `None`: to what is due next, all at the same time included.
+            ns: How far, nanoseconds, from 1; `None`: to what is due next. A step that is asked
+                for while another goes on is added to it.
+
+        Returns:
+            The nanoseconds by which time has gone on, once it stands again: fewer than `ns` if
+            time was paused or resumed, or the run ended, before.
 
         Raises:
             CommandError: Time cannot be controlled.
+            ValueError: `ns` is less than 1.
         """
         loop = self._checked()
+        if ns is not None and ns < 1:
+            raise ValueError(f"expected a step of 1 ns or more, found {ns}")
         begin = max(loop.now, self._limit) if loop.gate is self else loop.now
-        if seconds is None:
-            self._limit = max(_next_due(loop), begin)
-        else:
-            self._limit = begin + round(seconds * SECOND)
+        self._limit = max(_next_due(loop), begin) if ns is None else begin + ns
         loop.gate = self
         loop._wall_origin = None
+        done: asyncio.Future[int] = loop.create_future()
+        self._steps.append((loop.now, done))
+        return done
 
     def pace(self, factor: float | None) -> None:
         """Set the speed of time.
@@ -101,6 +129,13 @@ class Timekeeper:
         loop = self._checked()
         loop._pace = 0.0 if factor is None else 1.0 / (factor * SECOND)
         loop._wall_origin = None
+
+    def _end_steps(self) -> None:
+        assert self._loop is not None
+        steps, self._steps = self._steps, []
+        for begin, done in steps:
+            if not done.done():  # whoever waited may have been cancelled
+                done.set_result(self._loop.now - begin)
 
     def _checked(self) -> LockstepLoop:
         if reason := self.fixed():
