@@ -8,9 +8,11 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 import re
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -46,9 +48,13 @@ WAITING = 64
 PAUSE = 0.001
 """Seconds between two looks at what has come: what comes faster is taken in handfuls."""
 
+HEARTBEAT = 0.5
+"""Seconds after which a kept message that nothing followed is told of, as rmw_zenoh_cpp does."""
+
 CLOSING = 3.0
 """Seconds."""
 
+_QUEUE = "transport/link/tx/queue/congestion_control"
 _OURS: dict[str, Any] = {
     "mode": "peer",
     "scouting/multicast/enabled": False,
@@ -57,7 +63,7 @@ _OURS: dict[str, Any] = {
     "listen/endpoints": ["tcp/localhost:0"],
     "connect/timeout_ms": -1,  # try for ever,
     "connect/exit_on_failure": False,  # but beside the run; and again if a router goes
-    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP,
+    f"{_QUEUE}/drop/wait_before_drop": WAIT_BEFORE_DROP,
 }
 """Instead of Zenoh's own defaults, which are to listen on all addresses, and to use multicast."""
 
@@ -80,6 +86,8 @@ class Session:
         listen: Endpoints to listen on.
         file: A Zenoh configuration. What it leaves out, and the two endpoints if they are `None`,
             is as without a file: that of rmw_zenoh_cpp.
+        max_wait: Real seconds for which a held message waits for a peer that does not read; then
+            it counts as failed, and the connection to that peer is given up.
 
     Raises:
         SessionError: It cannot be opened.
@@ -93,10 +101,13 @@ class Session:
         connect: tuple[str, ...] | None = None,
         listen: tuple[str, ...] | None = None,
         file: str = "",
+        max_wait: float = 5.0,
     ) -> None:
         self._node = node
         self._keys = keys
+        self._max_wait = max_wait
         configuration = _configuration(connect, listen, file)
+        configuration.insert_json5(f"{_QUEUE}/block/wait_before_close", f"{max_wait * 1e6:.0f}")
         try:
             self._session = zenoh.open(configuration)
         except (zenoh.ZError, OSError) as error:
@@ -116,8 +127,8 @@ class Session:
 
         Args:
             topic: Its topic.
-            held: Whether every message must arrive: it is reliable, keeps all, and a put waits for
-                a peer that reads slowly rather than drop a message.
+            held: Whether every message must arrive: it is reliable, keeps all, and a put waits
+                (up to `max_wait`) for a peer that reads slowly rather than drop a message.
         """
         if held:
             qos = msgspec.structs.replace(topic.qos, reliable=True, keep_all=True)
@@ -125,9 +136,7 @@ class Session:
         qos, key, control = topic.qos, self._key(topic), zenoh.CongestionControl
         token = endpoint_token(self._node, self.zid, 0, next(self._ids), "MP", topic)
         options: dict[str, Any] = {
-            "congestion_control": (
-                control.BLOCK if qos.reliable and qos.keep_all else control.DROP
-            ),
+            "congestion_control": control.BLOCK if qos.reliable and qos.keep_all else control.DROP,
             "reliability": (
                 zenoh.Reliability.RELIABLE if qos.reliable else zenoh.Reliability.BEST_EFFORT
             ),
@@ -135,17 +144,23 @@ class Session:
         plain = self._session.declare_publisher(key, **options)
         declared: Any = plain
         if qos.transient_local:
+            heartbeat = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT)
             declared = zenoh.ext.declare_advanced_publisher(
                 self._session,
                 key,
                 cache=zenoh.ext.CacheConfig(max_samples=qos.depth),
+                sample_miss_detection=heartbeat if qos.reliable else None,
                 publisher_detection=True,
                 **options,
             )
         if self._keys == "rmw_zenoh":
             self._keep(token)
         owner = gid(token) if self._keys == "rmw_zenoh" else None
-        return Publisher(topic, declared, owner, plain)
+        publisher = Publisher(topic, declared, owner, plain, self._max_wait)
+        if qos.transient_local:
+            answer = publisher.answer
+            self._kept.append(self._session.declare_queryable(key, answer, complete=True))
+        return publisher
 
     def subscribe(self, topic: Topic, take: Take) -> None:
         """Declare a subscription, and show it to ROS."""
@@ -226,7 +241,15 @@ class Session:
         if not late:
             return self._session.declare_subscriber(key, channel)
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.qos.depth)
-        return zenoh.ext.declare_advanced_subscriber(self._session, key, channel, history=history)
+        recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        return zenoh.ext.declare_advanced_subscriber(
+            self._session,
+            key,
+            channel,
+            history=history,
+            recovery=recovery if topic.qos.reliable else None,
+            subscriber_detection=True,
+        )
 
     def _key(self, topic: Topic) -> str:
         if self._keys == "ros2dds":
@@ -243,16 +266,22 @@ class Publisher:
     Attributes:
         topic: Which.
         sent: How many messages went out.
-        failed: How many did not, since the session is closed.
+        failed: How many did not, since the session is closed, or a peer did not read one that is
+            held: whoever needs all of them has to look at it.
     """
 
-    def __init__(self, topic: Topic, declared: Any, gid_: bytes | None, plain: Any) -> None:
+    def __init__(
+        self, topic: Topic, declared: Any, gid_: bytes | None, plain: Any, max_wait: float
+    ) -> None:
         self.topic = topic
         self.sent = self.failed = 0
         self._put = declared.put
         self._gid = gid_
+        self._max_wait = max_wait if topic.qos.reliable and topic.qos.keep_all else math.inf
         self._plain = plain
         """What Zenoh tells the match of, which it does not of an advanced publisher."""
+        depth = topic.qos.depth if topic.qos.transient_local else 0
+        self._last: deque[tuple[bytes, bytes | None]] = deque(maxlen=depth)
 
     def matched(self) -> bool:
         """Tell whether somebody subscribes to the topic."""
@@ -261,15 +290,27 @@ class Publisher:
 
     def put(self, message: bytearray) -> None:
         """Put a message; its bytes may be overwritten afterwards."""
+        attachment = None
+        if self._gid is not None:
+            number = self.sent + self.failed + 1
+            attachment = pack(Attachment(number, time.time_ns(), self._gid))
+        if self._last.maxlen:
+            self._last.append((bytes(message), attachment))
+        begin = time.monotonic()
         try:
-            if self._gid is None:
-                self._put(message)
-            else:
-                attachment = Attachment(self.sent + 1, time.time_ns(), self._gid)
-                self._put(message, attachment=pack(attachment))
-            self.sent += 1
+            self._put(message, attachment=attachment)
+            # Zenoh says nothing of a message that it gives up.
+            gone_out = time.monotonic() - begin < self._max_wait
         except zenoh.ZError:
-            self.failed += 1
+            gone_out = False
+        self.sent += gone_out
+        self.failed += not gone_out
+
+    def answer(self, query: zenoh.Query) -> None:
+        """Answer who joins late and asks for the topic's key, with the messages that are kept."""
+        for message, attachment in tuple(self._last):
+            with contextlib.suppress(zenoh.ZError):
+                query.reply(self._plain.key_expr, message, attachment=attachment)
 
 
 def _read(subscriber: Any, take: Take) -> None:

@@ -4,23 +4,13 @@ from __future__ import annotations
 
 import json
 import queue
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from nodes.ros2_bridge.attachment import Message, gid, unpack
-from nodes.ros2_bridge.keys import (
-    Kind,
-    NodeName,
-    Token,
-    data_key,
-    endpoint_token,
-    node_token,
-)
+from nodes.ros2_bridge.keys import NodeName, data_key, endpoint_token, node_token
 from nodes.ros2_bridge.session import Session, SessionError, _configuration
 from nodes.ros_messages.topics import Qos, Topic
 from tests.nodes.ros2_bridge.network import free_port, zenoh_session
@@ -59,55 +49,6 @@ def test_tokens_and_messages_are_seen_from_outside_and_end_with_the_session() ->
         assert gone == expected
     publisher.put(bytearray(b"three"))
     assert (publisher.sent, publisher.failed) == (2, 1)
-
-
-def test_endpoints_are_told_of_when_they_appear_and_when_their_process_is_killed() -> None:
-    locator = f"tcp/127.0.0.1:{free_port()}"
-    told: queue.SimpleQueue[tuple[bool, Token]] = queue.SimpleQueue()
-    session = Session(NODE, connect=(), listen=(locator,))
-    session.publisher(TOPIC)
-    with zenoh_session(connect=locator) as other:
-        early = other.liveliness().declare_token(foreign_token("MS", TOPIC))
-        while not list(session._session.liveliness().get(foreign_token("MS", TOPIC))):
-            pass
-        session.watch(TOPIC.name, "MS", lambda there, token: told.put((there, token)))
-        there, token = told.get(timeout=10)
-        assert (there, token.key, token.topic) == (True, foreign_token("MS", TOPIC), TOPIC)
-        early.undeclare()  # type: ignore[no-untyped-call]
-        assert told.get(timeout=10) == (False, token)
-    session.subscribe(TOPIC, lambda _: None)  # its own are not told of
-    process = subprocess.Popen(
-        [sys.executable, "-c", TOKENS, locator, foreign_token("MS", TOPIC)],
-        stdout=subprocess.PIPE,
-    )
-    try:
-        assert told.get(timeout=20) == (True, token)
-        process.kill()
-        killed = time.monotonic()
-        assert told.get(timeout=5) == (False, token)
-        assert time.monotonic() - killed < 5.0
-        assert told.empty()
-    finally:
-        process.kill()
-        process.communicate()
-        session.close()
-
-
-def foreign_token(kind: Kind, topic: Topic) -> str:
-    """Return a token as newer releases have it."""
-    return endpoint_token(NODE, "ff1", 0, 7, kind, topic) + "/cpu:,demo:version=1.0"
-
-
-TOKENS = """
-import json, sys, time, zenoh
-c = zenoh.Config()
-c.insert_json5("scouting/multicast/enabled", "false")
-c.insert_json5("listen/endpoints", "[]")
-c.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
-session = zenoh.open(c)
-tokens = [session.liveliness().declare_token(key) for key in sys.argv[2:]]
-time.sleep(60)
-"""
 
 
 def test_a_configuration_file_says_where_to_listen(tmp_path: Path) -> None:
