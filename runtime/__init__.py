@@ -24,7 +24,6 @@ from runtime.bundles import Bundle
 from runtime.clock import Clock
 from runtime.config.parameters import Changeable
 from runtime.errors import RefusedError, VisnavError
-from runtime.hold import Hold, HoldConfig, Owed
 from runtime.node import Node, NodeConfig
 from runtime.ports import Input, Output, every, on
 from runtime.schedule import Tick
@@ -37,13 +36,10 @@ __all__ = [
     "Changeable",
     "Clock",
     "Duration",
-    "Hold",
-    "HoldConfig",
     "Input",
     "Node",
     "NodeConfig",
     "Output",
-    "Owed",
     "RefusedError",
     "Stream",
     "Tick",

@@ -10,10 +10,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from runtime import Duration, Hold, HoldConfig, Input, Node, NodeConfig, Output, Owed
+from runtime import Duration, Input, Node, NodeConfig, Output
 from runtime.config.model import Config, OnError, RunConfig
 from runtime.errors import VisnavError
 from runtime.execute import execute
+from runtime.hold import Hold, HoldConfig, Owed
 from runtime.summary import Summary
 from runtime.testing import spec
 from runtime.tools.cli.tables import run_tables
