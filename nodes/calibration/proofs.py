@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Imu, ImuAnnouncement
 from events.poses import pose_matrix
-from nodes.calibration.collector import _Collector
+from nodes.calibration.collector import Floats, Motion, _Collector
 from nodes.calibration.formats import FORMATS, GRAVITY, write_files
-from nodes.calibration.motion import Floats, Motion
 from nodes.calibration.readers import read
 from nodes.calibration.room import NEAREST, hits, spheres
 from nodes.dataset.rig import Rig

@@ -15,8 +15,7 @@ from events import CameraAnnouncement, Image, ImuAnnouncement, Odometry
 from events.rotations import from_rpy
 from nodes.calibration import proofs
 from nodes.calibration.allan import Curve, needed, noise
-from nodes.calibration.collector import _Collector
-from nodes.calibration.motion import Motion
+from nodes.calibration.collector import Motion, _Collector
 from nodes.calibration.proofs import Figure, Points
 from nodes.calibration.room import CENTRE, mjcf
 from nodes.dataset.rig import choose

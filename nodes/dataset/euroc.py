@@ -17,10 +17,8 @@ from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, Vector3
 from events.frames import flip_yz, rotation_to_nwu
 from events.poses import pose_matrix
 from events.rotations import rotate
-from nodes.dataset.images import ImageFile, in_16_bits, in_grey
-from nodes.dataset.recording import Recording, real
+from nodes.dataset.recording import ImageFile, Recording, RowFile, in_16_bits, in_grey, real
 from nodes.dataset.rig import WORLD_AXES, Rig
-from nodes.dataset.rows import RowFile
 from nodes.trajectory.formats import EUROC_HEADER, euroc_row
 
 _IMU_HEADER = (

@@ -11,8 +11,7 @@ import msgspec
 
 from events import Announcement, DepthImage, Image, Imu, Odometry, PoseStamped
 from nodes.dataset.euroc import Euroc
-from nodes.dataset.images import ImageFile
-from nodes.dataset.recording import Recording
+from nodes.dataset.recording import ImageFile, Recording
 from nodes.dataset.rig import choose
 from nodes.dataset.tum_mono import TumMono
 from nodes.dataset.tum_rgbd import TumRgbd

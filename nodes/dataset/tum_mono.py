@@ -14,8 +14,7 @@ import numpy as np
 from events import CameraInfo, Image, PoseStamped
 from events.frames import flip_yz, rotation_to_nwu
 from events.photometry import response_light, vignette_map
-from nodes.dataset.images import ImageFile, in_grey
-from nodes.dataset.recording import Recording
+from nodes.dataset.recording import ImageFile, Recording, in_grey
 from nodes.dataset.rig import Rig
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.table import seconds_text

@@ -12,10 +12,8 @@ from pathlib import Path
 from events import DepthImage, Image, Imu, PoseStamped
 from events.frames import flip_yz, rotation_to_nwu
 from events.rotations import rotate
-from nodes.dataset.images import ImageFile, in_16_bits, in_colour
-from nodes.dataset.recording import Recording, real
+from nodes.dataset.recording import ImageFile, Recording, RowFile, in_16_bits, in_colour, real
 from nodes.dataset.rig import WORLD_AXES, Rig
-from nodes.dataset.rows import RowFile
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.table import seconds_text
 

@@ -5,9 +5,9 @@ from nodes.estimation.estimator import (
     Estimator,
     EstimatorConfig,
     RgbdFrame,
+    TrackingResult,
 )
 from nodes.estimation.mount import Mount
-from nodes.estimation.tracking import TrackingResult
 
 __all__ = [
     "WORKER_ENVIRONMENT",

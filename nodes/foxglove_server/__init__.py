@@ -1,8 +1,8 @@
 """Foxglove: a live view over a WebSocket (the extra `foxglove`).
 
 Read in this order: `settings`, `node` (which events it takes, and where they are passed on),
-`publishing` (topics, and what becomes of each event), `messages`, `scene` (the paths to draw),
-`server` (the only import of foxglove) and `gate` (which pages may connect).
+`publishing` (topics, and what becomes of each event), `messages`, `server`
+(the only import of foxglove) and `gate` (which pages may connect).
 """
 
 from nodes.foxglove_server.node import FoxgloveServer

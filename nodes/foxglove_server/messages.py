@@ -25,12 +25,12 @@ from events import (
     Vector3,
 )
 from events.frames import convert_covariance
-from nodes.foxglove_server.scene import Trail
 from nodes.ros_messages.calibration import projection_matrix
 from nodes.ros_messages.images import LIDAR_POINT
 from nodes.viewing.appearance import INLIER, OUTLIER, VEHICLE, Box, Colour, describe
 from nodes.viewing.encoding import depth_in_steps, encode_image
 from nodes.viewing.measurements import as_json, fields_of
+from nodes.viewing.paths import Trail
 from runtime.schedule import SECOND
 
 _VECTOR = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyz"}}

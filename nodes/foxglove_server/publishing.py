@@ -39,14 +39,13 @@ from events import (
     Wind,
 )
 from nodes.foxglove_server.messages import SCORE_SCHEMA, Messages, measurement_schema
-from nodes.foxglove_server.scene import Trail
 from nodes.foxglove_server.server import Server
 from nodes.foxglove_server.settings import FoxgloveConfig
 from nodes.trajectory import RecentPoses
 from nodes.vehicles import Vehicles
 from nodes.viewing.appearance import PLAN, Colour, estimate_colour, moving_body, truth_colour
-from nodes.viewing.estimates import estimate_frame
 from nodes.viewing.measurements import MEASURED
+from nodes.viewing.paths import Trail, estimate_frame
 from nodes.viewing.selection import PlanSelection
 
 _MAP_IN_WORLD: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)

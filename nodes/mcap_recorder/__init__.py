@@ -1,7 +1,7 @@
 """Recordings in MCAP, with ROS 2's messages for its tools and the events as they are for replays.
 
 `node` takes all events; `backlog` holds those that wait, `writer_process` hands them through `pipe`
-to the process that writes (`process`, with `requests` for what the two send each other). There
+to the process that writes (`process`); in `pipe` is all that the two send each other. There
 `event_writer` makes messages of events. `recover` repairs files of runs that were killed; what is
 in a file is for `nodes.mcap`, replays are for `nodes.replay`.
 """

@@ -10,7 +10,7 @@ from pathlib import Path
 from events import Announcement, Event
 from nodes.mcap.disk import RecordingError
 from nodes.mcap_recorder.backlog import Backlog
-from nodes.mcap_recorder.requests import WriteRequest
+from nodes.mcap_recorder.pipe import WriteRequest
 from nodes.mcap_recorder.settings import McapRecorderConfig
 from nodes.mcap_recorder.writer_process import STANDSTILL, WriterProcess
 from nodes.trajectory.growing import part_name

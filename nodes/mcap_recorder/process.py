@@ -19,7 +19,7 @@ from nodes.mcap.disk import RecordingError
 from nodes.mcap.mcap_file import McapWriter
 from nodes.mcap_recorder import pipe
 from nodes.mcap_recorder.event_writer import EventWriter
-from nodes.mcap_recorder.requests import Reply, WriteRequest
+from nodes.mcap_recorder.pipe import Reply, WriteRequest
 from runtime.errors import MissingDependencyError, WireError
 
 LONGEST = 0.4

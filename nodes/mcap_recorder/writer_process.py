@@ -24,7 +24,7 @@ from events import Announcement
 from nodes.mcap.disk import RecordingError
 from nodes.mcap_recorder import pipe
 from nodes.mcap_recorder.backlog import Backlog, Waiting
-from nodes.mcap_recorder.requests import Reply, WriteRequest, command
+from nodes.mcap_recorder.pipe import Reply, WriteRequest, command
 from runtime.errors import MissingDependencyError, WireError
 from runtime.wire import pack
 

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from nodes.monocular_odometry.bundle import adjust
-from nodes.monocular_odometry.corners import new_corners
+from nodes.monocular_odometry.keyframes import new_corners
 from nodes.monocular_odometry.settings import MonocularSettings
 from nodes.monocular_odometry.views import (
     hypotheses,

@@ -1,4 +1,4 @@
-"""One frame for all of ORB-SLAM3's maps, whose own frames it rotates, scales and merges.
+"""One frame for all of ORB-SLAM3's maps, whose own frames it moves, and their points in it.
 
 ORB-SLAM3's world is that of its present map: when it has been lost for long it starts another one
 at identity, when it recognizes a place it merges the two, and when the IMU's scale and gravity
@@ -101,3 +101,39 @@ def first_key_frame(trajectory: Path) -> KeyFrame | None:
         return None
     stamp, x, y, z, qx, qy, qz, qw = map(float, words)
     return KeyFrame(stamp, pose_matrix((x, y, z), (qw, qx, qy, qz)))
+
+
+Points = npt.NDArray[np.float32]
+
+CELL = 0.05
+"""Metres; of each cell of this size, the last point that was seen is kept."""
+
+
+class Cloud:
+    """Points in the frame of the poses, by the map that they belong to.
+
+    Args:
+        cell: Metres.
+    """
+
+    def __init__(self, cell: float = CELL) -> None:
+        self._cell = cell
+        self._maps: dict[float, dict[tuple[int, ...], tuple[float, ...]]] = {}
+
+    def __len__(self) -> int:
+        return sum(map(len, self._maps.values()))
+
+    def add(self, map_: float, points: Points) -> None:
+        """Keep points of a map, shape (n, 3)."""
+        cells = np.floor(points / self._cell).astype(np.int64).tolist()
+        kept = self._maps.setdefault(map_, {})
+        kept.update(zip(map(tuple, cells), map(tuple, points.tolist()), strict=True))
+
+    def forget(self, map_: float) -> None:
+        """Leave out the points of a map, which has turned out to lie elsewhere."""
+        self._maps.pop(map_, None)
+
+    def points(self) -> Points:
+        """Return all points, shape (n, 3)."""
+        points = [point for kept in self._maps.values() for point in kept.values()]
+        return np.array(points, np.float32).reshape(-1, 3)

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from nodes.estimation import TrackingResult
-from nodes.orb_slam3.anchor import Anchor, first_key_frame
-from nodes.orb_slam3.cloud import Cloud
+from nodes.orb_slam3.anchor import Anchor, Cloud, first_key_frame
 from nodes.orb_slam3.settings import Settings
 from nodes.orb_slam3.vocabulary_file import check_vocabulary
 from runtime.errors import MissingDependencyError

@@ -19,9 +19,12 @@ imu, scores, log           plots and text; so pressures, ranges, magnetic_fields
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
 
-from events import CameraAnnouncement
+import numpy as np
+
+from events import CameraAnnouncement, Event
 
 WORLD = "map"
 PLAN = "map/plan"
@@ -104,3 +107,50 @@ def camera(announced: CameraAnnouncement, vehicles: Sequence[str]) -> str:
         return path(WORLD, "cameras", source)
     known = any(source.startswith(f"{vehicle}/") for vehicle in vehicles)
     return path(WORLD, *([] if known else vehicles[:1]), source)
+
+
+E = TypeVar("E", bound=Event)
+
+Numbered = tuple[int, E]
+"""How many events came before, and the event."""
+
+
+class EntityLog:
+    """Logs entities.
+
+    Args:
+        rr: The library.
+        stream: Its recording.
+    """
+
+    def __init__(self, rr: Any, stream: Any) -> None:
+        self.rr = rr
+        self.stream = stream
+        stream.set_log_time_enabled(False)  # one's own time lines: ``run`` and ``event``
+        stream.set_log_tick_enabled(False)
+
+    def at(self, number: int, stamp: int) -> None:
+        """Set the time of what is put next: the event's number, and its stamp (ns)."""
+        self.stream.set_time("event", sequence=number)
+        self.stream.set_time("run", duration=np.timedelta64(stamp, "ns"))
+
+    def put(self, entity: str, *what: Any) -> None:
+        """Log something at that time."""
+        self.stream.log(entity, *what)
+
+    def static(self, entity: str, *what: Any) -> None:
+        """Log what holds for the whole run."""
+        self.stream.log(entity, *what, static=True)
+
+    def columns(self, entity: str, events: Sequence[Numbered[E]], columns: Iterable[Any]) -> None:
+        """Log rows at once, one for each event."""
+        stamps = np.array([event.stamp for _, event in events], "timedelta64[ns]")
+        numbers = np.array([number for number, _ in events], np.int64)
+        self.stream.send_columns(
+            entity,
+            indexes=[
+                self.rr.TimeColumn("event", sequence=numbers),
+                self.rr.TimeColumn("run", duration=stamps),
+            ],
+            columns=columns,
+        )

@@ -22,7 +22,7 @@ from events import (
     TrackingEvent,
     VehicleEvent,
 )
-from nodes.rerun_view.entity_log import Numbered
+from nodes.rerun_view.entities import Numbered
 from nodes.rerun_view.recorder import Recorder
 from nodes.rerun_view.settings import RerunConfig
 from nodes.trajectory.growing import part_name

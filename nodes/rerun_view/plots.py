@@ -19,7 +19,7 @@ from events import (
     Wind,
 )
 from nodes.rerun_view import entities
-from nodes.rerun_view.entity_log import EntityLog, Numbered
+from nodes.rerun_view.entities import EntityLog, Numbered
 from nodes.viewing.appearance import Colour, describe
 from nodes.viewing.measurements import fields_of, numbers
 

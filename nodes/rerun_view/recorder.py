@@ -40,7 +40,7 @@ from events import (
     VehicleEvent,
     Wind,
 )
-from nodes.rerun_view.entity_log import EntityLog, Numbered
+from nodes.rerun_view.entities import EntityLog, Numbered
 from nodes.rerun_view.layout import Contents, Eye, layout
 from nodes.rerun_view.plots import GROUPS, PLOTS, Plots
 from nodes.rerun_view.sdk import Viewer, load

@@ -27,7 +27,7 @@ from events import (
     Wind,
 )
 from nodes.rerun_view import entities
-from nodes.rerun_view.entity_log import EntityLog, Numbered
+from nodes.rerun_view.entities import EntityLog, Numbered
 from nodes.rerun_view.scene_points import ScenePoints
 from nodes.rerun_view.settings import RerunConfig
 from nodes.trajectory import RecentPoses
@@ -44,8 +44,7 @@ from nodes.viewing.appearance import (
     truth_colour,
 )
 from nodes.viewing.encoding import depth_in_steps, encode_depth, encode_image
-from nodes.viewing.estimates import estimate_frame
-from nodes.viewing.paths import PathPieces
+from nodes.viewing.paths import PathPieces, estimate_frame
 from nodes.viewing.selection import PlanSelection
 
 CENTIMETRES = 100.0

@@ -30,8 +30,7 @@ from nodes.odometry.pose import (
     solve_pose,
 )
 from nodes.odometry.relocalization import detect_and_describe, relocalize
-from nodes.visual_odometry.corners import find_corners, squares
-from nodes.visual_odometry.keyframes import ORB_POINTS, Described, Keyframe
+from nodes.visual_odometry.keyframes import ORB_POINTS, Described, Keyframe, find_corners, squares
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import Rows, find_patches, half_width
 from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from events.photometry import response_light, srgb_light, vignette_map
 from sims.cameras.depth_sensor import DepthMeter
 from sims.cameras.noise import noise_steps, noisy_depth, noisy_image
-from sims.cameras.optics import defocused, mean
-from sims.cameras.response import read_response
+from sims.cameras.response import defocused, mean, read_response
 from sims.cameras.spec import CameraSpec, camera_info
 
 Image = npt.NDArray[np.uint8]

@@ -2,8 +2,8 @@
 
 Made for a worker process (a GL context belongs to the thread that made it), but works in-process.
 An exposure is *captured* (drawn, at each of its moments) and then *developed* (made the images of a
-sensor). The drawing is in `sims.cameras.stage`, effects on images are in `sims.cameras.optics` and
-`sims.cameras.noise`.
+sensor). The drawing is in `sims.cameras.stage`, effects on images are in `sims.cameras.response`
+and `sims.cameras.noise`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sims.cameras.frame import Frame
 from sims.cameras.graphics import gl_renderer, keep_memory
 from sims.cameras.lens import undistorted
 from sims.cameras.noise import generator, grey_of
-from sims.cameras.optics import moments
+from sims.cameras.response import moments
 from sims.cameras.shot import Shot
 from sims.cameras.shutter import FINER_FOR_DEPTH, image_speeds, row_bands, row_time, small_camera
 from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain

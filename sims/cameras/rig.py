@@ -25,9 +25,8 @@ from events import (
 from events.base import Quaternion, Vector3
 from runtime import Node, Worker
 from runtime.sender import Sender
-from sims.cameras.delivery import delay_of, stamp_error
 from sims.cameras.exposure import ExposureControl
-from sims.cameras.frame import Frame
+from sims.cameras.frame import Frame, delay_of, stamp_error
 from sims.cameras.lens import undistorted
 from sims.cameras.renderer import CameraRenderer
 from sims.cameras.shot import Motion, Shot

@@ -8,7 +8,7 @@ Everything here is pure: time is an argument, nothing waits, nothing is sent. On
 """
 
 from sims.vehicle.autopilot import Autopilot, Phase
-from sims.vehicle.control import Controller, Motors
+from sims.vehicle.control import Controller, Motors, Setpoint
 from sims.vehicle.gains import Gains, Limits
 from sims.vehicle.mixer import Mixer
 from sims.vehicle.model import (
@@ -20,7 +20,6 @@ from sims.vehicle.model import (
     read_parameters,
 )
 from sims.vehicle.physics import Contact, Physics, State
-from sims.vehicle.setpoints import Setpoint
 from sims.vehicle.simulation import PhysicsDivergedError, Simulation
 
 __all__ = [

@@ -43,11 +43,10 @@ from events import (
     VelocitySetpoint,
 )
 from events.rotations import yaw_of
-from sims.vehicle.control import Controller, Motors
+from sims.vehicle.control import Controller, Motors, fault
 from sims.vehicle.gains import Gains, Limits
 from sims.vehicle.model import VehicleParameters
 from sims.vehicle.physics import State
-from sims.vehicle.setpoints import fault
 
 _STOPPED: Motors = (0.0, 0.0, 0.0, 0.0)
 _IDLE: Motors = (0.05, 0.05, 0.05, 0.05)

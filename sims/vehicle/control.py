@@ -1,4 +1,4 @@
-"""The whole cascade behind one door: a set-point in, four motor commands out.
+"""The whole cascade behind one door: a checked set-point in, four motor commands out.
 
 Whether the vehicle may fly at all is not asked here; that is `autopilot`'s business.
 """
@@ -20,7 +20,6 @@ from sims.vehicle.mixer import Mixer
 from sims.vehicle.model import VehicleParameters
 from sims.vehicle.physics import State
 from sims.vehicle.position import PositionController
-from sims.vehicle.setpoints import Setpoint, fault
 
 Motors = tuple[float, float, float, float]
 """Motor commands, 0 to 1 of each motor's thrust."""
@@ -149,3 +148,32 @@ class Controller:
 
 def _clip(value: float, limit: float) -> float:
     return min(limit, max(-limit, value))
+
+
+Setpoint = PositionSetpoint | VelocitySetpoint | AttitudeSetpoint | BodyRateSetpoint
+"""What the cascade can follow."""
+
+MOST = 1e6
+"""In SI units; squares of much greater numbers would overflow in the control loops."""
+
+
+def fault(setpoint: Setpoint) -> str | None:
+    """Return what is wrong with a set-point, None if nothing is."""
+    match setpoint:
+        case PositionSetpoint():
+            numbers = [*setpoint.position, *setpoint.velocity, *setpoint.acceleration]
+            numbers += [setpoint.yaw, setpoint.yaw_rate]
+        case VelocitySetpoint():
+            if setpoint.frame_id not in ("map", "heading"):
+                return (
+                    "VelocitySetpoint.frame_id: expected 'map' or 'heading', "
+                    f"found {setpoint.frame_id!r}"
+                )
+            numbers = [*setpoint.velocity, setpoint.yaw_rate]
+        case AttitudeSetpoint():
+            numbers = [setpoint.thrust]
+        case BodyRateSetpoint():
+            numbers = [*setpoint.angular_velocity, setpoint.thrust]
+    if not all(-MOST <= number <= MOST for number in numbers):
+        return f"{type(setpoint).__name__}: expected numbers up to {MOST:g}, found {setpoint}"
+    return None

@@ -17,9 +17,9 @@ import numpy as np
 
 from sims.worlds import decals, facades, materials, yard_ground
 from sims.worlds.builder import WHOLE, Builder
+from sims.worlds.materials import add_sky
 from sims.worlds.model import Material
 from sims.worlds.patterns import Image, fractal, shade, smooth
-from sims.worlds.sky import add_sky
 from sims.worlds.yard_ground import CONTAINERS, CRATES, POSTS, TREES
 
 SUN = (0.50, 0.42, -0.76)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from runtime.config.model import Config
     from runtime.supervisor import Supervisor
-    from runtime.tools.monitor.records import LastRecords
+    from runtime.tools.monitor.observer import LastRecords
 
 Watch = Callable[["Supervisor"], contextlib.AbstractContextManager[None]]
 """What `execute` takes as `watch`."""
@@ -50,7 +50,7 @@ class Observers:
 
         from runtime.logs import terminal_handler
         from runtime.tools.cli.progress import progress
-        from runtime.tools.monitor.records import LastRecords
+        from runtime.tools.monitor.observer import LastRecords
 
         records = LastRecords()
         self.handlers: list[logging.Handler] = [records]

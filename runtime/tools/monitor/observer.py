@@ -1,7 +1,13 @@
-"""Makes snapshots of a run and carries commands out; all on the run's loop."""
+"""Makes snapshots of a run, its log's last records included, and carries commands out.
+
+All of it happens on the run's loop.
+"""
 
 from __future__ import annotations
 
+import collections
+import itertools
+import logging
 import os
 import time
 from collections import Counter
@@ -21,17 +27,44 @@ from runtime.supervisor import Supervisor
 from runtime.tools.monitor.command import Command, Pause, Restart, Resume, Set, Speed, Step, Stop
 from runtime.tools.monitor.meter import Meter
 from runtime.tools.monitor.recent import RecentSamples, Sample
-from runtime.tools.monitor.records import LastRecords
 from runtime.tools.monitor.snapshot import (
     ClockState,
     InputState,
     LinkState,
+    LogLine,
     NodeCondition,
     NodeState,
     OutputState,
     Snapshot,
     TickState,
 )
+
+KEPT = 100
+
+
+class LastRecords(logging.Handler):
+    """A handler that keeps the last records; runs in the log's own thread."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lines: collections.deque[LogLine] = collections.deque(maxlen=KEPT)
+        self._numbers = itertools.count()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a record."""
+        self._lines.append(
+            LogLine(
+                number=next(self._numbers),
+                seconds=getattr(record, "seconds", 0.0),
+                level=record.levelname,
+                logger_name=getattr(record, "logger_name", record.name),
+                text=record.getMessage(),
+            )
+        )
+
+    def lines(self) -> list[LogLine]:
+        """Return the records, the oldest first."""
+        return list(self._lines)
 
 
 class Observer:

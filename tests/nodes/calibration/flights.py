@@ -8,8 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Imu, Odometry, PoseStamped, Vector3
-from nodes.calibration.collector import _Collector
-from nodes.calibration.motion import Floats, Motion
+from nodes.calibration.collector import Floats, Motion, _Collector
 from nodes.calibration.room import CENTRE, hits
 from tests.nodes.calibration.samples import IMU
 

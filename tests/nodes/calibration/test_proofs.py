@@ -17,8 +17,7 @@ from events.frames import OPTICAL_TO_FRD
 from events.rotations import from_rpy, multiply
 from nodes.calibration import proofs
 from nodes.calibration.allan import noise, trials, variances
-from nodes.calibration.collector import _Collector
-from nodes.calibration.motion import Motion
+from nodes.calibration.collector import Motion, _Collector
 from nodes.calibration.room import HIGH, LOW, hits, mjcf, spheres
 from nodes.dataset.rig import Rig
 from tests.nodes.calibration.flights import ANGLE, flown, true_motion, twist

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from events import Announcement
-from nodes.dataset.images import ImageFile, Pixels, in_16_bits, in_colour, in_grey
+from nodes.dataset.recording import ImageFile, Pixels, RowFile, in_16_bits, in_colour, in_grey
 from nodes.dataset.rig import choose
-from nodes.dataset.rows import RowFile
 from tests.nodes.dataset.samples import camera, image, imu_announcement, png
 
 

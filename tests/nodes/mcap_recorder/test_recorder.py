@@ -18,8 +18,8 @@ from nodes.mcap.disk import RecordingError
 from nodes.mcap.mcap_file import McapWriter, contents, read
 from nodes.mcap_recorder import McapRecorder, McapRecorderConfig, pipe
 from nodes.mcap_recorder.backlog import Backlog
+from nodes.mcap_recorder.pipe import WriteRequest
 from nodes.mcap_recorder.process import FileWriter
-from nodes.mcap_recorder.requests import WriteRequest
 from nodes.mcap_recorder.writer_process import WriterProcess
 from nodes.replay.recorded import Recorded
 from runtime import Tick, every

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nodes.monocular_odometry.corners import SPACING, new_corners
-from nodes.monocular_odometry.tracks import Tracks
+from nodes.monocular_odometry.keyframes import SPACING, new_corners
+from nodes.monocular_odometry.local_map import Tracks
 from tests.nodes.monocular_odometry.world import FLAT, look, pose
 
 HERE = look(pose(), FLAT)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nodes.monocular_odometry.corners import new_corners
+from nodes.monocular_odometry.keyframes import new_corners
 from nodes.odometry.images import Floats
 from nodes.odometry.pose import rays
 from nodes.odometry.relocalization import (

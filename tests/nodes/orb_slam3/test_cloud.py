@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nodes.orb_slam3.cloud import Cloud
+from nodes.orb_slam3.anchor import Cloud
 
 
 def test_the_last_point_of_each_cell_stays() -> None:

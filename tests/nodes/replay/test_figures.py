@@ -26,7 +26,7 @@ from events import (
 from events.poses import pose_matrix
 from events.rotations import rotate
 from nodes.dataset.euroc import Euroc
-from nodes.dataset.images import in_grey
+from nodes.dataset.recording import in_grey
 from nodes.dataset.rig import choose
 from nodes.dataset.tum_rgbd import TumRgbd
 from nodes.replay.choice import Choice

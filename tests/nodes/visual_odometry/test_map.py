@@ -8,8 +8,8 @@ import pytest
 from events.poses import inverse
 from nodes.odometry.images import Floats
 from nodes.odometry.pose import rays
-from nodes.visual_odometry.corners import find_corners, squares
 from nodes.visual_odometry.features import FeatureSettings, FeatureTracker
+from nodes.visual_odometry.keyframes import find_corners, squares
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import find_patches
 from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at

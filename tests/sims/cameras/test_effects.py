@@ -26,7 +26,7 @@ from sims.cameras import (
 )
 from sims.cameras.development import Development
 from sims.cameras.noise import generator
-from sims.cameras.optics import moments
+from sims.cameras.response import moments
 
 EXPOSURE = 0.02
 PLAIN = CameraSpec(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sims.cameras.optics import MOST, defocused, mean, moments
+from sims.cameras.response import MOST, defocused, mean, moments
 
 
 @pytest.mark.parametrize("sigma", [0.7, 1.5, 4.0])

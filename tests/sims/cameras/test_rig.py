@@ -31,7 +31,7 @@ from runtime.errors import ConfigError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from runtime.units import Latency
 from sims.cameras import CameraSpec, optical_in_body
-from sims.cameras.delivery import delay_of
+from sims.cameras.frame import delay_of
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
 

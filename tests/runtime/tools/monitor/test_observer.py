@@ -13,8 +13,7 @@ from runtime.errors import VisnavError
 from runtime.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.monitor.command import Pause, Restart, Set, Speed, Step, Stop
-from runtime.tools.monitor.observer import Observer, describe
-from runtime.tools.monitor.records import LastRecords
+from runtime.tools.monitor.observer import LastRecords, Observer, describe
 from runtime.tools.monitor.snapshot import Snapshot
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
 

@@ -20,8 +20,7 @@ from runtime.tools.monitor import client, server
 from runtime.tools.monitor.address import find, runs
 from runtime.tools.monitor.client import Client, ask
 from runtime.tools.monitor.command import Answer, Command, Pause, Resume, Set, Speed, Stop, encode
-from runtime.tools.monitor.observer import Observer
-from runtime.tools.monitor.records import LastRecords
+from runtime.tools.monitor.observer import LastRecords, Observer
 from runtime.tools.monitor.snapshot import LogLine, Snapshot
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
 from tests.runtime.tools.monitor.samples import snapshot
