@@ -18,6 +18,7 @@ import msgspec
 
 from events import Announcement, Event
 from runtime import task_factory
+from runtime.answers import Answers
 from runtime.config.model import Config, NodeSpec, OnError, RunConfig
 from runtime.config.reading import convert
 from runtime.links import LinkConfig
@@ -44,6 +45,7 @@ class NodeResult(msgspec.Struct, frozen=True):
         drops: Inputs' peaks and drops, by ``node.port``.
         ticks: Punctuality, by ``node.method``.
         seconds: On the simulated clock.
+        outside: What became of the frames for systems outside the process, by their names.
     """
 
     sent: list[Event]
@@ -51,6 +53,7 @@ class NodeResult(msgspec.Struct, frozen=True):
     drops: dict[str, StreamSummary]
     ticks: dict[str, TickSummary]
     seconds: float
+    outside: dict[str, Answers]
 
     def of(self, event: type[E]) -> list[E]:
         """Return those events that are of this type."""
@@ -134,6 +137,7 @@ def run_nodes(
             count_drops(supervisor.state),
             tick_summaries(supervisor.state),
             loop.now / 1e9,
+            supervisor.state.outside,
         )
 
     # A test that expects an error reads it from the exception, not from the terminal.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from events import Event
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.mappings import import_mapping
@@ -49,11 +51,30 @@ class IncomingTopic:
 
     def event(self, data: bytes, now: int, stamps: Stamps) -> Event | None:
         """Return what a message becomes; `None` if it is refused, or of no use."""
+        message = self._message(data)
+        return None if message is None else self._event(message, now, stamps)
+
+    def answer(self, data: bytes, stamps: Stamps) -> tuple[int, Event | None] | None:
+        """Return the stamp of the image that a message answers (ns), and what the message becomes.
+
+        Its content may be refused, or of no use: `None`, and yet an answer. In any thread.
+        """
+        message = self._message(data)
+        if message is None:
+            return None
+        header = getattr(message, "header", message)
+        time = getattr(header, "stamp", header)
+        stamp = stamps.stamp(time.sec, time.nanosec)
+        return stamp, self._event(message, stamp, stamps)
+
+    def _message(self, data: bytes) -> Any:
         try:
-            message = self._store.deserialize(data, self.topic.type)
+            return self._store.deserialize(data, self.topic.type)
         except MessageError as error:
             self.complain(f"not a {self.topic.type}", str(error))
             return None
+
+    def _event(self, message: Any, now: int, stamps: Stamps) -> Event | None:
         context = MessageContext(
             source=self.source,
             now=now,

@@ -19,6 +19,7 @@ from events import (
     FluidPressure,
     Image,
     Imu,
+    LidarAnnouncement,
     MagneticField,
     NavSatFix,
     Odometry,
@@ -29,6 +30,8 @@ from events import (
 )
 from nodes.ros2_bridge.attachment import Message
 from nodes.ros2_bridge.complaints import Complaints
+from nodes.ros2_bridge.held_estimator import HeldEstimator, why_no_answer
+from nodes.ros2_bridge.held_line import HeldPublisher, Line
 from nodes.ros2_bridge.inbox import Inbox
 from nodes.ros2_bridge.incoming_topic import IncomingTopic
 from nodes.ros2_bridge.keys import NodeName
@@ -64,6 +67,10 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     What is announced has its topics from the start; what is not, from its first event. Messages
     from outside that make no sense are counted, logged now and then, and left out.
+
+    An ``estimate`` that `answers_to` a camera is held: simulated time waits for the answer to each
+    image. All that this node publishes is then reliable and complete, whatever `sensor_qos` says,
+    and in one order: a subscriber that reads slowly slows the run down.
     """
 
     estimates = Output(PoseEstimate)
@@ -81,7 +88,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     def __init__(self) -> None:
         self._session: Session | None = None
-        self._publishing: Publishing[Publisher] | None = None
+        self._publishing: Publishing[Publisher | HeldPublisher] | None = None
         self._queues: dict[type[Event], Stream[Any]] = {
             kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
             for kind in LARGE
@@ -90,15 +97,21 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self._unread: list[Stream[bytes]] = []
         """Images from ROS that wait to be read."""
         self._outgoing: list[tuple[OutgoingTopic, Stream[Event]]] = []
-        self._mapped: list[Publisher] = []
-        """Of the outgoing topics."""
+        self._puts: list[Callable[[Any], None]] = []
+        """Of the outgoing topics, as are their publishers."""
+        self._mapped: list[Publisher | HeldPublisher] = []
         self._cameras: list[CameraAnnouncement] = []
         self._stamps: Stamps | None = None
         self._open = False
+        self._line: Line | None = None
+        """On which all is published, in order, if there are such estimators."""
+        self._rates: dict[str, float] = {}
+        """Of announced cameras and lidars."""
         if self.config.publications:
             self._declare_mapped_events()
-        # Messages of ROS come at their own time.
-        self.deterministic = not self.config.subscriptions  # type: ignore[misc]
+        # Messages of ROS come at their own time, unless time waits for them.
+        self._unheld = [each.topic for each in self.config.subscriptions if not each.answers_to]
+        self.deterministic = not self._unheld  # type: ignore[misc]
 
     async def on_startup(self) -> None:
         """Join the network, and wait for the cameras that ROS has.
@@ -110,10 +123,11 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         config = self.config
         if config.time == "wall" and self.clock.kind != "real":
             self.log.fatal('time = "wall" needs clock = "real", found "%s"', self.clock.kind)
-        if config.subscriptions and self.clock.kind != "real":
+        if self._unheld and self.clock.kind != "real":
             self.log.warning(
-                "messages of ROS come at their own time, so runs in lockstep will differ; "
-                'subscriptions are for clock = "real"'
+                "messages of ROS on %s come at their own time, so runs in lockstep will differ; "
+                'such subscriptions are for clock = "real"',
+                ", ".join(self._unheld),
             )
         self._complaints = Complaints(self.log.warning)
         try:
@@ -146,7 +160,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         except (ValueError, SessionError) as error:
             self.log.fatal("%s", error)
         self._session = session
-        self._publishing = Publishing(session, self._store, config, self._time)
+        self._hold_for_estimators(session)
+        self._publishing = Publishing(self._line or session, self._store, config, self._time)
         await self.offload(self._publishing.warm_up)
         try:
             for topic in self._incoming:
@@ -177,8 +192,18 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     def on_announcement(self, announcement: Announcement) -> None:
         """Declare the topics of what is announced."""
         ours = {incoming.source for incoming in self._incoming}
+        if isinstance(announcement, CameraAnnouncement | LidarAnnouncement):
+            self._rates[announcement.source] = announcement.rate
         if self._publishing is not None and announcement.source not in ours:
             self._publishing.announced(announcement)
+
+    def check(self) -> Iterable[str]:
+        """Return why an estimator could never answer."""
+        for each in self.config.subscriptions:
+            if each.use == "estimate" and each.answers_to:
+                told = any(each.is_told_by(done) for done in self.config.subscriptions)
+                told = told or self.clock.kind == "real"  # where time does not stand
+                yield from why_no_answer(each, self._rates, told=told)
 
     async def run(self) -> None:
         """Subscribe, and publish images and point clouds beside the loop, each kind in order."""
@@ -187,18 +212,22 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         assert session is not None
         self._open = True
         self._fix_time()
-        publishing.begin()
-        for line in publishing.unannounced():
-            self.log.warning("%s", line)
+        self._publish(Publishing.begin, publishing)
+        for text in publishing.unannounced():
+            self.log.warning("%s", text)
         for kind, events in self._queues.items():
             self.start(self._publish_all(events, publishing.large[kind]))
         for outgoing, waiting in self._outgoing:
-            publisher = session.publisher(outgoing.topic)
+            publisher = (self._line or session).publisher(outgoing.topic)
             self._mapped.append(publisher)
             put = functools.partial(outgoing.put, publisher, publishing.builder)
+            self._puts.append(put)
             self.start(self._publish_all(waiting, put))
         for incoming in self._incoming:
-            await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).take)
+            if not incoming.subscription.answers_to:
+                await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).take)
+        if self._line is not None:
+            await self._line.begin()
 
     async def on_shutdown(self) -> None:
         """Leave the network, and log how many messages were published and received."""
@@ -206,6 +235,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         publishing, session = self._publishing, self._session
         if publishing is None or session is None:
             return
+        if self._line is not None:
+            await self._line.close()
         sent = [each for each in publishing.publishers + self._mapped if each.sent]
         refused = sum(self._complaints.counts.values()) + sum(each.dropped for each in self._unread)
         self.log.info(
@@ -213,7 +244,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             "%d received, %d refused or dropped",
             sum(each.sent for each in sent),
             len(sent),
-            sum(each.dropped for each in self._queues.values()),
+            sum(each.dropped for each in (*self._queues.values(), self._line) if each),
             sum(waiting.dropped for _, waiting in self._outgoing),
             sum(incoming.received for incoming in self._incoming),
             refused,
@@ -226,25 +257,33 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     @on(*LARGE)
     def images_and_clouds(self, event: Event) -> None:
         """Publish an image or a point cloud beside the loop."""
-        self._queues[next(kind for kind in self._queues if isinstance(event, kind))].offer(event)
+        kind = next(kind for kind in self._queues if isinstance(event, kind))
+        if self._line is None:
+            self._queues[kind].offer(event)
+        elif self._publishing is not None:
+            put = self._publishing.large[kind]
+            self._line.publish_image(event, put, self._publishing.clock)
 
     @on(*SMALL)
     def measurements(self, event: Event) -> None:
         """Publish what is small, at once."""
         if self._publishing is not None:
-            self._publishing.small(event)
+            self._publish(self._publishing.small, event)
 
     def publications(self, event: Event) -> None:
         """Publish, beside the loop, what a mapping of the user's own makes of an event."""
-        for outgoing, waiting in self._outgoing:
+        for (outgoing, waiting), put in zip(self._outgoing, self._puts, strict=True):
             if outgoing.wants(event):
-                waiting.offer(event)
+                if self._line is None:
+                    waiting.offer(event)
+                else:
+                    self._line.publish(put, event)
 
     @every(hz="clock_rate")
     def publish_clock(self, tick: Tick) -> None:  # noqa: ARG002
         """Publish ``/clock``."""
         if self._publishing is not None:
-            self._publishing.clock(self.clock.now())
+            self._publish(self._publishing.clock, self.clock.now())
 
     def _declare_mapped_events(self) -> None:
         """Have `publications` called with the events that the file's publications are of.
@@ -263,6 +302,26 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             handlers={**declared.handlers, "publications": Handles(events, None)},
             listening=[*declared.listening, "publications"],
         )
+
+    def _publish(self, put: Callable[[Any], None], what: Any) -> None:
+        """Publish what is small, at once or in its turn."""
+        if self._line is None:
+            put(what)
+        else:
+            self._line.publish(put, what)
+
+    def _hold_for_estimators(self, session: Session) -> None:
+        """Make the line and the holds, if there are estimators that owe answers."""
+        estimators = []
+        for each in self._incoming:
+            given = each.subscription
+            if given.use == "estimate" and given.answers_to:
+                told = [done for done in self._incoming if given.is_told_by(done.subscription)]
+                hold = self.hold(each.source, given.hold, given.latency)
+                stamps = self._fix_time()
+                estimators.append(HeldEstimator([each, *told], hold, stamps, self.config))
+        if estimators:
+            self._line = Line(self, session, estimators, self._send)
 
     async def _publish_all(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
         async for event in events:

@@ -6,14 +6,16 @@ Zenoh has threads of its own and no asyncio: what it calls runs there, and must 
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import json
 import math
+import queue
 import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -171,8 +173,33 @@ class Session:
         threading.Thread(
             target=_read, args=(subscriber, take), name=f"reads {topic.name}", daemon=True
         ).start()
-        if self._keys == "rmw_zenoh":
-            self._keep(endpoint_token(self._node, self.zid, 0, next(self._ids), "MS", topic))
+        self._show(topic, "MS")
+
+    def subscribe_in_order(self, takes: Sequence[tuple[Topic, Take]]) -> None:
+        """Subscribe to topics whose messages are taken one by one, in the order in which they came.
+
+        So what a process says on one of them after another is taken after it. They are read as they
+        come, and cost the loop more than with `subscribe`.
+        """
+        came: queue.Queue[tuple[Take, zenoh.Sample] | None] = queue.Queue(WAITING)
+        for topic, take in takes:
+            self._kept.append(
+                self._session.declare_subscriber(
+                    self._key(topic),
+                    zenoh.handlers.Callback(
+                        functools.partial(_queue, came, take),
+                        lambda: came.put(None),
+                        indirect=False,
+                    ),
+                )
+            )
+            self._show(topic, "MS")
+        threading.Thread(
+            target=_take_queued,
+            args=(came, len(takes)),
+            name=f"reads {takes[0][0].name}",
+            daemon=True,
+        ).start()
 
     def watch(self, topic_name: str, kind: Kind, changed: Callable[[bool, Token], None]) -> None:
         """Be told which endpoints of other sessions a topic has, at once and whenever that changes.
@@ -256,6 +283,11 @@ class Session:
             return ros2dds_key(topic)
         return data_key(self._node.domain_id, topic)
 
+    def _show(self, topic: Topic, kind: Kind) -> None:
+        """Show an endpoint to ROS."""
+        if self._keys == "rmw_zenoh":
+            self._keep(endpoint_token(self._node, self.zid, 0, next(self._ids), kind, topic))
+
     def _keep(self, token: str) -> None:
         self._kept.append(self._session.liveliness().declare_token(token))
 
@@ -323,6 +355,21 @@ def _read(subscriber: Any, take: Take) -> None:
                 sample = subscriber.try_recv()
             time.sleep(PAUSE)
             sample = subscriber.recv()
+
+
+def _queue(
+    came: queue.Queue[tuple[Take, zenoh.Sample] | None], take: Take, sample: zenoh.Sample
+) -> None:
+    came.put((take, sample))
+
+
+def _take_queued(came: queue.Queue[tuple[Take, zenoh.Sample] | None], open_: int) -> None:
+    """Take messages, in a thread, until all the subscriptions are closed."""
+    while open_:
+        if (found := came.get()) is None:
+            open_ -= 1
+        else:
+            found[0](_message(found[1]))
 
 
 def _message(sample: zenoh.Sample) -> Message:

@@ -11,7 +11,9 @@ from nodes.ros_messages.incoming import READERS
 from nodes.ros_messages.settings import Positive, PublishingConfig, Rate, check_name
 from nodes.ros_messages.topics import Qos, dds_type, topic_name
 from nodes.ros_messages.typestore import Distribution
+from runtime.hold import HoldConfig
 from runtime.paths import InputPath
+from runtime.units import Latency
 
 
 class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -25,7 +27,8 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``, ``depth`` (Image),
             ``imu`` (Imu), ``range`` (Range), ``pressure`` (FluidPressure), ``magnetic_field``
             (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the run waits for the
-            first one, and a camera is announced).
+            first one, and a camera is announced), ``done`` (Header or Time: an estimator will
+            say no more about the image of this stamp).
         mapping: Instead: ``module:function``, which takes a message and a `MessageContext` and
             returns an event, or None.
         source: Of the events; if empty, the node's name and the topic.
@@ -38,7 +41,15 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         max_rate: Messages a second at most; what comes faster is dropped.
         transient_local: Whether to get messages that were published before, and are kept
             (``/map``, ``/tf_static``); a ``camera`` always does.
-        timeout: Seconds that the run's start waits for a ``camera``.
+        timeout: Seconds that the run's start waits for a ``camera``, or for the estimator that
+            `answers_to` images.
+        answers_to: Source of the images whose stamps the messages of an ``estimate`` or ``done``
+            bear. Each image is then owed an answer, for which simulated time waits, and nothing
+            between the two is dropped; `depth` and `max_rate` do not apply. See `runtime.hold`.
+        latency: Time on the run's clock from the arrival of an image to its answer's event.
+        hold: How long is waited for an answer, and what if none comes.
+        needs: Topics of this node that the estimator must have subscribed to before the first
+            image is sent; if empty, that of the images.
     """
 
     topic: str
@@ -54,6 +65,10 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     max_rate: Rate = 1000.0
     transient_local: bool = False
     timeout: Annotated[float, msgspec.Meta(ge=0, le=86_400)] = 10.0
+    answers_to: str = ""
+    latency: Latency = Latency(0.015)  # immutable
+    hold: HoldConfig = HoldConfig()
+    needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         dds_type(self.type)
@@ -73,11 +88,26 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 f'{self.topic}: frame_id: expected "map" or "heading" for a velocity, '
                 f"found {self.frame_id!r}"
             )
+        if self.answers_to and (self.use not in {"estimate", "done"} or not self.reliable):
+            raise ValueError(
+                f'{self.topic}: answers_to: expected as = "estimate" or "done", and reliable, '
+                f'found as = "{self.use}", reliable = {str(self.reliable).lower()}'
+            )
+        if self.use == "done" and not self.answers_to:
+            raise ValueError(f'{self.topic}: as = "done": expected answers_to, found none')
 
     @property
     def qos(self) -> Qos:
         """Return the quality of service."""
         return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
+
+    def is_told_by(self, other: Subscription) -> bool:
+        """Tell whether this is an estimate of which another subscription says what is done."""
+        return (
+            (self.use, other.use) == ("estimate", "done")
+            and self.answers_to == other.answers_to
+            and other.source in {"", self.source}
+        )
 
 
 class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -164,3 +194,14 @@ class Ros2BridgeConfig(PublishingConfig):
                 dds_type(type_)
             except ValueError as error:
                 raise ValueError(f"definitions: {error}") from None
+        if any(each.answers_to for each in self.subscriptions) and self.keys != "rmw_zenoh":
+            raise ValueError(
+                'answers_to: expected keys = "rmw_zenoh", whose messages are numbered and whose '
+                f'nodes are seen to go, found keys = "{self.keys}"'
+            )
+        for done in (each for each in self.subscriptions if each.use == "done"):
+            if len([each for each in self.subscriptions if each.is_told_by(done)]) != 1:
+                raise ValueError(
+                    f'{done.topic}: as = "done": expected one estimate with the same answers_to, '
+                    "and of the same source if there are several"
+                )

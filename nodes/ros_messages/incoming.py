@@ -238,6 +238,8 @@ READERS: dict[tuple[str, str], Reader] = {
     ("sensor_msgs/msg/MagneticField", "magnetic_field"): magnetic_field,
     ("sensor_msgs/msg/NavSatFix", "fix"): fix,
     ("sensor_msgs/msg/CameraInfo", "camera"): nothing,
+    ("std_msgs/msg/Header", "done"): nothing,
+    ("builtin_interfaces/msg/Time", "done"): nothing,
 }
 """By type of message and use."""
 

@@ -26,6 +26,10 @@ class Stamps(msgspec.Struct, frozen=True):
         """Return the seconds and nanoseconds of a stamp."""
         return divmod(stamp + self.offset, SECOND)
 
+    def stamp(self, seconds: int, nanoseconds: int) -> int:
+        """Return a message's time on the run's clock (ns), whether it is one of the run or not."""
+        return int(seconds) * SECOND + int(nanoseconds) - self.offset
+
     def back(self, seconds: int, nanoseconds: int, now: int) -> int:
         """Return a message's time on the run's clock (ns).
 
@@ -39,7 +43,7 @@ class Stamps(msgspec.Struct, frozen=True):
         """
         if seconds == 0 and nanoseconds == 0:
             return now
-        stamp = int(seconds) * SECOND + int(nanoseconds) - self.offset
+        stamp = self.stamp(seconds, nanoseconds)
         if not 0 <= stamp <= now + AHEAD:
             raise ValueError(
                 f"stamp: expected a time of this run, from 0 s to {now / SECOND:.3f} s, "

@@ -88,7 +88,7 @@ def valid(type_: str) -> bytes:
             return bytes(store.serialize(make(type_)(header=header, pose=inner)))
 
 
-ALL = sorted(READERS)
+ALL = sorted(each for each in READERS if each[1] != "done")  # that becomes no event
 
 
 @pytest.mark.parametrize(("type_", "use"), ALL)
