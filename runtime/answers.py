@@ -13,7 +13,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import xxhash
 from typing_extensions import Buffer
@@ -57,6 +57,7 @@ class Answers:
         self._stamps = array("q")
         self._latencies = array("d")
         self._outcomes: list[Outcome] = []
+        self._dues = array("q")
         self._first: int | None = None
         self._initialised: int | None = None
         self._inputs: dict[str, xxhash.xxh3_128] = {}
@@ -68,15 +69,31 @@ class Answers:
             if self._first is None:
                 self._first = stamp
 
-    def settled(self, stamp: int, outcome: Outcome, latency: float = math.nan) -> None:
-        """Note what became of a frame, and the real seconds that its answer took."""
+    def settled(self, stamp: int, due: int, outcome: Outcome, latency: float = math.nan) -> None:
+        """Note what became of a frame that was due, and the real seconds that its answer took."""
         with self._lock:
             self.counts[outcome] += 1
             self._stamps.append(stamp)
             self._latencies.append(latency)
             self._outcomes.append(outcome)
+            self._dues.append(due)
             if outcome == "answered" and self._initialised is None:
                 self._initialised = stamp
+
+    def end(self, now: int) -> None:
+        """Forget what came of frames that are not due by now (ns): nobody has received it.
+
+        Whether they were answered by now was up to real time, and no figure is.
+        """
+        with self._lock:
+            kept = [n for n, due in enumerate(self._dues) if due <= now]
+            self._stamps = array("q", [self._stamps[n] for n in kept])
+            self._latencies = array("d", [self._latencies[n] for n in kept])
+            self._dues = array("q", [self._dues[n] for n in kept])
+            self._outcomes = [self._outcomes[n] for n in kept]
+            for outcome in get_args(Outcome):
+                self.counts[outcome] = self._outcomes.count(outcome)
+            self.counts = +self.counts
 
     def wrong(self, kind: Wrong) -> None:
         """Note an answer that belongs to no frame which waits."""

@@ -229,7 +229,11 @@ class Hold(Generic[T]):
             value: What it holds; `None` if it is known only that there is no more to come.
         """
         with self._changed:
-            now = self._heard = self._wall()
+            if self._closed:
+                return
+            now = self._wall()
+            unanswered = [each for each in self._owed if self._initialising(each)]
+            self._heard = now
             owed = self._match(stamp)
             if owed is None:
                 known = _nearest(stamp, self._settled, self.config.tolerance_ns)
@@ -245,9 +249,11 @@ class Hold(Generic[T]):
             self._let_go, self._in_a_row = False, 0
             if owed is None:
                 return
-            if self._skips:
-                for each in [each for each in self._owed.values() if each.stamp < owed.stamp]:
-                    self._settle(each, "skipped")
+            for each in [each for each in self._owed if each < owed.stamp]:
+                if each in unanswered:
+                    self._settle(self._owed[each], "initialising")
+                elif self._skips:
+                    self._settle(self._owed[each], "skipped")
             self._settle(owed, "empty" if value is None else "answered", value, now - owed.since)
 
     def gone(self, why: str) -> None:
@@ -283,9 +289,12 @@ class Hold(Generic[T]):
             self._fail(error)
 
     def close(self) -> None:
-        """Watch no more; what is owed still stays so."""
+        """Watch no more, and take no answers; what is owed still stays so."""
         with self._changed:
+            if self._closed:
+                return
             self._closed = True
+            self.answers.end(self._clock.now())
             self._changed.notify_all()
 
     def look(self) -> None:
@@ -331,7 +340,7 @@ class Hold(Generic[T]):
         self._settled[owed.stamp] = outcome
         while len(self._settled) > _REMEMBERED:
             del self._settled[next(iter(self._settled))]
-        self.answers.settled(owed.stamp, outcome, seconds)
+        self.answers.settled(owed.stamp, owed.due, outcome, seconds)
         (owed.work if owed.later is None else owed.later).set_result(value)
 
     def _release(self, owed: Owed[T]) -> None:

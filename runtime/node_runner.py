@@ -171,6 +171,9 @@ class NodeRunner:
         for ticker in self.tickers:
             ticker.stopped = True
         self.tickers.clear()
+        for hold in self.holds:  # before the systems are told to end: what they leave is not lost
+            hold.close()
+        self.holds.clear()
         wrong += await self._end_tasks(limit)
         if node is not None and self.started:
             try:
@@ -184,9 +187,6 @@ class NodeRunner:
         workers = [asyncio.create_task(asyncio.to_thread(worker.close)) for worker in self.workers]
         wrong += await self._end_by(limit, "its workers", workers)
         self.workers.clear()
-        for hold in self.holds:
-            hold.close()
-        self.holds.clear()
         self.started = False
         for link in self.links.values():
             link.close()

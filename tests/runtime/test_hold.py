@@ -326,6 +326,15 @@ class TestInitialising:
         assert hold.answers.initialisation == pytest.approx(0.099)
         assert not hold.answers.why_not
 
+    def test_frames_before_the_first_answer_are_never_answered(self) -> None:
+        def act(hold: Hold[str], wall: Wall, number: int) -> None:
+            if number >= 3:
+                answer_all(hold, wall, number)
+
+        came, hold = fly(act, latency=0.12, initialise=Duration(10))
+        assert [value for _, value in came] == [None, None, None, "3", "4"]
+        assert hold.answers.counts == {"initialising": 3, "answered": 2}
+
     def test_a_first_answer_that_comes_too_late_is_said(self) -> None:
         def act(hold: Hold[str], wall: Wall, number: int) -> None:
             if number == 0:
@@ -349,14 +358,29 @@ class TestInitialising:
         assert "the frame of 0.066000 s" in str(caught.value.exceptions[0])
 
 
+def test_what_is_not_due_at_the_end_is_open_whether_it_was_answered_or_not() -> None:
+    async def main() -> None:
+        hold = hold_in(asyncio.get_running_loop(), Wall(), 0.04)
+        owed = [hold.owe(n) for n in range(2)]
+        hold.answer(0, "answered already")
+        hold.close()
+        hold.answer(1, "after the end")
+        hold.gone("as it was told to end")
+        assert not +hold.answers.counts
+        assert hold.answers.sent == 2
+        assert await owed[0] == "answered already"
+
+    run_async(main())
+
+
 class TestLatencies:
     def test_what_a_run_measured_is_replayed_in_the_order_of_the_frames(
         self, tmp_path: Path
     ) -> None:
         answers = Answers()
         for number, milliseconds in enumerate([10.0, 50.0, 5.0]):
-            answers.settled(number * PERIOD, "answered", milliseconds / 1e3)
-        answers.settled(3 * PERIOD, "lost")
+            answers.settled(number * PERIOD, 0, "answered", milliseconds / 1e3)
+        answers.settled(3 * PERIOD, 0, "lost")
         answers.write(tmp_path, "slam")
         file = tmp_path / "answers" / "slam.csv"
         came, hold = fly(answer_all, latencies=str(file), latency_factor=2.0)
