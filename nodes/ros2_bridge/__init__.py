@@ -1,7 +1,7 @@
 """ROS 2 over Zenoh, as rmw_zenoh_cpp uses it; no ROS needs to be installed here.
 
 Read in this order: `settings`, `keys` and `attachment` (how a topic is named on Zenoh),
-`session` (the only import of zenoh), `incoming_topic` (from messages to events) and
+`publisher`, `session` (the only import of zenoh), `incoming_topic` (from messages to events) and
 `outgoing_topic` (by mappings of the user's own, which `mappings` imports), `inbox` and `complaints`
 (messages from outside must not hurt the run), `node`. What a message of ROS is, is for
 `nodes.ros_messages`.

@@ -17,7 +17,8 @@ import msgspec
 
 from events import Event
 from nodes.ros2_bridge.held_estimator import HeldEstimator
-from nodes.ros2_bridge.session import Publisher, Session
+from nodes.ros2_bridge.publisher import Publisher
+from nodes.ros2_bridge.session import Session
 from nodes.ros_messages.topics import Topic
 from runtime import Node
 from runtime.hold import Hold, Owed

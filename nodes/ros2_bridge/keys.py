@@ -6,11 +6,12 @@ otherwise (`ros2dds_key`). Nothing here talks to Zenoh.
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+import re
+from typing import Any, Literal
 
 import msgspec
 
-from nodes.ros_messages.topics import Qos, Topic, dds_type, ros_type
+from nodes.ros_messages.topics import Topic, dds_type
 
 Kind = Literal["NN", "MP", "MS", "SS", "SC"]
 """Node, publisher, subscription, service server, service client."""
@@ -40,9 +41,7 @@ class Token(msgspec.Struct, frozen=True, kw_only=True):
         kind: What it is of.
         node: Whose.
         zid: The session's id as text.
-        node_id: The node's number in the session.
-        id: Its own number in the session.
-        topic: Its topic or service; ``None`` for a node.
+        topic: The name of its topic or service; empty for a node.
         extra: What follows; newer releases say there which buffers an endpoint can share.
     """
 
@@ -50,42 +49,31 @@ class Token(msgspec.Struct, frozen=True, kw_only=True):
     kind: Kind
     node: NodeName
     zid: str
-    node_id: int
-    id: int
-    topic: Topic | None = None
-    extra: tuple[str, ...] = ()
+    topic: str = ""
+    extra: str = ""
+
+
+_TOKEN = re.compile(
+    r"@ros2_lv/(\d{1,9})/([^/]+)/\d+/\d+/(NN|MP|MS|SS|SC)/[^/]+/([^/]+)/([^/]+)"
+    r"(?:/([^/]+)/[^/]+/[^/]+/\d?:\d?:\d?,\d*:\d*,\d*:\d*,\d*:\d?,\d*,\d*)?((?:/[^/]+)*)",
+    re.ASCII,
+)
 
 
 def parse_token(key: str) -> Token:
     """Read a liveliness token.
 
     Raises:
-        ValueError: It is none that `rmw_zenoh_cpp` would declare.
+        ValueError: It is none that rmw_zenoh_cpp would declare.
     """
-    parts = key.split("/")
-    try:
-        space, domain, zid, node_id, id_, kind, _, namespace, name, *rest = parts
-        if space != ADMIN_SPACE or kind not in get_args(Kind) or "" in parts:
-            raise ValueError(f"expected {ADMIN_SPACE}, one of {get_args(Kind)}, no empty part")
-        topic = None
-        if kind != "NN":
-            topic_, type_, hash_, qos, *rest = rest
-            plain = {"name": topic_.replace("%", "/"), "type": ros_type(type_), "hash": hash_}
-            topic = Topic(**plain, qos=Qos.parse(qos))
-        return Token(
-            key=key,
-            kind=kind,  # type: ignore[arg-type]
-            node=NodeName(name=name, namespace=namespace.replace("%", "/"), domain_id=int(domain)),
-            zid=zid,
-            node_id=int(node_id),
-            id=int(id_),
-            topic=topic,
-            extra=tuple(rest),
-        )
-    except ValueError as error:
-        raise ValueError(
-            f"expected a liveliness token of ROS, found {key!r:.200}: {error}"
-        ) from None
+    found = _TOKEN.fullmatch(key)
+    if found is None or (found[3] != "NN" and found[6] is None):
+        raise ValueError(f"expected a liveliness token of ROS, found {key!r:.200}")
+    kind: Any
+    domain, zid, kind, namespace, name, topic, extra = found.groups("")
+    namespace, topic = namespace.replace("%", "/"), topic.replace("%", "/")
+    node = NodeName(name=name, namespace=namespace, domain_id=int(domain))
+    return Token(key=key, kind=kind, node=node, zid=zid, topic=topic, extra=extra[1:])
 
 
 def mangle(name: str) -> str:

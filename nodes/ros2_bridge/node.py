@@ -37,7 +37,8 @@ from nodes.ros2_bridge.incoming_topic import IncomingTopic
 from nodes.ros2_bridge.keys import NodeName
 from nodes.ros2_bridge.mappings import event_type
 from nodes.ros2_bridge.outgoing_topic import OutgoingTopic
-from nodes.ros2_bridge.session import Publisher, Session, SessionError
+from nodes.ros2_bridge.publisher import Publisher
+from nodes.ros2_bridge.session import Session, SessionError
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
 from nodes.ros_messages.calibration import camera_announcement
 from nodes.ros_messages.publishing import LARGE, SMALL, Publishing

@@ -14,7 +14,6 @@ import queue
 import re
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -22,7 +21,7 @@ from typing import Any, Literal, TypeVar
 import msgspec
 import zenoh
 
-from nodes.ros2_bridge.attachment import Attachment, Message, gid, pack
+from nodes.ros2_bridge.attachment import Message, gid
 from nodes.ros2_bridge.keys import (
     Kind,
     NodeName,
@@ -34,6 +33,7 @@ from nodes.ros2_bridge.keys import (
     parse_token,
     ros2dds_key,
 )
+from nodes.ros2_bridge.publisher import Publisher
 from nodes.ros_messages.topics import Topic
 
 T = TypeVar("T")
@@ -135,16 +135,15 @@ class Session:
         if held:
             qos = msgspec.structs.replace(topic.qos, reliable=True, keep_all=True)
             topic = msgspec.structs.replace(topic, qos=qos)
-        qos, key, control = topic.qos, self._key(topic), zenoh.CongestionControl
-        token = endpoint_token(self._node, self.zid, 0, next(self._ids), "MP", topic)
+        qos, key, reliability = topic.qos, self._key(topic), zenoh.Reliability
+        block, drop = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+        waits = qos.reliable and qos.keep_all
         options: dict[str, Any] = {
-            "congestion_control": control.BLOCK if qos.reliable and qos.keep_all else control.DROP,
-            "reliability": (
-                zenoh.Reliability.RELIABLE if qos.reliable else zenoh.Reliability.BEST_EFFORT
-            ),
+            "congestion_control": block if waits else drop,
+            "reliability": reliability.RELIABLE if qos.reliable else reliability.BEST_EFFORT,
         }
-        plain = self._session.declare_publisher(key, **options)
-        declared: Any = plain
+        plain: Any = self._session.declare_publisher(key, **options)
+        declared = plain
         if qos.transient_local:
             heartbeat = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT)
             declared = zenoh.ext.declare_advanced_publisher(
@@ -155,12 +154,15 @@ class Session:
                 publisher_detection=True,
                 **options,
             )
-        if self._keys == "rmw_zenoh":
-            self._keep(token)
-        owner = gid(token) if self._keys == "rmw_zenoh" else None
-        publisher = Publisher(topic, declared, owner, plain, self._max_wait)
+        publisher = Publisher(
+            topic,
+            functools.partial(_put, declared.put),
+            lambda: plain.matching_status.matching,  # an advanced publisher does not know
+            self._show(topic, "MP"),
+            self._max_wait if waits else math.inf,
+        )
         if qos.transient_local:
-            answer = publisher.answer
+            answer = functools.partial(_answer, publisher, key)
             self._kept.append(self._session.declare_queryable(key, answer, complete=True))
         return publisher
 
@@ -202,10 +204,9 @@ class Session:
         ).start()
 
     def watch(self, topic_name: str, kind: Kind, changed: Callable[[bool, Token], None]) -> None:
-        """Be told which endpoints of other sessions a topic has, at once and whenever that changes.
+        """Be told which endpoints of other sessions a topic has, now and whenever that changes.
 
-        Those of a process that ended, in whatever way, disappear as soon as its connection does.
-        What ROS cannot have declared is left out. zenoh-plugin-ros2dds has no such tokens.
+        Those of a process that is killed disappear at once; tokens that make no sense are left out.
 
         Args:
             topic_name: With its leading slash.
@@ -283,66 +284,31 @@ class Session:
             return ros2dds_key(topic)
         return data_key(self._node.domain_id, topic)
 
-    def _show(self, topic: Topic, kind: Kind) -> None:
-        """Show an endpoint to ROS."""
-        if self._keys == "rmw_zenoh":
-            self._keep(endpoint_token(self._node, self.zid, 0, next(self._ids), kind, topic))
+    def _show(self, topic: Topic, kind: Kind) -> bytes | None:
+        """Show an endpoint to ROS, and return its GID; ``None`` if no ROS speaks these keys."""
+        if self._keys != "rmw_zenoh":
+            return None
+        token = endpoint_token(self._node, self.zid, 0, next(self._ids), kind, topic)
+        self._keep(token)
+        return gid(token)
 
     def _keep(self, token: str) -> None:
         self._kept.append(self._session.liveliness().declare_token(token))
 
 
-class Publisher:
-    """Puts messages on a topic.
+def _put(put: Any, message: bytearray, attachment: bytes | None) -> bool:
+    try:
+        put(message, attachment=attachment)
+    except zenoh.ZError:
+        return False
+    return True
 
-    Attributes:
-        topic: Which.
-        sent: How many messages went out.
-        failed: How many did not, since the session is closed, or a peer did not read one that is
-            held: whoever needs all of them has to look at it.
-    """
 
-    def __init__(
-        self, topic: Topic, declared: Any, gid_: bytes | None, plain: Any, max_wait: float
-    ) -> None:
-        self.topic = topic
-        self.sent = self.failed = 0
-        self._put = declared.put
-        self._gid = gid_
-        self._max_wait = max_wait if topic.qos.reliable and topic.qos.keep_all else math.inf
-        self._plain = plain
-        """What Zenoh tells the match of, which it does not of an advanced publisher."""
-        depth = topic.qos.depth if topic.qos.transient_local else 0
-        self._last: deque[tuple[bytes, bytes | None]] = deque(maxlen=depth)
-
-    def matched(self) -> bool:
-        """Tell whether somebody subscribes to the topic."""
-        matching: bool = self._plain.matching_status.matching
-        return matching
-
-    def put(self, message: bytearray) -> None:
-        """Put a message; its bytes may be overwritten afterwards."""
-        attachment = None
-        if self._gid is not None:
-            number = self.sent + self.failed + 1
-            attachment = pack(Attachment(number, time.time_ns(), self._gid))
-        if self._last.maxlen:
-            self._last.append((bytes(message), attachment))
-        begin = time.monotonic()
-        try:
-            self._put(message, attachment=attachment)
-            # Zenoh says nothing of a message that it gives up.
-            gone_out = time.monotonic() - begin < self._max_wait
-        except zenoh.ZError:
-            gone_out = False
-        self.sent += gone_out
-        self.failed += not gone_out
-
-    def answer(self, query: zenoh.Query) -> None:
-        """Answer who joins late and asks for the topic's key, with the messages that are kept."""
-        for message, attachment in tuple(self._last):
-            with contextlib.suppress(zenoh.ZError):
-                query.reply(self._plain.key_expr, message, attachment=attachment)
+def _answer(publisher: Publisher, key: str, query: zenoh.Query) -> None:
+    """Answer who joins late and asks for the topic's key, as those do that know no `@adv`."""
+    for message, attachment in tuple(publisher.kept):
+        with contextlib.suppress(zenoh.ZError):  # whoever asked may have gone
+            query.reply(key, message, attachment=attachment)
 
 
 def _read(subscriber: Any, take: Take) -> None:

@@ -11,8 +11,6 @@ NO_HASH = "TypeHashNotSupported"
 
 _DEFAULT_DEPTH = 42
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_QOS = re.compile(r"(\d?):(\d?):(\d?),(\d{0,20}):\d*,\d*:\d*,\d*:\d*,\d*,\d*", re.ASCII)
-_DDS_TYPE = re.compile(r"(\w+)::(\w+)::dds_::(\w+)_", re.ASCII)
 
 
 class Qos(msgspec.Struct, frozen=True, kw_only=True):
@@ -40,26 +38,6 @@ class Qos(msgspec.Struct, frozen=True, kw_only=True):
         history = "2" if self.keep_all else ""
         depth = "" if self.depth == _DEFAULT_DEPTH else str(self.depth)
         return f"{reliability}:{durability}:{history},{depth}:,:,:,,"
-
-    @classmethod
-    def parse(cls, text: str) -> Qos:
-        """Read what stands in a token.
-
-        Raises:
-            ValueError: It is not of the form that `text` has.
-        """
-        found = _QOS.fullmatch(text)
-        if found is None:
-            raise ValueError(
-                f'expected a quality of service such as "::,10:,:,:,,", found {text!r}'
-            )
-        reliability, durability, history, depth = found.groups()
-        return cls(
-            reliable=reliability != "2",
-            transient_local=durability == "1",
-            depth=int(depth or _DEFAULT_DEPTH),
-            keep_all=history == "2",
-        )
 
 
 class Topic(msgspec.Struct, frozen=True, kw_only=True):
@@ -89,18 +67,6 @@ def dds_type(type_: str) -> str:
         raise ValueError(f'expected a type such as "sensor_msgs/msg/Image", found {type_!r}')
     package, folder, name = parts
     return f"{package}::{folder}::dds_::{name}_"
-
-
-def ros_type(dds: str) -> str:
-    """Return ``sensor_msgs/msg/Image`` for ``sensor_msgs::msg::dds_::Image_``.
-
-    Raises:
-        ValueError: It is not of that form.
-    """
-    found = _DDS_TYPE.fullmatch(dds)
-    if found is None:
-        raise ValueError(f'expected a type such as "sensor_msgs::msg::dds_::Image_", found {dds!r}')
-    return "/".join(found.groups())
 
 
 def topic_name(namespace: str, name: str) -> str:
