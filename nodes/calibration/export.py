@@ -25,9 +25,10 @@ from events import (
 )
 from events.frames import flip_yz, rotation_to_nwu
 from nodes.calibration.formats import DEPTH_FACTOR, write_files
-from nodes.dataset.recording import ImageFile, Recording, in_16_bits, in_colour
+from nodes.dataset.recording import ImageFile, Recording, in_colour
 from nodes.dataset.rig import Rig, choose
 from nodes.trajectory.table import EPOCH, epoch_of
+from nodes.viewing.encoding import depth_in_steps
 
 
 def export_calibration(
@@ -150,7 +151,7 @@ class VslamLab(Recording):
         if name not in self._stamps:
             return None
         self._stamps[name].append(self.epoch + event.stamp)
-        convert = functools.partial(in_16_bits, factor=self.depth_factor)
+        convert = functools.partial(depth_in_steps, per_metre=self.depth_factor)
         path = self.folder / name / f"{self.epoch + event.stamp}.png"
         return ImageFile(path, event.data, in_colour if kind == "rgb" else convert)
 

@@ -17,9 +17,10 @@ from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, Vector3
 from events.frames import flip_yz, rotation_to_nwu
 from events.poses import pose_matrix
 from events.rotations import rotate
-from nodes.dataset.recording import ImageFile, Recording, RowFile, in_16_bits, in_grey, real
+from nodes.dataset.recording import ImageFile, Recording, RowFile, in_grey, real
 from nodes.dataset.rig import WORLD_AXES, Rig
 from nodes.trajectory.formats import EUROC_HEADER, euroc_row
+from nodes.viewing.encoding import depth_in_steps
 
 _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -85,7 +86,7 @@ class Euroc(Recording):
 
     def depth(self, event: DepthImage) -> ImageFile | None:
         """Note a depth image of one of the cameras."""
-        convert = functools.partial(in_16_bits, factor=self.depth_factor)
+        convert = functools.partial(depth_in_steps, per_metre=self.depth_factor)
         return self._note(self._depths, event, functools.partial(ImageFile, convert=convert))
 
     def odometry(self, event: Odometry) -> None:

@@ -65,21 +65,6 @@ def in_grey(data: Pixels) -> Pixels:
     return cv2.cvtColor(data, cv2.COLOR_RGB2GRAY) if data.ndim == 3 else data
 
 
-def in_16_bits(depth: npt.NDArray[np.float32], factor: float) -> npt.NDArray[np.uint16]:
-    """Return depth as whole numbers.
-
-    Args:
-        depth: Metres, shape (h, w); ``inf`` where nothing was hit.
-        factor: Steps per metre.
-
-    Returns:
-        uint16, shape (h, w); 0 where there is none, or more than 65535 steps of it.
-    """
-    steps = np.rint(depth * np.float32(factor))
-    there = np.isfinite(steps) & (steps >= 1.0) & (steps <= 65535.0)
-    return np.where(there, steps, 0.0).astype(np.uint16)
-
-
 class RowFile:
     """A text file of rows with rising stamps.
 

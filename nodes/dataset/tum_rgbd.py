@@ -12,10 +12,11 @@ from pathlib import Path
 from events import DepthImage, Image, Imu, PoseStamped
 from events.frames import flip_yz, rotation_to_nwu
 from events.rotations import rotate
-from nodes.dataset.recording import ImageFile, Recording, RowFile, in_16_bits, in_colour, real
+from nodes.dataset.recording import ImageFile, Recording, RowFile, in_colour, real
 from nodes.dataset.rig import WORLD_AXES, Rig
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.table import seconds_text
+from nodes.viewing.encoding import depth_in_steps
 
 
 class TumRgbd(Recording):
@@ -64,7 +65,7 @@ class TumRgbd(Recording):
         """Note a depth image of the camera."""
         if event.source != self._camera.source or not self._add("depth", event.stamp):
             return None
-        convert = functools.partial(in_16_bits, factor=self.depth_factor)
+        convert = functools.partial(depth_in_steps, per_metre=self.depth_factor)
         return ImageFile(self._path("depth", event.stamp), event.data, convert)
 
     def pose(self, event: PoseStamped) -> None:

@@ -8,7 +8,7 @@ viewers that have no other up.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from events import (
     Announcement,
@@ -51,6 +51,8 @@ from nodes.viewing.selection import PlanSelection
 _MAP_IN_WORLD: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
 """North, east, down in east, north, up."""
 
+
+E = TypeVar("E", bound=Event)
 
 LARGE: tuple[type[Event], ...] = (Image, DepthImage, TrackedFeatures, PointCloud, LidarScan)
 """Events whose messages take long to make: `Publishing.large` has a function for each."""
@@ -152,28 +154,20 @@ class Publishing:
         """Put an image."""
         self._frames.setdefault(event.frame_id, event.source)
         topic, type_ = self._image_topic(event.source)
-        self._server.declare(topic, type_)
-        if self._server.wanted(topic):
-            quality = self._config.jpeg_quality
-            make = self._make
-            message = make.compressed(event, quality) if quality else make.image(event)
-            self._server.log(topic, message, event.stamp)
+        if quality := self._config.jpeg_quality:
+            self._put(topic, type_, event, lambda each: self._make.compressed(each, quality))
+        else:
+            self._put(topic, type_, event, self._make.image)
 
     def depth(self, event: DepthImage) -> None:
         """Put a depth image."""
-        topic = f"{_topic(event.source)}/depth"
-        self._server.declare(topic, "RawImage")
-        if self._server.wanted(topic):
-            self._server.log(topic, self._make.depth(event), event.stamp)
+        self._put(f"{_topic(event.source)}/depth", "RawImage", event, self._make.depth)
 
     def features(self, event: TrackedFeatures) -> None:
         """Put the features that an estimator tracks in an image."""
-        if (camera := self._frames.get(event.frame_id)) is None:
-            return
-        topic = f"{_topic(camera)}/features{_topic(event.source)}"
-        self._server.declare(topic, "ImageAnnotations")
-        if self._server.wanted(topic):
-            self._server.log(topic, self._make.features(event), event.stamp)
+        if (camera := self._frames.get(event.frame_id)) is not None:
+            topic = f"{_topic(camera)}/features{_topic(event.source)}"
+            self._put(topic, "ImageAnnotations", event, self._make.features)
 
     def cloud(self, event: PointCloud) -> None:
         """Put a point cloud; viewers that connect later get the newest."""
@@ -184,11 +178,15 @@ class Publishing:
 
     def scan(self, event: LidarScan) -> None:
         """Put a turn of a lidar."""
+        frame = self._frame(event.frame_id, event.source)
         topic = f"{_topic(event.source)}/points"
-        self._server.declare(topic, "PointCloud")
+        self._put(topic, "PointCloud", event, lambda each: self._make.scan(each, frame))
+
+    def _put(self, topic: str, type_: str, event: E, make: Callable[[E], Any]) -> None:
+        """Declare a topic, and put the message of an event if anybody looks."""
+        self._server.declare(topic, type_)
         if self._server.wanted(topic):
-            frame = self._frame(event.frame_id, event.source)
-            self._server.log(topic, self._make.scan(event, frame), event.stamp)
+            self._server.log(topic, make(event), event.stamp)
 
     # At once.
 

@@ -37,64 +37,9 @@ def path(*names: str) -> str:
     return "/".join(re.sub(r"([^\w.-])", r"\\\1", part) for part in parts)
 
 
-def body(vehicle: str) -> str:
-    """Return where a vehicle's body is."""
-    return path(WORLD, vehicle)
-
-
-def truth(vehicle: str) -> str:
-    """Return where a vehicle's true path is."""
-    return path(WORLD, "truth", vehicle)
-
-
-def estimate(estimator: str) -> str:
-    """Return where an estimator's own frame is."""
-    return path(WORLD, "estimates", estimator)
-
-
-def estimated_path(estimator: str) -> str:
-    """Return where an estimator's path is."""
-    return f"{estimate(estimator)}/path"
-
-
-def points(camera: str) -> str:
-    """Return where the points of a camera's depth images are."""
-    return path(WORLD, "points", camera)
-
-
-def cloud(source: str) -> str:
-    """Return where a node's clouds are."""
-    return path(WORLD, "clouds", source)
-
-
-def scores(subject: str, metric: str) -> str:
-    """Return where a plot of errors is."""
-    return path("scores", metric, subject)
-
-
-def measured(group: str, field: str, source: str) -> str:
-    """Return where a plot of measurements is."""
-    return path(group, field, source)
-
-
-def sensor(source: str) -> str:
-    """Return where a sensor's frame is, or a body that moves by itself."""
-    return path(WORLD, source)
-
-
-def moving_path(body: str) -> str:
-    """Return where the path is of a body that moves by itself."""
-    return path(WORLD, "paths", body)
-
-
-def wind(vehicle: str) -> str:
-    """Return where the arrow of a vehicle's wind is."""
-    return path(WORLD, "wind", vehicle)
-
-
-def images(source: str) -> str:
-    """Return where the images are of a camera of which nothing else is known."""
-    return path("images", source)
+def world(*names: str) -> str:
+    """Return the path of an entity in the world: ``world("truth", "drone")``."""
+    return path(WORLD, *names)
 
 
 def camera(announced: CameraAnnouncement, vehicles: Sequence[str]) -> str:

@@ -46,7 +46,11 @@ def layout(rrb: Any, contents: Contents) -> Any:
     if views := _images(rrb, contents):
         above.append(rrb.Vertical(*views))
     rows = [rrb.Horizontal(*above, column_shares=[2.4, 1.0][: len(above)])]
-    plots = [_plot(rrb, *each) for each in contents.plots.items()]
+    legend = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
+    plots = [
+        rrb.TimeSeriesView(name=title, origin="/", contents=what, plot_legend=legend)
+        for title, what in contents.plots.items()
+    ]
     if len(plots) > _ABREAST:  # the rest share the last place
         plots[_ABREAST - 1 :] = [rrb.Tabs(*plots[_ABREAST - 1 :])]
     if plots:
@@ -102,15 +106,6 @@ def _camera(rrb: Any, entity: str, kinds: list[str]) -> tuple[str, list[Any]]:
     name = entity.removeprefix(f"{entities.WORLD}/")
     views = [rrb.Spatial2DView(name=f"{name} {k}", origin=f"/{entity}/{k}") for k in kinds]
     return name, views
-
-
-def _plot(rrb: Any, title: str, what: str) -> Any:
-    return rrb.TimeSeriesView(
-        name=title,
-        origin="/",
-        contents=what,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
-    )
 
 
 _DARK = (22, 25, 31)

@@ -72,7 +72,7 @@ class Plots:
     def measurements(self, kind: type[Event], source: str, events: Sequence[Numbered[Any]]) -> None:
         """Put measurements of one sensor."""
         for field in fields_of(kind):
-            entity = entities.measured(GROUPS[kind], field, source)
+            entity = entities.path(GROUPS[kind], field, source)
             rows = np.array([numbers(event, field) for _, event in events])
             if rows.shape[1] == 3:
                 self._style(entity, colors=_AXES, names=["x", "y", "z"])
@@ -91,7 +91,7 @@ class Plots:
             key = event.subject, event.metric, event.unit
             apart.setdefault(key, []).append((number, event))
         for (subject, metric, unit), found in apart.items():
-            entity = entities.scores(subject, metric)
+            entity = entities.path("scores", metric, subject)
             shown, factor = _HANDY.get(unit, (unit, 1.0))
             style = {"colors": [self._colours[subject]]} if subject in self._colours else {}
             name = subject if metric in _TITLED else f"{subject} ({shown})"

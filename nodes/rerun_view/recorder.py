@@ -9,7 +9,7 @@ There are two time lines: ``run``, an event's stamp, and ``event``, the order in
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,16 @@ class Recorder:
         self._entities = EntityLog(library.log, self._stream)
         self._world = World(self._entities, config)
         self._plots = Plots(self._entities, self._world.colours)
+        self._puts: dict[type[Event], Callable[[Any], None]] = {
+            Image: self._world.image,
+            DepthImage: self._world.depth,
+            SegmentationImage: self._world.segmentation,
+            TrackedFeatures: self._world.features,
+            LidarScan: self._world.scan,
+            PointCloud: self._world.cloud,
+            TrackingEvent: self._plots.logged,
+            VehicleEvent: self._plots.logged,
+        }
         self._plotted: set[str] = set()
         self._shown: tuple[int, ...] = ()
         self._closed = False
@@ -208,26 +218,15 @@ class Recorder:
                 self._world.wind(source, events)
 
     def _put(self, number: int, event: Event) -> None:
-        world = self._world
-        match event:
-            case Image():
-                world.image(event)
-            case DepthImage():
-                world.depth(event)
-            case SegmentationImage():
-                world.segmentation(event)
-            case TrackedFeatures():
-                world.features(event)
-            case LidarScan():
-                world.scan(event)
-            case PoseStamped():
-                world.pose(number, event)
-            case PointCloud():
-                world.cloud(event)
-            case PlannedPose() | PositionSetpoint():
-                world.plan(number, event)
-            case TrackingEvent() | VehicleEvent():
-                self._plots.logged(event)
+        if isinstance(event, PoseStamped):
+            self._world.pose(number, event)
+        elif isinstance(event, PlannedPose | PositionSetpoint):
+            self._world.plan(number, event)
+        else:
+            for kind, put in self._puts.items():
+                if isinstance(event, kind):
+                    put(event)
+                    return
 
     def _show(self, eye: Eye | None = None) -> None:
         """Send the layout if there is something new to show."""

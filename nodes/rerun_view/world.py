@@ -101,7 +101,7 @@ class World:
         self.vehicles.add(source)
         colour = truth_colour(len(self._truth))
         self._truth[source] = RecentPoses()
-        entity = entities.body(source)
+        entity = entities.world(source)
         self._to.static(
             f"{entity}/shape",
             self._rr.Boxes3D(
@@ -112,14 +112,14 @@ class World:
             ),
         )
         self._to.static(entity, self._rr.TransformAxes3D(0.4))
-        self._path(entities.truth(source), colour, _THICK)
+        self._path(entities.world("truth", source), colour, _THICK)
 
     def estimator(self, source: str) -> None:
         """Prepare an estimator's path, and give it a colour."""
         if source in self.colours:
             return
         self.colours[source] = estimate_colour(len(self.colours))
-        self._path(entities.estimated_path(source), self.colours[source], _THIN)
+        self._path(entities.world("estimates", source, "path"), self.colours[source], _THIN)
 
     def camera(self, announced: CameraAnnouncement) -> None:
         """Prepare a camera: where it sits, and how it sees."""
@@ -143,20 +143,20 @@ class World:
                 config.points_max_distance,
                 config.points_max_height,
             )
-            self.trails.append(entities.points(announced.source))
+            self.trails.append(entities.world("points", announced.source))
 
     def sensor(self, announced: ImuAnnouncement | SensorAnnouncement) -> None:
         """Prepare a sensor: where it sits on its vehicle."""
-        entity = entities.sensor(announced.source)
+        entity = entities.world(announced.source)
         if announced.frame_id != announced.parent_frame_id:
             self._to.static(entity, self._transform(announced.position, announced.orientation))
 
     def moving_body(self, announced: BodyAnnouncement) -> None:
         """Prepare a body that moves by itself, and its path."""
-        box, entity = moving_body(announced.kind), entities.sensor(announced.source)
+        box, entity = moving_body(announced.kind), entities.world(announced.source)
         shape = self._rr.Boxes3D(centers=[box.centre], sizes=[box.size], colors=[box.colour])
         self._to.static(f"{entity}/shape", shape)
-        self._path(entities.moving_path(announced.source), box.colour, _THIN)
+        self._path(entities.world("paths", announced.source), box.colour, _THIN)
         self._moving.add(announced.source)
 
     # What moves.
@@ -164,15 +164,15 @@ class World:
     def odometry(self, source: str, events: Sequence[Numbered[Odometry]]) -> None:
         """Put true poses of one vehicle."""
         self.vehicle(source)
-        self._others.setdefault(events[0][1].child_frame_id, entities.body(source))
+        self._others.setdefault(events[0][1].child_frame_id, entities.world(source))
         truth = self._truth[source]
         for number, event in events:
             truth.add(event.stamp, event.position, event.orientation)
-            self._extend(entities.truth(source), number, event.stamp, event.position)
+            self._extend(entities.world("truth", source), number, event.stamp, event.position)
         positions = np.array([event.position for _, event in events])
         self.bounds[0] = np.minimum(self.bounds[0], positions.min(axis=0))
         self.bounds[1] = np.maximum(self.bounds[1], positions.max(axis=0))
-        self._poses(entities.body(source), events)
+        self._poses(entities.world(source), events)
 
     def estimates(self, source: str, events: Sequence[Numbered[PoseEstimate]]) -> None:
         """Put estimates of one estimator.
@@ -181,18 +181,19 @@ class World:
         them.
         """
         self.estimator(source)
+        frame_entity = entities.world("estimates", source)
         first = events[0][1]
         if source not in self._anchored:
             self._anchored.add(source)
             if first.frame_id != "map":
-                self._others.setdefault(first.frame_id, entities.estimate(source))
+                self._others.setdefault(first.frame_id, frame_entity)
                 truth = self._truth.get(self.vehicles.of(source))
                 if (frame := estimate_frame(first, truth)) is not None:
-                    self._to.static(entities.estimate(source), self._transform(*frame))
-            self._to.static(f"{entities.estimate(source)}/body", self._rr.TransformAxes3D(0.3))
+                    self._to.static(frame_entity, self._transform(*frame))
+            self._to.static(f"{frame_entity}/body", self._rr.TransformAxes3D(0.3))
         for number, event in events:
-            self._extend(entities.estimated_path(source), number, event.stamp, event.position)
-        self._poses(f"{entities.estimate(source)}/body", events)
+            self._extend(f"{frame_entity}/path", number, event.stamp, event.position)
+        self._poses(f"{frame_entity}/body", events)
 
     def plan(self, number: int, event: PlannedPose | PositionSetpoint) -> None:
         """Put where a vehicle is meant to be."""
@@ -211,7 +212,7 @@ class World:
                 arrow = self._rr.Arrows3D(
                     origins=[there[0]], vectors=[event.velocity], colors=[WIND], radii=[_THICK]
                 )
-                self._to.put(entities.wind(vehicle), arrow)
+                self._to.put(entities.world("wind", vehicle), arrow)
 
     def pose(self, number: int, event: PoseStamped) -> None:
         """Put where a free camera is, or what moves by itself.
@@ -219,9 +220,9 @@ class World:
         The pose of a vehicle's camera serves its depth images.
         """
         if event.source in self._moving:
-            entity = entities.sensor(event.source)
+            entity = entities.world(event.source)
             self._to.put(entity, self._transform(event.position, event.orientation))
-            path = entities.moving_path(event.source)
+            path = entities.world("paths", event.source)
             self._extend(path, number, event.stamp, event.position)
             return
         camera = self._cameras.get(event.source)
@@ -272,7 +273,7 @@ class World:
 
     def cloud(self, event: PointCloud) -> None:
         """Put a cloud, in the world or below what its frame belongs to."""
-        entity = entities.cloud(event.source)
+        entity = entities.world("clouds", event.source)
         for frames in (self._others, self._frames):
             if (owner := frames.get(event.frame_id)) is not None:
                 entity = f"{owner}/{entities.path('cloud', event.source)}"
@@ -283,7 +284,7 @@ class World:
         """Put a turn of a lidar, brighter where more light came back."""
         grey = (55.0 + 200.0 * np.clip(event.intensities, 0.0, 1.0)).astype(np.uint8)
         colours = np.stack([grey, grey, np.full_like(grey, 255)], axis=1)
-        entity = f"{entities.sensor(event.source)}/points"
+        entity = f"{entities.world(event.source)}/points"
         self._to.put(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
 
     def finish(self) -> None:
@@ -296,7 +297,7 @@ class World:
         """Return where an image belongs: to its camera, or by itself if nobody announced that."""
         camera = self._entities.get(event.source)
         if camera is None:  # grey images of a camera with colours, or nobody's
-            camera = self._frames.setdefault(event.frame_id, entities.images(event.source))
+            camera = self._frames.setdefault(event.frame_id, entities.path("images", event.source))
         if kind not in (kinds := self.images.setdefault(camera, [])):
             kinds.append(kind)
         return f"{camera}/{kind}"
@@ -305,7 +306,7 @@ class World:
         found = self._scene_points.get(event.source)
         if found is not None and (new := found.take(event)) is not None:
             points = self._rr.Points3D(new.points, colors=new.colours, radii=0.02)
-            self._to.put(entities.points(event.source), points)
+            self._to.put(entities.world("points", event.source), points)
 
     def _pinhole(self, entity: str, info: CameraInfo, stride: int) -> None:
         """Put how an image of every n-th pixel was taken; Rerun's centres are at halves."""

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from events import Announcement
-from nodes.dataset.recording import ImageFile, Pixels, RowFile, in_16_bits, in_colour, in_grey
+from nodes.dataset.recording import ImageFile, Pixels, RowFile, in_colour, in_grey
 from nodes.dataset.rig import choose
+from nodes.viewing.encoding import depth_in_steps
 from tests.nodes.dataset.samples import camera, image, imu_announcement, png
 
 
 def test_depth_that_16_bits_cannot_hold_is_none() -> None:
     depth = np.array([[0.0, 1.0, 1.23456, np.inf, np.nan, -1.0, 13.107, 13.1072]], np.float32)
-    found = in_16_bits(depth, 5000.0)
+    found = depth_in_steps(depth, 5000.0)
     assert found.dtype == np.uint16
     assert found.tolist() == [[0, 5000, 6173, 0, 0, 0, 65535, 0]]
 
