@@ -1,0 +1,362 @@
+// The native interface's client for C++17: feeds a program with a run's images and IMU samples.
+//
+// One header, which may be copied; docs/reference/link.md of visnav-runtime has the protocol.
+//
+//     visnav::Link link("my_slam");            // connects to the socket that $VISNAV_SOCKET names
+//     visnav::Camera camera = link.camera(0);
+//     link.ready();
+//     while (auto frame = link.next())         // until the run ends
+//         if (auto pose = track(frame->image("rgb8"), frame->image("depth32f"), frame->imu))
+//             link.pose(*frame, *pose);
+//         else
+//             link.lost(*frame);
+//
+// Answers may be given from any thread; one thread receives. Problems are visnav::Error.
+#pragma once
+
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#include <array>
+#include <cerrno>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <locale>
+#include <map>
+#include <mutex>
+#include <optional>
+#include <sstream>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace visnav {
+
+constexpr std::uint32_t version = 1;  // of the protocol
+
+struct Error : std::runtime_error {
+    using std::runtime_error::runtime_error;
+};
+
+// A sample of the IMU, in its own axes, as it is in a message.
+struct Imu {
+    std::int64_t stamp;                 // ns
+    double angular_velocity[3];         // rad/s
+    double linear_acceleration[3];      // m/s², specific force
+};
+static_assert(sizeof(Imu) == 56 && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__);
+
+// An image in shared memory: read-only, valid until its frame has been answered.
+struct Image {
+    std::uint32_t camera;               // index in the description
+    std::string kind;                   // mono8, rgb8, depth32f (metres along z), segmentation32i
+    int height, width;
+    std::size_t stride;                 // bytes from row to row
+    const std::uint8_t* data;
+
+    template <class T> const T* row(int v) const {
+        return reinterpret_cast<const T*>(data + stride * static_cast<std::size_t>(v));
+    }
+};
+
+// The images of one exposure.
+struct Frame {
+    std::uint64_t sequence = 0;         // 0, 1, 2, …
+    std::int64_t stamp = 0;             // ns
+    std::vector<Image> images;
+    std::vector<Imu> imu;               // what came since the frame before
+
+    const Image& image(const std::string& kind, std::uint32_t camera = 0) const {
+        for (const Image& each : images)
+            if (each.camera == camera && each.kind == kind) return each;
+        throw Error("expected an image " + kind + " of camera " + std::to_string(camera));
+    }
+};
+
+// From the optical camera (or the body: see Link::ready) to a frame that stays the same.
+struct Pose {
+    std::array<double, 12> matrix{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0};  // 3 rows of 4
+
+    static Pose from_quaternion(double px, double py, double pz, double x, double y, double z,
+                                double w) {
+        const double s = 2.0 / (x * x + y * y + z * z + w * w);
+        return {{1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w), px,
+                 s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w), py,
+                 s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y), pz}};
+    }
+};
+
+// The description: its values' texts by their place, as "cameras.0.info.fx": "256.0".
+class Description : public std::map<std::string, std::string> {
+public:
+    explicit Description(const std::string& json = "{}") {
+        const char* at = json.c_str();
+        read(at, "", 0);
+    }
+    const std::string& text(const std::string& place) const {
+        const auto found = find(place);
+        if (found == end()) throw Error("expected " + place + " in the description");
+        return found->second;
+    }
+    double number(const std::string& place) const {  // with a point in any locale
+        std::istringstream stream(text(place));
+        stream.imbue(std::locale::classic());
+        double found = 0.0;
+        if (!(stream >> found)) throw Error("expected a number as " + place);
+        return found;
+    }
+
+private:
+    void read(const char*& at, const std::string& place, int depth) {
+        const char first = space(at);
+        if (first != '{' && first != '[') {
+            const std::size_t length = std::strcspn(at, ",]} \n\t\r");
+            (*this)[place] = first == '"' ? string(at) : std::string(at, length);
+            if (first != '"') at += length;
+            return;
+        }
+        if (depth > 32) throw Error("expected JSON of at most 32 levels");
+        ++at;
+        for (int n = 0; space(at) != (first == '{' ? '}' : ']'); ++n) {
+            if (n > 0) expect(at, ',');
+            const std::string key = first == '{' ? string(at) : std::to_string(n);
+            if (first == '{') expect(at, ':');
+            read(at, place.empty() ? key : place + '.' + key, depth + 1);
+        }
+        ++at;
+    }
+    static char space(const char*& at) { return *(at += std::strspn(at, " \n\t\r")); }
+    static void expect(const char*& at, char what) {
+        if (space(at) != what) throw Error(std::string("expected ") + what + " in JSON");
+        ++at;
+    }
+    static std::string string(const char*& at) {  // \uXXXX stays as it is
+        std::string found;
+        for (expect(at, '"'); *at != '"'; found += *at++) {
+            if (*at == '\\' && at[1] != 'u') ++at;
+            if (*at == '\0') throw Error("expected the end of a string in JSON");
+        }
+        ++at;
+        return found;
+    }
+};
+
+// What most programs need of a camera; Link::description has everything.
+struct Camera {
+    std::string name, distortion_model;
+    std::vector<double> distortion;                // OpenCV's order
+    int width, height;
+    double fx, fy, cx, cy, rate;
+};
+
+class Link {
+public:
+    enum class PoseOf : std::uint32_t { camera, body };
+    enum class Status : std::uint32_t { tracked, lost, initialising };
+
+    // Connect to a run; an empty path is $VISNAV_SOCKET.
+    explicit Link(const std::string& name, std::string path = "") {
+        if (const char* set = std::getenv("VISNAV_SOCKET"); path.empty() && set) path = set;
+        sockaddr_un address{};
+        address.sun_family = AF_UNIX;
+        if (path.size() >= sizeof address.sun_path) throw Error("expected a shorter path: " + path);
+        std::memcpy(address.sun_path, path.c_str(), path.size());
+        socket_.reset(::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0));
+        if (::connect(socket_.fd, reinterpret_cast<sockaddr*>(&address), sizeof address) != 0)
+            throw Error("expected the socket of a run at '" + path + "': " + std::strerror(errno));
+        std::string hello("VISNAVLK");
+        words(hello, version, 0);
+        send(1, hello + name);
+        welcome();
+    }
+    Link(const Link&) = delete;
+    Link& operator=(const Link&) = delete;
+    ~Link() {
+        send(5, "");
+        if (memory_) ::munmap(memory_, size_);
+    }
+
+    const Description& description() const { return description_; }
+
+    Camera camera(std::size_t index) const {
+        const std::string place = "cameras." + std::to_string(index) + '.', info = place + "info.";
+        const auto get = [&](const std::string& name) { return description_.number(name); };
+        Camera found{description_.text(place + "source"),
+                     description_.text(info + "distortion_model"), {},
+                     static_cast<int>(get(info + "width")), static_cast<int>(get(info + "height")),
+                     get(info + "fx"), get(info + "fy"), get(info + "cx"), get(info + "cy"),
+                     get(place + "rate")};
+        for (std::string name; description_.count(
+                 name = info + "distortion." + std::to_string(found.distortion.size()));)
+            found.distortion.push_back(get(name));
+        return found;
+    }
+
+    // Tell the run to begin, and whose poses come: of the optical camera 0, or of the body (FRD).
+    void ready(PoseOf of = PoseOf::camera) {
+        std::string body;
+        words(body, of, 0);
+        send(4, body);
+    }
+
+    // Wait for the next frame, with the IMU samples since the one before; nothing: the run ended.
+    std::optional<Frame> next() {
+        std::vector<Imu> samples;
+        for (;;) {
+            const auto [type, body] = receive();
+            if (type == 5) return std::nullopt;
+            if (type == 17) return read_frame(body, samples);
+            if (type != 16) throw Error("expected IMU, FRAME or BYE, found another message");
+            for (std::size_t at = 0; at < body.size(); at += sizeof(Imu))
+                samples.push_back(get<Imu>(body, at));
+        }
+    }
+
+    // Answer a frame. The covariance is 6×6, of x, y, z and the rotations about them; points are
+    // columns and rows of tracked features, in turns; a missing inlier flag is 1.
+    void pose(const Frame& frame, const Pose& pose, Status status = Status::tracked,
+              const std::vector<float>& points = {}, std::vector<std::uint8_t> inliers = {},
+              const double* covariance = nullptr) {
+        std::string body = answer(frame);
+        const std::size_t count = points.size() / 2;
+        inliers.resize(count, 1);
+        words(body, status, covariance != nullptr, count, 0);
+        append(body, pose.matrix.data(), sizeof pose.matrix);
+        append(body, covariance, covariance ? 36 * sizeof(double) : 0);
+        append(body, points.data(), 2 * count * sizeof(float));
+        append(body, inliers.data(), count);
+        send(32, body);
+    }
+    void lost(const Frame& frame) { pose(frame, {}, Status::lost); }
+    void initialising(const Frame& frame) { pose(frame, {}, Status::initialising); }
+    void done(const Frame& frame) { send(33, answer(frame)); }  // without a pose: it was skipped
+    void log(const std::string& text) { send(34, text); }       // a line of the run's log
+
+private:
+    struct File {
+        int fd = -1;
+        void reset(int other) {
+            if (fd >= 0) ::close(fd);
+            fd = other;
+        }
+        ~File() { reset(-1); }
+    };
+
+    static void append(std::string& body, const void* data, std::size_t size) {
+        if (size) body.append(static_cast<const char*>(data), size);
+    }
+    template <class... T> static void words(std::string& body, T... values) {
+        for (const std::uint32_t each : {static_cast<std::uint32_t>(values)...})
+            append(body, &each, sizeof each);
+    }
+    template <class T> static T get(const std::string& body, std::size_t at) {
+        T value{};
+        if (at + sizeof value > body.size()) throw Error("expected a longer message from the run");
+        std::memcpy(&value, body.data() + at, sizeof value);
+        return value;
+    }
+    static std::string answer(const Frame& frame) {
+        std::string body;
+        append(body, &frame.sequence, 8);
+        append(body, &frame.stamp, 8);
+        return body;
+    }
+    void send(std::uint32_t type, const std::string& body) {
+        std::string message;
+        words(message, body.size(), type);
+        message += body;
+        const std::lock_guard<std::mutex> lock(sending_);
+        for (std::size_t at = 0; at < message.size();) {
+            const ssize_t sent =
+                ::send(socket_.fd, message.data() + at, message.size() - at, MSG_NOSIGNAL);
+            if (sent < 0 && errno != EINTR) return;  // the run has ended, which next() says
+            if (sent > 0) at += static_cast<std::size_t>(sent);
+        }
+    }
+
+    // Read that many bytes, and a file descriptor that may come with them.
+    std::string read(std::size_t size, File* file = nullptr) {
+        std::string data(size, '\0');
+        for (std::size_t at = 0; at < size;) {
+            iovec part{&data[at], size - at};
+            alignas(cmsghdr) char control[CMSG_SPACE(sizeof(int))] = {};
+            msghdr message{};
+            message.msg_iov = &part;
+            message.msg_iovlen = 1;
+            if (file) message.msg_control = control, message.msg_controllen = sizeof control;
+            const ssize_t count = ::recvmsg(socket_.fd, &message, MSG_CMSG_CLOEXEC);
+            if (count < 0 && errno == EINTR) continue;
+            if (count <= 0) throw Error("the run is gone, without BYE");
+            at += static_cast<std::size_t>(count);
+            const cmsghdr* head = file ? CMSG_FIRSTHDR(&message) : nullptr;
+            if (head && head->cmsg_type == SCM_RIGHTS && head->cmsg_len == CMSG_LEN(sizeof(int))) {
+                int fd = -1;
+                std::memcpy(&fd, CMSG_DATA(head), sizeof fd);
+                file->reset(fd);
+            }
+        }
+        return data;
+    }
+    std::pair<std::uint32_t, std::string> receive(File* file = nullptr) {
+        const auto [length, type] = get<std::array<std::uint32_t, 2>>(read(8, file), 0);
+        if (length > (1u << 24)) throw Error("expected at most 16 MiB in a message");
+        return {type, read(length)};
+    }
+
+    void welcome() {
+        File file;
+        const auto [type, body] = receive(&file);
+        if (body.compare(0, 8, "VISNAVLK") != 0 || (type != 2 && type != 3))
+            throw Error("expected a run of visnav-runtime, found something else");
+        if (type == 3) throw Error("the run refuses: " + body.substr(16));
+        if (const auto found = get<std::uint32_t>(body, 8); found != version) {
+            const std::string problem = "expected version " + std::to_string(version) +
+                                        " of the protocol, the run has " + std::to_string(found);
+            send(5, problem);
+            throw Error(problem);
+        }
+        const auto size = get<std::uint64_t>(body, 16);
+        if (file.fd < 0 || size == 0 || static_cast<off_t>(size) > ::lseek(file.fd, 0, SEEK_END))
+            throw Error("expected the run's shared memory with WELCOME");
+        description_ = Description(body.substr(24));
+        void* mapped = ::mmap(nullptr, size, PROT_READ, MAP_SHARED, file.fd, 0);
+        if (mapped == MAP_FAILED) throw Error(std::string("mmap: ") + std::strerror(errno));
+        memory_ = mapped;
+        size_ = size;
+    }
+
+    Frame read_frame(const std::string& body, const std::vector<Imu>& samples) {
+        static const char* const kinds[] = {"mono8", "rgb8", "depth32f", "segmentation32i"};
+        static const std::size_t pixels[] = {1, 3, 4, 4};
+        Frame frame{get<std::uint64_t>(body, 0), get<std::int64_t>(body, 8), {}, samples};
+        const std::size_t count = get<std::uint32_t>(body, 16);
+        if (frame.sequence != expected_++) throw Error("expected the next frame, found another");
+        if (body.size() != 24 + count * 32) throw Error("expected a frame of another length");
+        for (std::size_t at = 24; at < body.size(); at += 32) {
+            const auto [camera, kind, height, width, stride, _] =
+                get<std::array<std::uint32_t, 6>>(body, at);
+            const auto offset = get<std::uint64_t>(body, at + 24);
+            if (kind < 1 || kind > 4) throw Error("expected a known kind of image");
+            if (height > 65535 || width > 65535 || width * pixels[kind - 1] > stride ||
+                offset > size_ || std::uint64_t{height} * stride > size_ - offset)
+                throw Error("expected an image inside the shared memory");
+            frame.images.push_back({camera, kinds[kind - 1],
+                                    static_cast<int>(height), static_cast<int>(width), stride,
+                                    static_cast<const std::uint8_t*>(memory_) + offset});
+        }
+        return frame;
+    }
+
+    File socket_;
+    std::mutex sending_;
+    Description description_;
+    void* memory_ = nullptr;
+    std::size_t size_ = 0;
+    std::uint64_t expected_ = 0;
+};
+
+}  // namespace visnav
