@@ -147,6 +147,7 @@ def test_a_recording_is_looked_for_beside_the_file(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize(
     "path",

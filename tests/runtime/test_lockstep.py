@@ -41,6 +41,7 @@ def test_sleeps_time_outs_and_timers_jump() -> None:
     assert run_in_lockstep(main()) == [3600.0, 5400.0, 7200.0]
 
 
+@pytest.mark.slow
 def test_many_short_sleeps_do_not_drift() -> None:
     async def main() -> int:
         for _ in range(100_000):

@@ -80,6 +80,7 @@ async def play(kind: str, soon: bool, program: list[Command], between: list[Betw
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", LOOPS)
 @given(
     ours=st.booleans(),

@@ -63,6 +63,7 @@ def test_a_run_without_a_summary_is_refused(tmp_path: Path) -> None:
         export_calibration(tmp_path, "kalibr")
 
 
+@pytest.mark.slow
 def test_a_recorded_run_gives_vslam_lab_its_data(tmp_path: Path) -> None:
     execute(parse(RECORDED, "test"), tmp_path)
     names = [path.name for path in export_calibration(tmp_path, "vslamlab", epoch=10**18)]

@@ -23,6 +23,8 @@ from nodes.dataset.rig import Rig
 from tests.nodes.calibration.flights import ANGLE, flown, true_motion, twist
 from tests.nodes.calibration.samples import IMU, camera
 
+pytestmark = pytest.mark.slow
+
 LENSES: dict[str, tuple[DistortionModel, tuple[float, ...]]] = {
     "pinhole": ("plumb_bob", (0.0, 0.0, 0.0, 0.0, 0.0)),
     "radtan": ("plumb_bob", (-0.2, 0.04, 1e-3, -1e-3, 0.0)),

@@ -132,6 +132,7 @@ def test_what_a_file_accepts_is_left_out_and_a_wrong_name_is_said() -> None:
     assert "imu-rate" in found.change
 
 
+@pytest.mark.slow
 def test_the_command_ends_with_1_on_findings_and_check_warns(tmp_path: Path) -> None:
     text = (
         '[[nodes]]\nname = "drone"\ntype = "sims.multirotor:Multirotor"\n'

@@ -112,6 +112,7 @@ def test_an_eight_fills_its_box_and_crosses_itself_in_its_centre(
     assert np.abs(places[:, 2]).max() == pytest.approx(abs(rise))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("length", "width", "speed", "error"), [(4, 2.5, 1.5, 0.1), (8, 4, 3, 0.2), (16, 8, 6, 0.3)]
 )
@@ -125,6 +126,7 @@ def test_an_eight_is_flown_as_it_is_drawn(
     assert fastest > 0.85 * speed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "acceleration", "radius"), [(3, 3.5, 1.0), (6, 5.0, 1.5)])
 @pytest.mark.parametrize("heading", ["path", "sweep"])
 def test_aggressive_tours_are_really_flown(

@@ -105,6 +105,7 @@ def test_an_estimate_that_is_off_takes_the_vehicle_off(world: str) -> None:
     assert error[-100:, 2].mean() == pytest.approx(0.4, abs=0.03)
 
 
+@pytest.mark.slow
 def test_without_estimates_it_stops_and_waits(world: str) -> None:
     result = fly(world, blind=(5.0, 8.0))
     waits = [event for event in result.of(Hover) if 5.0 < event.stamp / SECOND < 8.0]

@@ -18,6 +18,8 @@ from nodes.trajectory.formats import tum_row, write_tum
 from tests.nodes.report.folders import SECOND, evaluated, ply, recorded, summary, walk
 from tests.nodes.report.test_report import Page
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_killed_run_gives_a_page_of_what_it_left(tmp_path: Path) -> None:
     """Trajectories grow as the run goes on; their last lines may be cut off."""

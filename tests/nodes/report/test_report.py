@@ -170,6 +170,7 @@ def test_every_image_is_one_and_shows_something(run: Path, page: Page) -> None:
     assert page.markup.count("<img") == len(images)
 
 
+@pytest.mark.slow
 def test_of_two_vehicles_each_has_its_line_and_its_estimators(tmp_path: Path) -> None:
     first, second = walk(10), walk(10, seed=5)
     far = Trajectory(

@@ -63,6 +63,7 @@ def record(tmp_path: Path, *batches: list[Event], **settings: float) -> Recorded
     return Recorded(file)
 
 
+@pytest.mark.slow
 def test_a_pose_lands_where_it_was_said_on_both_time_lines(tmp_path: Path) -> None:
     events: list[Event] = [odometry((3 + i) * MS, (1.0 + i, 2.0, -3.0)) for i in range(4)]
     found = record(tmp_path, events[:2], events[2:])

@@ -183,6 +183,7 @@ def test_a_long_line_is_shown_in_part(tmp_path: Path) -> None:
     assert len(str(error.value)) < 250
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("write", "read"), [(write_tum, read_tum), (write_euroc, read_euroc), (write_kitti, read_kitti)]
 )

@@ -52,6 +52,7 @@ class Eyes(Node):
                 self.images.send(event)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 def test_the_first_image_is_tracked_on_either_clock(clock: str) -> None:
     """Its pose is the announced one; a tracker that starts late would be off from there on."""
@@ -74,6 +75,7 @@ BLACK = np.zeros((INFO.height, INFO.width), np.uint8)
 NOWHERE = np.full((INFO.height, INFO.width), np.inf, np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("node", [VisualOdometry, MonocularOdometry])
 def test_whatever_it_is_shown_the_run_goes_on(node: type[Node[Any]]) -> None:
     random = np.random.default_rng(1)

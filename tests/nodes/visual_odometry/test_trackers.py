@@ -43,6 +43,7 @@ MOTIONS = {
 }
 
 
+@pytest.mark.slow
 @METHODS
 @pytest.mark.parametrize("path", MOTIONS.values(), ids=MOTIONS)
 def test_follows_a_motion_with_its_signs_and_in_metres(make: Make, path: list[Floats]) -> None:

@@ -51,6 +51,7 @@ on_error = "{on_error}"
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
 @pytest.mark.parametrize("when", ["on_startup", "announce", "on_announcement", "run"])
 def test_what_fails_in_one_process_ends_both_with_its_reason(clock: str, when: str) -> None:

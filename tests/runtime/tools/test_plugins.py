@@ -114,6 +114,7 @@ def test_every_command_is_one() -> None:
     assert [offer.name for offer in ours if not load(offer).help] == []
 
 
+@pytest.mark.slow
 def test_commands_of_another_package_plug_in_and_broken_ones_are_a_line(folder: Path) -> None:
     done = command("--help", folder=folder)
     assert done.returncode == 0
@@ -135,6 +136,7 @@ def test_commands_of_another_package_plug_in_and_broken_ones_are_a_line(folder: 
         assert line.startswith(f"error: {name} of the package other-package: expected 'other_")
 
 
+@pytest.mark.slow
 def test_nodes_of_another_package_are_listed_and_broken_ones_are_a_line(folder: Path) -> None:
     done = command("nodes", "other_package", folder=folder)
     assert done.returncode == 0

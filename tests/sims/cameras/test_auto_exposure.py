@@ -13,6 +13,8 @@ from events.photometry import srgb_light
 from runtime.testing import NodeResult, run_node
 from sims.computer_vision import FreeCamera
 
+pytestmark = pytest.mark.slow
+
 WORLD = """<mujoco><visual>
 <headlight ambient="{0} {0} {0}" diffuse="0 0 0" specular="0 0 0"/></visual>
 <worldbody><geom type="plane" size="9 9 1" rgba="0.8 0.8 0.8 1"/>

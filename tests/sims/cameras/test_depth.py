@@ -79,6 +79,7 @@ def inside(frame: Frame) -> npt.NDArray[np.bool_]:
     return flat
 
 
+@pytest.mark.slow
 def test_depth_lies_on_the_true_surfaces(world: tuple[Scene, CameraRenderer, str]) -> None:
     """Every pixel inside a face, to 15 m, is within 5 mm of where its ray hits."""
     built, renderer, name = world

@@ -150,6 +150,7 @@ def test_known_points_fall_on_their_pixels(spec: CameraSpec) -> None:
     assert np.abs(np.mean(errors, axis=0)).max() < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", CAMERAS, ids=lambda spec: spec.name)
 def test_depth_is_planar_and_exact_on_planes(spec: CameraSpec) -> None:
     """Of floor and walls, at any slant, within what the depth buffer resolves; numbers as well."""

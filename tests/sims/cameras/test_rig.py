@@ -35,6 +35,8 @@ from sims.cameras.frame import delay_of
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
 
+pytestmark = pytest.mark.slow
+
 MS = 1_000_000
 PERIOD = 40 * MS
 

@@ -136,6 +136,7 @@ def test_bands_look_like_one_drawing_for_each_row(
     assert np.quantile(np.abs(found.depth[same] - expected.depth[same]), 0.95) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plain", "barrel", "fisheye"])
 def test_known_points_fall_on_their_pixels_in_the_row_that_sees_them(
     renderer: CameraRenderer, name: str

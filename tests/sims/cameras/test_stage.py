@@ -70,6 +70,7 @@ def test_depth_alone_is_that_beside_colours(world: str) -> None:
         np.testing.assert_array_equal(alone, beside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("aimed", [False, True])
 def test_what_is_out_of_view_is_not_missed(

@@ -50,6 +50,7 @@ def test_the_white_noise_is_the_announced_one() -> None:
     assert sensor.measure(truth()).variance == pytest.approx(2.7**2)
 
 
+@pytest.mark.slow
 def test_the_drift_tends_to_its_standard_deviation_and_airsims_does_not() -> None:
     """With a time constant of 1 s: 0.001825 of the pressure, and √(dt/2τ) = 0.1 of that."""
     base = pressure_at(ORIGIN[2])

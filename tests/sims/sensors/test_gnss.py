@@ -55,6 +55,7 @@ def test_white_noise_is_the_announced_one() -> None:
     np.testing.assert_allclose(np.std(speeds, axis=0), 0.1, rtol=0.06)
 
 
+@pytest.mark.slow
 def test_the_slow_error_is_slow_and_as_large_as_announced() -> None:
     sensor = gnss(horizontal_drift=2.0, vertical_drift=4.0, drift_time=0.2)
     found = errors(sensor, 20_000)[200:]

@@ -139,6 +139,7 @@ def densities_of(values: npt.NDArray[np.float64], rate: float) -> npt.NDArray[np
     return np.sqrt(squared)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_allan_deviation_gives_the_announced_numbers(seed: int) -> None:
     rate = 50.0
@@ -152,6 +153,7 @@ def test_the_allan_deviation_gives_the_announced_numbers(seed: int) -> None:
     np.testing.assert_allclose(found, expected, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_an_imu_that_is_worse_than_announced_is_found_by_its_allan_deviation() -> None:
     worse = ImuParameters(gyroscope_noise_density=2.1e-4)
     found = densities_of(ImuNoise(worse, 50.0, np.random.default_rng(1)).errors(360_000), 50.0)

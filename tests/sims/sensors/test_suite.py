@@ -145,6 +145,7 @@ def test_lidars_send_turns_with_the_stamp_of_their_first_ray_when_they_are_over(
             assert now - event.stamp == pytest.approx(0.063 * SECOND, abs=0.0011 * SECOND)
 
 
+@pytest.mark.slow
 def test_equal_runs_give_equal_scans() -> None:
     lidar = {"name": "top", "columns": 90, "channels": 4, "noise": 0.02, "dropout": 0.1}
     one, again = (fly(lidars=[lidar]).of(LidarScan) for _ in range(2))

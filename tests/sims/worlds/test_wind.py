@@ -56,6 +56,7 @@ def test_intensities_and_lengths_are_those_of_the_standard() -> None:
     assert lu == pytest.approx(lw)
 
 
+@pytest.mark.slow
 def test_the_spectrum_is_that_of_the_formula() -> None:
     """In each octave, from half the corner frequency to 16 times it."""
     step, speed, height, w20 = 0.02, 40.0, 50.0, 15.4
