@@ -30,8 +30,7 @@ from events import (
 )
 from nodes.ros2_bridge.attachment import Message
 from nodes.ros2_bridge.complaints import Complaints
-from nodes.ros2_bridge.held_estimator import HeldEstimator, why_no_answer
-from nodes.ros2_bridge.held_line import HeldPublisher, Line
+from nodes.ros2_bridge.held import HeldEstimator, HeldLine, why_no_answers
 from nodes.ros2_bridge.inbox import Inbox
 from nodes.ros2_bridge.incoming_topic import IncomingTopic
 from nodes.ros2_bridge.keys import NodeName
@@ -89,7 +88,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     def __init__(self) -> None:
         self._session: Session | None = None
-        self._publishing: Publishing[Publisher | HeldPublisher] | None = None
+        self._publishing: Publishing[Publisher] | None = None
         self._queues: dict[type[Event], Stream[Any]] = {
             kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
             for kind in LARGE
@@ -100,11 +99,11 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self._outgoing: list[tuple[OutgoingTopic, Stream[Event]]] = []
         self._puts: list[Callable[[Any], None]] = []
         """Of the outgoing topics, as are their publishers."""
-        self._mapped: list[Publisher | HeldPublisher] = []
+        self._mapped: list[Publisher] = []
         self._cameras: list[CameraAnnouncement] = []
         self._stamps: Stamps | None = None
         self._open = False
-        self._line: Line | None = None
+        self._line: HeldLine | None = None
         """On which all is published, in order, if there are such estimators."""
         self._rates: dict[str, float] = {}
         """Of announced cameras and lidars."""
@@ -157,6 +156,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                 connect=config.connect,
                 listen=config.listen,
                 file=config.zenoh_config,
+                max_wait=max((each.hold.max_wait for each in config.subscriptions), default=5.0),
             )
         except (ValueError, SessionError) as error:
             self.log.fatal("%s", error)
@@ -200,11 +200,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     def check(self) -> Iterable[str]:
         """Return why an estimator could never answer."""
-        for each in self.config.subscriptions:
-            if each.use == "estimate" and each.answers_to:
-                told = any(each.is_told_by(done) for done in self.config.subscriptions)
-                told = told or self.clock.kind == "real"  # where time does not stand
-                yield from why_no_answer(each, self._rates, told=told)
+        return why_no_answers(self.config, self._rates, lockstep=self.clock.kind == "lockstep")
 
     async def run(self) -> None:
         """Subscribe, and publish images and point clouds beside the loop, each kind in order."""
@@ -322,7 +318,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                 stamps = self._fix_time()
                 estimators.append(HeldEstimator([each, *told], hold, stamps, self.config))
         if estimators:
-            self._line = Line(self, session, estimators, self._send)
+            self._line = HeldLine(self, session, estimators, self._send)
 
     async def _publish_all(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
         async for event in events:

@@ -24,6 +24,7 @@ class Publisher:
     Attributes:
         sent: How many messages went out.
         failed: How many did not: the session is closed, or a peer did not read for `max_wait`.
+        note: Called with each message that was put.
         kept: The last messages and their attachments, if the topic is transient local.
     """
 
@@ -38,6 +39,7 @@ class Publisher:
         self.topic = topic
         self.matched = matched
         self.sent = self.failed = 0
+        self.note: Callable[[Publisher, bytearray], None] | None = None
         self._put = put
         self._gid = gid_
         self._max_wait = max_wait
@@ -56,3 +58,5 @@ class Publisher:
         gone_out = self._put(message, attachment) and time.monotonic() - begin < self._max_wait
         self.sent += gone_out
         self.failed += not gone_out
+        if self.note is not None:
+            self.note(self, message)

@@ -184,24 +184,21 @@ class Session:
         come, and cost the loop more than with `subscribe`.
         """
         came: queue.Queue[tuple[Take, zenoh.Sample] | None] = queue.Queue(WAITING)
+
+        def queue_for(take: Take) -> Any:
+            put, closed = lambda sample: came.put((take, sample)), lambda: came.put(None)
+            return zenoh.handlers.Callback(put, closed, indirect=False)
+
+        def read() -> None:
+            for _ in takes:  # until each is closed
+                for take, sample in iter(came.get, None):
+                    take(_message(sample))
+
         for topic, take in takes:
-            self._kept.append(
-                self._session.declare_subscriber(
-                    self._key(topic),
-                    zenoh.handlers.Callback(
-                        functools.partial(_queue, came, take),
-                        lambda: came.put(None),
-                        indirect=False,
-                    ),
-                )
-            )
+            subscriber = self._session.declare_subscriber(self._key(topic), queue_for(take))
+            self._kept.append(subscriber)
             self._show(topic, "MS")
-        threading.Thread(
-            target=_take_queued,
-            args=(came, len(takes)),
-            name=f"reads {takes[0][0].name}",
-            daemon=True,
-        ).start()
+        threading.Thread(target=read, name=f"reads {takes[0][0].name}", daemon=True).start()
 
     def watch(self, topic_name: str, kind: Kind, changed: Callable[[bool, Token], None]) -> None:
         """Be told which endpoints of other sessions a topic has, now and whenever that changes.
@@ -321,21 +318,6 @@ def _read(subscriber: Any, take: Take) -> None:
                 sample = subscriber.try_recv()
             time.sleep(PAUSE)
             sample = subscriber.recv()
-
-
-def _queue(
-    came: queue.Queue[tuple[Take, zenoh.Sample] | None], take: Take, sample: zenoh.Sample
-) -> None:
-    came.put((take, sample))
-
-
-def _take_queued(came: queue.Queue[tuple[Take, zenoh.Sample] | None], open_: int) -> None:
-    """Take messages, in a thread, until all the subscriptions are closed."""
-    while open_:
-        if (found := came.get()) is None:
-            open_ -= 1
-        else:
-            found[0](_message(found[1]))
 
 
 def _message(sample: zenoh.Sample) -> Message:

@@ -92,10 +92,13 @@ _QOS: dict[TopicKind, Qos] = {
     "path": Qos(depth=1),
 }
 
+IMAGES: tuple[TopicKind, ...] = (
+    "image", "mono", "compressed", "depth", "compressed_depth", "segmentation", "lidar",
+)  # fmt: skip
+"""Of which an estimator subscribes to one at least."""
+
 _SENSORS: set[TopicKind] = {
-    "image", "mono", "info", "compressed", "depth", "depth_info", "compressed_depth",
-    "segmentation", "lidar", "imu", "range", "pressure", "magnetic", "fix",
-    "fix_velocity",
+    *IMAGES, "info", "depth_info", "imu", "range", "pressure", "magnetic", "fix", "fix_velocity",
 }  # fmt: skip
 """With the quality of service of rclcpp's ``SensorDataQoS``."""
 

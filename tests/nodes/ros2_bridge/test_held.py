@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -12,8 +13,10 @@ import pytest
 
 from events import DepthImage, Event, Imu, PoseEstimate
 from nodes.ros2_bridge.node import Ros2Bridge
-from runtime.testing import NodeResult, run_node
-from tests.nodes.ros2_bridge.network import free_port
+from runtime import Node
+from runtime.errors import ConfigError, FatalError, NodeError
+from runtime.testing import NodeResult, run_node, run_nodes, spec
+from tests.nodes.ros2_bridge.network import free_port, zenoh_session
 from tests.nodes.ros2_bridge.outside import TYPES, Outside
 from tests.nodes.ros_messages import samples
 
@@ -38,7 +41,9 @@ def flight(frames: int = FRAMES) -> list[Event]:
     events: list[Event] = []
     for n in range(frames):
         stamp = n * PERIOD
-        image = msgspec.structs.replace(samples.image(stamp), data=np.full((4, 6, 3), n, np.uint8))
+        image = msgspec.structs.replace(
+            samples.image(stamp), data=np.full((4, 6, 3), n % 256, np.uint8)
+        )
         depth = DepthImage(
             stamp=stamp,
             source=image.source,
@@ -142,6 +147,127 @@ def test_answers_are_what_they_say_however_they_come(
     assert not answers.why_not
     if expected == ALL:
         assert result.of(PoseEstimate) == reference.of(PoseEstimate)
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "hold", "message"),
+    [
+        ("stops", {"max_wait": 0.3}, r"an answer to the frame of 0\.165000 s within 0\.3 s"),
+        ("dies", {"max_wait": 60.0}, r"slam: nobody publishes /slam/pose any more"),
+        ("loses_one", {}, r"/slam/pose: expected message 5 of its publisher, found 6"),
+    ],
+)
+def test_an_answer_that_never_comes_ends_the_run_at_once(
+    behaviour: str, hold: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(NodeError, match=message):
+        fly(behaviour, hold=hold)
+
+
+def test_frames_of_an_estimator_that_died_are_lost_and_counted() -> None:
+    result, _ = fly("dies", hold={"max_wait": 60.0, "on_missing": "lost"})
+    assert estimates(result) == ALL[:4]
+    assert dict(result.outside["slam"].counts) == {"answered": 4, "lost": 8}
+
+
+def test_an_estimator_that_stops_is_gone_on_without() -> None:
+    result, _ = fly("stops", hold={"max_wait": 0.3, "on_missing": "continue"})
+    assert estimates(result) == ALL[:5]
+    assert result.outside["slam"].why_not
+
+
+class Pace(Node):
+    """Lets the run wait for an estimator that comes back, which takes real time."""
+
+    outside: Outside
+
+    async def run(self) -> None:
+        while self.outside.images < 8:
+            await self.clock.sleep(0.033)
+            await self.offload(time.sleep, 0.033)  # what is waited for is in threads of Zenoh
+
+
+def test_an_estimator_that_comes_back_is_held_for_again() -> None:
+    with stub("comes_back") as (outside, port):
+        Pace.outside = outside
+        config = settings(port, hold={"max_wait": 60.0, "on_missing": "lost"})
+        result = run_nodes(
+            [spec(Ros2Bridge, "node", config), spec(Pace, "pace")],
+            inputs=[*ANNOUNCED, *flight(300)],
+            duration=10.0,
+        )
+    answers = result.outside["slam"]
+    assert answers.counts["lost"] > 0
+    assert answers.counts["answered"] == 300 - answers.counts["lost"]
+    assert estimates(result)[:4] == ALL[:4]
+    assert estimates(result)[-1] == (299 * PERIOD, 299 % 256)
+
+
+def test_images_before_it_has_initialised_are_no_losses(reference: NodeResult) -> None:
+    result, _ = fly("initialises", hold={"initialise": "1s"})
+    answers = result.outside["slam"]
+    assert answers.inputs() == reference.outside["slam"].inputs()
+    assert estimates(result)[-6:] == ALL[-6:]
+    assert answers.counts["lost"] == 0
+
+
+@pytest.mark.parametrize(
+    ("needs", "missing"),
+    [
+        ([IMAGES, "/odd"], f"a subscription to {IMAGES} and /odd within 0.4 s, found none"),
+        ([], "a subscription to /drone/camera/image_raw or "),
+    ],
+)
+def test_what_is_missing_at_the_start_is_named(needs: list[str], missing: str) -> None:
+    port = free_port()
+    with zenoh_session(listen=f"tcp/127.0.0.1:{port}"):
+        config = settings(port, needs=needs, timeout=0.4)
+        with pytest.raises(FatalError, match=f"expected a publisher of /slam/pose and {missing}"):
+            run_node(Ros2Bridge, inputs=[*ANNOUNCED, *flight()], config=config)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"answers_to": "drone/cam"}, r'found "drone/cam" \(there are: drone/camera\)'),
+        (
+            {"hold": {"skips": "allowed"}, "latency": "30ms"},
+            r"above the period of drone/camera \(33\.33 ms\), found 30 ms",
+        ),
+    ],
+)
+def test_what_could_never_be_answered_is_refused_before_the_run(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(NodeError, match=message):
+        run_node(Ros2Bridge, inputs=ANNOUNCED, config=settings(free_port(), **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"as": "velocity", "type": "geometry_msgs/msg/Twist"}, 'as = "estimate" or "done"'),
+        ({"reliable": False}, "and reliable"),
+        ({"hold": {"skips": "some"}}, "skips"),
+        ({"answers_to": "", "as": "done", "type": "std_msgs/msg/Header"}, "expected answers_to"),
+        ({"as": "done", "type": "std_msgs/msg/Header"}, "expected one estimate with the same"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        run_node(Ros2Bridge, config=settings(1, **changes))
+
+
+def test_only_what_is_not_held_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    with stub("at_once") as (_, port):
+        config = settings(port)
+        run_node(Ros2Bridge, inputs=[*ANNOUNCED, *flight(1)], config=config, duration=0.1)
+        assert "at their own time" not in caplog.text
+        config["subscriptions"].append(
+            {"topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "as": "velocity"}
+        )
+        run_node(Ros2Bridge, inputs=[*ANNOUNCED, *flight(1)], config=config, duration=0.1)
+    assert "messages of ROS on /cmd_vel come at their own time" in caplog.text
 
 
 def test_all_that_is_sent_arrives_in_the_order_of_its_events_after_its_time() -> None:
