@@ -269,12 +269,12 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     def publications(self, event: Event) -> None:
         """Publish, beside the loop, what a mapping of the user's own makes of an event."""
-        for (outgoing, waiting), put in zip(self._outgoing, self._puts, strict=True):
+        for number, (outgoing, waiting) in enumerate(self._outgoing):
             if outgoing.wants(event):
-                if self._line is None:
+                if self._line is None or not self._puts:  # `run` has not begun
                     waiting.offer(event)
                 else:
-                    self._line.publish(put, event)
+                    self._line.publish(self._puts[number], event)
 
     @every(hz="clock_rate")
     def publish_clock(self, tick: Tick) -> None:  # noqa: ARG002
