@@ -88,22 +88,8 @@ def write_files(rig: Rig, name: str) -> dict[str, str]:
     for what in ("fisheye",) if name == "orbslam3" else ("time_offset",) * (name != "kalibr"):
         if len({camera[what] for camera in cameras}) > 1:
             raise ValueError(f"{name} has one {what} for all cameras, found several")
-    common: dict[str, Any] = {
-        "cameras": cameras,
-        "imu": rig.imu,
-        "stereo": len(pair(rig)) == 2,
-        "gravity": GRAVITY,
-        "depth_factor": DEPTH_FACTOR,
-    }
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=False,  # noqa: S701  # neither YAML nor JSON is HTML
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters |= {"real": real, "row": _row}
+    common = variables(rig, cameras)
+    environment = templates(Path(__file__).parent)
     found = {
         file: environment.get_template(f"{name}.{file}.jinja").render(common)
         for file in form.files
@@ -113,6 +99,36 @@ def write_files(rig: Rig, name: str) -> dict[str, str]:
         template = environment.get_template(f"{name}.{form.camera_file.format('')}.jinja")
         found[form.camera_file.format(number)] = template.render(camera=camera)
     return found
+
+
+def templates(folder: Path) -> jinja2.Environment:
+    """Return what reads the templates of a folder, with the filters ``real`` and ``row``."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(folder),
+        autoescape=False,  # noqa: S701  # neither YAML nor JSON is HTML
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {"real": real, "row": _row}
+    return environment
+
+
+def variables(rig: Rig, cameras: list[dict[str, Any]] | None = None) -> dict[str, Any]:
+    """Return what every template may use: cameras, imu, stereo, gravity and depth_factor.
+
+    Args:
+        rig: Sensors of one body.
+        cameras: In a format's words; if not given, all of the rig, with up to eight coefficients.
+    """
+    return {
+        "cameras": [_camera(rig, each, "") for each in rig.cameras] if cameras is None else cameras,
+        "imu": rig.imu,
+        "stereo": len(pair(rig)) == 2,
+        "gravity": GRAVITY,
+        "depth_factor": DEPTH_FACTOR,
+    }
 
 
 def _camera(rig: Rig, camera: CameraAnnouncement, name: str) -> dict[str, Any]:
@@ -157,7 +173,7 @@ def _coefficients(camera: CameraAnnouncement, name: str) -> tuple[float, ...]:
     Raises:
         ValueError: It has no word for the lens.
     """
-    info, most = camera.info, FORMATS[name].radtan
+    info, most = camera.info, FORMATS[name].radtan if name else 8
     if info.distortion_model == "equidistant":
         return info.distortion
     k = (0.0,) * 8 if info.is_pinhole else (*info.distortion, 0.0, 0.0, 0.0)[:8]

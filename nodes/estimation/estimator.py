@@ -205,7 +205,7 @@ class Estimator(Node[C], ABC):
             self.log.fatal("%s", self._no_camera())
         return self.camera
 
-    def exposed_at(self, image: Image) -> int:
+    def exposed_at(self, image: Image | DepthImage) -> int:
         """Return when an image was exposed on the clock of IMU and ground truth (ns).
 
         That is its stamp without the offset of the camera's clock, which was announced.
@@ -223,7 +223,9 @@ class Estimator(Node[C], ABC):
             f"found {found}{suggest(named or '', self._cameras)}"
         )
 
-    def publish(self, image: Image, result: TrackingResult, origin: int | None = None) -> None:
+    def publish(
+        self, image: Image | DepthImage, result: TrackingResult, origin: int | None = None
+    ) -> None:
         """Send what a tracker found in an image: features, pose, and whether tracking was lost.
 
         Args:

@@ -2,13 +2,10 @@
 
     python -I -S guard.py SOCKET GRACE WORD…
 
-The run holds the other end of the socket. When the program ends, its exit code goes there, a line;
-when the run closes its end, or is gone however it went, the program gets SIGTERM. Whatever is left
-after `GRACE` seconds is killed: the program, its group, and what it started elsewhere, for orphans
-become children of this process. It prints where the program prints, and imports nothing of ours.
+The exit code of the program goes to the socket, a line. When the run closes its end, or is gone
+however it went, the program gets SIGTERM; what is left after GRACE seconds is killed, wherever it
+went, for orphans become children of this process. It imports nothing of ours.
 """
-
-from __future__ import annotations
 
 import contextlib
 import ctypes
@@ -21,23 +18,19 @@ import sys
 import time
 from pathlib import Path
 
-_PR_SET_PDEATHSIG = 1
-_PR_SET_CHILD_SUBREAPER = 36
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 """prctl(2): the signal that ends a process with its parent; who becomes the parent of orphans."""
-
-_PAUSE = 0.01
-"""Seconds between two looks at what is left."""
 
 
 def main(control: socket.socket, grace: float, command: list[str]) -> None:
     """Run a command until it ends, or the other side of `control` is closed; then end the rest."""
     prctl = ctypes.CDLL(None).prctl
-    prctl(_PR_SET_CHILD_SUBREAPER, 1)
+    prctl(PR_SET_CHILD_SUBREAPER, 1)
     try:
         program = subprocess.Popen(  # noqa: S603  # what the user's file says
             command,
             process_group=0,
-            preexec_fn=lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGKILL),
+            preexec_fn=lambda: prctl(PR_SET_PDEATHSIG, signal.SIGKILL),
         ).pid
     except OSError as error:
         control.sendall(f"cannot be started: {error.strerror}\n".encode())
@@ -46,35 +39,28 @@ def main(control: socket.socket, grace: float, command: list[str]) -> None:
     ends.register(os.pidfd_open(program), select.POLLIN)
     ends.register(control, select.POLLIN)
     ends.poll()
-    # The number is still that of the program and its group: nobody has waited for it.
-    try:
+    try:  # its number is still its own: nobody has waited for it
         os.killpg(program, signal.SIGTERM)
     except OSError:  # it has gone into another group
         os.kill(program, signal.SIGTERM)
-    _end_orphans(signal.SIGTERM, program)
+    end_orphans(signal.SIGTERM, program)
     until = time.monotonic() + grace
-    while _reap(program, control):
-        if time.monotonic() >= until:
-            _end_orphans(signal.SIGKILL)
-        time.sleep(_PAUSE)
-
-
-def _reap(program: int, control: socket.socket) -> bool:
-    """Wait for what has ended, and tell whether anything is left."""
     while True:
         try:
             ended, status = os.waitpid(-1, os.WNOHANG)
         except ChildProcessError:
-            return False
+            return
         if ended == program:
             with contextlib.suppress(OSError):  # the run is gone
                 control.sendall(f"{os.waitstatus_to_exitcode(status)}\n".encode())
-        if not ended:
-            return True
+        elif not ended:
+            if time.monotonic() >= until:
+                end_orphans(signal.SIGKILL)
+            time.sleep(0.01)
 
 
-def _end_orphans(number: int, but: int = 0) -> None:
-    """Send a signal to the children of this process, ended ones included."""
+def end_orphans(number: int, but: int = 0) -> None:
+    """Send a signal to the children of this process."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             parent = int(stat.read_bytes().rpartition(b")")[2].split()[1])

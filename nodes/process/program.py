@@ -18,22 +18,20 @@ from runtime.workers.output import Output, how_it_ended
 LINES = 100
 """Lines a (real) second that are handed on; what is printed beyond is counted."""
 
-_GUARD = Path(__file__).with_name("guard.py")
-
 _AT_ONCE = 1 << 16
 """Bytes that are read together."""
 
 _REST = 1.0
-"""Seconds of the last output of a program that has ended, which others may still write to."""
+"""Seconds for the last output of a program that has ended, which others may still write to."""
 
 _LATE = 3.0
 """Seconds beyond its grace after which a guard is killed, and with it the program."""
 
 
 class Program:
-    """A command, started in a process group of its own, below `nodes.process.guard`.
+    """A command in a process group of its own, below `nodes.process.guard`.
 
-    Whichever way the run ends, the program ends with it, and all processes that it has started.
+    Whichever way the run ends, the program ends with it, and all that it has started.
 
     Args:
         command: A program and its arguments; no shell has a part in it.
@@ -41,10 +39,14 @@ class Program:
         environment: All variables.
         grace: Seconds that it may take to end once it gets SIGTERM.
         printed: Called in a thread with lines that it prints, at most `LINES` a second.
-        ended: Called in a thread, at once, when it has ended by itself, with how and what last.
+        ended: Called in a thread, at once, when it has ended by itself, with how and what it last
+            printed.
 
     Attributes:
         code: Its exit code, once it has ended; below 0 the signal that killed it.
+
+    Raises:
+        OSError: The folder is missing.
     """
 
     def __init__(
@@ -59,19 +61,17 @@ class Program:
     ) -> None:
         self.code: int | None = None
         self._grace = grace
-        self._printed = printed
-        self._ended = ended
+        self._printed, self._ended = printed, ended
         self._output = Output(self._show)
-        self._shown = self._unshown = 0
-        self._since = time.monotonic()
+        self._second, self._shown = 0, 0
         self._closing = False
         self._over = threading.Event()
-        self._story = ""
+        self._how = ""
         self._control, theirs = socket.socketpair()
-        words = [sys.executable, "-I", "-S", str(_GUARD), str(theirs.fileno()), str(grace)]
-        try:
+        guard = [sys.executable, "-I", "-S", str(Path(__file__).with_name("guard.py"))]
+        with theirs:
             self._guard = subprocess.Popen(  # noqa: S603  # what the user's file says
-                [*words, *command],
+                [*guard, str(theirs.fileno()), str(grace), *command],
                 cwd=folder,
                 env=environment,
                 stdin=subprocess.DEVNULL,
@@ -80,18 +80,16 @@ class Program:
                 pass_fds=(theirs.fileno(),),
                 process_group=0,  # so that a terminal's Ctrl-C does not reach it
             )
-        except BaseException:
-            self._control.close()
-            raise
-        finally:
-            theirs.close()
         self._watcher = threading.Thread(target=self._watch, name=command[0], daemon=True)
         self._watcher.start()
 
-    def wait(self) -> str:
-        """Wait until it has ended, and return how, and its last lines."""
-        self._over.wait()
-        return self._story
+    def wait(self, seconds: float | None = None) -> bool:
+        """Wait until it has ended, and tell whether it has."""
+        return self._over.wait(seconds)
+
+    def story(self) -> str:
+        """Return how it ended, if it did, and what it last printed."""
+        return self._output.story(self._how or "still runs")
 
     def leave(self) -> None:
         """Have it ended, and wait for nothing."""
@@ -102,23 +100,20 @@ class Program:
     def close(self) -> None:
         """End it, and all that it has started. Takes up to its grace: not on a loop."""
         self.leave()
-        try:
-            self._guard.wait(self._grace + _LATE)
-        except subprocess.TimeoutExpired:  # somebody stopped it
+        self._watcher.join(self._grace + _LATE)
+        if self._watcher.is_alive():  # somebody stopped the guard
             self._guard.kill()
-            self._guard.wait()
-        self._watcher.join()
-        self._control.close()
+            self._watcher.join()
 
     def _watch(self) -> None:
         """Read what it prints, and note its end, until its guard has gone."""
         assert self._guard.stdout is not None
         output, control = self._guard.stdout.fileno(), self._control.fileno()
         news = select.poll()
-        for each in (output, control):
-            news.register(each, select.POLLIN)
-        told = b""
-        while True:
+        news.register(output, select.POLLIN)
+        news.register(control, select.POLLIN)
+        told, more = b"", b"\0"
+        while more:
             ready = {number for number, _ in news.poll()}
             if output in ready and not self._read(output):
                 news.unregister(output)
@@ -126,13 +121,12 @@ class Program:
                 more = self._control.recv(_AT_ONCE)
                 told += more
                 if not self._over.is_set() and (told.endswith(b"\n") or not more):
-                    self._note_end(output, told.decode())
-                if not more:
-                    break
+                    self._note_end(output, told.decode().strip())
         self._guard.stdout.close()
+        self._guard.wait()
+        self._control.close()
         self._output.end()
-        if self._unshown:
-            self._printed(f"({self._unshown} more lines)")
+        self._say_how_many_more()
 
     def _read(self, output: int) -> bool:
         data = os.read(output, _AT_ONCE)
@@ -140,29 +134,27 @@ class Program:
         return bool(data)
 
     def _note_end(self, output: int, told: str) -> None:
-        """Tell of its end what the guard says, once the last that it printed is read."""
+        """Tell of its end, once the last that it printed is read."""
         rest, until = select.poll(), time.monotonic() + _REST
         rest.register(output, select.POLLIN)
         while rest.poll(0) and time.monotonic() < until and self._read(output):
             pass
-        how = told.strip() or "killed with its guard"
         with contextlib.suppress(ValueError):
-            self.code = int(how)
-            how = how_it_ended(self.code)
-        self._story = self._output.story(how)
+            self.code = int(told)
+        self._how = (told or "killed") if self.code is None else how_it_ended(self.code)
         self._over.set()
         if not self._closing:
-            self._ended(self._story)
+            self._ended(self.story())
 
     def _show(self, line: str) -> None:
         """Hand a line on, unless there were too many within a second."""
-        now = time.monotonic()
-        if now >= self._since + 1.0:
-            if self._unshown:
-                self._printed(f"({self._unshown} more lines)")
-            self._since, self._shown, self._unshown = now, 0, 0
-        if self._shown < LINES:
-            self._shown += 1
+        if (second := int(time.monotonic())) != self._second:
+            self._say_how_many_more()
+            self._second, self._shown = second, 0
+        self._shown += 1
+        if self._shown <= LINES:
             self._printed(line)
-        else:
-            self._unshown += 1
+
+    def _say_how_many_more(self) -> None:
+        if self._shown > LINES:
+            self._printed(f"({self._shown - LINES} more lines)")

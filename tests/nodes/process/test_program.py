@@ -130,7 +130,8 @@ def test_its_end_is_told_with_its_exit_code_and_last_lines(
     command: tuple[str, ...], story: str, code: int | None, start: type[Started]
 ) -> None:
     it = start(*command)
-    assert it.program.wait().startswith(story)
+    assert it.program.wait(30)
+    assert it.program.story().startswith(story)
     assert it.program.code == code
     it.program.close()
     assert len(it.told) == 1
@@ -174,7 +175,7 @@ def test_a_guard_that_is_killed_takes_the_program_along(start: type[Started]) ->
     pid = int(it.wait_for_line())
     it.program._guard.kill()
     assert it.ended.wait(10)
-    assert it.told[0].startswith("killed with its guard")
+    assert it.told[0].startswith("killed; its last output:")
     assert gone_soon(pid)
 
 

@@ -1,0 +1,97 @@
+"""A program for tests, which knows nothing of ours but the client: ``stub.py MODE…``.
+
+It says that the camera moves a millimetre along its axis for each grey level of the first pixel, so
+that an answer depends on what was sent, and on nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from nodes.link.client import Frame, Link
+else:
+    from client import Frame, Link  # $PYTHONPATH is the folder of that one file
+
+modes = {word.partition("=")[0]: word.partition("=")[2] for word in sys.argv[1:]}
+
+
+def pose_of(frame: Frame) -> npt.NDArray[np.float64]:
+    """Return what is answered to a frame."""
+    pose = np.eye(4)
+    pose[2, 3] = frame.sequence + frame.images[0].data.flat[0] / 1000
+    return pose
+
+
+def main() -> None:
+    """Answer as the modes say."""
+    print("began", *modes, flush=True)
+    if "deaf" in modes:  # to SIGTERM, and to the end of the run
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if "daemon" in modes and os.fork() == 0:
+        os.setsid()
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        Path(modes["daemon"]).write_text(str(os.getpid()))
+        time.sleep(600)
+    if "never" in modes:
+        time.sleep(600)
+    if "early" in modes:
+        sys.exit("no vocabulary")
+    held: list[Frame] = []
+    with Link("stub") as link:
+        link.ready()
+        for frame in link:
+            number = frame.sequence
+            if "log" in modes:
+                link.log(f"imu {len(frame.imu)} {frame.imu['stamp'].tolist()}")
+            if "flood" in modes:
+                print("x" * 200 + "\n" * 500, flush=True)
+            if "slow" in modes:
+                time.sleep(float(modes["slow"]))
+            if "dies" in modes and number == int(modes["dies"]) and first_time():
+                print("out of features", flush=True)
+                os._exit(7)
+            if "hangs" in modes and number == int(modes["hangs"]):
+                time.sleep(600)
+            if "reversed" in modes:  # of two
+                held.append(frame)
+                if len(held) == 2:
+                    for each in reversed(held):
+                        link.pose(each, pose_of(each))
+                    held.clear()
+            elif "skips" in modes and number % 3:
+                if modes["skips"] == "done":
+                    link.done(frame)
+            elif "starts" in modes and number < int(modes["starts"]):
+                link.initialising(frame)
+            elif "loses" in modes and number % 4 == 3:
+                link.lost(frame)
+            elif "nan" in modes and number == 5:
+                link.pose(frame, pose_of(frame) * np.nan)
+            elif "future" in modes and number == 5:
+                link.pose(frame._replace(stamp=frame.stamp + 10**9), pose_of(frame))
+            else:
+                link.pose(frame, pose_of(frame))
+                if "twice" in modes:
+                    link.pose(frame, pose_of(frame) * 2 - np.eye(4))
+    if "deaf" in modes:
+        time.sleep(600)
+
+
+def first_time() -> bool:
+    """Tell whether this is the program's first life in a run."""
+    mark = Path(os.environ["VISNAV_FOLDER"]) / "lived"
+    before = mark.exists()
+    mark.touch()
+    return not before
+
+
+main()

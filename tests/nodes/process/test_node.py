@@ -1,0 +1,291 @@
+"""A program as an estimator: whatever it does, what it is sent stays the same."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runtime.errors import ConfigError, VisnavError
+from runtime.summary import Summary
+from runtime.testing import spec
+from tests.nodes.process.rig import AsWorker, fly, program
+from tests.nodes.process.test_program import alive, gone_soon
+
+pytestmark = pytest.mark.timeout(120)
+
+FRAMES = 15
+"""Of half a second."""
+
+BEHAVIOURS: dict[str, tuple[list[str], dict[str, Any], dict[str, Any]]] = {
+    # what it does: modes, settings, and what is counted besides 15 answers and estimates
+    "answers": ([], {}, {}),
+    "slowly": (["slow=0.03"], {}, {}),
+    "twice": (["twice"], {}, {"repeated": FRAMES}),
+    "floods": (["flood"], {}, {}),
+    "is deaf": (["deaf"], {}, {}),
+    "out of order": (["reversed"], {"latency": 0.05}, {"estimates": 14}),
+    "leaves out": (["skips=done"], {}, {"estimates": 5, "answered": 5, "empty": 10}),
+    "skips": (["skips=silent"], {"latency": 0.12, "hold": {"skips": "allowed"}}, {"estimates": 4}),
+    "initialises": (["starts=4"], {}, {"estimates": 11, "answered": 11, "empty": 4}),
+    "loses track": (["loses"], {}, {"estimates": 12}),
+}
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Summary:
+    """The run of a program that answers everything."""
+    return fly(program(), tmp_path_factory.mktemp("plain"))
+
+
+@pytest.mark.parametrize("behaviour", BEHAVIOURS)
+def test_what_it_is_sent_depends_on_nothing_that_it_does(
+    behaviour: str, plain: Summary, tmp_path: Path
+) -> None:
+    modes, settings, counted = BEHAVIOURS[behaviour]
+    summary = fly(program(*modes, **settings), tmp_path)
+    outside = summary.outside["slam"]
+    assert summary.outputs["slam.estimates"] == counted.pop("estimates", FRAMES)
+    assert outside.inputs == plain.outside["slam"].inputs
+    assert outside.reproducible
+    assert (outside.lost, outside.unknown) == (0, 0)
+    if "latency" in settings:  # what is on its way at the end may be answered or not
+        return
+    for name, value in ({"answered": FRAMES, "empty": 0, "open": 0} | counted).items():
+        assert (name, getattr(outside, name)) == (name, value)
+    if not counted or "repeated" in counted:
+        assert ("loses" in modes) == (summary.digest != plain.digest)
+
+
+def test_as_a_worker_it_gives_the_same_estimates_at_the_same_times(
+    plain: Summary, tmp_path: Path
+) -> None:
+    worker = fly(spec(AsWorker, "slam", {"latency": 0.015}), tmp_path)
+    for output in ("slam.estimates", "slam.features"):
+        assert worker.digests[output] == plain.digests[output]
+
+
+@pytest.mark.slow
+def test_with_both_cores_busy_it_is_the_same(plain: Summary, tmp_path: Path) -> None:
+    over = threading.Event()
+    busy = [threading.Thread(target=lambda: [None for _ in iter(over.is_set, True)]) for _ in "ab"]
+    for each in busy:
+        each.start()
+    try:
+        assert fly(program("slow=0.01"), tmp_path).digest == plain.digest
+    finally:
+        over.set()
+
+
+GOES_WRONG: dict[str, tuple[list[str], dict[str, Any], str]] = {
+    "dies": (["dies=5"], {}, r"ended with exit code 7; its last output:\nbegan dies\nout of feat"),
+    "hangs": (
+        ["hangs=5"],
+        {"hold": {"max_wait": 0.3}},
+        r"slam: expected an answer to the frame of 0\.\d+ s within 0.3 s \(max_wait\), found none",
+    ),
+    "nan": (
+        ["nan"],
+        {},
+        r"POSE\.pose: expected finite numbers, found nan; .* still runs|exit code",
+    ),
+    "future": (["future"], {}, r"stamp: expected \d+ of frame 5, found \d+"),
+    "does not connect": (
+        ["never"],
+        {"timeout": 0.5},
+        r"link\.socket: expected a program, found none within 0.5 s; .*python.* still runs; its "
+        r"last output:\nbegan never",
+    ),
+    "ends at once": (
+        ["early"],
+        {},
+        r"ended with exit code 1; its last output:\nbegan early\nno voc",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", GOES_WRONG)
+def test_what_goes_wrong_is_one_error_that_says_all(what: str, tmp_path: Path) -> None:
+    modes, settings, message = GOES_WRONG[what]
+    with pytest.raises(VisnavError, match=message) as caught:
+        fly(program(*modes, **settings), tmp_path)
+    assert str(caught.value).startswith("slam: ")
+
+
+@pytest.mark.parametrize(
+    ("policy", "lost", "reproducible", "passed"),
+    [("lost", FRAMES - 5, True, False), ("continue", FRAMES - 5, False, False)],
+)
+def test_without_it_a_run_goes_on_if_it_may(
+    policy: str, lost: int, reproducible: bool, passed: bool, tmp_path: Path
+) -> None:
+    begin = time.monotonic()
+    summary = fly(program("dies=5", hold={"on_missing": policy, "max_wait": 60}), tmp_path)
+    assert time.monotonic() - begin < 30  # and not a minute for each frame
+    outside = summary.outside["slam"]
+    assert (outside.answered, outside.lost) == (5, lost)
+    assert outside.reproducible == reproducible
+    assert summary.verdict is not None
+    assert summary.verdict.passed == passed
+    assert "ended with exit code 7" in (tmp_path / "log.txt").read_text()
+
+
+def test_one_that_died_is_started_again_and_begins_anew(tmp_path: Path) -> None:
+    first, second = (
+        fly(program("dies=5", on_error="restart"), tmp_path / name, 1.5) for name in "ab"
+    )
+    assert first.outputs["slam.estimates"] > 20
+    assert first.outputs["slam.tracking_events"] == 2
+    assert first.digest == second.digest
+    assert first.outside["slam"].inputs == second.outside["slam"].inputs
+
+
+@pytest.mark.parametrize("mode", ["deaf", "plain"])
+def test_no_child_of_it_stays(mode: str, tmp_path: Path) -> None:
+    file = tmp_path / "pid"
+    fly(program(f"daemon={file}", mode), tmp_path / "out", 0.1)
+    assert gone_soon(int(file.read_text()))
+
+
+def test_several_cameras_come_together_and_what_is_incomplete_is_left_out(tmp_path: Path) -> None:
+    eyes: dict[str, Any] = {"cameras": ("left", "right"), "images": ("grey",), "leaves_out": (3, 7)}
+    node = program("log", cameras=["left", "right"], images=["grey"])
+    summary = fly(node, tmp_path, **eyes)
+    assert summary.outside["slam"].answered == FRAMES - 2
+    assert "2 exposures lacked an image" in (tmp_path / "log.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cameras": ["left", "up"]}, "cameras: expected depth, rgb images of up, found none"),
+        (
+            {"command": ["./no"], "folder": "/"},
+            "command: expected a program .* found none at //?no",
+        ),
+        ({"command": ["no-such-program"]}, "found none at no-such-program"),
+        ({"folder": "/not/there"}, "folder: expected a folder, found none at /not/there"),
+        ({"feed": "ros2"}, "feed: expected a Ros2Bridge"),
+        (
+            {"files": [{"path": "a", "template": "/no/where.jinja"}]},
+            "where.jinja: expected a templ",
+        ),
+        ({"hold": {"skips": "allowed"}}, "hold.skips: expected a latency of one frame or more"),
+    ],
+)
+def test_what_is_missing_is_found_before_the_run(
+    settings: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(VisnavError, match=message):
+        fly(program(**settings), tmp_path, cameras=("left", "right"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"feed": "ros2", "command": []}, "command: expected one"),
+        ({"images": ["rgb", "rgb"]}, "images: expected each once"),
+        ({"images": []}, "images"),
+        ({"files": [{"path": "../a", "template": "b"}]}, "path: expected one below"),
+    ],
+)
+def test_wrong_settings_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        program(**settings)
+
+
+def test_a_template_gets_what_was_announced(tmp_path: Path) -> None:
+    template = tmp_path / "settings.jinja"
+    template.write_text(
+        "{% for c in cameras %}{{ c.source }} {{ c.info.fx | real }} {{ c.in_imu[0] | row }}\n"
+        "{% endfor %}{{ imu.rate }} {{ imu.source }} {{ vehicle.source }} "
+        "{{ topic('image', cameras[0].source) }} {{ topic('imu', imu.source) }} {{ socket }}\n"
+    )
+    words = ["sh", "-c", 'cat "$0" >&2; exit 9', "$VISNAV_FOLDER/in/settings"]
+    files = [{"path": "in/settings", "template": str(template)}]
+    with pytest.raises(VisnavError, match="exit code 9"):
+        fly(program(command=words, files=files), tmp_path / "out")
+    folder = tmp_path / "out" / "programs" / "slam"
+    text = (folder / "in" / "settings").read_text()
+    assert text == (
+        "drone/camera 4.000000000000001 [0.0, 0.0, 1.0, 0.2]\n"
+        f"200.0 drone/imu drone /drone/camera/image_raw /drone/imu {folder / 'link.socket'}\n"
+    )
+
+
+def test_a_mistake_in_a_template_is_told_with_its_line(tmp_path: Path) -> None:
+    template = tmp_path / "settings.jinja"
+    for text, message in (("a\n{{ camera.fx }}", "'camera' is undefined"), ("{% if %}", "line 1")):
+        template.write_text(text)
+        files = [{"path": "settings", "template": str(template)}]
+        with pytest.raises(VisnavError, match=f"settings.jinja: .*{message}"):
+            fly(program(files=files), tmp_path / "out")
+
+
+def test_a_build_comes_first_and_its_failure_ends_the_run(tmp_path: Path) -> None:
+    made = tmp_path / "made"
+    summary = fly(program(build=["touch", str(made)]), tmp_path / "out", 0.1)
+    assert summary.outside["slam"].answered == 3
+    assert made.exists()
+    with pytest.raises(VisnavError, match=r"slam: build: sh -c .* exit code 2; .*\nno compiler"):
+        fly(program(build=["sh", "-c", "echo no compiler; exit 2"]), tmp_path / "out")
+
+
+def test_what_an_earlier_run_has_left_is_not_there_any_more(tmp_path: Path) -> None:
+    folder = tmp_path / "programs" / "slam"
+    fly(program(), tmp_path, 0.1)
+    (folder / "map.bin").touch()
+    fly(program(), tmp_path, 0.1)
+    assert [*folder.iterdir()] == []
+
+
+def test_a_path_that_is_too_long_for_a_socket_is_no_hindrance(tmp_path: Path) -> None:
+    out = tmp_path / ("x" * 120)
+    assert fly(program(), out, 0.1).outside["slam"].answered == 3
+
+
+def test_in_real_time_it_gets_what_it_has_room_for(tmp_path: Path) -> None:
+    summary = fly(program("slow=0.15"), tmp_path, 2.0, clock="real")
+    outside = summary.outside["slam"]
+    assert outside.skipped > 10
+    assert outside.answered < 20
+    assert outside.answered + outside.skipped + outside.open == outside.sent
+    assert "frames were not sent: the program had no room" in (tmp_path / "log.txt").read_text()
+
+
+def test_one_that_is_started_by_hand_may_go_and_come_back(tmp_path: Path) -> None:
+    pids: list[int] = []
+
+    def start_by_hand() -> None:
+        import subprocess
+        import sys
+
+        from tests.nodes.process.rig import ROOT, STUB
+
+        socket = tmp_path / "programs" / "slam" / "link.socket"
+        environment = {
+            **os.environ,
+            "VISNAV_SOCKET": str(socket),
+            "VISNAV_FOLDER": str(tmp_path),
+            "PYTHONPATH": str(ROOT / "nodes" / "link"),
+        }
+        for _ in range(2):
+            while not socket.exists():
+                time.sleep(0.01)  # until the run listens
+            child = subprocess.Popen([sys.executable, STUB, "dies=3"], env=environment)
+            pids.append(child.pid)
+            child.wait()
+
+    thread = threading.Thread(target=start_by_hand)
+    thread.start()
+    hold = {"on_missing": "lost", "max_wait": 60}
+    summary = fly(program(command=[], hold=hold), tmp_path, 4.0, clock="real")
+    thread.join(30)
+    outside = summary.outside["slam"]
+    assert outside.answered > 10
+    assert outside.lost > 0
+    assert not any(alive(pid) for pid in pids)
