@@ -1,9 +1,9 @@
-"""A peer in a process of its own that only knows Zenoh, to be stopped or killed.
+"""A peer in a process of its own, to be stopped or killed.
 
-python -m tests.nodes.ros2_bridge.peer LOCATOR KEY [TOKEN …]
+python -m tests.nodes.ros2_bridge.peer LOCATOR TOPIC [TOKEN …]
 
-It declares the tokens and subscribes to the key twice: as a plain subscriber, and as rmw_zenoh_cpp
-does for what is reliable and transient local. It prints ``ready`` and then a line for each message:
+It declares the tokens, and subscribes to the topic as the bridge does (``ours``), and as who knows
+nothing of messages that are kept (``plain``). It prints ``ready``, then a line for each message:
 which of the two has it, its number, and its first bytes. What comes on ``junk`` it only reads.
 """
 
@@ -11,44 +11,57 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 
 import zenoh
 
-from nodes.ros2_bridge.attachment import unpack
-from tests.nodes.ros2_bridge.network import zenoh_session
+from nodes.ros2_bridge.attachment import Attachment, Message, unpack
+from nodes.ros2_bridge.keys import NodeName, data_key
+from nodes.ros2_bridge.session import Session
+from nodes.ros_messages.topics import Qos, Topic
+
+DOMAIN = 3
+PLAIN = Topic(name="/a/b", type="std_msgs/msg/Empty", hash="RIHS01_0", qos=Qos(depth=3))
+KEPT = Topic(
+    name="/kept",
+    type="std_msgs/msg/Empty",
+    hash="RIHS01_0",
+    qos=Qos(transient_local=True, depth=2),
+)
 
 
-def printer(who: str) -> Callable[[zenoh.Sample], None]:
-    """Return what prints a message."""
+def tell(who: str, attachment: Attachment | None, data: bytes) -> None:
+    """Print a message."""
+    assert attachment is not None
+    sys.stdout.write(f"{who} {attachment.sequence} {data[:5].decode()}\n")
+    sys.stdout.flush()
 
-    def tell(sample: zenoh.Sample) -> None:
-        assert sample.attachment is not None
-        number = unpack(sample.attachment.to_bytes()).sequence
-        sys.stdout.write(f"{who} {number} {sample.payload.to_bytes()[:5].decode()}\n")
-        sys.stdout.flush()
 
-    return tell
+def ours(message: Message) -> None:
+    """Take a message of the bridge's own subscription."""
+    tell("ours", message.attachment, message.read())
+
+
+def plain(sample: zenoh.Sample) -> None:
+    """Take a message of the other one."""
+    assert sample.attachment is not None
+    tell("plain", unpack(sample.attachment.to_bytes()), sample.payload.to_bytes())
 
 
 def main() -> None:
-    locator, key, *tokens = sys.argv[1:]
-    ext = zenoh.ext
-    with zenoh_session(connect=locator) as session:
-        held = [session.liveliness().declare_token(token) for token in tokens]
-        ext.declare_advanced_subscriber(
-            session,
-            key,
-            printer("advanced"),
-            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
-            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
-        session.declare_subscriber(key, printer("plain"))
-        session.declare_subscriber("junk", lambda _: None)
-        sys.stdout.write("ready\n")
-        sys.stdout.flush()
-        time.sleep(120)  # to be killed before
-        del held
+    locator, name, *tokens = sys.argv[1:]
+    node = NodeName(name="peer", domain_id=DOMAIN)
+    session = Session(node, connect=(locator,), listen=())
+    (topic,) = (each for each in (PLAIN, KEPT) if each.name == name)
+    session.subscribe(topic, ours)
+    kept = [
+        session._session.declare_subscriber(data_key(DOMAIN, topic), plain),
+        session._session.declare_subscriber("junk", lambda _: None),
+        *(session._session.liveliness().declare_token(token) for token in tokens),
+    ]
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    time.sleep(120)  # to be killed before
+    del kept
 
 
 if __name__ == "__main__":

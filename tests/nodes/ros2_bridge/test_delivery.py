@@ -15,25 +15,19 @@ from typing import Any
 import pytest
 import zenoh
 
-from nodes.ros2_bridge.attachment import unpack
+from nodes.ros2_bridge.attachment import Attachment, Message, pack, unpack
 from nodes.ros2_bridge.keys import Kind, NodeName, Token, data_key, endpoint_token, node_token
 from nodes.ros2_bridge.publisher import Publisher
 from nodes.ros2_bridge.session import CLOSING, Session
 from nodes.ros_messages.topics import Qos, Topic
 from tests.nodes.ros2_bridge.network import free_port, zenoh_session
+from tests.nodes.ros2_bridge.peer import DOMAIN, KEPT, PLAIN
 
-NODE = NodeName(name="eye", namespace="/fleet", domain_id=3)
-PLAIN = Topic(name="/a/b", type="std_msgs/msg/Empty", hash="RIHS01_0", qos=Qos(depth=3))
-KEPT = Topic(
-    name="/kept",
-    type="std_msgs/msg/Empty",
-    hash="RIHS01_0",
-    qos=Qos(transient_local=True, depth=2),
-)
+NODE = NodeName(name="eye", namespace="/fleet", domain_id=DOMAIN)
 Told = queue.SimpleQueue[tuple[bool, Token]]
 
 
-def foreign_token(kind: Kind, topic: Topic, zid: str = "ff1", domain: int = 3) -> str:
+def foreign_token(kind: Kind, topic: Topic, zid: str = "ff1", domain: int = DOMAIN) -> str:
     """Return a token as newer releases have it."""
     node = NodeName(name="slam", domain_id=domain)
     return endpoint_token(node, zid, 0, 7, kind, topic) + "/cpu:,demo:version=1.0"
@@ -87,22 +81,36 @@ def watch(session: Session, kind: Kind = "MS", topic: Topic = PLAIN) -> Told:
 
 def test_a_subscriber_that_loses_a_kept_message_gets_it_all_the_same() -> None:
     """The plain one of the same process shows that it was lost."""
-    with listening() as (session, locator), peer(locator, data_key(3, KEPT)) as (process, lines):
+    with listening() as (session, locator), peer(locator, KEPT.name) as (process, lines):
         publisher = session.publisher(KEPT)
         junk = session._session.declare_publisher("junk")
         until(publisher.matched)
         until(lambda: junk.matching_status.matching)  # type: ignore[attr-defined]
         publisher.put(bytearray(b"one"))
         first = {lines.get(timeout=10) for _ in range(2)}
-        assert first == {"plain 1 one", "advanced 1 one"}
+        assert first == {"plain 1 one", "ours 1 one"}
         process.send_signal(signal.SIGSTOP)
         for _ in range(30):  # more than sockets take; then messages are dropped
             junk.put(bytes(1_000_000))
         publisher.put(bytearray(b"two"))
         process.send_signal(signal.SIGCONT)
-        assert lines.get(timeout=10) == "advanced 2 two"
+        assert lines.get(timeout=10) == "ours 2 two"
         publisher.put(bytearray(b"three"))
-        assert {lines.get(timeout=10) for _ in range(2)} == {"plain 3 three", "advanced 3 three"}
+        assert {lines.get(timeout=10) for _ in range(2)} == {"plain 3 three", "ours 3 three"}
+
+
+def test_a_message_has_its_attachment_and_none_if_what_came_is_none() -> None:
+    said = Attachment(7, 123, bytes(range(16)))
+    with listening() as (session, locator), zenoh_session(connect=locator) as other:
+        heard: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        session.subscribe(PLAIN, heard.put)
+        publisher: Any = other.declare_publisher(data_key(DOMAIN, PLAIN))
+        until(lambda: publisher.matching_status.matching)
+        for attached in (pack(said), None, b"", bytes(33), pack(said)[:-1], b"x" * 100_000):
+            publisher.put(b"hello", attachment=attached)
+        messages = [heard.get(timeout=10) for _ in range(6)]
+        assert [message.attachment for message in messages] == [said, *[None] * 5]
+        assert [(message.size, message.read()) for message in messages] == [(5, b"hello")] * 6
 
 
 def test_who_joins_late_and_asks_for_the_topic_s_key_gets_what_is_kept() -> None:
@@ -115,8 +123,8 @@ def test_who_joins_late_and_asks_for_the_topic_s_key_gets_what_is_kept() -> None
 
         def asked(topic: Topic) -> list[tuple[int, bytes]]:
             every = zenoh.ConsolidationMode.NONE
-            samples = [each.ok for each in other.get(data_key(3, topic), consolidation=every)]
-            assert all(str(each.key_expr) == data_key(3, topic) for each in samples if each)
+            samples = [each.ok for each in other.get(data_key(DOMAIN, topic), consolidation=every)]
+            assert all(str(each.key_expr) == data_key(DOMAIN, topic) for each in samples if each)
             return [
                 (unpack(each.attachment.to_bytes()).sequence, each.payload.to_bytes())
                 for each in samples
@@ -137,7 +145,7 @@ def put_many(publisher: Publisher, count: int = 40) -> None:
 @pytest.mark.parametrize("held", [True, False])
 def test_a_peer_that_reads_slowly_gets_every_message_of_a_held_topic(held: bool) -> None:
     """Of another one it gets what the link has room for: so here the link has too little."""
-    with listening() as (session, locator), peer(locator, data_key(3, PLAIN)) as (process, lines):
+    with listening() as (session, locator), peer(locator, PLAIN.name) as (process, lines):
         publisher = session.publisher(PLAIN, held=held)
         assert publisher.topic.qos == Qos(depth=3, keep_all=held)
         until(publisher.matched)
@@ -165,7 +173,7 @@ def test_a_peer_that_reads_slowly_gets_every_message_of_a_held_topic(held: bool)
 def test_a_peer_that_stands_still_keeps_a_held_message_and_the_end_for_a_bounded_time() -> None:
     with (
         listening(max_wait=1.0) as (session, locator),
-        peer(locator, data_key(3, PLAIN)) as (process, _),
+        peer(locator, PLAIN.name) as (process, _),
     ):
         publisher = session.publisher(PLAIN, held=True)
         until(publisher.matched)
@@ -195,7 +203,7 @@ def test_endpoints_are_told_of_when_they_appear_and_when_their_process_is_killed
             early.undeclare()  # type: ignore[no-untyped-call]
             assert told.get(timeout=10) == (False, found)
         session.subscribe(PLAIN, lambda _: None)  # one's own are not told of
-        with peer(locator, data_key(3, PLAIN), token) as (process, _):
+        with peer(locator, KEPT.name, token) as (process, _):
             assert told.get(timeout=10) == (True, found)
             process.kill()
             assert told.get(timeout=5) == (False, found)  # or else it would take 10 s
