@@ -1,4 +1,6 @@
-"""Settings that name files: what the file reads, and what its nodes write into the run's folder.
+"""Settings that name files, and the private folder of a user.
+
+A setting names what the file reads, or what its nodes write into the run's folder::
 
     class ReplayConfig(NodeConfig):
         recording: InputPath
@@ -11,12 +13,16 @@ may write the same file.
 
 from __future__ import annotations
 
+import os
+import stat
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
+from runtime.errors import CommandError
 from runtime.units import plain
 
 Kind = Literal["input", "name", "output", "secret"]
@@ -118,3 +124,24 @@ def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
     if len(inner) == 1:  # or None
         return _walk(value, inner[0], change)
     return value
+
+
+def user_folder() -> Path:
+    """Return the folder, made if missing.
+
+    Raises:
+        CommandError: It cannot be made, or others than its user may get at it.
+    """
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    path = Path(base) / "visnav" if base else Path(tempfile.gettempdir()) / f"visnav-{os.getuid()}"
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = path.lstat()
+    except OSError as error:
+        raise CommandError(f"{path}: expected a folder for sockets: {error.strerror}") from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise CommandError(
+            f"{path}: expected a folder that only its user may enter, found mode "
+            f"{stat.S_IMODE(found.st_mode):o} of user {found.st_uid}"
+        )
+    return path

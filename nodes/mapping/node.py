@@ -22,7 +22,7 @@ from events import (
 )
 from events.poses import pose_matrix
 from nodes.estimation import WORKER_ENVIRONMENT
-from nodes.mapping.mapper import Mapper
+from nodes.mapping.cloud import Mapper
 from nodes.mapping.transforms import TransformError, TransformTree
 from nodes.trajectory.growing import part_name
 from runtime import Bundle, Duration, Node, NodeConfig, Output, on

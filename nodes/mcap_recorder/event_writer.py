@@ -17,8 +17,8 @@ import cv2
 
 from events import Announcement, Event
 from nodes.mcap import native
-from nodes.mcap.arrays import HOLDERS
 from nodes.mcap.mcap_file import McapWriter
+from nodes.mcap.native import HOLDERS
 from nodes.mcap_recorder.settings import McapRecorderConfig
 from nodes.ros_messages.publishing import Publishing
 from nodes.ros_messages.settings import ALL_GROUPS, PublishingConfig

@@ -14,8 +14,7 @@ from nodes.monocular_odometry.views import (
     reprojection_errors,
     triangulate,
 )
-from nodes.odometry.flow import follow_both_ways
-from nodes.odometry.images import Floats, Grey
+from nodes.odometry.images import Floats, Grey, follow_both_ways
 from nodes.odometry.pose import Observations, rays, solve_pose
 
 _SNAPSHOT = 5.0

@@ -24,8 +24,14 @@ from nodes.monocular_odometry.initialization import Initialization
 from nodes.monocular_odometry.keyframes import Keyframe
 from nodes.monocular_odometry.local_map import LocalMap
 from nodes.monocular_odometry.settings import MonocularSettings
-from nodes.odometry.flow import follow_both_ways
-from nodes.odometry.images import Floats, Grey, grey_image, inside, refuse_distortion
+from nodes.odometry.images import (
+    Floats,
+    Grey,
+    follow_both_ways,
+    grey_image,
+    inside,
+    refuse_distortion,
+)
 from nodes.odometry.pose import Observations, Solution, intrinsics, solve_pose
 from nodes.odometry.relocalization import describe, detect_and_describe, relocalize
 

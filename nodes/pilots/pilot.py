@@ -1,7 +1,7 @@
 """What all scripted flights have in common: take off, follow a path, land, end the run.
 
-By which pose the path is followed is up to the subclass: `nodes.pilots.waypoint_follower` takes the
-vehicle's true one, `nodes.pilots.visual_pilot` an estimator's.
+By which pose the path is followed is up to the subclass: `WaypointFollower` takes the vehicle's
+true one, `nodes.pilots.visual_pilot` an estimator's.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from events import (
     PathAnnouncement,
     PilotAnnouncement,
     PoseEstimate,
+    PositionSetpoint,
     Shutdown,
     TakenOff,
     Takeoff,
@@ -213,3 +214,43 @@ class Pilot(Node[C], ABC):
             )
             parts.append(headed(path, config.heading, yaw))
         return functools.reduce(joined, parts) if parts else None
+
+
+class WaypointFollower(Pilot[PilotConfig]):
+    """Flies a vehicle along waypoints, its nose in the direction of flight.
+
+    It takes off, follows the path, lands, and ends the run.
+    """
+
+    setpoints = Output(PositionSetpoint)
+
+    @on(Odometry)
+    def odometry(self, event: Odometry) -> None:
+        """Note the vehicle's pose."""
+        self.update_pose(event)
+
+    async def follow(self, path: WaypointPath) -> None:
+        """Send a position set-point for every step of the path."""
+        start = self.clock.now()
+        rows = zip(
+            path.position.tolist(),
+            path.velocity.tolist(),
+            path.acceleration.tolist(),
+            path.yaw.tolist(),
+            path.yaw_rate.tolist(),
+            strict=True,
+        )
+        for index, (position, velocity, acceleration, yaw, yaw_rate) in enumerate(rows):
+            await self.clock.sleep_until(start + round(index * path.step * 1e9))
+            self.setpoints.send(
+                PositionSetpoint(
+                    stamp=self.clock.now(),
+                    source=self.name,
+                    vehicle=self.config.vehicle,
+                    position=tuple(position),
+                    velocity=tuple(velocity),
+                    acceleration=tuple(acceleration),
+                    yaw=yaw,
+                    yaw_rate=yaw_rate,
+                )
+            )

@@ -1,7 +1,7 @@
 """Recordings and data sets in the place of a simulator.
 
-`node` sends the events again; `choice` selects them, `ahead` reads in a thread. `reader` is what
-formats have in common, `formats` finds the right one of `recorded` (ours), `rosbag`, `euroc` and
+`node` finds the right reader and sends the events again; `choice` selects them, `ahead` reads in a
+thread. `reader` is what the readers have in common: `recorded` (ours), `rosbag`, `euroc` and
 `tum_rgbd`.
 """
 

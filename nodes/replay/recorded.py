@@ -8,9 +8,9 @@ from pathlib import Path
 
 from events import Announcement, CameraAnnouncement, Event
 from nodes.mcap import native
-from nodes.mcap.arrays import HOLDERS, arrays
 from nodes.mcap.disk import RecordingError
 from nodes.mcap.mcap_file import Record, contents, read
+from nodes.mcap.native import HOLDERS, arrays
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.ros_messages.frame_names import FrameNames
 from nodes.ros_messages.typestore import TypeStore

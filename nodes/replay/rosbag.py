@@ -28,9 +28,8 @@ from events import (
     PoseEstimate,
 )
 from nodes.mcap import layout
-from nodes.replay.bag_topics import chosen
+from nodes.replay.bag_topics import Mountings, chosen
 from nodes.replay.folders import vehicle_at
-from nodes.replay.mounting import Mountings
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 from nodes.replay.settings import BagTopic, Use
 from nodes.ros_messages.calibration import camera_announcement

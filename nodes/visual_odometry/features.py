@@ -21,8 +21,14 @@ import numpy.typing as npt
 from events import CameraInfo
 from events.poses import inverse
 from nodes.estimation import TrackingResult
-from nodes.odometry.flow import FLOW_CRITERIA
-from nodes.odometry.images import Depth, Floats, Grey, grey_and_depth, refuse_distortion
+from nodes.odometry.images import (
+    FLOW_CRITERIA,
+    Depth,
+    Floats,
+    Grey,
+    grey_and_depth,
+    refuse_distortion,
+)
 from nodes.odometry.pose import (
     Observations,
     Solution,

@@ -13,8 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.odometry.flow import follow_both_ways
-from nodes.odometry.images import Floats, Grey
+from nodes.odometry.images import Floats, Grey, follow_both_ways
 
 Rows = npt.NDArray[np.int64]
 

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 from runtime.errors import CommandError, PeerError
-from runtime.user_folder import user_folder
+from runtime.paths import user_folder
 
 SHORTEST = 16
 """Characters of a secret at least."""

@@ -20,12 +20,11 @@ import numpy.typing as npt
 from events.base import Quaternion, Vector3
 from events.poses import pose_matrix
 from sims.cameras.development import Development
-from sims.cameras.frame import Frame
+from sims.cameras.frame import Frame, Shot
 from sims.cameras.graphics import gl_renderer, keep_memory
 from sims.cameras.lens import undistorted
 from sims.cameras.noise import generator, grey_of
 from sims.cameras.response import moments
-from sims.cameras.shot import Shot
 from sims.cameras.shutter import FINER_FOR_DEPTH, image_speeds, row_bands, row_time, small_camera
 from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain
 from sims.cameras.stage import Changing, Colours, Depths, Floats, Stage

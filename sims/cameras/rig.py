@@ -26,10 +26,9 @@ from events.base import Quaternion, Vector3
 from runtime import Node, Worker
 from runtime.sender import Sender
 from sims.cameras.exposure import ExposureControl
-from sims.cameras.frame import Frame, delay_of, stamp_error
+from sims.cameras.frame import Frame, Motion, Shot, delay_of, stamp_error
 from sims.cameras.lens import undistorted
 from sims.cameras.renderer import CameraRenderer
-from sims.cameras.shot import Motion, Shot
 from sims.cameras.spec import CameraSpec, announcement, eyes, optical_frame, optical_in_body
 
 STEP = 1_000_000

@@ -7,8 +7,7 @@ when it is due.
 
 from sims.sensors.imu import ImuModel, ImuNoise, ImuParameters
 from sims.sensors.settings import SensorsConfig
-from sims.sensors.suite import SensorSuite
-from sims.sensors.vehicle_imu import mount_imu
+from sims.sensors.suite import SensorSuite, mount_imu
 
 __all__ = [
     "ImuModel",

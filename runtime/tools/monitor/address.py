@@ -9,7 +9,7 @@ import socket
 from pathlib import Path
 
 from runtime.errors import CommandError, suggest
-from runtime.user_folder import user_folder
+from runtime.paths import user_folder
 
 _LONGEST = 100
 """Bytes of a Unix socket's path at most (108 on Linux, 104 elsewhere)."""

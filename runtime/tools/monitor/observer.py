@@ -25,8 +25,7 @@ from runtime.schedule import SECOND
 from runtime.summary import count_drops
 from runtime.supervisor import Supervisor
 from runtime.tools.monitor.command import Command, Pause, Restart, Resume, Set, Speed, Step, Stop
-from runtime.tools.monitor.meter import Meter
-from runtime.tools.monitor.recent import RecentSamples, Sample
+from runtime.tools.monitor.meter import Meter, RecentSamples, Sample
 from runtime.tools.monitor.snapshot import (
     ClockState,
     InputState,

@@ -3,9 +3,8 @@
     config.toml, --vary, --seeds  →  Plan of Jobs  →  Executor  →  Rows  →  tables and plots
 
 Read in this order: `values` (what ``--vary`` says), `plan` (which runs there are), `process` (one
-run), `rows` (what is remembered of it), `execute` (all runs), `tables`, `plots` and `page` (the
-result).
-`console` is what a terminal shows meanwhile; the command itself is `runtime.tools.cli.sweep`.
+run), `rows` (what is remembered of it), `console` (all runs, and what a terminal shows meanwhile),
+`tables`, `plots` and `page` (the result). The command itself is `runtime.tools.cli.sweep`.
 
 The executor may be any of `concurrent.futures`, also one that spreads the runs over machines on
 which the project is installed. With Dask (``pip install distributed``)::
@@ -23,7 +22,7 @@ machine, and a run's folder of results stays on the machine that ran it unless t
 is shared. The rows come back in any case.
 """
 
-from runtime.tools.sweep.execute import Watch, sweep
+from runtime.tools.sweep.console import Watch, sweep
 from runtime.tools.sweep.page import write_page
 from runtime.tools.sweep.plan import Job, Plan, make_plan
 from runtime.tools.sweep.plots import draw_plots

@@ -25,7 +25,7 @@ from events import (
 from events.rotations import from_rpy, rotate
 from nodes.dataset import DatasetWriter
 from nodes.dataset.recording import ImageFile
-from nodes.replay.formats import open_reader
+from nodes.replay.node import open_reader
 from nodes.replay.settings import ReplayConfig
 from nodes.trajectory.formats import read_euroc, read_tum
 from runtime.errors import ConfigError, FatalError, NodeError

@@ -18,7 +18,7 @@ from nodes.mcap import layout
 from nodes.mcap.disk import RecordingError
 from nodes.mcap.mcap_file import McapWriter, contents, read
 from nodes.mcap_recorder.recover import recover_file
-from nodes.replay.formats import open_reader
+from nodes.replay.node import open_reader
 from nodes.replay.reader import ReplayError
 from nodes.replay.settings import ReplayConfig
 from tests.nodes.mcap.test_mcap_file import fill, write

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nodes.monocular_odometry.keyframes import new_corners
-from nodes.odometry.flow import follow_both_ways
-from nodes.odometry.images import inside
+from nodes.odometry.images import follow_both_ways, inside
 from tests.nodes.monocular_odometry.world import FLAT, INFO, look, pose
 
 HERE, THERE = look(pose(), FLAT), look(pose(x=0.1), FLAT)

@@ -18,7 +18,7 @@ from nodes.dataset import DatasetWriter
 from nodes.mcap.mcap_file import McapWriter
 from nodes.mcap_recorder.event_writer import EventWriter
 from nodes.mcap_recorder.settings import McapRecorderConfig
-from nodes.replay.formats import open_reader
+from nodes.replay.node import open_reader
 from nodes.replay.reader import Reader
 from nodes.replay.settings import ReplayConfig
 from runtime.testing import run_node

@@ -31,7 +31,7 @@ from nodes.dataset.rig import choose
 from nodes.dataset.tum_rgbd import TumRgbd
 from nodes.replay.choice import Choice
 from nodes.replay.euroc import read_sensor
-from nodes.replay.formats import open_reader
+from nodes.replay.node import open_reader
 from nodes.replay.reader import Reader, ReplayError
 from nodes.replay.settings import ReplayConfig
 from nodes.trajectory.table import epoch_of

@@ -26,8 +26,8 @@ from sims.cameras import (
     model_to_bytes,
     pose_to_qpos,
 )
+from sims.cameras.frame import Motion, Shot
 from sims.cameras.intrinsics import Lens
-from sims.cameras.shot import Motion, Shot
 from sims.cameras.shutter import MOST_BANDS, OFF, row_bands, row_time
 
 Array = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import pytest
 
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.tools.monitor import meter
-from runtime.tools.monitor.recent import Amount
+from runtime.tools.monitor.meter import Amount
 
 
 def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) -> None:
