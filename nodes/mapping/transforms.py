@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from events import Odometry, PoseStamped, TransformStamped
+from events import Odometry, TransformStamped
 from events.poses import Pose, pose_matrix
 from nodes.trajectory import RecentPoses
 
@@ -88,19 +88,6 @@ class TransformTree:
         """
         pose = event.position, event.orientation
         self._add(event.frame_id, event.child_frame_id, event.stamp, pose)
-
-    def add_pose(self, event: PoseStamped, child_frame_id: str) -> None:
-        """Take in a pose, as the transform from a frame to the pose's parent.
-
-        Args:
-            event: The pose.
-            child_frame_id: Whose pose it is, which the event does not name.
-
-        Raises:
-            ValueError: As for `add`.
-        """
-        pose = event.position, event.orientation
-        self._add(event.frame_id, child_frame_id, event.stamp, pose)
 
     def lookup(self, target: str, source: str, stamp: int) -> Floats:
         """Return the transform that takes coordinates in `source` to coordinates in `target`.

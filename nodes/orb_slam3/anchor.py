@@ -1,4 +1,4 @@
-"""One frame for all of ORB-SLAM3's maps, whose own frames it moves, and their points in it.
+"""One frame for all of ORB-SLAM3's maps, whose own frames it rotates, scales and merges.
 
 ORB-SLAM3's world is that of its present map: when it has been lost for long it starts another one
 at identity, when it recognizes a place it merges the two, and when the IMU's scale and gravity
@@ -36,9 +36,6 @@ class Anchor:
 
     A map that starts after tracking was lost is put at the last known pose of the camera, since
     nothing better is known: so the motion in between is missing, until the maps are merged.
-
-    Attributes:
-        map: Stamp of the present map's first key frame (seconds); -1 before there is one.
     """
 
     def __init__(self) -> None:
@@ -46,7 +43,6 @@ class Anchor:
         self._from_world = np.eye(4)
         self._last = np.eye(4)
         self._doubted = False
-        self.map = -1.0
 
     @property
     def maps(self) -> int:
@@ -71,7 +67,6 @@ class Anchor:
         self._doubted = known and old_fits and not self._doubted
         if not self._doubted:
             self._from_world = from_world
-            self.map = first.stamp
 
     def _jump(self, from_world: Floats, pose: Floats) -> float:
         """Return how far a pose would be from the last one."""
@@ -81,11 +76,6 @@ class Anchor:
         """Return a pose in the frame of the very first key frame; remembered as the last one."""
         self._last = self._from_world @ pose
         return self._last
-
-    def place_points(self, points: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return points (n, 3) of the present world in the frame of the very first key frame."""
-        turned = points @ self._from_world[:3, :3].T + self._from_world[:3, 3]
-        return turned.astype(np.float32)
 
     @property
     def last(self) -> Floats:
@@ -101,39 +91,3 @@ def first_key_frame(trajectory: Path) -> KeyFrame | None:
         return None
     stamp, x, y, z, qx, qy, qz, qw = map(float, words)
     return KeyFrame(stamp, pose_matrix((x, y, z), (qw, qx, qy, qz)))
-
-
-Points = npt.NDArray[np.float32]
-
-CELL = 0.05
-"""Metres; of each cell of this size, the last point that was seen is kept."""
-
-
-class Cloud:
-    """Points in the frame of the poses, by the map that they belong to.
-
-    Args:
-        cell: Metres.
-    """
-
-    def __init__(self, cell: float = CELL) -> None:
-        self._cell = cell
-        self._maps: dict[float, dict[tuple[int, ...], tuple[float, ...]]] = {}
-
-    def __len__(self) -> int:
-        return sum(map(len, self._maps.values()))
-
-    def add(self, map_: float, points: Points) -> None:
-        """Keep points of a map, shape (n, 3)."""
-        cells = np.floor(points / self._cell).astype(np.int64).tolist()
-        kept = self._maps.setdefault(map_, {})
-        kept.update(zip(map(tuple, cells), map(tuple, points.tolist()), strict=True))
-
-    def forget(self, map_: float) -> None:
-        """Leave out the points of a map, which has turned out to lie elsewhere."""
-        self._maps.pop(map_, None)
-
-    def points(self) -> Points:
-        """Return all points, shape (n, 3)."""
-        points = [point for kept in self._maps.values() for point in kept.values()]
-        return np.array(points, np.float32).reshape(-1, 3)

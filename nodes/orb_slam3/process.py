@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from nodes.estimation import TrackingResult
-from nodes.orb_slam3.anchor import Anchor, Cloud, first_key_frame
+from nodes.orb_slam3.anchor import Anchor, first_key_frame
 from nodes.orb_slam3.settings import Settings
 from nodes.orb_slam3.vocabulary_file import check_vocabulary
 from runtime.errors import MissingDependencyError
@@ -48,14 +48,12 @@ class OrbSlam3Result(TrackingResult, frozen=True, eq=False):
         state: ORB-SLAM3's own word (OK, NOT_INITIALIZED, RECENTLY_LOST, LOST, …), or RESET when
             it has just discarded its map.
         matches: Number of map points that were found in the image.
-        map_points: Number of points that `OrbSlam3Process.map_points` returns now.
         first_keyframe: Stamp of the first key frame (ns); -1 before there is one.
         maps: Number of maps so far. The motion between two is guessed: see `Anchor`.
     """
 
     state: str = ""
     matches: int = 0
-    map_points: int = 0
     first_keyframe: int = -1
     maps: int = 0
 
@@ -90,7 +88,6 @@ class OrbSlam3Process:
         self._was_ok = self._new = False
         self._stamps: list[int] = []
         self._first_keyframe = -1
-        self._cloud = Cloud()
         self._folder = tempfile.TemporaryDirectory(prefix="orb_slam3_")
         file = Path(self._folder.name) / "settings.yaml"
         file.write_text(settings.text, encoding="ascii")
@@ -136,14 +133,6 @@ class OrbSlam3Process:
         self._left_alone = time.monotonic()
         return found
 
-    def map_points(self) -> Points:
-        """Return the points of the map seen so far, shape (n, 3), one in each 5 cm cell.
-
-        In the optical camera at the first key frame, as the poses. The library only gives the
-        points that an image shows; of each place this is the last one.
-        """
-        return self._cloud.points()
-
     def close(self) -> None:
         """End ORB-SLAM3's threads."""
         if not self._slam.is_shutdown():
@@ -171,7 +160,6 @@ class OrbSlam3Process:
             points = self._slam.tracked_map_points()
             if len(points) and len(corners):
                 inliers[self._corners_of(points, pose, corners)] = True
-                self._cloud.add(self._anchor.map, self._anchor.place_points(points))
         self._new, self._was_ok = valid and not self._was_ok, valid
         return OrbSlam3Result(
             pose=self._anchor.last,
@@ -181,7 +169,6 @@ class OrbSlam3Process:
             points=corners,
             inliers=inliers,
             matches=int(result.num_tracked_points) if valid else 0,
-            map_points=len(self._cloud),
             first_keyframe=self._first_keyframe,
             maps=self._anchor.maps,
         )
@@ -192,10 +179,7 @@ class OrbSlam3Process:
         self._slam.save_keyframe_trajectory_tum(str(file))
         first = first_key_frame(file)
         if first is not None:
-            left, maps = self._anchor.map, self._anchor.maps
             self._anchor.world_may_have_changed(first, pose)
-            if self._anchor.map != left and self._anchor.maps == maps:
-                self._cloud.forget(left)  # merged: these points are now elsewhere
             if self._first_keyframe < 0:
                 nearest = np.abs(np.array(self._stamps) - first.stamp * 1e9).argmin()
                 self._first_keyframe = self._stamps[nearest]

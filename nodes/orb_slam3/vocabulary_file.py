@@ -61,40 +61,6 @@ def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
     part.replace(path)
 
 
-def read_vocabulary(path: Path) -> Vocabulary:
-    """Read a file in DBoW2's text format.
-
-    Raises:
-        ValueError: It is missing or not in this format; the message says where.
-    """
-    branching, depth = check_vocabulary(path)
-    lines = path.read_text(encoding="ascii").splitlines()[1:]
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines, 2):
-        row = _numbers(path, number, line)
-        parent, leaf = row[:2]
-        if not 0 <= parent < number - 1 or (parent > 0 and rows[int(parent) - 1][1]):
-            raise ValueError(
-                f"{path}: line {number}: expected a parent that stands above and is no leaf, "
-                f"found {parent:g}"
-            )
-        if leaf not in {0, 1} or not all(0 <= value <= 255 for value in row[2:-1]):
-            raise ValueError(
-                f"{path}: line {number}: expected parent, 0 or 1, 32 bytes, weight, "
-                f"found {line[:60]!r}"
-            )
-        rows.append(row)
-    table = np.array([[-1, 0, *[0] * 32, 0], *rows])
-    return Vocabulary(
-        branching=branching,
-        depth=depth,
-        parents=table[:, 0].astype(np.int64),
-        leaves=table[:, 1].astype(bool),
-        descriptors=table[:, 2:-1].astype(np.uint8),
-        weights=table[:, -1].copy(),
-    )
-
-
 def check_vocabulary(path: Path) -> tuple[int, int]:
     """Check quickly whether a file can be a vocabulary.
 

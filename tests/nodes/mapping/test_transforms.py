@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from events import Odometry, PoseStamped, Quaternion, TransformStamped, Vector3
+from events import Odometry, Quaternion, TransformStamped, Vector3
 from nodes.mapping.transforms import (
     TransformError,
     TransformTree,
@@ -152,10 +152,16 @@ def test_events_of_all_kinds_become_transforms() -> None:
         )
     )
     turned = Pose((0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1.0))
-    pose = PoseStamped(
-        stamp=7, source="x", position=turned.position, orientation=turned.orientation
+    tree.add(
+        TransformStamped(
+            stamp=7,
+            source="x",
+            frame_id="map",
+            child_frame_id="thing",
+            translation=turned.position,
+            rotation=turned.orientation,
+        )
     )
-    tree.add_pose(pose, "thing")
     np.testing.assert_allclose(tree.lookup("map", "base_link", 7)[:3, 3], [1, 2, 3])
     np.testing.assert_allclose(tree.lookup("thing", "base_link", 7)[:3, 3], [-1, -2, 4], atol=1e-12)
 

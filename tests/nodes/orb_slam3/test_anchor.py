@@ -69,11 +69,11 @@ def test_a_new_map_begins_where_the_camera_was_last_and_falls_into_place_when_me
     anchor.world_may_have_changed(KeyFrame(7.0, np.eye(4)), np.eye(4))
     np.testing.assert_allclose(anchor.place(np.eye(4)), pose(2.0, 0.3), atol=1e-12)
     np.testing.assert_allclose(anchor.place(pose(0.5)), pose(2.0, 0.3) @ pose(0.5), atol=1e-12)
-    assert (anchor.maps, anchor.map) == (2, 7.0)
+    assert anchor.maps == 2
     # Merged: the world is the first map's again, and its pose there is the truth.
     anchor.world_may_have_changed(KeyFrame(0.0, np.eye(4)), pose(3.1))
     np.testing.assert_allclose(anchor.place(pose(3.1)), pose(3.1), atol=1e-12)
-    assert (anchor.maps, anchor.map) == (2, 0.0)
+    assert anchor.maps == 2
 
 
 def test_a_new_map_may_begin_before_the_present_image() -> None:
@@ -83,16 +83,6 @@ def test_a_new_map_may_begin_before_the_present_image() -> None:
     anchor.place(pose(2.0))
     anchor.world_may_have_changed(KeyFrame(7.0, np.eye(4)), pose(0.4))
     np.testing.assert_allclose(anchor.place(pose(0.4)), pose(2.0), atol=1e-12)
-
-
-def test_points_are_placed_as_poses_are() -> None:
-    anchor = Anchor()
-    world = pose(1.0, np.pi / 2)
-    anchor.world_may_have_changed(KeyFrame(0.0, world), world)
-    points = np.array([[1.0, 0.0, 0.0], [1.0, 2.0, -3.0]], np.float32)
-    placed = anchor.place_points(points)
-    assert placed.dtype == np.float32
-    np.testing.assert_allclose(placed, [[0.0, 0.0, 0.0], [3.0, 2.0, 0.0]], atol=1e-6)
 
 
 def test_the_first_key_frame_of_a_trajectory(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import pytest
 from events import Event, Image
 from nodes.orb_slam3.command import vocabulary
 from nodes.orb_slam3.training import VocabularyTrainer, describe
-from nodes.orb_slam3.vocabulary_file import read_vocabulary
 from runtime.errors import ConfigError, NodeError
 from runtime.testing import run_node
+from tests.nodes.orb_slam3.reading import read_vocabulary
 from tests.nodes.orb_slam3.scene import views
 
 SHAPE = {"branching": 5, "depth": 2, "index_level": 0}

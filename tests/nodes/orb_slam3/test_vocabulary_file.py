@@ -12,9 +12,9 @@ from nodes.orb_slam3.vocabulary_file import (
     cached_vocabulary,
     check_vocabulary,
     find_vocabulary,
-    read_vocabulary,
     write_vocabulary,
 )
+from tests.nodes.orb_slam3.reading import read_vocabulary
 from tests.nodes.orb_slam3.test_vocabulary import trained
 
 NODE = "0 1 " + "7 " * 32 + "0.5"
@@ -69,21 +69,6 @@ def test_what_is_no_vocabulary_is_refused_where_it_is_wrong(
     with pytest.raises(ValueError, match=message) as caught:
         check_vocabulary(path)
     assert str(caught.value).startswith(str(path))
-
-
-@pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        ([NODE, NODE.replace("0 1", "7 1", 1)], "line 3: expected a parent that stands above"),
-        ([NODE, NODE.replace("0 1", "1 1", 1)], "line 3: expected a parent .* no leaf, found 1"),
-        ([NODE.replace("0 1", "0 2", 1)], "line 2: expected parent, 0 or 1, 32 bytes"),
-        ([NODE.replace(" 7", " 256", 1)], "line 2: expected parent, 0 or 1, 32 bytes"),
-        ([NODE, "0 1"], "line 3: expected 35 numbers"),
-    ],
-)
-def test_reading_finds_faults_further_down(tmp_path: Path, lines: list[str], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        read_vocabulary(written(tmp_path, "10 4 0 0", *lines))
 
 
 def test_files_that_are_missing_or_binary_are_refused(tmp_path: Path) -> None:
