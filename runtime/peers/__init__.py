@@ -13,6 +13,7 @@
     remote_events    outputs here with listeners there, and the other way round
     handshake        how two processes that see each other come to a session
     member           another process, and what is known of it
+    waiting          for other processes, and for the return of those that were lost
     membership       who is there, who comes and who goes
     joint_shutdown   the end: in order, and no process leaves before all summaries are exchanged
     peers            all of it together, for the supervisor

@@ -18,7 +18,7 @@ import struct
 
 from runtime.errors import PeerError, WireError
 
-VERSION = 2
+VERSION = 3
 """Of the messages of `runtime.peers.messages`; processes of different ones do not meet."""
 
 NONCE = 16

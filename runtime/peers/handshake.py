@@ -191,6 +191,7 @@ class Handshakes:
             if contact is None or member is None:
                 return
             contact.member = None
+            self._complained.add(sender)  # its last words may come late
         self._membership.soon(
             self._membership.left, member, f"their process is not understood: {error}"
         )

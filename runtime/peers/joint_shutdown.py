@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 import msgspec
 
+from runtime.errors import WireError
 from runtime.peers.compatibility import name_of
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
@@ -71,7 +72,7 @@ class JointShutdown:
         """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
         nodes = self._membership.nodes
         after = set(nodes[nodes.index(node) + 1 if node else 0 :])
-        await self._membership.until(
+        await self._membership.waiting.until(
             lambda: (
                 not any(after & {*m.nodes} - self.ended_nodes for m in self._membership.present())
             ),
@@ -80,9 +81,16 @@ class JointShutdown:
         )
         self.at_work = bool(node)
 
-    def take_summary(self, member: Member, part: Summary) -> None:
-        """Take in another process's part of the summary."""
-        member.final_summary = part
+    def take_summary(self, member: Member, message: FinalSummary) -> None:
+        """Take in another process's part of the summary.
+
+        Raises:
+            WireError: It is none.
+        """
+        try:
+            member.final_summary = msgspec.json.decode(message.part, type=Summary)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise WireError(f"expected a part of the summary, found: {error}") from None
         self._with_summary[member.number] = member
         member.outbox.send(SummaryReceived())
 
@@ -92,7 +100,7 @@ class JointShutdown:
         membership.broadcast(FinalSummary(msgspec.json.encode(mine)))
         try:
             async with real_time_limit(PARTING):
-                await membership.until(
+                await membership.waiting.until(
                     lambda: all(
                         m.final_summary and m.has_our_summary for m in membership.present()
                     ),
@@ -142,4 +150,4 @@ class JointShutdown:
             for member in silent:
                 membership.forget(member)
             self._on_timeout()
-            membership.notify()
+            membership.waiting.notify()

@@ -1,24 +1,41 @@
 """The start of a run in several processes: announcements exchanged, and one first update for all.
 
-One process decides that the run has begun, once all are ready. A loss before that ends the run;
-one after it is dealt with as in the run, also by a process that learns of it before it learns that
-the run has begun.
+A process is in one of these states, and says so to each other one when it comes to it:
+
+    meeting     knows who is there, not yet how many                    `Hello`
+    starting    all were there once, and have numbers; its nodes start  `Announcements`
+    ready       all announcements were heard; its nodes can begin       `Subscriptions`, `Ready`
+    told        knows when the first update is                          `FirstUpdate`
+    begun       the first update was                                    `Ready(begun=True)`
+
+The first process (or, of a run that goes on, its first process that has begun) decides: once all
+are ready, it says `FirstUpdate`. The others say it again, so that all learn of it although the
+first one is lost meanwhile. A process begins once it was told and all that are there are ready:
+then it knows what all of them want to receive.
+
+Until it begins, it waits for the return of each process that is lost: for `run.startup_limit`, and
+so does whoever is still needed for the decision. Who comes back, by itself (its link had failed) or
+as a new process, begins a session, and both ends say again all that they have said. So nothing
+depends on what was lost with the session before. A new process starts its nodes anew, and must
+announce what it announced before, since nodes elsewhere have heard of it. A loss after the decision
+is one of the run, also for a process that learns of it before it was told.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from events import Announcement
 from runtime.clock import Clock
 from runtime.errors import PeerError, WireError
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.peers.clock_sync import compare
+from runtime.peers.compatibility import name_of
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
-from runtime.peers.messages import Announcements, FirstUpdate, Ready
+from runtime.peers.messages import Announcements, FirstUpdate, Message, Ready
 from runtime.real_clock import RealClock
 from runtime.wire import pack, unpack
 
@@ -33,34 +50,31 @@ class JointStart:
         membership: Who is there.
         clock: The run's clock here.
         startup_limit: Seconds that one node may take to start up.
-
-    Attributes:
-        announced: What the nodes here announce, as the others receive it.
     """
 
     def __init__(self, membership: Membership, clock: Clock, startup_limit: float) -> None:
-        self.announced = Announcements({})
         self._membership = membership
         self._clock = clock
         self._startup_limit = startup_limit
-        self._ready = self._decided = False
-        self._decider: Member | None = None
+        self._said: dict[type[Message], Message] = {}
+        self._heard: dict[int, Announcements] = {}
 
     async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Send the others what the nodes here announce; return what all do, in file order."""
-        self.announced = Announcements(
-            {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in own.items()}
+        self.say(
+            Announcements(
+                {name: tuple(bytes(pack(a).frame()) for a in each) for name, each in own.items()}
+            )
         )
-        self._membership.broadcast(self.announced)
-        others = self._membership.present
-        await self._membership.until(
-            lambda: all(m.announced is not None for m in others()),
+        membership = self._membership
+        await self._until(
+            lambda: self._whole() and all(m.announced is not None for m in membership.present()),
             whom=lambda m: m.announced is None,
-            limit=self._limit(),
         )
         everything = dict(own)
-        for member in others():
+        for member in membership.present():
             if member.announced is not None:
+                self._heard[member.number] = member.announced
                 for name, frames in member.announced.by_node.items():
                     try:
                         everything[name] = [_announcement(frame) for frame in frames]
@@ -77,53 +91,100 @@ class JointStart:
             The process whose clock counts, or `None` if it is this one.
         """
         membership, lockstep = self._membership, isinstance(self._clock, LockstepClock)
-        reference = self._decider = self._reference()
-        if reference is not None and not lockstep:
-            await compare(reference, membership.until)
-        self._ready = True
-        membership.broadcast(Ready())
+        while True:
+            await self._until(self._whole, whom=lambda _: False)
+            reference = self._reference()
+            if reference is not None and not lockstep:
+                await compare(reference, membership.waiting.until)
+            self.say(Ready())
+            if await self._decided(reference):
+                break
         if reference is None:
-            await membership.until(
-                lambda: all(m.ready for m in membership.present()),
-                whom=lambda m: not m.ready,
-                limit=self._limit(),
-            )
-            self._decided = True
             origin = time.monotonic_ns() + LEAD
-            membership.broadcast(FirstUpdate(origin))
         else:
-            await membership.until(
-                lambda: reference.begin is not None,
-                whom=lambda m: not m.ready or m is reference,
-                limit=self._limit(),
-            )
             assert reference.begin is not None
-            self._decided = True
             best = reference.exchanges.best()
             origin = reference.begin.origin - (best.offset if best else 0)
             if lockstep:
                 loop = asyncio.get_running_loop()
                 assert isinstance(loop, LockstepLoop)
                 loop.move(reference.begin.now, loop.orders())
+        self.say(FirstUpdate(origin, self._clock.now()))
         if isinstance(self._clock, RealClock):
             await asyncio.sleep(max(origin - time.monotonic_ns(), 0) / 1e9)
             self._clock.start_at(origin)
-        return reference
+        return reference and (membership.numbered(reference.number) or reference)
 
-    def may_have_begun(self, lost: Member) -> bool:
-        """Return whether the run may have begun although a process has been lost here."""
-        return self._decided or (self._ready and self._decider not in {None, lost})
+    async def _decided(self, reference: Member | None) -> bool:
+        """Wait until the run begins; return whether it does so by this reference."""
+        membership = self._membership
+
+        def ready() -> bool:
+            return all(member.ready for member in membership.present())
+
+        if reference is None:
+            await self._until(
+                lambda: self._reference() is not None or (self._whole() and ready()),
+                whom=lambda m: not m.ready,
+            )
+            return self._reference() is None
+        await self._until(
+            lambda: reference.over != "" or (reference.begin is not None and ready()),
+            whom=lambda m: not m.ready or m is reference,
+        )
+        return not reference.over
+
+    def say(self, message: Message) -> None:
+        """Send a message to all processes, also to those that come, or come back, from now on."""
+        if self._said.get(type(message)) != message:
+            self._said[type(message)] = message
+            self._membership.broadcast(message)
+
+    def say_again(self, member: Member) -> None:
+        """Send a process all that it needs to know of the start here."""
+        for _, message in sorted(self._said.items(), key=lambda item: item[0] is Ready):
+            member.outbox.send(message)
+
+    def over(self) -> None:
+        """Take in that the first update was: who comes from now on is told so."""
+        del self._said[FirstUpdate]
+        self._said[Ready] = Ready(begun=True)
+
+    def hear(self, member: Member, message: Announcements) -> None:
+        """Take in what a process announces; if it came back, the nodes here were told that before.
+
+        Raises:
+            WireError: These are not announcements of its own nodes.
+        """
+        if not message.by_node.keys() <= {*member.nodes}:
+            raise WireError("expected announcements of its own nodes")
+        member.announced = message
+        if self._heard.get(member.number, message) != message:
+            self._membership.misfit(
+                PeerError(
+                    f"expected {name_of(member.nodes)}, which came back, to announce what it had "
+                    f"announced before, found something else ({member.place})"
+                )
+            )
+
+    def _whole(self) -> bool:
+        """Return whether nobody is waited for to return: all are there, or the run goes on."""
+        return self._membership.complete() or any(m.running for m in self._membership.present())
+
+    async def _until(
+        self, condition: Callable[[], bool], *, whom: Callable[[Member], bool]
+    ) -> None:
+        await self._membership.waiting.until(condition, whom=whom, limit=self._limit())
 
     def _limit(self) -> float:
         """Return the real seconds that all nodes of another process may take to start up."""
-        most = max((len(m.nodes) for m in self._membership.present()), default=1)
-        return self._startup_limit * (most + 1)
+        return self._startup_limit * (self._membership.largest() + 1)
 
     def _reference(self) -> Member | None:
         """Return the process whose clock counts, or `None` if it is this one."""
         present = self._membership.present()
-        running = [m for m in present if m.hello.running]
-        first = min(running or present, key=lambda m: m.number, default=None)
+        running = [m for m in present if m.running]
+        first = next(iter(running or present), None)
         return first if first and (running or first.number < self._membership.me) else None
 
 

@@ -15,7 +15,6 @@ from runtime.peers.messages import (
     FirstUpdate,
     Hello,
     OfTheRun,
-    Subscription,
 )
 from runtime.peers.outbox import Outbox, Put
 from runtime.peers.shared_memory import Incoming, Outgoing
@@ -42,6 +41,8 @@ class Member:
     Attributes:
         number: Its number among the processes of the run, or -1 if it is none of them.
         over: Why the session has ended, if it has.
+        lost_at: When it ended, on `time.monotonic`.
+        running: Whether its first update was already, as far as is known.
         unfit: Whether it is no part of the run: it runs another file, or nodes that run elsewhere.
         held: Messages it has sent, while another process with its nodes is still in the run.
         exchanges: Of the time.
@@ -49,7 +50,6 @@ class Member:
         announced: What its nodes announced.
         ready: Whether its nodes can begin.
         begin: When the first update is, if it has sent that.
-        subscriptions: Of nodes here, as it was sent them.
         final_summary: Its part of the run's summary.
         outgoing: Memory that was offered to it.
         incoming: Memory of its own that we see.
@@ -69,6 +69,8 @@ class Member:
         self.sealing = sealing
         self.number = -1
         self.over = ""
+        self.lost_at = 0.0
+        self.running = hello.running
         self.unfit = True
         self.held: list[tuple[OfTheRun, Event | None]] | None = None
         self.exchanges = Exchanges()
@@ -76,7 +78,6 @@ class Member:
         self.announced: Announcements | None = None
         self.ready = False
         self.begin: FirstUpdate | None = None
-        self.subscriptions: tuple[Subscription, ...] | None = None
         self._arrived = 0
         self.final_summary: Summary | None = None
         self.outgoing: Outgoing | None = None

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import math
 import os
 import socket
 import time
@@ -47,13 +46,11 @@ from runtime.peers.messages import (
 )
 from runtime.peers.secret import secret_of
 from runtime.peers.shared_memory import Incoming, Outgoing
+from runtime.peers.waiting import Waiting
 from runtime.peers.zenoh_session import Session, certified
 from runtime.time_limits import real_time_limit
 
 log = logging.getLogger("visnav.runtime")
-
-NAMED_EVERY = 5.0
-"""Real seconds between two log lines that name the processes waited for."""
 
 
 class Reactions(Protocol):
@@ -63,10 +60,10 @@ class Reactions(Protocol):
         """Take in a message."""
 
     def lost(self, member: Member) -> None:
-        """Deal with the loss of a process."""
+        """Deal with the loss of a process in the run."""
 
-    def reconnected(self, member: Member) -> None:
-        """Go on with a process that was disconnected."""
+    def joined(self, member: Member) -> None:
+        """Meet a process that came, or came back, after the processes were numbered."""
 
     def unsent(self, member: Member, error: VisnavError) -> None:
         """Log what could not be sent."""
@@ -89,6 +86,7 @@ class Membership:
         me: Number of this process. They are numbered by their first nodes, once all have met.
         count: How many processes there are in all.
         hello: Who we are.
+        waiting: For other processes, and for the return of those lost before the first update.
         ended: Once the run ends, what is sent to processes that join.
     """
 
@@ -112,8 +110,7 @@ class Membership:
         self.ended: Stop | None = None
         self._numbers: dict[tuple[str, ...], int] = {}
         self._numbered: dict[int, Member] = {}
-        self._waiting: set[asyncio.Future[None]] = set()
-        self._broken: VisnavError | None = None
+        self.waiting = Waiting(self.present, float(config.run.startup_limit))
 
     async def meet(self) -> int:
         """Wait until all nodes of the file are there, and number their processes.
@@ -134,7 +131,7 @@ class Membership:
             log.info("waiting for %s at %s", name_of(absent), network.meet)
         try:
             async with real_time_limit(float(network.wait)):
-                await self.until(lambda: not self._missing())
+                await self.waiting.until(lambda: not self._missing())
         except TimeoutError:
             text = missing_message(self._missing(), float(network.wait), network.meet)
             raise PeerError(text) from None
@@ -154,6 +151,10 @@ class Membership:
         running = [m.hello for m in others if m.hello.running]
         return max((max(h.lost.count(self.here[0]), 1) for h in running), default=0)
 
+    def largest(self) -> int:
+        """Return how many nodes the process with the most has."""
+        return max(map(len, self._numbers))
+
     def owners(self) -> dict[str, int]:
         """Return the number of the process that has each node."""
         return {node: number for nodes, number in self._numbers.items() for node in nodes}
@@ -161,6 +162,10 @@ class Membership:
     def present(self) -> list[Member]:
         """Return the other processes of the run that are there, in the order of their numbers."""
         return [member for _, member in sorted(self._numbered.items())]
+
+    def complete(self) -> bool:
+        """Return whether all processes of the run are there."""
+        return len(self._numbered) == self.count - 1
 
     def numbered(self, number: int) -> Member | None:
         """Return the process with a number, if it is there."""
@@ -192,63 +197,6 @@ class Membership:
         if self._handshakes is not None:
             await self._handshakes.close()
 
-    # Waiting for other processes.
-
-    async def until(
-        self,
-        condition: Callable[[], bool],
-        *,
-        despite: bool = False,
-        whom: Callable[[Member], bool] | None = None,
-        limit: float = math.inf,
-    ) -> None:
-        """Wait for something that others bring about.
-
-        Args:
-            condition: Looked at whenever something has come.
-            despite: Go on waiting though something has failed: the run ends anyway.
-            whom: Tells who is waited for; they are named when it takes long.
-            limit: Real seconds after which it takes too long, if `whom` is given.
-
-        Raises:
-            PeerError: It takes too long.
-            VisnavError: It will not come; see `fail`.
-        """
-        begin = time.monotonic()
-        while True:
-            if self._broken is not None and not despite:
-                raise self._broken
-            if condition():
-                return
-            future = self._loop.create_future()
-            self._waiting.add(future)
-            try:
-                if whom is None:
-                    await future
-                else:
-                    async with real_time_limit(NAMED_EVERY):
-                        await future
-            except TimeoutError:
-                assert whom is not None
-                absent = [f"{name_of(m.nodes)} ({m.place})" for m in self.present() if whom(m)]
-                if time.monotonic() - begin > limit:
-                    text = f"expected a word within {limit:g} s of {'; '.join(absent)}, found none"
-                    raise PeerError(text) from None
-                log.info("still waiting for %s", "; ".join(absent))
-            finally:
-                self._waiting.discard(future)
-
-    def notify(self) -> None:
-        """Have all who wait look again."""
-        for future in list(self._waiting):
-            if not future.done():
-                future.set_result(None)
-
-    def fail(self, error: VisnavError) -> None:
-        """Let all who wait fail."""
-        self._broken = self._broken or error
-        self.notify()
-
     # In threads of Zenoh's and of lines.
 
     def _receive(self, sender: str, sealed: bytes, payload: bytes) -> None:
@@ -266,7 +214,7 @@ class Membership:
             handshakes.refuse(sender, error)
             return
         except PeerError as error:  # another version
-            self.soon(self._misfit, error)
+            self.soon(self.misfit, error)
             return
         except WireError as error:
             handshakes.end(sender, error)
@@ -288,7 +236,7 @@ class Membership:
                 offset = message.here - message.sent - half
                 late = message.now - self._peers.now(ago=half)
                 member.exchanges.add(Exchange(received - message.sent, offset, late))
-                self.soon(self.notify)
+                self.soon(self.waiting.notify)
             case Hello():
                 pass
             case MemoryOffer():
@@ -298,7 +246,7 @@ class Membership:
             case MemoryMapped():
                 member.outbox.memory = member.outgoing
             case _:
-                self.soon(self._take, member, message, event)
+                self.soon(self.take, member, message, event)
         member.acknowledge(len(data) + len(payload))
 
     def soon(self, call: Callable[..., Any], *args: Any) -> None:
@@ -312,7 +260,8 @@ class Membership:
 
     # On the loop.
 
-    def _take(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+    def take(self, member: Member, message: OfTheRun, event: Event | None) -> None:
+        """Hand on a message, unless its session has ended; what makes no sense is logged."""
         try:
             if member.held is not None:
                 member.held.append((message, event))
@@ -322,14 +271,14 @@ class Membership:
                 self._peers.receive(member, message, event)
         except WireError as error:
             log.warning("from %s: %s", member.place, error)
-        self.notify()
+        self.waiting.notify()
 
-    def _misfit(self, error: PeerError) -> None:
+    def misfit(self, error: PeerError) -> None:
         """Deal with a process with which there can be no run."""
         if self.hello.running:
-            log.warning("left alone: %s", error)
+            log.warning("%s", error)
         else:
-            self.fail(error)
+            self.waiting.fail(error)
 
     def joined(self, member: Member) -> None:
         """Take in a process with which a session began."""
@@ -339,7 +288,7 @@ class Membership:
             if self.hello.began < member.hello.began:  # the newcomer gives up
                 log.warning("left alone: %s", error)
             else:
-                self._misfit(error)
+                self.misfit(error)
             return
         if self.ended is not None:
             member.outbox.send(self.ended)
@@ -353,30 +302,38 @@ class Membership:
                 member.held = member.held or []
                 return
             if number < 0:
+                text = "left alone: %s, at %s: no process of this run had these nodes"
+                log.warning(text, name_of(member.nodes), member.place)
                 return
             member.number = number
             self._numbered[number] = member
+            self.waiting.returned(member)
         member.unfit = False
-        if member.number >= 0 and member.hello.running and self.hello.running:
-            self._peers.reconnected(member)
+        if self._numbers:
+            self._peers.joined(member)
         held, member.held = member.held, None
         for message, event in held or ():
-            self._take(member, message, event)
-        self.notify()
+            self.take(member, message, event)
+        self.waiting.notify()
 
     def left(self, member: Member, why: str = "their process is gone") -> None:
         """Go on without a process whose session has ended."""
         if member.over:
             return
         member.over = why
+        member.lost_at = time.monotonic()
         member.outbox.abandon()
+        early = not self.hello.running and self.ended is None
+        if early and not member.unfit:
+            self.waiting.lost(member)
         if self._numbered.get(member.number) is member:
             del self._numbered[member.number]
-            self._peers.lost(member)
+            if not early:
+                self._peers.lost(member)
             for other in self._handshakes.members() if self._handshakes else ():
                 if other.held is not None and other.nodes == member.nodes:
                     self.joined(other)
-        self.notify()
+        self.waiting.notify()
 
     def _fitting(self) -> list[Member]:
         members = self._handshakes.members() if self._handshakes else []

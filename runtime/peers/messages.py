@@ -102,7 +102,13 @@ class Pong(Message, frozen=True):
 
 
 class Ready(Message, frozen=True):
-    """My nodes can begin."""
+    """My nodes can begin.
+
+    Attributes:
+        begun: They have: our session began after my first update.
+    """
+
+    begun: bool = False
 
 
 class FirstUpdate(Message, frozen=True):

@@ -43,7 +43,6 @@ from runtime.peers.remote_events import RemoteEvents, subscriptions
 from runtime.peers.time_token import TimeTokenHolder
 from runtime.real_clock import RealClock
 from runtime.sender import Listener
-from runtime.summary import Summary
 from runtime.tasks import Fault
 
 log = logging.getLogger("visnav.runtime")
@@ -84,7 +83,7 @@ class Peers:
         self._token: TimeTokenHolder | None = None
         self._early: list[tuple[Member, OfTheRun, Event | None]] = []
         self._begun = self._suspended = self._ends = False
-        self._lost_early: list[Member] = []
+        self._returning: set[int] = set()
         self._apart: set[int] = set()
         self._ended_here: list[str] = []
         self._follower: ClockFollower | None = None
@@ -113,6 +112,7 @@ class Peers:
             self._token = TimeTokenHolder(
                 membership.me, membership.count, loop, self._send_to, self._do
             )
+        self._receive_early()
         return before
 
     async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
@@ -131,15 +131,21 @@ class Peers:
     def nodes_run(self) -> None:
         """Deliver messages from now on: the nodes here have begun."""
         self._begun = True
+        self._start.over()
         self._membership.settle()
         if self._loop is not None:
             self._loop.move(0, (len(self._membership.nodes) << 33, self._membership.me << 32))
             self._gather()
+        self._receive_early()
+        absent = self._membership.waiting.absent
+        while absent:
+            self.lost(absent.pop(min(absent)))
+
+    def _receive_early(self) -> None:
+        """Take in what came too early, but for what a process said that was lost since."""
         early, self._early = self._early, []
         for item in early:
-            self.receive(*item)
-        for member in self._lost_early:
-            self.lost(member)
+            self._membership.take(*item)
 
     # During the run.
 
@@ -152,11 +158,9 @@ class Peers:
         if self._remote is None:
             return
         self._remote.connect(listeners, fault)
-        wanted = subscriptions(each for each in listeners if each.node != "run")
-        for member in self._membership.present():
-            if member.subscriptions != wanted:
-                member.subscriptions = wanted
-                member.outbox.send(Subscriptions(wanted))
+        self._start.say(
+            Subscriptions(subscriptions(each for each in listeners if each.node != "run"))
+        )
 
     def stopping(self, reason: str, error: Exception | None, *, from_peer: bool) -> None:
         """Notify the others that the run ends, and why; also where the reason is `from_peer`.
@@ -167,6 +171,7 @@ class Peers:
         text = None if error is None else str(error)
         stop = Stop(reason, text, apart=not self._begun)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
+        self._membership.waiting.absent.clear()
         if not self._begun:  # also its senders: they need not wait for our turn
             self._membership.broadcast(stop)
             early, self._early = self._early, []
@@ -214,30 +219,28 @@ class Peers:
             ):  # first, since there are many
                 self._do(member.number, message, event)
             case Announcements():
-                if not message.by_node.keys() <= {*member.nodes}:
-                    raise WireError("expected announcements of its own nodes")
-                member.announced = message
-                if self._begun:  # it was gone, and needs ours again
-                    member.outbox.send(self._start.announced)
+                self._start.hear(member, message)
             case FinalSummary():
-                try:
-                    part = msgspec.json.decode(message.part, type=Summary)
-                except (msgspec.DecodeError, RecursionError) as error:
-                    raise WireError(f"expected a part of the summary, found: {error}") from None
-                self.shutdown.take_summary(member, part)
+                self.shutdown.take_summary(member, message)
             case SummaryReceived():
                 member.has_our_summary = True
             case FirstUpdate():
                 member.begin = message
-            case Ready() if not member.ready:
+                member.running = True
+            case Ready():
                 member.ready = True
-                if self._begun:
-                    self._welcome(member)
-            case Subscriptions() if self._remote is not None:
+                member.running = member.running or message.begun
+                if member.number in self._returning:
+                    self._returning.discard(member.number)
+                    self._take_back(member, begun=message.begun)
+            case Subscriptions():
+                if self._remote is None:  # the processes here have no numbers yet
+                    self._early.append((member, message, event))
+                    return
                 self._remote.wants(member.number, message.wanted)
                 if self._begun:
                     self._run.connect()
-            case StillWorking() | Ready() | Subscriptions():
+            case StillWorking():
                 pass
             case Stop() if not self._begun or message.serial < 0:
                 if message.apart:
@@ -261,16 +264,15 @@ class Peers:
 
     def lost(self, member: Member) -> None:
         """Deal with the loss of a process as its nodes' `on_error` says."""
-        if not (self._begun or self._ends) and self._start.may_have_begun(member):
-            self._lost_early.append(member)
-            return
         lost = set(member.nodes) - self.shutdown.ended_nodes
         self.shutdown.ended_nodes |= lost
         name = name_of(member.nodes)
-        gone = PeerError(f"{name}: {member.over} ({member.place})")
-        if not (self._begun or self._ends):
-            self._membership.fail(gone)
+        if member.number in self._returning and not self._ends:  # not yet taken back: wait on
+            self._returning.discard(member.number)
+            log.error("%s: lost again", name)
+            self._membership.settle(lost=member.nodes)
             return
+        gone = PeerError(f"{name}: {member.over} ({member.place})")
         if self._ends or not lost:
             if lost:
                 log.warning("%s: the run ends without it", gone)
@@ -302,12 +304,11 @@ class Peers:
             self._gather()
         self._run.connect()
 
-    def reconnected(self, member: Member) -> None:
-        """Go on with a process that was disconnected."""
-        log.warning("%s: found again, at %s", name_of(member.nodes), member.place)
-        self._take_back(member)
-        if member.number == self._followed:
-            self._follow(member)
+    def joined(self, member: Member) -> None:
+        """Meet a process that came, or came back, after the processes were numbered."""
+        self._start.say_again(member)
+        if self._begun:  # until it is ready, the run goes on without it
+            self._returning.add(member.number)
 
     def now(self, ago: int = 0) -> int:
         """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
@@ -334,17 +335,18 @@ class Peers:
                     self.shutdown.ended_nodes.add(message.node)
         except WireError as error:
             log.warning("from process %d: %s", number, error)
-        self._membership.notify()
+        self._membership.waiting.notify()
 
-    def _welcome(self, member: Member) -> None:
-        """Let a process that was gone take part again."""
-        log.warning("%s: back, at %s", name_of(member.nodes), member.place)
-        now = self._clock.now()
-        real = now / self._clock.speed if isinstance(self._clock, RealClock) else 0
-        member.outbox.send(FirstUpdate(time.monotonic_ns() - round(real), now))
-        self._take_back(member)
-
-    def _take_back(self, member: Member) -> None:
+    def _take_back(self, member: Member, *, begun: bool) -> None:
+        """Let a process take part again: a new one, or one that had begun and was disconnected."""
+        what = "found again" if begun else "back"
+        log.warning("%s: %s, at %s", name_of(member.nodes), what, member.place)
+        if not begun:
+            now = self._clock.now()
+            real = now / self._clock.speed if isinstance(self._clock, RealClock) else 0
+            member.outbox.send(FirstUpdate(time.monotonic_ns() - round(real), now))
+        elif member.number == self._followed:
+            self._follow(member)
         self.shutdown.ended_nodes -= {*member.nodes}
         self._apart.discard(member.number)
         self._gather(new=(member.number,))

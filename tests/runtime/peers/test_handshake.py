@@ -25,7 +25,7 @@ class Nobody:
     """In the place of `Peers`."""
 
     def __init__(self) -> None:
-        self.lost = self.reconnected = self.receive = lambda *_: None
+        self.lost = self.joined = self.receive = lambda *_: None
 
     def now(self, ago: int = 0) -> int:
         return -ago

@@ -34,6 +34,7 @@ name = "ends"
 clock = "{clock}"
 duration = "{duration}"
 speed = 1.0
+startup_limit = "4s"
 
 [network]
 meet = "tcp/127.0.0.1:{port}"
@@ -229,6 +230,10 @@ def test_a_signal_to_one_process_ends_all_soon(
     if how == "STOP":
         time.sleep(2)  # longer than Zenoh waits for it
         process.send_signal(signal.SIGCONT)
+        if phase == "start-up":  # they meet again, and the run begins
+            trial.wait_for(who, SIGNS["run"])
+        if phase in {"start-up", "begin"}:
+            process.send_signal(signal.SIGINT)
     if phase == "waiting":
         if how == "STOP":  # else it may still meet the other one, and they run for a minute
             trial.ended(who, begin)
@@ -246,6 +251,8 @@ def test_a_signal_to_one_process_ends_all_soon(
     if how == "KILL" and phase != "shut-down":
         assert others == 2
         assert f"{who}: their process is gone" in trial.said(other)
+        if phase == "start-up":
+            assert "expected its return within 4 s, found none" in trial.said(other)
     if how in {"INT", "TERM"}:
         assert code == others == 0
 

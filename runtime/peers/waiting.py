@@ -1,0 +1,132 @@
+"""Waiting for other processes: named when it takes long, and never for ever."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from collections.abc import Callable, Iterable
+
+from runtime.errors import PeerError, VisnavError
+from runtime.peers.compatibility import name_of
+from runtime.peers.member import Member
+from runtime.time_limits import real_time_limit
+
+log = logging.getLogger("visnav.runtime")
+
+NAMED_EVERY = 5.0
+"""Real seconds between two log lines that name the processes waited for."""
+
+
+class Waiting:
+    """Who waits for something that other processes bring about, and for whom.
+
+    Args:
+        present: Returns the other processes of the run that are there.
+        startup_limit: Real seconds within which a process lost before the first update must return.
+
+    Attributes:
+        absent: Those processes, by number, until they return.
+    """
+
+    def __init__(self, present: Callable[[], Iterable[Member]], startup_limit: float) -> None:
+        self.absent: dict[int, Member] = {}
+        self._present = present
+        self._startup_limit = startup_limit
+        self._first_losses: dict[int, float] = {}
+        self._futures: set[asyncio.Future[None]] = set()
+        self._broken: VisnavError | None = None
+
+    async def until(
+        self,
+        condition: Callable[[], bool],
+        *,
+        despite: bool = False,
+        whom: Callable[[Member], bool] | None = None,
+        limit: float = math.inf,
+    ) -> None:
+        """Wait for something that others bring about.
+
+        Args:
+            condition: Looked at whenever something has come.
+            despite: Go on waiting though something has failed: the run ends anyway.
+            whom: Tells who is waited for; they are named when it takes long.
+            limit: Real seconds after which it takes too long, if `whom` is given. They count from
+                the first loss of a process, if that is later: it has to start again.
+
+        Raises:
+            PeerError: It takes too long, or a process that was lost has not returned in time.
+            VisnavError: It will not come; see `fail`.
+        """
+        begin = time.monotonic()
+        while True:
+            if self._broken is not None and not despite:
+                raise self._broken
+            if condition():
+                return
+            future = asyncio.get_running_loop().create_future()
+            self._futures.add(future)
+            try:
+                if whom is None:
+                    await future
+                else:
+                    left = self._time_left(begin, limit)
+                    async with real_time_limit(min(NAMED_EVERY, max(left, 0.0))):
+                        await future
+            except TimeoutError:
+                assert whom is not None
+                self._name(whom, limit, late=self._time_left(begin, limit) <= 0)
+            finally:
+                self._futures.discard(future)
+
+    def notify(self) -> None:
+        """Have all who wait look again."""
+        for future in list(self._futures):
+            if not future.done():
+                future.set_result(None)
+
+    def fail(self, error: VisnavError) -> None:
+        """Let all who wait fail."""
+        self._broken = self._broken or error
+        self.notify()
+
+    def lost(self, member: Member) -> None:
+        """Wait from now on for the return of a process that was lost before the first update."""
+        log.warning("%s: waiting for its return", _loss(member))
+        if member.number >= 0:
+            self.absent[member.number] = member
+            self._first_losses.setdefault(member.number, member.lost_at)
+
+    def returned(self, member: Member) -> None:
+        """Take in that a process is there; it may have been absent."""
+        if self.absent.pop(member.number, None) is not None:
+            log.warning("%s: back, at %s", name_of(member.nodes), member.place)
+
+    def _time_left(self, begin: float, limit: float) -> float:
+        """Return the real seconds that a wait may go on."""
+        if limit == math.inf:
+            return limit
+        ends = [max([begin, *self._first_losses.values()]) + limit]
+        if not any(member.running for member in self._present()):  # else the run goes on without
+            ends += [member.lost_at + self._startup_limit for member in self.absent.values()]
+        return min(ends) - time.monotonic()
+
+    def _name(self, whom: Callable[[Member], bool], limit: float, *, late: bool) -> None:
+        """Log who is waited for.
+
+        Raises:
+            PeerError: It is too late.
+        """
+        slow = "; ".join(f"{name_of(m.nodes)} ({m.place})" for m in self._present() if whom(m))
+        gone = "; ".join(_loss(member) for _, member in sorted(self.absent.items()))
+        if late and gone:
+            text = f"{gone}: expected its return within {self._startup_limit:g} s, found none"
+            raise PeerError(text) from None
+        if late:
+            raise PeerError(f"expected a word within {limit:g} s of {slow}, found none") from None
+        log.info("still waiting for %s", "; ".join(filter(None, [gone, slow])))
+
+
+def _loss(member: Member) -> str:
+    return f"{name_of(member.nodes)}: {member.over} ({member.place})"

@@ -1,0 +1,174 @@
+"""Before the first update, a process that is lost is waited for, and meets again from the start."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from runtime.errors import PeerError, WireError
+from runtime.execute import execute
+from runtime.peers.joint_start import JointStart
+from runtime.peers.membership import Membership
+from runtime.peers.messages import Message
+from tests.runtime.peers.samples import Offer, Process, settings
+from tests.runtime.peers.test_runs import THREE
+
+CLOCKS = ["lockstep", "real"]
+WHO = ["asker", "one"]
+POINTS = ["met", "Announcements", "heard", "Subscriptions", "Ready"]
+"""After which of its steps something happens to a process; names of messages: once it sent one."""
+
+At = Callable[[Membership], None]
+
+
+class DiedError(Exception):
+    """In the place of what a killed process does not do any more."""
+
+
+def die(membership: Membership) -> None:
+    """Be gone, as a killed process is, without a word."""
+    handshakes = membership._handshakes
+    assert handshakes is not None
+    handshakes._enough.set()
+    handshakes._session._session.close()  # type: ignore[no-untyped-call]
+    membership._numbered.clear()
+    raise DiedError
+
+
+def cut(membership: Membership) -> None:
+    """Lose the sessions with all others, as if links had failed."""
+    handshakes = membership._handshakes
+    assert handshakes is not None
+    for member in handshakes.members():
+        handshakes.end(member.id, WireError("a link that failed"))
+
+
+@pytest.fixture
+def once(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, At], threading.Event]:
+    """Return what has something called at a point of one process; the event tells that it was."""
+
+    def arrange(who: str, point: str, call: At) -> threading.Event:
+        reached = threading.Event()
+        say, meet, announce = JointStart.say, Membership.meet, JointStart.announce
+
+        def reach(membership: Membership, here: str) -> None:
+            if (membership.here, here) == ((who,), point) and not reached.is_set():
+                reached.set()
+                call(membership)
+
+        def say_and_reach(start: JointStart, message: Message) -> None:
+            say(start, message)
+            reach(start._membership, type(message).__name__)
+
+        async def meet_and_reach(membership: Membership) -> int:
+            before = await meet(membership)
+            reach(membership, "met")
+            return before
+
+        async def announce_and_reach(start: JointStart, own: Any) -> Any:
+            heard = await announce(start, own)
+            reach(start._membership, "heard")
+            return heard
+
+        monkeypatch.setattr(JointStart, "say", say_and_reach)
+        monkeypatch.setattr(Membership, "meet", meet_and_reach)
+        monkeypatch.setattr(JointStart, "announce", announce_and_reach)
+        return reached
+
+    return arrange
+
+
+def cases(*, last: str) -> Iterator[Any]:
+    """Yield clocks, processes and points; after the last of "one", the first one may decide."""
+    for clock in CLOCKS:
+        for who in WHO:
+            for point in POINTS:
+                if who == "asker" or POINTS.index(point) <= POINTS.index(last):
+                    quick = (clock, who) == ("lockstep", "asker") or point == "heard"
+                    yield pytest.param(clock, who, point, marks=[] if quick else pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("clock", "who", "point"), [*cases(last="Subscriptions")])
+def test_who_dies_before_the_first_update_and_comes_back_changes_nothing(
+    once: Any, clock: str, who: str, point: str
+) -> None:
+    config = settings(*THREE, clock=clock, duration=0.3)
+    died = once(who, point, die)
+    others = [Process(config, only) for only in ("asker", "one", "other") if only != who]
+    victim = Process(config, who)
+    assert died.wait(20)
+    back = Process(config, who)
+    summaries = [process.ended() for process in [*others, back]]
+    assert victim.done().error is not None
+    for summary in summaries:
+        assert summary.reason == "duration"
+        assert len(summary.processes) == 3
+        assert summary.outputs == summaries[0].outputs
+        assert summary.outputs["one.answers"] > 0
+        assert summary.outputs["other.answers"] > 0
+        if clock == "lockstep":
+            assert summary.digest == execute(config).digest
+
+
+@pytest.mark.parametrize(("clock", "who", "point"), [*cases(last="heard")])
+def test_links_that_fail_before_the_first_update_change_nothing(
+    once: Any, clock: str, who: str, point: str
+) -> None:
+    config = settings(*THREE, clock=clock, duration=0.3)
+    was_cut = once(who, point, cut)
+    processes = [Process(config, only) for only in ("asker", "one", "other")]
+    summaries = [process.ended() for process in processes]
+    assert was_cut.is_set()
+    for summary in summaries:
+        assert summary.reason == "duration"
+        assert summary.outputs == summaries[0].outputs
+        assert summary.outputs["other.answers"] > 0
+        if clock == "lockstep":
+            assert summary.digest == execute(config).digest
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+@pytest.mark.parametrize("who", WHO)
+def test_who_does_not_come_back_is_named_after_the_limit(once: Any, clock: str, who: str) -> None:
+    config = settings(*THREE, clock=clock, startup_limit=0.5)
+    once(who, "Announcements", die)
+    processes = {only: Process(config, only) for only in ("asker", "one", "other")}
+    assert "Died" in repr(processes.pop(who).done().error)
+    for process in processes.values():
+        assert isinstance(process.done(15).error, PeerError)
+        assert re.search(
+            rf"{who}: their process is gone \(.*\): expected its return within 0.5 s, found none",
+            str(process.error),
+        )
+
+
+def test_who_comes_back_with_other_announcements_ends_the_run(
+    once: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nodes elsewhere have prepared themselves for what it announced before."""
+    config = settings(*THREE)
+    died = once("asker", "heard", die)
+    heard = threading.Event()
+    take = JointStart.announce
+
+    async def announce(start: JointStart, own: Any) -> Any:
+        if died.is_set():
+            heard.wait(10)
+            own = {"asker": [Offer(stamp=0, source="asker", rate=49.0)]}
+        found = await take(start, own)
+        if start._membership.here != ("asker",):
+            heard.set()
+        return found
+
+    monkeypatch.setattr(JointStart, "announce", announce)
+    others = [Process(config, "asker"), Process(config, "one,other")]
+    assert died.wait(20)
+    back = Process(config, "asker")
+    for process in (others[1], back):
+        assert "to announce what it had announced before, found something" in str(
+            process.done().error
+        )
