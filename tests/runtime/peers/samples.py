@@ -142,7 +142,12 @@ def settings(
     """Return a configuration of nodes of this module: name, class, settings."""
     table = {
         "run": {"name": "apart", "duration": 1.0} | run,
-        "network": {"meet": meet or f"tcp/127.0.0.1:{free_port()}", "wait": wait, "shared": shared},
+        "network": {
+            "meet": meet or f"tcp/127.0.0.1:{free_port()}",
+            "wait": wait,
+            "shared": shared,
+            "lease": 5,  # under load, Zenoh's threads may be late
+        },
         "nodes": [{"name": name, "type": f"{__name__}:{cls}", **rest} for name, cls, rest in nodes],
     }
     return parse(table, "test.toml")
