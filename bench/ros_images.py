@@ -50,11 +50,7 @@ class RosImageRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def measure(repeats: int = 300) -> list[RosImageRow]:
-    """Measure a colour image and a depth image of 512×512.
-
-    Args:
-        repeats: Samples of each side.
-    """
+    """Measure a colour image and a depth image of 512×512."""
     drawn = np.random.default_rng(0)
     return [
         _measure("rgb8", drawn.integers(0, 256, (512, 512, 3), np.uint8), repeats),

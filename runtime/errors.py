@@ -67,12 +67,7 @@ class UnsupportedInterpreterError(VisnavError):
 
 
 class NodeError(VisnavError):
-    """A node failed.
-
-    Args:
-        node: The node's name.
-        what: What happened.
-    """
+    """A node failed."""
 
     def __init__(self, node: str, what: str) -> None:
         super().__init__(f"{node}: {what}")

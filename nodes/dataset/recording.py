@@ -26,13 +26,7 @@ _DEPTH = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
 class ImageFile:
-    """An image on its way to a file: call it to write it, from any thread, as often as need be.
-
-    Args:
-        path: The file.
-        data: The image, as an event has it.
-        convert: Makes of it what is written.
-    """
+    """An image on its way to a file: call it to write it, from any thread, as often as need be."""
 
     def __init__(self, path: Path, data: Pixels, convert: Callable[[Pixels], Pixels]) -> None:
         self._path = path

@@ -66,12 +66,7 @@ SMALL: tuple[type[Event], ...] = (
 
 
 class Publishing:
-    """Turns events into messages.
-
-    Args:
-        server: Where to.
-        config: The node's settings.
-    """
+    """Turns events into messages."""
 
     def __init__(self, server: Server, config: FoxgloveConfig) -> None:
         self._server = server

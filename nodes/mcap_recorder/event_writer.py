@@ -152,13 +152,7 @@ class EventWriter:
 
 
 class RecordedTopic:
-    """A topic of ROS's messages in the file.
-
-    Args:
-        writer: Of the events.
-        topic: Its name and type.
-        channel: Its number in the file.
-    """
+    """A topic of ROS's messages in the file."""
 
     def __init__(self, writer: EventWriter, topic: Topic, channel: int) -> None:
         self.topic = topic

@@ -29,9 +29,6 @@ LONGEST = 0.4
 class FileWriter:
     """Writes one file.
 
-    Args:
-        request: What to do.
-
     Raises:
         RecordingError: The file cannot be made.
         MissingDependencyError: A library is not installed.

@@ -21,10 +21,6 @@ from runtime.schedule import SECOND
 def open_reader(config: ReplayConfig, name: str) -> Reader:
     """Return a reader of a recording.
 
-    Args:
-        config: The replay's settings.
-        name: Of the node.
-
     Raises:
         ReplayError: There is nothing there that can be read.
         MissingDependencyError: A library is not installed.

@@ -24,9 +24,6 @@ _LOOK = 64
 class Recorded(Reader):
     """Reads a recording of ours, torn ones too.
 
-    Args:
-        path: The file.
-
     Raises:
         ReplayError: It is no MCAP file.
         MissingDependencyError: mcap or rosbags is not installed.

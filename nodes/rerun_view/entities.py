@@ -61,12 +61,7 @@ Numbered = tuple[int, E]
 
 
 class EntityLog:
-    """Logs entities.
-
-    Args:
-        rr: The library.
-        stream: Its recording.
-    """
+    """Logs entities."""
 
     def __init__(self, rr: Any, stream: Any) -> None:
         self.rr = rr

@@ -36,12 +36,7 @@ class Contents(msgspec.Struct):
 
 
 def layout(rrb: Any, contents: Contents) -> Any:
-    """Return the blueprint.
-
-    Args:
-        rrb: ``rerun.blueprint``.
-        contents: What there is.
-    """
+    """Return the blueprint."""
     above = [_world(rrb, contents)]
     if views := _images(rrb, contents):
         above.append(rrb.Vertical(*views))

@@ -57,12 +57,7 @@ _TITLED = ("position_error", "rotation_error")
 
 
 class Plots:
-    """Writes curves and the log.
-
-    Args:
-        log: Where to.
-        colours: Of what is scored, by source.
-    """
+    """Writes curves and the log."""
 
     def __init__(self, log: EntityLog, colours: Mapping[str, Colour]) -> None:
         self._to = log

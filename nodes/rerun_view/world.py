@@ -58,12 +58,7 @@ _THICK, _THIN = 0.02, 0.01
 
 
 class World:
-    """Writes what has a place.
-
-    Args:
-        log: Where to.
-        config: The node's settings.
-    """
+    """Writes what has a place."""
 
     def __init__(self, log: EntityLog, config: RerunConfig) -> None:
         self._to = log

@@ -138,12 +138,7 @@ class CompressedWriter:
 
 
 class CloudWriter:
-    """Writes ``sensor_msgs/msg/PointCloud2``.
-
-    Args:
-        store: Of the types.
-        frame_id: Of the points.
-    """
+    """Writes ``sensor_msgs/msg/PointCloud2``."""
 
     def __init__(self, store: TypeStore, frame_id: str) -> None:
         self._store = store

@@ -47,12 +47,7 @@ class Transform(NamedTuple):
 
 
 class Messages:
-    """Makes messages.
-
-    Args:
-        store: Of the types.
-        frames: What ROS calls our frames.
-    """
+    """Makes messages."""
 
     def __init__(self, store: TypeStore, frames: FrameNames) -> None:
         self._store = store

@@ -160,9 +160,6 @@ class TypeStore:
 class Bag:
     """Reads a bag of ROS 2 (a folder, or an MCAP or SQLite file), or of ROS 1.
 
-    Args:
-        path: Where it is.
-
     Raises:
         MissingDependencyError: rosbags is not installed.
         ValueError: It cannot be read.

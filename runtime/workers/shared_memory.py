@@ -127,11 +127,7 @@ class Arena:
 
 
 class MappedFile:
-    """The reader's side of a file.
-
-    Args:
-        fd: The file.
-    """
+    """The reader's side of a file."""
 
     def __init__(self, fd: int) -> None:
         self._fd = fd

@@ -42,9 +42,6 @@ class Development:
     last two are in linear light. What is off costs nothing: an image of an ideal camera stays
     as it is, byte for byte.
 
-    Args:
-        spec: The camera.
-
     Raises:
         ValueError: The file of its response is missing or holds something else.
     """

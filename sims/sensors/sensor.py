@@ -82,12 +82,7 @@ S = TypeVar("S", bound=SensorSpec)
 
 
 class Mounted(Generic[S]):
-    """A sensor on a body.
-
-    Args:
-        spec: Its settings.
-        place: Where it is.
-    """
+    """A sensor on a body."""
 
     announced: ClassVar[type[SensorAnnouncement]]
     """What announces it; the fields that its settings have, too, are theirs."""

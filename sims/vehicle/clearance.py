@@ -25,12 +25,7 @@ FALL = 0.05
 
 
 class Clearance:
-    """What a vehicle would meet at a place, or on a straight line.
-
-    Args:
-        model: A compiled world, with the vehicle.
-        name: The vehicle's.
-    """
+    """What a vehicle would meet at a place, or on a straight line."""
 
     def __init__(self, model: mujoco.MjModel, name: str) -> None:
         self._model = model

@@ -31,11 +31,6 @@ class Controller:
     Position and velocity set-points go through the whole cascade and its limits. Attitude and
     body-rate set-points enter further down: of the limits only those on body rates hold for them,
     and the thrust is theirs.
-
-    Args:
-        parameters: Parameters of the vehicle.
-        gains: Gains of the cascade.
-        limits: Limits of the flight.
     """
 
     def __init__(

@@ -18,9 +18,6 @@ class Mixer:
     *Thrust mixing, saturation, and body-rate control for accurate aggressive quadrotor flight*,
     RA-L 2017.)
 
-    Args:
-        parameters: Parameters of the vehicle.
-
     Raises:
         ValueError: The motors cannot make all four of thrust and torques, or equal thrust from
             all would turn the vehicle.

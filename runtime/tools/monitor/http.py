@@ -25,12 +25,7 @@ _REASONS = {
 
 
 class HttpError(Exception):
-    """A request that cannot be served.
-
-    Args:
-        status: Of the response.
-        text: What to say.
-    """
+    """A request that cannot be served."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)

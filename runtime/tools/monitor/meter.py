@@ -130,9 +130,6 @@ class DurationSum:
 class Meter(Instrument):
     """An instrument that adds up durations, and keeps the newest images.
 
-    Args:
-        clock: The run's clock.
-
     Attributes:
         nodes: Time each node took of the loop, by name, without the calls of other nodes in it.
         outputs: Times from stamp to delivery of each output's events, by ``node.port``.

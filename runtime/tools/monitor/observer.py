@@ -67,13 +67,7 @@ class LastRecords(logging.Handler):
 
 
 class Observer:
-    """Observes and controls one run.
-
-    Args:
-        supervisor: Of the run.
-        config: Of the run.
-        records: Its log.
-    """
+    """Observes and controls one run."""
 
     def __init__(self, supervisor: Supervisor, config: Config, records: LastRecords) -> None:
         self._supervisor = supervisor

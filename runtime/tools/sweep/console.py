@@ -105,12 +105,7 @@ def _row(future: concurrent.futures.Future[Row], job: Job) -> Row:
 
 
 class Display(Watch):
-    """A bar in a terminal, else a line for each run that has ended; a context manager.
-
-    Args:
-        children: What is counted as running.
-        console: Where to show it.
-    """
+    """A bar in a terminal, else a line for each run that has ended; a context manager."""
 
     def __init__(self, children: Children, console: Console) -> None:
         self.failed = 0
