@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import mmap
 import os
 import socket
@@ -144,7 +145,10 @@ class Link:
     """Cameras, IMU and clock of the run."""
 
     def _welcome(self) -> dict[str, Any]:
-        head, fds, *_ = socket.recv_fds(self._socket, HEADER.size, 1)
+        try:
+            head, fds, *_ = socket.recv_fds(self._socket, HEADER.size, 1)
+        except OSError as error:
+            raise ProtocolError(f"the run is gone: {error}") from None
         try:
             kind, body = self._read(head)
             magic, version, _ = GREETING.unpack_from(body.ljust(GREETING.size, b"\0"))
@@ -188,6 +192,8 @@ class Link:
             ProtocolError: The run has gone without a word, or does not keep to the protocol.
         """
         kind, body = self._read()
+        if kind == BYE and body:
+            raise ProtocolError(f"the run has ended the connection: {text_of(body)}")
         if kind == BYE:
             return None
         if kind == IMU and len(body) % SAMPLE.itemsize == 0:
@@ -214,7 +220,10 @@ class Link:
             if not kind:
                 raise ValueError(f"an image of kind {number}")
             _, dtype, pixel = KINDS[kind]
-            strides = (stride, *np.empty((1, 1, *pixel), dtype).strides[1:])
+            step = dtype.itemsize * math.prod(pixel)
+            if width * step > stride or offset + height * stride > len(self._memory):
+                raise ValueError("an image outside the shared memory")
+            strides = (stride, step, dtype.itemsize)[: 2 + len(pixel)]
             data = np.ndarray((height, width, *pixel), dtype, self._memory, offset, strides)
             images.append(LinkImage(camera, kind, data))
         return Frame(sequence, stamp, tuple(images), np.empty(0, SAMPLE))
@@ -282,6 +291,8 @@ class Link:
     def _read(self, head: bytes = b"") -> tuple[int, bytearray]:
         try:
             return read_message(self._socket, head)
+        except ProtocolError:
+            raise
         except (EOFError, OSError) as error:
             raise ProtocolError(f"the run is gone: {str(error) or 'without BYE'}") from None
 
@@ -296,11 +307,12 @@ def read_message(connection: socket.socket, head: bytes = b"") -> tuple[int, byt
 
     Raises:
         EOFError: The other side has closed the connection.
-        OSError: The same, found out in another way; or the message is too long.
+        OSError: The same, found out in another way.
+        ProtocolError: The message is too long.
     """
     length, kind = HEADER.unpack(head + _exactly(connection, HEADER.size - len(head)))
     if length > LONGEST:
-        raise OSError(f"expected at most {LONGEST} bytes, found a message of {length}")
+        raise ProtocolError(f"expected at most {LONGEST} bytes, found a message of {length}")
     return kind, _exactly(connection, length)
 
 

@@ -11,7 +11,6 @@ import functools
 import mmap
 import os
 import socket
-import stat
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -30,6 +29,10 @@ from runtime.workers.shared_memory import anonymous_file
 GREETING_TIME = 10.0
 """Real seconds that a connection has for HELLO."""
 
+GREETING = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
+
+READERS = {wire.POSE: read_pose, wire.DONE: read_done}
+
 ALIGNMENT = 64
 """Images begin at multiples of this (bytes); a slot has room for the gaps between 16 of them."""
 
@@ -41,7 +44,7 @@ class _Program:
         self.connection = connection
         self.sending = threading.Lock()
         self.name = ""
-        self.pose_of: str | None = None  # until READY
+        self.pose_of = ""  # until READY
         self.sequence = 0
         self.owed: dict[int, tuple[int, int]] = {}  # sequence: stamp, slot
         self.free = list(range(slots))
@@ -54,6 +57,17 @@ class _Program:
             self.connection.sendall(wire.message(kind, *parts))
             return True
         return False
+
+    def end(self, kind: int, *parts: bytes) -> None:
+        """Send a last message, if that is possible at once, and disconnect."""
+        with contextlib.suppress(OSError):  # it has ended already
+            if self.sending.acquire(timeout=0.5):
+                try:
+                    self.connection.send(wire.message(kind, *parts), socket.MSG_DONTWAIT)
+                finally:
+                    self.sending.release()
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_RDWR)
 
 
 class Endpoint:
@@ -99,6 +113,7 @@ class Endpoint:
         self._problem = ""
         self._closed = False
         self._listener: socket.socket | None = None
+        self._programs: list[_Program] = []
         self._threads: list[threading.Thread] = []
         self._file = anonymous_file()
         os.ftruncate(self._file, slots * self._slot_bytes)
@@ -121,17 +136,13 @@ class Endpoint:
         """
         with self._changed:
             self._changed.wait_for(lambda: self._ready() or self._problem or self._closed, seconds)
-            program = self._program
-            if program is not None and self._ready():
+            if program := self._ready():
                 return program.name
-            problem, self._problem = self._problem, ""
-        if self._closed:
-            raise LinkError(f"{self._path}: closed before a program was ready")
-        if not problem and program is not None:
-            problem = f"{program.name} connected, but did not say READY within {seconds:g} s"
-        raise LinkError(
-            f"{self._path}: expected a program, {problem or f'found none within {seconds:g} s'}"
-        )
+            found, self._problem = self._problem, ""
+            if self._program is not None:
+                found = found or f"found {self._program.name}, which did not say READY"
+        found = found or ("found none before the end" if self._closed else "found none")
+        raise LinkError(f"{self._path}: expected a program within {seconds:g} s, {found}")
 
     def send_imu(self, samples: npt.NDArray[Any]) -> bool:
         """Send a row of IMU samples (of type `SAMPLE`), and return whether a program is there.
@@ -161,16 +172,13 @@ class Endpoint:
         Raises:
             ValueError: An image is not as its kind, or all do not fit into a slot.
         """
-        entries, size = [], 0
-        for camera, kind, image in images:
-            entries.append((camera, kind, image, size))
+        for _, kind, image in images:
             _check(kind, image)
-            size += -(-image.nbytes // ALIGNMENT) * ALIGNMENT
-        if size > self._slot_bytes:
-            raise ValueError(f"expected images of {self._slot_bytes} bytes, found {size}")
+        starts = np.cumsum([0] + [image.nbytes + -image.nbytes % ALIGNMENT for *_, image in images])
+        if starts[-1] > self._slot_bytes:
+            raise ValueError(f"expected images of {self._slot_bytes} bytes, found {starts[-1]}")
         with self._changed:
-            program = self._program
-            if program is None or program.pose_of is None:
+            if (program := self._ready()) is None:
                 return False
             if wait:
                 self._changed.wait_for(lambda: program.free or program.gone or self._closed)
@@ -179,42 +187,36 @@ class Endpoint:
             slot = program.free.pop(0)
             sequence, program.sequence = program.sequence, program.sequence + 1
             program.owed[sequence] = stamp, slot
-        parts = [wire.FRAME_HEAD.pack(sequence, stamp, len(entries), 0)]
-        for camera, kind, image, start in entries:
+        heads = [wire.FRAME_HEAD.pack(sequence, stamp, len(images), 0)]
+        for (camera, kind, image), start in zip(images, starts.tolist(), strict=False):
             offset = slot * self._slot_bytes + start
             place = np.ndarray(image.shape, image.dtype, self._memory, offset)
             np.copyto(place, image)
             head = camera, wire.KINDS[kind][0], *image.shape[:2], place.strides[0], 0, offset
-            parts.append(wire.IMAGE_HEAD.pack(*head))
-        return program.send(wire.FRAME, *parts)
+            heads.append(wire.IMAGE_HEAD.pack(*head))
+        return program.send(wire.FRAME, *heads)
 
     def close(self) -> None:
         """Say BYE, disconnect, and remove the socket; takes two seconds at most."""
         with self._changed:
-            if self._closed:
-                return
-            self._closed = True
-            program = self._program
+            closed, self._closed = self._closed, True
             self._changed.notify_all()
+        if closed:
+            return
         if self._listener is not None:
             self._path.unlink(missing_ok=True)
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # wakes the thread that accepts
                 self._listener.shutdown(socket.SHUT_RDWR)
             self._listener.close()
-        if program is not None:
-            if program.sending.acquire(timeout=0.5):
-                with contextlib.suppress(OSError):
-                    program.connection.send(wire.HEADER.pack(0, wire.BYE), socket.MSG_DONTWAIT)
-                program.sending.release()
-            _shut_down(program.connection)
-        deadline = time.monotonic() + 1.5
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(max(deadline - time.monotonic(), 0.0))
+        for program in list(self._programs):
+            program.end(wire.BYE)
+        deadline = time.monotonic() + 1.0
+        for thread in set(self._threads) - {threading.current_thread()}:
+            thread.join(max(deadline - time.monotonic(), 0.0))
         os.close(self._file)
 
-    def _ready(self) -> bool:
-        return self._program is not None and self._program.pose_of is not None
+    def _ready(self) -> _Program | None:
+        return self._program if self._program is not None and self._program.pose_of else None
 
     def _start(self, run: Callable[[], None]) -> None:
         self._threads = [thread for thread in self._threads if thread.is_alive()]
@@ -229,38 +231,43 @@ class Endpoint:
                 self._start(functools.partial(self._serve, connection))
 
     def _serve(self, connection: socket.socket) -> None:
-        program = _Program(connection, self._slots)
-        reason = "its connection has ended"
+        program = _Program(connection, self._slots)  # without a name: it only looks who is here
+        self._programs.append(program)
+        problem = "its connection has ended"
+        kind, head = wire.BYE, b""
         with connection:
             try:
                 self._greet(program)
                 self._read(program)
-            except LinkError as error:
-                reason = str(error)
-                self._leave(program, reason)
-                connection.settimeout(1.0)
-                if program.pose_of is None:
-                    head = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
-                    program.send(wire.REFUSED, head, reason.encode())
-                else:
-                    program.send(wire.BYE, reason.encode())
-            except EOFError as error:
-                reason = str(error) or reason
-            except TimeoutError:
-                reason = f"no HELLO came within {GREETING_TIME:g} s"
-            except OSError as error:
-                reason = f"{reason}: {error}"
-            self._leave(program, reason)
+            except (LinkError, wire.ProtocolError) as error:
+                problem = str(error)
+                if not program.pose_of:
+                    kind, head = wire.REFUSED, GREETING
+            except (EOFError, TimeoutError) as error:
+                problem = str(error) or problem
+            except OSError:
+                pass
+            with self._changed:
+                program.gone = True
+                if self._program is program:
+                    self._program = None
+                if program.name and not program.pose_of:
+                    self._problem = f"found {program.name}: {problem}"
+                closed = self._closed
+                self._changed.notify_all()
+            program.end(kind, head, problem.encode())
+        self._programs.remove(program)
+        if program.pose_of and not closed:
+            self._gone(f"{program.name}: {problem}")
 
     def _greet(self, program: _Program) -> None:
         """Read HELLO, take the program if there is no other, and send WELCOME."""
-        program.connection.settimeout(GREETING_TIME)
-        kind, body = wire.read_message(program.connection)
-        if kind != wire.HELLO or len(body) < wire.GREETING.size:
-            raise LinkError(f"expected HELLO, found type {kind} with {len(body)} bytes")
-        magic, version, _ = wire.GREETING.unpack_from(body)
-        if magic != wire.MAGIC:
-            raise LinkError(f"HELLO.magic: expected {wire.MAGIC!r}, found {magic!r}")
+        connection = program.connection
+        connection.settimeout(GREETING_TIME)
+        kind, body = wire.read_message(connection)
+        magic, version, _ = wire.GREETING.unpack_from(body.ljust(wire.GREETING.size, b"\0"))
+        if kind != wire.HELLO or magic != wire.MAGIC:
+            raise LinkError(f"expected HELLO with {wire.MAGIC!r}, found type {kind} with {magic!r}")
         program.name = wire.text_of(body[wire.GREETING.size :]) or "a program without a name"
         if version != wire.VERSION:
             raise LinkError(f"expected version {wire.VERSION} of the protocol, found {version}")
@@ -268,32 +275,28 @@ class Endpoint:
             if self._closed:
                 raise LinkError("the run has ended")
             if self._program is not None:
-                raise LinkError(f"another program is connected: {self._program.name}")
+                raise LinkError(f"expected one program, found {self._program.name} connected")
             self._program, self._problem = program, ""
-        program.connection.settimeout(None)
+        connection.settimeout(None)
         size = wire.MEMORY.pack(self._slots * self._slot_bytes)
-        greeting = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
-        welcome = wire.message(wire.WELCOME, greeting, size, self._description)
-        socket.send_fds(program.connection, [welcome[:8]], [self._file])
-        program.connection.sendall(welcome[8:])
+        welcome = wire.message(wire.WELCOME, GREETING, size, self._description)
+        socket.send_fds(connection, [welcome[:8]], [self._file])
+        connection.sendall(welcome[8:])
 
     def _read(self, program: _Program) -> None:
         """Read until the program is gone."""
         while True:
             kind, body = wire.read_message(program.connection)
             if kind == wire.BYE:
-                raise EOFError(
-                    f"it said goodbye: {wire.text_of(body)}" if body else "it said goodbye"
-                )
+                raise EOFError(f"it said goodbye {wire.text_of(body)}".rstrip())
             if kind == wire.LOG:
                 self._logged(wire.text_of(body))
-            elif kind == wire.READY and program.pose_of is None:
+            elif kind == wire.READY and not program.pose_of:
                 self._take_ready(program, body)
-            elif kind in (wire.POSE, wire.DONE) and program.pose_of is not None:
-                answer = read_done(body) if kind == wire.DONE else read_pose(body)
-                self._take(program, answer)
+            elif kind in READERS and program.pose_of:
+                self._take(program, READERS[kind](body))
             else:
-                raise LinkError(f"expected LOG, POSE, DONE or BYE, found type {kind}")
+                raise LinkError(f"expected READY once, POSE, DONE, LOG or BYE, found type {kind}")
 
     def _take_ready(self, program: _Program, body: bytearray) -> None:
         codes = {code: name for name, code in wire.POSE_OF.items()}
@@ -311,15 +314,12 @@ class Endpoint:
                 raise LinkError(
                     f"sequence: expected below {program.sequence}, found {answer.sequence}"
                 )
-            stamp, _ = program.owed.get(answer.sequence, (answer.stamp, None))
+            stamp, _ = program.owed.get(answer.sequence, (answer.stamp, 0))
             if stamp != answer.stamp:
-                raise LinkError(
-                    f"stamp: expected {stamp} of frame {answer.sequence}, found {answer.stamp}"
-                )
-            earlier = [n for n in program.owed if n < answer.sequence] if self._skips else []
-            for sequence in (*earlier, answer.sequence):
-                if sequence in program.owed:
-                    program.free.append(program.owed.pop(sequence)[1])
+                raise LinkError(f"stamp: expected {stamp}, found {answer.stamp}")
+            done = [n for n in program.owed if self._skips and n < answer.sequence]
+            for sequence in {*done, answer.sequence} & program.owed.keys():
+                program.free.append(program.owed.pop(sequence)[1])
             self._changed.notify_all()
         if answer.pose is not None:
             pose = answer.pose
@@ -330,47 +330,21 @@ class Endpoint:
             answer = msgspec.structs.replace(answer, pose=program.origin @ pose)
         self._answered(answer)
 
-    def _leave(self, program: _Program, reason: str) -> None:
-        """Let go of a program, and say so."""
-        with self._changed:
-            if program.gone:
-                return
-            program.gone = True
-            if self._program is program:
-                self._program = None
-            if program.pose_of is None and program.name:
-                self._problem = f"found {program.name}: {reason}"
-            elif program.pose_of is None and not reason.startswith("its connection"):
-                self._problem = f"found something else: {reason}"
-            tell = program.pose_of is not None and not self._closed
-            self._changed.notify_all()
-        if tell:
-            self._gone(f"{program.name}: {reason}")
-
 
 def _bound(path: Path) -> socket.socket:
     """Return a socket that listens at `path`; only this user may connect."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        try:
-            listener.bind(str(path))
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise
-            if not stat.S_ISSOCK(path.lstat().st_mode):
-                raise LinkError(f"{path}: expected a socket or nothing, found a file") from None
-            if _alive(path):
-                raise LinkError(f"{path}: another run listens there") from None
-            path.unlink(missing_ok=True)
-            listener.bind(str(path))
+        if path.is_socket() and not _alive(path):
+            path.unlink()
+        listener.bind(str(path))
         path.chmod(0o600)
         listener.listen(4)
-    except OSError as error:  # the folder is missing, or the path is too long
+    except OSError as error:  # a run or a file is there, the folder is missing, it is too long
         listener.close()
-        raise LinkError(f"{path}: {error}") from None
-    except LinkError:
-        listener.close()
-        raise
+        raise LinkError(
+            f"{path}: expected a place for a socket, found: {error.strerror or error}"
+        ) from None
     return listener
 
 
@@ -379,11 +353,6 @@ def _alive(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         return probe.connect_ex(str(path)) != errno.ECONNREFUSED
-
-
-def _shut_down(connection: socket.socket) -> None:
-    with contextlib.suppress(OSError):  # it has ended already
-        connection.shutdown(socket.SHUT_RDWR)
 
 
 def _check(kind: str, image: npt.NDArray[Any]) -> None:

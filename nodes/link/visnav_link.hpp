@@ -208,6 +208,7 @@ public:
         std::vector<Imu> samples;
         for (;;) {
             const auto [type, body] = receive();
+            if (type == 5 && !body.empty()) throw Error("the run has ended the connection: " + body);
             if (type == 5) return std::nullopt;
             if (type == 17) return read_frame(body, samples);
             if (type != 16) throw Error("expected IMU, FRAME or BYE, found another message");
