@@ -73,7 +73,7 @@ def test_a_copied_example_is_whole(path: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert load(tmp_path / path.name).nodes
     beside = {"brightness": "brightness.py", "plain": "plain_room.xml"}
-    beside["computer_vision"] = "orbit.tum"
+    beside |= {"computer_vision": "orbit.tum", "outside_cpp": "outside_cpp/odometry.cpp"}
     if path.stem in beside:
         assert (tmp_path / beside[path.stem]).is_file()
     again = command_here("example", path.stem, "--out", str(tmp_path), folder=ROOT)

@@ -22,5 +22,9 @@ class BuildWithExamples(build_py):
             return
         target = Path(self.build_lib) / INSIDE
         target.mkdir(parents=True, exist_ok=True)
-        for file in [ROOT / "config.toml", *sorted((ROOT / "examples").glob("*.*"))]:
-            shutil.copyfile(file, target / file.name)
+        examples = ROOT / "examples"
+        for file in [ROOT / "config.toml", *sorted(examples.rglob("*.*"))]:
+            copy = target / file.relative_to(examples if examples in file.parents else ROOT)
+            if file.suffix != ".pyc":
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, copy)

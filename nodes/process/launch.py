@@ -13,6 +13,7 @@ from typing import Any
 
 import jinja2
 
+from nodes import link
 from nodes.calibration.formats import templates
 from nodes.process.program import Program
 from nodes.process.settings import ProcessConfig
@@ -99,8 +100,12 @@ class Launch:
 
     def environment(self) -> dict[str, str]:
         """Return all variables of the program."""
-        place = {"VISNAV_FOLDER": str(self.folder), "VISNAV_SOCKET": str(self.socket)}
-        return {**os.environ, **place, **self._ours, **self._config.environment}
+        places = {
+            "VISNAV_FOLDER": str(self.folder),
+            "VISNAV_SOCKET": str(self.socket),
+            "VISNAV_INCLUDE": str(Path(link.__file__).parent),
+        }
+        return {**os.environ, **places, **self._ours, **self._config.environment}
 
     def _expanded(self, word: str) -> str:
         return string.Template(word).safe_substitute(self.environment())

@@ -96,9 +96,18 @@ class Process(Estimator[ProcessConfig]):
     # Before the run.
 
     async def on_startup(self) -> None:
-        """Run the command that builds the program."""
-        command = self.config.build
-        if not command or self.checking:
+        """Make the program's folder, and run the command that builds it."""
+        if self.checking:
+            return
+        await self.offload(self._launch.make_folder, anew=not self.restarts)
+        try:
+            await self._build()
+        except BaseException:
+            self._launch.close()
+            raise
+
+    async def _build(self) -> None:
+        if not (command := self.config.build):
             return
         if missing := self._launch.missing("build", command):
             raise ProgramError(missing)
@@ -161,7 +170,6 @@ class Process(Estimator[ProcessConfig]):
         config, launch = self.config, self._launch
         self._loop = asyncio.get_running_loop()
         self._end: asyncio.Future[str] = self._loop.create_future()
-        await self.offload(launch.make_folder, anew=not self.restarts)
         for path, text in launch.texts(self._known()).items():
             path.parent.mkdir(parents=True, exist_ok=True)
             await self.offload(path.write_text, text, "utf-8")

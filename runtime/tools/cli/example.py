@@ -55,7 +55,7 @@ def example(
         raise CommandError(f"{existing[0]}: expected no file of this name, found one")
     out.mkdir(parents=True, exist_ok=True)
     for file, target in zip(files, targets, strict=True):
-        shutil.copyfile(file, target)
+        (shutil.copytree if file.is_dir() else shutil.copyfile)(file, target)
         if file.suffix == ".toml":  # the schema lies elsewhere; the command `schema` writes one
             text = file.read_text(encoding="utf-8")
             target.write_text(re.sub(r"\A#:schema .*\n", "", text), encoding="utf-8")
@@ -93,12 +93,11 @@ def _about(path: Path) -> str:
 
 
 def _read_by(path: Path) -> list[Path]:
-    """Return the files beside an example that it names: worlds, trajectories, modules of nodes."""
+    """Return what an example names beside it: worlds, trajectories, modules of nodes, programs."""
     text = path.read_text(encoding="utf-8")
     beside = (file for file in sorted(path.parent.iterdir()) if file.suffix != ".toml")
     return [
         file
         for file in beside
-        if file.is_file()
-        and (f'"{file.name}"' in text or (file.suffix == ".py" and f'"{file.stem}:' in text))
+        if f' = "{file.name}"' in text or (file.suffix == ".py" and f'"{file.stem}:' in text)
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 from collections.abc import Mapping
@@ -171,8 +172,15 @@ def program(
 
 
 def fly(
-    node: NodeSpec, out: Path, duration: float = 0.5, clock: Any = "lockstep", **eyes: Any
+    node: NodeSpec,
+    out: Path,
+    duration: float = 0.5,
+    clock: Any = "lockstep",
+    handlers: list[logging.Handler] | None = None,
+    **eyes: Any,
 ) -> Summary:
     """Run the rig and a node for a while."""
     settings = RunConfig(duration=Duration(duration), seed=3, clock=clock)
-    return execute(Config(run=settings, nodes=(spec(Eyes, "drone", eyes), node)), out)
+    return execute(
+        Config(run=settings, nodes=(spec(Eyes, "drone", eyes), node)), out, handlers=handlers
+    )

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import subprocess
+import sys
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +17,7 @@ import pytest
 from runtime.errors import ConfigError, VisnavError
 from runtime.summary import Summary
 from runtime.testing import spec
-from tests.nodes.process.rig import AsWorker, fly, program
+from tests.nodes.process.rig import ROOT, STUB, AsWorker, fly, program
 from tests.nodes.process.test_program import alive, gone_soon
 
 pytestmark = pytest.mark.timeout(120)
@@ -132,6 +136,36 @@ def test_without_it_a_run_goes_on_if_it_may(
     assert summary.verdict is not None
     assert summary.verdict.passed == passed
     assert "ended with exit code 7" in (tmp_path / "log.txt").read_text()
+
+
+class Heard(logging.Handler):
+    """When, in real time, the log said what."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.said: list[tuple[float, str]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.said.append((record.created, record.getMessage()))
+
+    def when(self, what: str) -> float:
+        return next(created for created, text in self.said if what in text)
+
+
+@pytest.mark.parametrize("policy", ["error", "lost", "continue", "restart"])
+def test_a_program_that_is_killed_is_missed_within_a_second(policy: str, tmp_path: Path) -> None:
+    heard = Heard()
+    hold = {"on_missing": policy if policy != "restart" else "error", "max_wait": 60}
+    node = program("killed", on_error="restart" if policy == "restart" else "stop", hold=hold)
+    with (
+        pytest.raises(VisnavError, match="killed by signal 9")
+        if policy == "error"
+        else nullcontext()
+    ):
+        fly(node, tmp_path, 1.0, handlers=[heard])
+    killed = float((tmp_path / "programs" / "slam" / "when").read_text())
+    assert heard.when("killed by signal 9") - killed < 1.0
+    assert ("restarts in 0.5 s" in str(heard.said)) == (policy == "restart")
 
 
 def test_one_that_died_is_started_again_and_begins_anew(tmp_path: Path) -> None:
@@ -261,11 +295,6 @@ def test_one_that_is_started_by_hand_may_go_and_come_back(tmp_path: Path) -> Non
     pids: list[int] = []
 
     def start_by_hand() -> None:
-        import subprocess
-        import sys
-
-        from tests.nodes.process.rig import ROOT, STUB
-
         socket = tmp_path / "programs" / "slam" / "link.socket"
         environment = {
             **os.environ,
