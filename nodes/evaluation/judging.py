@@ -5,7 +5,7 @@ Pure functions; `nodes.evaluation.node` collects, and `nodes.evaluation.results`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -15,15 +15,16 @@ import numpy.typing as npt
 from nodes.evaluation.alignment import How, align, transform
 from nodes.evaluation.coverage import Interval, Stamps, choose_frames, cover, seconds
 from nodes.evaluation.metrics import (
-    absolute_error,
+    absolute_errors,
     drift_percent,
+    path_errors,
     position_errors,
-    relative_error,
     rotation_errors,
 )
 from nodes.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory, associate
 from runtime.schedule import SECOND
+from runtime.summary import overall
 
 Floats = npt.NDArray[np.float64]
 
@@ -106,6 +107,7 @@ class Errors(msgspec.Struct, frozen=True, eq=False):
     Attributes:
         stamps: Nanoseconds: of the image, or of the control tick.
         since: Nanoseconds: when the estimate came; for ticks, the stamp of the pose there was.
+            Shape (0,) if not known.
         position: Metres, after alignment.
         rotation: Radians, after alignment.
     """
@@ -158,7 +160,8 @@ def judge(
     """Judge an estimator against the truth.
 
     Args:
-        record: What it sent.
+        record: What it sent. Where arrivals are not known, latencies and errors at control ticks
+            are not among the figures.
         truth: The true poses of the same body.
         cameras: Stamps of the images (ns), strictly rising, by camera. The flight is from the
             first to the last image of the camera that the estimator follows; without cameras it
@@ -172,11 +175,12 @@ def judge(
     end = int(truth.stamps[-1]) if end is None else end
     estimate = record.rows.trajectory() if len(record) else None
     poses = np.empty(0, np.int64) if estimate is None else estimate.stamps
+    arrivals = record.arrivals()
     frames = choose_frames(cameras or {}, poses)
     waits = 0
-    if estimate is not None:
+    if len(arrivals):
         # The last images of an orderly run are not answered yet, if answers take their time.
-        usual = int(np.median(record.arrivals() - poses))
+        usual = int(np.median(arrivals - poses))
         waits = min(max(usual, 0), round(gap * SECOND))
     due = truth.stamps if frames is None else frames
     due = due[: max(int(np.searchsorted(due, end - waits, side="right")), 1)]
@@ -198,14 +202,13 @@ def judge(
     if estimate is None:
         return Judgement(figures=figures, estimate=None, lost=coverage.lost)
     how = choose_alignment(record) if alignment == "auto" else alignment
-    latencies = (record.arrivals() - poses) / MILLISECOND
-    figures |= {
-        "alignment": how,
-        "rate_hz": (len(estimate) - 1) / estimate.seconds if estimate.seconds else 0.0,
-        "latency_p50_ms": float(np.percentile(latencies, 50)),
-        "latency_p99_ms": float(np.percentile(latencies, 99)),
-        "first_s": (int(poses[0]) - coverage.flight.start) / SECOND,
-    }
+    figures["alignment"] = how
+    figures["rate_hz"] = (len(estimate) - 1) / estimate.seconds if estimate.seconds else 0.0
+    if len(arrivals):
+        latencies = (arrivals - poses) / MILLISECOND
+        figures["latency_p50_ms"] = float(np.percentile(latencies, 50))
+        figures["latency_p99_ms"] = float(np.percentile(latencies, 99))
+    figures["first_s"] = (int(poses[0]) - coverage.flight.start) / SECOND
     try:
         there, kept = associate(truth, estimate)
         aligned = align(kept, there, how)
@@ -214,41 +217,23 @@ def judge(
             figures={**figures, "why": str(error)}, estimate=estimate, lost=coverage.lost
         )
     moved = aligned.trajectory
-    absolute = absolute_error(there, moved)
+    figures |= {"scale": aligned.scale, **absolute_errors(there, moved)}
     path = flight.length()
-    north, east, down = absolute.axes_rmse_m
-    figures |= {
-        "scale": aligned.scale,
-        "ate_rmse_m": absolute.rmse_m,
-        "ate_percent": 100.0 * absolute.rmse_m / path if path > 0 else None,
-        "ate_mean_m": absolute.mean_m,
-        "ate_median_m": absolute.median_m,
-        "ate_std_m": absolute.std_m,
-        "ate_max_m": absolute.max_m,
-        "ate_north_rmse_m": north,
-        "ate_east_rmse_m": east,
-        "ate_down_rmse_m": down,
-        "mse_m2": absolute.mse_m2,
-        "rot_rmse_deg": absolute.rotation_rmse_deg,
-    }
+    figures["ate_percent"] = 100.0 * figures["ate_rmse_m"] / path if path > 0 else None
     try:
-        relative = relative_error(there, moved, delta)
-        figures |= {
-            "rpe_trans_percent": relative.translation_percent,
-            "rpe_rot_deg_per_m": relative.rotation_deg_per_m,
-            "drift_percent": drift_percent(there, moved),
-        }
+        figures |= path_errors(there, moved, delta)
+        figures["drift_percent"] = drift_percent(there, moved)
     except ValueError as error:  # it did not get that far
         figures["why"] = str(error)
     inside = truth.covers(poses)
     of_images = Errors(
         stamps=there.stamps,
-        since=record.arrivals()[inside],
+        since=arrivals[inside] if len(arrivals) else arrivals,
         position=position_errors(there.positions, moved.positions),
         rotation=rotation_errors(there.orientations, moved.orientations),
     )
     whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
-    of_ticks = errors_at_ticks(truth, whole, record.arrivals(), rate)
+    of_ticks = errors_at_ticks(truth, whole, arrivals, rate) if len(arrivals) else None
     if of_ticks is not None:
         figures |= {
             "available_rmse_m": _rms(of_ticks.position),
@@ -256,6 +241,33 @@ def judge(
             "available_age_ms": float(np.mean(of_ticks.stamps - of_ticks.since)) / MILLISECOND,
         }
     return Judgement(figures, estimate, moved, of_images, of_ticks, coverage.lost)
+
+
+def conclude(
+    found: Mapping[str, dict[str, Any]], thresholds: Thresholds, faults: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return the verdict, as ``evaluation/verdict.json`` has it.
+
+    Args:
+        found: Figures by estimator; see `judge`.
+        thresholds: What they may be.
+        faults: Further reasons why all have failed.
+    """
+    estimators = {}
+    for name, figures in found.items():
+        failed = []
+        if figures.get("ate_rmse_m") is None:
+            failed.append(figures.get("why", "expected estimates, found none"))
+        if "coverage_percent" in figures:
+            failed += thresholds.missed(figures)
+        failed += faults
+        passed = not failed if failed or thresholds.given else None
+        estimators[name] = {"passed": passed, **figures, "failed": failed}
+    return {
+        "passed": overall(figures["passed"] for figures in estimators.values()),
+        "estimators": estimators,
+        "thresholds": msgspec.to_builtins(thresholds),
+    }
 
 
 def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:

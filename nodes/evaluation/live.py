@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
 from events import PoseEstimate
 from events.poses import Pose, pose_matrix, pose_tuples
 from events.rotations import angle_between
-from nodes.evaluation.metrics import position_error
 
 
 class LiveErrors:
@@ -27,7 +28,7 @@ class LiveErrors:
             if self._origin is None:
                 self._origin = pose_matrix(*truth) @ np.linalg.inv(matrix)
             position, orientation = pose_tuples(self._origin @ matrix)
-        distance = position_error(truth[0], position)
+        distance = math.dist(truth[0], position)
         self.count += 1
         self.sum_of_squares += distance * distance
         return distance, angle_between(truth[1], orientation)

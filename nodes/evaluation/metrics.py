@@ -8,114 +8,66 @@ have the same stamps and are in one frame: see `nodes.evaluation.alignment` for 
 from __future__ import annotations
 
 import math
-from typing import Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from events import Vector3
 from nodes.trajectory import Trajectory
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 
-class AbsoluteError(msgspec.Struct, frozen=True):
-    """Absolute trajectory error (ATE): how far each pose is from the truth.
+def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
+    """Return the absolute trajectory errors (ATE) of an aligned estimate: how far each pose is off.
 
-    Attributes:
-        rmse_m: Root mean square of the position errors.
-        mean_m: Their mean.
-        median_m: Their median.
-        std_m: Their standard deviation.
-        max_m: The greatest.
-        mse_m2: Their mean square.
-        axes_rmse_m: Root mean squares along x, y and z of the truth's frame.
-        rotation_rmse_deg: Root mean square of the angles between the orientations.
-        rotation_max_deg: The greatest angle.
-    """
-
-    rmse_m: float
-    mean_m: float
-    median_m: float
-    std_m: float
-    max_m: float
-    mse_m2: float
-    axes_rmse_m: tuple[float, float, float]
-    rotation_rmse_deg: float
-    rotation_max_deg: float
-
-
-class RelativeError(msgspec.Struct, frozen=True):
-    """Relative pose error (RPE): how far the estimate drifts on a stretch of the path.
-
-    Attributes:
-        delta_m: Length of the stretches.
-        pairs: How many there were.
-        translation_percent: Root mean square of their position errors, per length.
-        translation_mean_percent: Mean of the same.
-        rotation_deg_per_m: Root mean square of their errors of orientation, per length.
-        rotation_mean_deg_per_m: Mean of the same.
-    """
-
-    delta_m: float
-    pairs: int
-    translation_percent: float
-    translation_mean_percent: float
-    rotation_deg_per_m: float
-    rotation_mean_deg_per_m: float
-
-
-def absolute_error(truth: Trajectory, estimate: Trajectory) -> AbsoluteError:
-    """Return the absolute errors, pose by pose, of an aligned estimate.
+    Returns:
+        By name, with the unit at its end: root mean square, mean, median, standard deviation,
+        maximum and mean square of the distances; root mean squares along x (north), y (east) and
+        z (down) of the truth's frame; root mean square of the angles between the orientations.
 
     Raises:
         ValueError: The stamps of the two differ.
     """
     same_stamps(truth, estimate)
     errors = position_errors(truth.positions, estimate.positions)
-    angles = np.degrees(rotation_errors(truth.orientations, estimate.orientations))
-    mse = float(np.mean(errors**2))
+    angles = rotation_errors(truth.orientations, estimate.orientations)
     x, y, z = (estimate.positions - truth.positions).T
-    return AbsoluteError(
-        rmse_m=math.sqrt(mse),
-        mean_m=float(errors.mean()),
-        median_m=float(np.median(errors)),
-        std_m=float(errors.std()),
-        max_m=float(errors.max()),
-        mse_m2=mse,
-        axes_rmse_m=(_rms(x), _rms(y), _rms(z)),
-        rotation_rmse_deg=_rms(angles),
-        rotation_max_deg=float(angles.max()),
-    )
+    return {
+        "ate_rmse_m": _rms(errors),
+        "ate_mean_m": float(errors.mean()),
+        "ate_median_m": float(np.median(errors)),
+        "ate_std_m": float(errors.std()),
+        "ate_max_m": float(errors.max()),
+        "ate_north_rmse_m": _rms(x),
+        "ate_east_rmse_m": _rms(y),
+        "ate_down_rmse_m": _rms(z),
+        "mse_m2": float(np.mean(errors**2)),
+        "rot_rmse_deg": _rms(np.degrees(angles)),
+    }
 
 
-def relative_error(
-    truth: Trajectory,
-    estimate: Trajectory,
-    delta: float = 1.0,
-    *,
-    pairs_from: Literal["truth", "estimate"] = "truth",
-) -> RelativeError:
-    """Return the relative errors over all pairs of poses a given path length apart.
+def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> dict[str, float]:
+    """Return the relative errors (RPE) over all pairs of poses a given path length apart.
 
-    No alignment but that of the scale changes it. The same as evo's with ``--delta 1
+    No alignment but that of the scale changes them. The same as evo's with ``--delta 1
     --delta_unit m --all_pairs --pairs_from_reference`` (without the last, evo measures the
     stretches along the estimate, which noise makes longer).
 
     Args:
         truth: The true poses.
         estimate: The estimated ones, at the same stamps.
-        delta: Path length in metres; a pair may miss it by a tenth.
-        pairs_from: Whose path is measured.
+        delta: Length of true path in metres; a pair may miss it by a tenth.
+
+    Returns:
+        By name: root mean squares of the errors of position and of orientation, per length.
 
     Raises:
         ValueError: The stamps of the two differ, or no poses are that far apart.
     """
     same_stamps(truth, estimate)
-    distances = (truth if pairs_from == "truth" else estimate).distances()
+    distances = truth.distances()
     first, last = path_pairs(distances, delta)
     if not len(first):
         raise ValueError(
@@ -123,15 +75,10 @@ def relative_error(
             f"in {len(truth)} poses and {distances[-1]:.3f} m"
         )
     shifts, angles = relative_errors(truth, estimate, first, last)
-    degrees = np.degrees(angles)
-    return RelativeError(
-        delta_m=delta,
-        pairs=len(first),
-        translation_percent=100.0 * _rms(shifts) / delta,
-        translation_mean_percent=100.0 * float(shifts.mean()) / delta,
-        rotation_deg_per_m=_rms(degrees) / delta,
-        rotation_mean_deg_per_m=float(degrees.mean()) / delta,
-    )
+    return {
+        "rpe_trans_percent": 100.0 * _rms(shifts) / delta,
+        "rpe_rot_deg_per_m": _rms(np.degrees(angles)) / delta,
+    }
 
 
 def drift_percent(truth: Trajectory, estimate: Trajectory) -> float:
@@ -201,11 +148,6 @@ def rotation_errors(truth: Floats, estimate: Floats) -> Floats:
     a = Rotation.from_quat(truth, scalar_first=True)
     b = Rotation.from_quat(estimate, scalar_first=True)
     return np.asarray((a.inv() * b).magnitude())
-
-
-def position_error(truth: Vector3, estimate: Vector3) -> float:
-    """Return the distance between two positions, metres; for one pose in a running node."""
-    return math.dist(truth, estimate)
 
 
 def same_stamps(truth: Trajectory, estimate: Trajectory) -> None:

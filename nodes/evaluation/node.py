@@ -26,7 +26,7 @@ from events import (
 )
 from nodes.evaluation.album import Album
 from nodes.evaluation.flight import Flight, collision_rows
-from nodes.evaluation.judging import Judgement, Thresholds, judge
+from nodes.evaluation.judging import Judgement, Thresholds, conclude, judge
 from nodes.evaluation.live import LiveErrors
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import FRAMES, file_name, write_results
@@ -36,7 +36,6 @@ from nodes.trajectory.growing import GrowingFile
 from nodes.vehicles import Vehicles
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
-from runtime.summary import overall
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -193,31 +192,20 @@ class Evaluation(Node[EvaluationConfig]):
         cameras = {name: np.array(stamps, np.int64) for name, stamps in self._frames.items()}
         truths = {v: f.truth.trajectory() for v, f in self._flights.items() if len(f.truth)}
         flown = {vehicle: flight.figures() for vehicle, flight in self._flights.items()}
-        judgements, estimators = {}, {}
+        judgements = {}
         for name, record in self._records.items():
             vehicle = self._vehicle_of(name)
             judgement = self._judge(record, truths.get(vehicle), self._seen(vehicle, cameras), end)
             judgement.figures.update(flown.get(vehicle, {}))
             if len(self._vehicles.names) > 1:
                 judgement.figures["vehicle"] = vehicle
-            failed = []
-            if judgement.figures.get("ate_rmse_m") is None:
-                failed.append(judgement.figures.get("why", "expected estimates, found none"))
-            if "coverage_percent" in judgement.figures:
-                failed += config.thresholds.missed(judgement.figures)
-            if self.restarts:
-                failed.append(
-                    f"{self.name}: expected it to judge the whole flight, found that it was "
-                    "restarted: what was sent before is not in the figures"
-                )
-            passed = not failed if failed or config.thresholds.given else None
-            estimators[name] = {"passed": passed, **judgement.figures, "failed": failed}
             judgements[name] = judgement
-        verdict = {
-            "passed": overall(figures["passed"] for figures in estimators.values()),
-            "estimators": estimators,
-            "thresholds": msgspec.to_builtins(config.thresholds),
-        }
+        restarted = (
+            f"{self.name}: expected it to judge the whole flight, found that it was restarted: "
+            "what was sent before is not in the figures"
+        )
+        figures = {name: judgement.figures for name, judgement in judgements.items()}
+        verdict = conclude(figures, config.thresholds, [restarted] if self.restarts else [])
         if self.out is not None:
             plans = {self._named("plan", v): f.plan() for v, f in self._flights.items()}
             write_results(self.out, plans, judgements, verdict)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from events import PoseEstimate, TrackingEvent, TrackingLost
 from nodes.evaluation.coverage import Interval
-from nodes.trajectory import PoseRows
+from nodes.trajectory import PoseRows, Trajectory
 
 _AHEAD = 1_000_000
 """Nanoseconds by which a stamp may be later than its arrival: clocks are that close."""
@@ -47,9 +47,21 @@ class EstimatorRecord:
         self._arrivals = array("q")
         self._tracking: list[TrackingEvent] = []
 
-    def add(self, event: PoseEstimate, now: int) -> bool:
-        """Note an estimate that has come at a time (ns); tell if it is part of the trajectory."""
-        if event.stamp > now + _AHEAD:
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> EstimatorRecord:
+        """Return the record of a trajectory of which nobody knows when its poses came."""
+        record = cls()
+        for pose in trajectory.poses():
+            record.rows.add(*pose)
+        return record
+
+    def add(self, event: PoseEstimate, now: int | None) -> bool:
+        """Note an estimate that has come at a time (ns), if that is known.
+
+        Returns:
+            Whether it is part of the trajectory.
+        """
+        if now is not None and event.stamp > now + _AHEAD:
             self.future += 1
             return False
         if self._last_stamp is not None and event.stamp <= self._last_stamp:
@@ -63,7 +75,8 @@ class EstimatorRecord:
             self.elsewhere += 1
             return False
         self.rows.add(event.stamp, event.position, event.orientation)
-        self._arrivals.append(now)
+        if now is not None:
+            self._arrivals.append(now)
         return True
 
     def note(self, event: TrackingEvent) -> None:
@@ -74,7 +87,7 @@ class EstimatorRecord:
         return len(self.rows)
 
     def arrivals(self) -> npt.NDArray[np.int64]:
-        """Return when each pose of the trajectory came (ns), shape (n,)."""
+        """Return when each pose of the trajectory came (ns), shape (n,); (0,) if not known."""
         return np.array(self._arrivals, np.int64)
 
     def reported_lost(self, end: int) -> list[Interval]:

@@ -5,7 +5,8 @@ trajectories/<estimator>.tum        the estimates as they were sent; likewise
 trajectories/plan.tum               where the pilot meant to be
 trajectories/truth.<vehicle>.tum    both of the second vehicle, the third, …
 trajectories/collisions.csv         what the vehicles hit, when and where
-evaluation/<estimator>.csv          errors of each estimate at the time of its image
+evaluation/<estimator>.csv          errors of each estimate at the time of its image, and when it
+                                    came if that is known
 evaluation/<estimator>.lost.csv     when it had no pose
 evaluation/<estimator>.ticks.csv    errors of the newest pose there was at each control tick (of a
                                     long run every second one, fourth, …)
@@ -73,19 +74,20 @@ def read_errors(path: Path) -> Errors:
         OSError: It cannot be read.
         ValueError: It holds something else.
     """
-    stamps = np.loadtxt(path, np.int64, delimiter=",", skiprows=1, usecols=(0, 1), ndmin=2)
-    errors = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(2, 3), ndmin=2)
-    return Errors(stamps[:, 0], stamps[:, 1], errors[:, 0], errors[:, 1])
+    with path.open(encoding="ascii") as file:
+        known = file.readline().count(",") == 3  # or else not when each came
+    times, columns = ((0, 1), (2, 3)) if known else ((0,), (1, 2))
+    stamps = np.loadtxt(path, np.int64, delimiter=",", skiprows=1, usecols=times, ndmin=2)
+    errors = np.loadtxt(path, delimiter=",", skiprows=1, usecols=columns, ndmin=2)
+    return Errors(stamps[:, 0], stamps[:, 1:].ravel(), errors[:, 0], errors[:, 1])
 
 
 def _write_errors(path: Path, since: str, errors: Errors) -> None:
-    rows = zip(
-        errors.stamps.tolist(),
-        errors.since.tolist(),
-        errors.position.tolist(),
-        errors.rotation.tolist(),
-        strict=True,
-    )
-    lines = [f"stamp_ns,{since},position_error_m,rotation_error_rad\n"]
-    lines += [f"{stamp},{came},{p:.9f},{r:.9f}\n" for stamp, came, p, r in rows]
+    known = len(errors.since) > 0
+    times = (f"{stamp}," for stamp in errors.stamps.tolist())
+    if known:
+        times = (f"{time}{came}," for time, came in zip(times, errors.since.tolist(), strict=True))
+    rows = zip(times, errors.position.tolist(), errors.rotation.tolist(), strict=True)
+    lines = [f"stamp_ns,{f'{since},' if known else ''}position_error_m,rotation_error_rad\n"]
+    lines += [f"{time}{p:.9f},{r:.9f}\n" for time, p, r in rows]
     path.write_text("".join(lines), encoding="ascii")

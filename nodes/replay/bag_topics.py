@@ -30,6 +30,7 @@ TYPES: dict[Use, tuple[str, ...]] = {
         "nav_msgs/msg/Odometry",
         "geometry_msgs/msg/PoseStamped",
         "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "nav_msgs/msg/Path",
     ),
 }
 """What can be read of which type of message."""

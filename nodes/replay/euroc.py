@@ -8,7 +8,6 @@ EuRoC's own those of its IMU, which is no FRD, but cameras and truth agree on it
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator
 from functools import partial
@@ -39,6 +38,7 @@ from nodes.replay.folders import (
     while_seen,
 )
 from nodes.replay.reader import ReplayError
+from nodes.trajectory.formats import euroc_rows
 from nodes.trajectory.table import read_rows
 
 _TRUTH = "state_groundtruth_estimate0"
@@ -113,15 +113,12 @@ class Euroc(FolderReader):
         try:
             for camera in sorted(folder.glob("cam[0-9]*")):
                 self._announcements.append(self._camera(camera))
-            self._imu = self._table("imu0", 7, "timestamp, w x 3, a x 3")
+            self._imu = self._measurements(folder / "imu0" / "data.csv")
             if self._imu:
                 self._announcements.append(self._imu_announcement())
-            self._truth = self._table(
-                _TRUTH,
-                17,
-                "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3",
-                quaternion=slice(3, 7),
-            )
+            truth = folder / _TRUTH / "data.csv"
+            rows = euroc_rows(truth, tolerance=UNIT_TOLERANCE) if truth.is_file() else ()
+            self._truth = sorted((stamp, values) for _, stamp, values in rows)
         except ReplayError:
             raise
         except ValueError as error:
@@ -235,19 +232,11 @@ class Euroc(FolderReader):
         rows = read_rows(folder / "data.csv", ",", (2,), "timestamp, filename")
         return sorted((row.nanoseconds(), folder / "data" / row.fields[1]) for row in rows)
 
-    def _table(
-        self, name: str, columns: int, meaning: str, quaternion: slice | None = None
-    ) -> list[tuple[int, list[float]]]:
-        path = self._folder / name / "data.csv"
+    def _measurements(self, path: Path) -> list[tuple[int, list[float]]]:
         if not path.is_file():
             return []
-        found = []
-        for row in read_rows(path, ",", (columns,), meaning):
-            values = row.numbers(1, columns)
-            if quaternion and abs(math.hypot(*values[quaternion]) - 1.0) > UNIT_TOLERANCE:
-                row.wrong("a quaternion of length 1", f"w x y z = {values[quaternion]}")
-            found.append((row.nanoseconds(), values))
-        return sorted(found)
+        rows = read_rows(path, ",", (7,), "timestamp, w x 3, a x 3")
+        return sorted((row.nanoseconds(), row.numbers(1, 7)) for row in rows)
 
 
 def noted_epoch(path: Path) -> list[int]:

@@ -72,14 +72,10 @@ class RosBag(Reader):
         super().__init__()
         self._path = path
         self._vehicle = vehicle
-        with _readable(path):
-            for each in [path] if path.is_file() else sorted(path.glob("*.mcap")):
-                with each.open("rb") as file:
-                    if file.read(len(layout.MAGIC)) == layout.MAGIC:
-                        layout.check_chunks(file)  # rosbags would believe whatever they claim
-            self._bag = Bag(path)
+        with readable(path):
+            self._bag = open_bag(path)
         try:
-            with _readable(path):
+            with readable(path):
                 found = self._bag.topics()
                 self._topics = chosen(found, topics, vehicle)
                 self._firsts = self._first_messages()
@@ -102,7 +98,7 @@ class RosBag(Reader):
         ]
         stop = None if end is None else end + self._times
         wrong: set[str] = set()
-        with _readable(self._path):
+        with readable(self._path):
             for name, type_, time, message in self._bag.messages(names, start + self._times, stop):
                 try:
                     event = self._event(self._topics[name], type_, message)
@@ -245,8 +241,17 @@ class RosBag(Reader):
         return max(count - 1, 1) / seconds if seconds > 0 else 1.0
 
 
+def open_bag(path: Path) -> Bag:
+    """Open a bag whose chunks are as long as they claim; call it within `readable`."""
+    for each in [path] if path.is_file() else sorted(path.glob("*.mcap")):
+        with each.open("rb") as file:
+            if file.read(len(layout.MAGIC)) == layout.MAGIC:
+                layout.check_chunks(file)  # rosbags would believe whatever they claim
+    return Bag(path)
+
+
 @contextlib.contextmanager
-def _readable(path: Path) -> Iterator[None]:
+def readable(path: Path) -> Iterator[None]:
     """Make of whatever a damaged bag raises, in rosbags and below it, an error with its name."""
     try:
         yield

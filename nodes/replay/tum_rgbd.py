@@ -174,13 +174,9 @@ class TumRgbd(FolderReader):
         if not path.is_file():
             return []
         truth = read_tum(path, in_order=False)
-        rows = zip(
-            truth.stamps.tolist(),
-            truth.positions.tolist(),
-            truth.orientations.tolist(),
-            strict=True,
-        )
-        return [(stamp, flip_yz(place), rotation_to_ned(turn)) for stamp, place, turn in rows]
+        return [
+            (stamp, flip_yz(place), rotation_to_ned(turn)) for stamp, place, turn in truth.poses()
+        ]
 
 
 def _rate(rows: _Images) -> float:

@@ -22,7 +22,11 @@ from runtime.summary import (
 
 
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
-    """What the report wants of ``summary.json``; see `runtime.summary.Summary`."""
+    """What the report wants of ``summary.json``; see `runtime.summary.Summary`.
+
+    Of trajectories that were judged without a run (`nodes.judge`), ``judged`` has the files that
+    they came from, by name, and ``notes`` has what is to be said of them.
+    """
 
     name: str | None = None
     clock: str | None = None
@@ -43,6 +47,8 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     stalls: dict[str, int] = {}
     announcements: list[dict[str, Any]] = []
     environment: dict[str, str] = {}
+    judged: dict[str, str] = {}
+    notes: list[str] = []
 
 
 class Verdict(msgspec.Struct, frozen=True):

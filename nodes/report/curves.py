@@ -125,7 +125,8 @@ def draw_distributions(run: Run) -> Plot | None:
     known = [e for e in run.estimators if e.of_images is not None or e.of_ticks is not None]
     if not known:
         return None
-    figure = sheet(3.4, names=[*(each.name for each in known), *_STYLES])
+    styles = _STYLES if any(each.of_ticks is not None for each in known) else {}
+    figure = sheet(3.4, names=[*(each.name for each in known), *styles])
     axes: Any = figure.subplots(1, 2, sharey=True)
     shares = np.linspace(0.0, 1.0, 401)
     series: tuple[list[Floats], list[Floats]] = ([], [])
@@ -149,16 +150,18 @@ def draw_distributions(run: Run) -> Plot | None:
         axis.set_ylim(0, 101)
     axes[0].set(xlabel="position error (m)", ylabel="share of poses below (%)")
     axes[1].set(xlabel="rotation error (°)")
-    lines = [Line2D([], [], color="#666666", ls=ls, label=what) for what, ls in _STYLES.items()]
+    lines = [Line2D([], [], color="#666666", ls=ls, label=what) for what, ls in styles.items()]
     legend_above(figure, axes[0], *lines)
+    dashed = (
+        "Dashed: the newest pose a controller had at each of its ticks against the truth at that "
+        "tick; the distance between the two is what latency and frame rate cost. "
+    )
     return Plot(
         "distributions",
         figure,
         "Distribution of the errors",
-        "Solid: each estimate against the truth at the time of its image. Dashed: the newest pose "
-        "a controller had at each of its ticks against the truth at that tick; the distance "
-        "between the two is what latency and frame rate cost. "
-        f"The axes end where {_SHOWN} % of the widest curve are below.",
+        "Solid: each estimate against the truth at the time of its image. "
+        f"{dashed if styles else ''}The axes end where {_SHOWN} % of the widest curve are below.",
     )
 
 

@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.coverage import Interval, seconds
-from nodes.evaluation.judging import Errors
+from nodes.evaluation.judging import Errors, judge
+from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import file_name, read_errors
 from nodes.report.contents import Estimator, Facts, Run, Verdict
-from nodes.report.poses import gaps, lay_on, read_poses
+from nodes.report.poses import gaps, read_poses
 from nodes.report.style import COLORS
 from nodes.trajectory import Trajectory
 
@@ -68,8 +69,10 @@ class _Reader:
                 )
                 verdict = None
             verdict = verdict or facts.verdict
-        config = self._try("config.toml", _text, "the settings are not known")
-        log = self._try("log.txt", _text, "what was logged is not known")
+        self.missing += [] if facts is None else facts.notes
+        flown = facts is None or not facts.judged
+        config = self._try("config.toml", _text, "the settings are not known" if flown else "")
+        log = self._try("log.txt", _text, "what was logged is not known" if flown else "")
         first = _first_vehicle(facts or Facts())
         truths = self._by_vehicle("truth", first)
         if not (self.folder / "trajectories" / "truth.tum").is_file():
@@ -139,10 +142,10 @@ class _Reader:
                 self.missing.append(f"{name}: no curves: {why}")
                 return found
             if truth is not None:
-                try:
-                    aligned, errors = lay_on(truth, estimate)
-                except ValueError as error:
-                    self.missing.append(f"{name}: no curves: {error}")
+                judged = judge(EstimatorRecord.of(estimate), truth, alignment="origin")
+                aligned, errors = judged.aligned, judged.of_images
+                if aligned is None:
+                    self.missing.append(f"{name}: no curves: {judged.figures['why']}")
                     return found
                 self.missing.append(
                     f"{name}: the run left no evaluation of it; its first pose was laid on the "

@@ -1,4 +1,4 @@
-"""Trajectories as a report needs them: read leniently, laid on the truth, with their gaps."""
+"""Trajectories as a report needs them: read leniently, with their gaps."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from nodes.evaluation.alignment import align
 from nodes.evaluation.coverage import Interval, cover
-from nodes.evaluation.judging import Errors
-from nodes.evaluation.metrics import position_errors, rotation_errors
-from nodes.trajectory import Trajectory, associate
+from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import read_tum
 from runtime.schedule import SECOND
 
@@ -36,23 +33,6 @@ def read_poses(path: Path) -> Trajectory:
     if (far := np.abs(poses.positions).max()) > _FARTHEST:
         raise ValueError(f"expected positions within {_FARTHEST:g} m, found {far:g} m")
     return poses
-
-
-def lay_on(truth: Trajectory, estimate: Trajectory) -> tuple[Trajectory, Errors]:
-    """Lay an estimate's first pose on the true one, and return what it is off from there.
-
-    Raises:
-        ValueError: They have no time in common.
-    """
-    there, kept = associate(truth, estimate)
-    moved = align(kept, there, "origin").trajectory
-    errors = Errors(
-        stamps=moved.stamps,
-        since=np.zeros(0, np.int64),  # when each came is not known
-        position=position_errors(there.positions, moved.positions),
-        rotation=rotation_errors(there.orientations, moved.orientations),
-    )
-    return moved, errors
 
 
 def gaps(estimate: Trajectory | None, truth: Trajectory | None) -> list[Interval]:

@@ -14,6 +14,7 @@ from nodes.report.style import number
 MAIN = {
     "ate_rmse_m": ("absolute trajectory error (ATE), RMS", "m"),
     "ate_percent": ("ATE in percent of the path", "%"),
+    "coverage_percent": ("share of the flight with poses", "%"),
     "ate_mean_m": ("mean position error", "m"),
     "ate_median_m": ("median position error", "m"),
     "ate_std_m": ("standard deviation of the position error", "m"),
@@ -31,7 +32,6 @@ MAIN = {
     "plan_max_m": ("greatest distance of the flight from its plan", "m"),
     "latency_p50_ms": ("latency, median", "ms"),
     "latency_p99_ms": ("latency, 99th percentile", "ms"),
-    "coverage_percent": ("share of the flight with poses", "%"),
     "frame_coverage_percent": ("share of the images with a pose", "%"),
     "lost_seconds": ("time without a pose", "s"),
     "lost_count": ("times lost", ""),
@@ -115,7 +115,7 @@ def show(value: Any) -> str:
 def facts(run: Run) -> list[tuple[str, str]]:
     """Return what is known of the run as a whole."""
     f = run.facts
-    rows: list[tuple[str, str]] = []
+    rows = list(f.judged.items())
     for vehicle, truth in run.truths.items():
         name = f"true path of {vehicle}" if len(run.truths) > 1 else "true path"
         speed = np.linalg.norm(truth.velocities(), axis=1).max()
@@ -138,7 +138,7 @@ def facts(run: Run) -> list[tuple[str, str]]:
         rows.append(("ended by", f.reason))
     if f.error is not None:
         rows.append(("error", f.error))
-    if f.name is not None:
+    if f.clock is not None:
         rows.append(("digest", _digest(f)))
     rows += [(f"digest of what {k} was sent", o.inputs) for k, o in f.outside.items() if o.inputs]
     rows += [(f"dropped at {port}", str(s.dropped)) for port, s in f.streams.items() if s.dropped]
@@ -152,7 +152,7 @@ def facts(run: Run) -> list[tuple[str, str]]:
         for port, link in f.links.items()
     ]
     rows += [(f"loop stood still in {node}", f"{count} times") for node, count in f.stalls.items()]
-    if f.name is not None and not any(s.dropped or s.missed for s in f.streams.values()):
+    if f.clock is not None and not any(s.dropped or s.missed for s in f.streams.values()):
         rows.append(("dropped or unmatched", "nothing"))
     return rows
 

@@ -83,6 +83,15 @@ def estimate_with_covariance(message: Any, context: MessageContext) -> Event:
     return _estimate(message.header, message.pose.pose, given, context, child)
 
 
+def newest(message: Any, context: MessageContext) -> Event:
+    """Read the last pose of a Path, which each time holds all poses so far, as an estimate."""
+    if not message.poses:
+        raise ValueError("poses: expected one or more, found none")
+    pose = message.poses[-1]
+    pose.header.frame_id = pose.header.frame_id or message.header.frame_id
+    return estimate(pose, context)
+
+
 def odometry(message: Any, context: MessageContext) -> Event:
     """Read an Odometry as a body's pose and twist."""
     frame_id, child = context.frame(message.header, "odom"), message.child_frame_id or "base_link"
@@ -226,6 +235,7 @@ READERS: dict[tuple[str, str], Reader] = {
     ("geometry_msgs/msg/PoseWithCovarianceStamped", "estimate"): estimate_with_covariance,
     ("nav_msgs/msg/Odometry", "estimate"): estimate_with_covariance,
     ("nav_msgs/msg/Odometry", "odometry"): odometry,
+    ("nav_msgs/msg/Path", "estimate"): newest,
     ("geometry_msgs/msg/Twist", "velocity"): velocity,
     ("geometry_msgs/msg/TwistStamped", "velocity"): stamped_velocity,
     ("geometry_msgs/msg/PoseStamped", "position"): position,

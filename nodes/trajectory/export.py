@@ -81,7 +81,7 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
     folder = out or run / "export"
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
-    mounted = _mounting(run) if pairs else np.eye(4)
+    mounted = mounting(run) if pairs else np.eye(4)
     for name, (true, estimate) in pairs.items():
         for path, poses in (
             (folder / f"{name}.{TRUTH}.kitti.txt", true),
@@ -108,19 +108,20 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
 
 def _placed(trajectory: Trajectory, epoch: int, *, z_up: bool) -> Trajectory:
     """Return a trajectory in Unix time, and in a parent frame that is turned by half a turn."""
-    positions, (w, x, y, z) = trajectory.positions, trajectory.orientations.T
-    orientations = trajectory.orientations
-    if z_up:
-        positions = positions * [1.0, -1.0, -1.0]
-        orientations = np.stack([-x, w, -z, y], axis=1)  # (0, 1, 0, 0) ⊗ orientation
-    return Trajectory(trajectory.stamps + epoch, positions, orientations)
+    turn = np.diag([1.0, -1.0, -1.0, 1.0] if z_up else np.ones(4))
+    return Trajectory.from_matrices(trajectory.stamps + epoch, turn @ trajectory.matrices())
 
 
-def _mounting(run: Path) -> npt.NDArray[np.float64]:
-    """Return the transform from the run's first camera to its body, shape (4, 4).
+def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
+    """Return the transform from a camera that a run announced to its body, shape (4, 4).
+
+    Args:
+        run: The run's folder.
+        camera: Its source; if empty, the first one on a body, or else one at the body's origin
+            that looks ahead.
 
     Raises:
-        ValueError: The run's summary is none.
+        ValueError: The run's summary is none, or there is no such camera.
     """
     path = run / "summary.json"
     try:
@@ -128,9 +129,17 @@ def _mounting(run: Path) -> npt.NDArray[np.float64]:
         announced = msgspec.json.decode(content, type=_Summary).announcements
     except (OSError, msgspec.DecodeError) as error:
         raise ValueError(f"{path}: expected the run's summary, found: {error}") from None
-    for each in announced:
-        if each.type == "CameraAnnouncement" and each.parent_frame_id != "map":
+    cameras = [
+        each
+        for each in announced
+        if each.type == "CameraAnnouncement" and each.parent_frame_id != "map"
+    ]
+    for each in cameras:
+        if camera in {"", each.source}:
             return pose_matrix(each.position, each.orientation)
+    if camera:
+        found = ", ".join(each.source for each in cameras) or "none"
+        raise ValueError(f"{path}: expected {camera!r} among the cameras on a body, found {found}")
     return pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
 
 
@@ -138,6 +147,7 @@ class _Announced(msgspec.Struct):
     """What an export asks of an announcement."""
 
     type: str
+    source: str = ""
     parent_frame_id: str = "map"
     position: Vector3 = (0.0, 0.0, 0.0)
     orientation: Quaternion = OPTICAL_TO_FRD

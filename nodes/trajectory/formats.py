@@ -1,18 +1,20 @@
-"""Trajectory files of other tools, read and written: TUM, EuRoC, KITTI.
+"""Trajectory files of other tools: TUM, EuRoC and KITTI, read and written; VSLAM-LAB, read.
 
 - TUM (cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): ``timestamp tx ty tz qx qy qz qw``
   in seconds and metres, the scalar last.
 - EuRoC's ground truth (M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016):
   nanoseconds, position, quaternion with the scalar first, velocity, biases; with commas.
+- VSLAM-LAB (github.com/VSLAM-LAB/VSLAM-LAB): nanoseconds, position, the scalar last; with commas.
 - KITTI (cvlibs.net/datasets/kitti/eval_odometry.php): the first three rows of the transform from
   child to parent, row by row; no stamps, so two such files go together line by line.
 
-All are written with nanoseconds, nanometres and 12 decimals of a quaternion.
+They are written with nanoseconds, nanometres and 12 decimals of a quaternion.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,7 @@ import numpy.typing as npt
 
 from events import Quaternion, Vector3
 from nodes.trajectory.table import Row, read_rows, seconds_text
-from nodes.trajectory.trajectory import Trajectory, not_rotations
+from nodes.trajectory.trajectory import UNIT_LENGTH, Trajectory, not_rotations
 
 Floats = npt.NDArray[np.float64]
 
@@ -66,7 +68,7 @@ def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
         OSError: It cannot be written.
     """
     header = "timestamp[s] tx ty tz[m] qx qy qz qw"
-    rows = (tum_row(*pose) for pose in _poses(trajectory))
+    rows = (tum_row(*pose) for pose in trajectory.poses())
     _write(path, [*_comment(comment), f"# {header}\n", *rows])
 
 
@@ -84,8 +86,39 @@ def read_euroc(path: Path) -> Trajectory:
     Raises:
         ValueError: It cannot be read or holds something else; the message names the line.
     """
-    rows = read_rows(path, ",", (17, 8), "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3")
-    return _trajectory([(row, row.nanoseconds(), row.numbers(1, 17)[:7]) for row in rows])
+    return _trajectory([(row, stamp, v[:7]) for row, stamp, v in euroc_rows(path, (17, 8))])
+
+
+def euroc_rows(
+    path: Path, columns: tuple[int, ...] = (17,), tolerance: float = UNIT_LENGTH
+) -> Iterator[tuple[Row, int, list[float]]]:
+    """Yield the rows of a EuRoC ground truth with their stamps (ns) and all other values.
+
+    Args:
+        path: The file.
+        columns: How many there may be.
+        tolerance: How far from 1 the length of a quaternion may be.
+
+    Raises:
+        ValueError: It cannot be read or holds something else; the message names the line.
+    """
+    for row in read_rows(path, ",", columns, "timestamp, p x 3, q x 4, v x 3, b_w x 3, b_a x 3"):
+        values = row.numbers(1, 17)
+        _check_quaternion(row, values[3:7], tolerance)
+        yield row, row.nanoseconds(), values
+
+
+def read_vslamlab(path: Path) -> Trajectory:
+    """Read a CSV file of VSLAM-LAB under its header ``ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw``.
+
+    Raises:
+        ValueError: It cannot be read or holds something else; the message names the line.
+    """
+    rows = [
+        (row, row.nanoseconds(), row.numbers(1, 8))
+        for row in read_rows(path, ",", (8,), "ts, t x 3, qx, qy, qz, qw", header=True)
+    ]
+    return _trajectory([(row, stamp, [*v[:3], v[6], *v[3:6]]) for row, stamp, v in rows])
 
 
 def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
@@ -102,7 +135,7 @@ def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
     velocities = [(x, y, z) for x, y, z in trajectory.velocities().tolist()]
     rows = (
         euroc_row(*pose, velocity)
-        for pose, velocity in zip(_poses(trajectory), velocities, strict=True)
+        for pose, velocity in zip(trajectory.poses(), velocities, strict=True)
     )
     _write(path, [*_comment(comment), f"{EUROC_HEADER}\n", *rows])
 
@@ -155,15 +188,6 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
     _write(path, [" ".join(f"{value:.12f}" for value in row) + "\n" for row in rows])
 
 
-def _poses(trajectory: Trajectory) -> Iterable[tuple[int, Vector3, Quaternion]]:
-    return zip(
-        trajectory.stamps.tolist(),
-        trajectory.positions.tolist(),
-        trajectory.orientations.tolist(),
-        strict=True,
-    )
-
-
 def _trajectory(rows: list[tuple[Row, int, list[float]]]) -> Trajectory:
     """Make a trajectory of lines, stamps, and rows of x y z qw qx qy qz, checked line by line."""
     last: int | None = None
@@ -171,11 +195,15 @@ def _trajectory(rows: list[tuple[Row, int, list[float]]]) -> Trajectory:
         if last is not None and stamp <= last:
             row.wrong(f"a stamp above {last} ns", f"{stamp} ns")
         last = stamp
-        if not abs(np.linalg.norm(pose[3:]) - 1.0) < 0.01:
-            row.wrong("a quaternion of length 1", f"w x y z = {pose[3:]}")
+        _check_quaternion(row, pose[3:], UNIT_LENGTH)
     values = np.array([pose for _, _, pose in rows])
     stamps = np.array([stamp for _, stamp, _ in rows], dtype=np.int64)
     return Trajectory(stamps, values[:, :3], values[:, 3:])
+
+
+def _check_quaternion(row: Row, quaternion: list[float], tolerance: float) -> None:
+    if not abs(math.hypot(*quaternion) - 1.0) <= tolerance:
+        row.wrong("a quaternion of length 1", f"w x y z = {quaternion}")
 
 
 def _comment(text: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import decimal
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NoReturn
 
@@ -90,7 +90,8 @@ class Row:
         except (decimal.InvalidOperation, ValueError, OverflowError):
             stamp = _TOO_LATE
         if abs(stamp) >= _TOO_LATE:
-            self.wrong("a stamp in seconds", self.fields[0])
+            unit = "seconds, not in nanoseconds" if 1e23 < abs(stamp) < 1e28 else "seconds"
+            self.wrong(f"a stamp in {unit}", self.fields[0])
         return stamp
 
     def nanoseconds(self) -> int:
@@ -114,7 +115,13 @@ class Row:
 
 
 def read_rows(
-    path: Path, separator: str | None, columns: tuple[int, ...], meaning: str, *, whole: bool = True
+    path: Path,
+    separator: str | None,
+    columns: Collection[int],
+    meaning: str,
+    *,
+    whole: bool = True,
+    header: bool = False,
 ) -> Iterator[Row]:
     """Yield the rows of a file.
 
@@ -124,6 +131,7 @@ def read_rows(
         columns: How many fields a row may have.
         meaning: What they are, for messages.
         whole: Whether a last line without its end counts.
+        header: Whether a first line that begins with a letter is passed over.
 
     Raises:
         ValueError: The file cannot be read, has no rows, or a row of another length.
@@ -139,7 +147,7 @@ def read_rows(
     empty = True
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.partition("#")[0].strip()
-        if not content:
+        if not content or (header and number == 1 and content[0].isalpha()):
             continue
         row = Row(f"{path}:{number}", [field.strip() for field in content.split(separator)])
         if len(row.fields) not in columns:

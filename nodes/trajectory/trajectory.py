@@ -7,6 +7,7 @@ Pure numpy and scipy. Files are in `nodes.trajectory.formats`; errors between tw
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable
 from typing import IO, Any
 
 import msgspec
@@ -19,10 +20,13 @@ from events import Quaternion, Vector3
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
-_UNIT = 0.01
+UNIT_LENGTH = 0.01
 """How far from 1 the length of a quaternion may be: files of few decimals are let in, and what
 is no quaternion is not."""
 
+
+_CALENDAR = 10**17
+"""A stamp (ns) above this is Unix time (1973); below it counts from some beginning."""
 
 _ROW = np.dtype([("stamp", "i8"), ("position", "f8", 3), ("orientation", "f8", 4)])
 _BLOCK = 1024
@@ -66,7 +70,7 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
                 f"found {stamps[row]} ns"
             )
         norms = np.linalg.norm(orientations, axis=1)
-        if odd := np.flatnonzero(abs(norms - 1.0) > _UNIT).tolist():
+        if odd := np.flatnonzero(abs(norms - 1.0) > UNIT_LENGTH).tolist():
             row = odd[0]
             raise ValueError(
                 f"trajectory: row {row}: expected a quaternion of length 1, "
@@ -130,6 +134,11 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         inner = (each[:-1] * steps[1:] + each[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
         return np.concatenate([each[:1], inner, each[-1:]])
 
+    def poses(self) -> Iterable[tuple[int, Vector3, Quaternion]]:
+        """Return stamps (ns), positions (m) and orientations (w, x, y, z), pose by pose."""
+        rows = (self.stamps.tolist(), self.positions.tolist(), self.orientations.tolist())
+        return zip(*rows, strict=True)
+
     def rotations(self) -> Any:
         """Return the orientations as a `scipy.spatial.transform.Rotation` of n rotations."""
         return Rotation.from_quat(self.orientations, scalar_first=True)
@@ -149,20 +158,6 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
             ValueError: Nothing is left, or the order of time is.
         """
         return Trajectory(self.stamps[rows], self.positions[rows], self.orientations[rows])
-
-    def slice(self, start: int, end: int) -> Trajectory:
-        """Return the poses of ``start <= stamp <= end`` (ns).
-
-        Raises:
-            ValueError: There is none.
-        """
-        inside = (self.stamps >= start) & (self.stamps <= end)
-        if not inside.any():
-            raise ValueError(
-                f"trajectory: expected poses between {start} and {end} ns, found them "
-                f"between {self.stamps[0]} and {self.stamps[-1]} ns"
-            )
-        return self.take(inside)
 
     def covers(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
         """Tell which stamps (ns) lie between the first pose and the last, shape as given."""
@@ -268,27 +263,31 @@ class PoseRows:
 
 
 def associate(
-    truth: Trajectory, estimate: Trajectory, *, exact: bool = False, name: str = ""
+    truth: Trajectory, estimate: Trajectory, *, name: str = ""
 ) -> tuple[Trajectory, Trajectory]:
     """Return the truth at the estimate's stamps, and the estimate where there is a truth.
 
     Args:
-        truth: True poses, as densely as there are.
+        truth: True poses, as densely as there are: they are interpolated, and only estimates
+            before their start or after their end are left out.
         estimate: Estimated poses.
-        exact: Take only stamps that both have; else the truth is interpolated, and only
-            estimates before its start or after its end are left out.
         name: What the message of an error begins with, such as the estimate's file.
 
     Raises:
-        ValueError: They have no time in common.
+        ValueError: They have no time in common; the message says if their units or clocks differ.
     """
-    known = np.isin(estimate.stamps, truth.stamps) if exact else truth.covers(estimate.stamps)
+    known = truth.covers(estimate.stamps)
     if not known.any():
-        what = "stamps in common" if exact else "estimates within the truth's time"
+        first, second = int(truth.stamps[-1]), int(estimate.stamps[-1])
+        why = ""
+        if 0.5e9 < max(first, second) / max(min(first, second), 1) < 2e9:
+            why = ": is one in seconds and the other in nanoseconds?"
+        elif (first > _CALENDAR) != (second > _CALENDAR):
+            why = ": one is Unix time, the other counts from a run's beginning"
         raise ValueError(
-            f"{name}{name and ': '}expected {what}, found the truth from {truth.stamps[0]} to "
-            f"{truth.stamps[-1]} ns and the estimate from {estimate.stamps[0]} to "
-            f"{estimate.stamps[-1]} ns"
+            f"{name}{name and ': '}expected estimates within the truth's time, found the truth "
+            f"from {truth.stamps[0]} to {first} ns and the estimate from {estimate.stamps[0]} to "
+            f"{second} ns{why}"
         )
     kept = estimate.take(known)
     return truth.at(kept.stamps), kept

@@ -169,7 +169,7 @@ def report(summary: Summary, folder: Path) -> None:
     if summary.digest and summary.not_deterministic:
         digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
     if summary.verdict is not None:
-        _judge(console, summary.verdict)
+        print_verdict(console, summary.verdict)
     page = ": open report.html" if (folder / "report.html").is_file() else ""
     took = ""
     if summary.clock == "lockstep":
@@ -183,7 +183,7 @@ def report(summary: Summary, folder: Path) -> None:
     )
 
 
-def _judge(console: Console, verdict: Verdict) -> None:
+def print_verdict(console: Console, verdict: Verdict) -> None:
     """Print who passed, and what those failed that did not."""
     for name, figures in verdict.estimators.items():
         passed = _STATES[figures["passed"]]

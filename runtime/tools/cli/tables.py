@@ -62,10 +62,10 @@ def run_tables(summary: Summary) -> Iterator[Table]:
     if stalls.row_count:
         yield _numbers(stalls)
     if summary.verdict is not None:
-        yield from _verdict(summary.verdict)
+        yield verdict_table(summary.verdict)
 
 
-def _verdict(verdict: Verdict) -> Iterator[Table]:
+def verdict_table(verdict: Verdict) -> Table:
     """Return the figures of those that were judged: one column each."""
     table = Table("figure", *verdict.estimators, title="verdict")
     figures = dict.fromkeys(key for each in verdict.estimators.values() for key in each)
@@ -73,7 +73,7 @@ def _verdict(verdict: Verdict) -> Iterator[Table]:
         row = [each.get(figure, "") for each in verdict.estimators.values()]
         if not any(isinstance(value, list | tuple | dict) for value in row):
             table.add_row(figure, *(_show(value) for value in row))
-    yield _numbers(table)
+    return _numbers(table)
 
 
 def _show(value: Any) -> str:

@@ -142,13 +142,6 @@ def test_times_outside_are_an_error_and_can_be_known_before() -> None:
         path.at(stamps)
 
 
-def test_slices_hold_both_ends() -> None:
-    path = walk(5)
-    assert path.slice(50_000_000, 100_000_000).stamps.tolist() == [50_000_000, 100_000_000]
-    with pytest.raises(ValueError, match=r"poses between 1 and 2 ns, found them between 0 and"):
-        path.slice(1, 2)
-
-
 def test_rows_come_in_any_order_and_the_last_word_on_a_stamp_holds() -> None:
     rows = PoseRows()
     for stamp, x in ((10, 1.0), (0, 0.0), (20, 9.0), (20, 2.0)):

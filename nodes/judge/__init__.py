@@ -1,0 +1,1 @@
+"""Trajectories that somebody else computed, judged as a run judges its estimators."""

@@ -1,0 +1,158 @@
+"""Several trajectories held against one truth, and the folder that is left of it.
+
+The figures are those of an evaluation (`nodes.evaluation.judging`), but for what poses alone do not
+tell: when they came, and thus latencies, errors at control ticks and stamps of the future.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.evaluation.alignment import How
+from nodes.evaluation.judging import Judgement, conclude, judge
+from nodes.evaluation.node import EvaluationConfig
+from nodes.evaluation.record import EstimatorRecord
+from nodes.evaluation.results import FRAMES, file_name, write_results
+from nodes.judge.sources import Axes, Source
+from nodes.report.contents import Facts, Verdict
+from nodes.report.page import write_report
+from nodes.trajectory import Trajectory
+from nodes.trajectory.formats import write_tum
+from runtime import Duration, results
+from runtime.errors import ResultsError
+from runtime.schedule import SECOND
+from runtime.summary import command_line, commit, environment
+
+_UNKNOWN = ("restarts", "repeated_stamps", "future_stamps")
+"""Figures that poses alone do not tell."""
+
+
+class JudgeConfig(EvaluationConfig):
+    """How to judge: as an evaluation does, but for ``auto``.
+
+    That alignment is ``sim3`` for scale-free estimates; if their source names their frame, as in a
+    run ``none`` in ``map`` and else ``origin``; otherwise ``se3``.
+
+    Attributes:
+        scale_free: Whether the estimates' unit of length is their own.
+        axes: Those of the estimates' files; see `nodes.judge.sources.AXES`.
+        max_difference: From an estimate to the nearest true pose, at most; one that is farther
+            from it is not compared.
+    """
+
+    scale_free: bool = False
+    axes: Axes | None = None
+    max_difference: Duration = Duration(0.1)
+
+
+def judge_all(
+    truth: Source,
+    estimates: Sequence[Source],
+    frames: npt.NDArray[np.int64] | None,
+    config: JudgeConfig,
+) -> tuple[dict[str, Judgement], Verdict, list[str]]:
+    """Judge estimates by the truth.
+
+    Args:
+        truth: The true poses.
+        estimates: Of the same body.
+        frames: Stamps of the images (ns), if they are known; the flight is then theirs.
+        config: How.
+
+    Returns:
+        Judgements by name, the verdict, and sentences on what was not compared.
+
+    Raises:
+        ValueError: Two have one name, or an estimate and the truth no time in common.
+    """
+    judgements: dict[str, Judgement] = {}
+    notes = []
+    for source in estimates:
+        if source.name in judgements:
+            raise ValueError(
+                f"expected names that differ, found two {source.name}: NAME={source.file}"
+            )
+        poses, note = _compared(truth.poses, source, config.max_difference)
+        judgement = judge(
+            EstimatorRecord.of(poses),
+            truth.poses,
+            cameras=None if frames is None else {"": frames},
+            alignment=_alignment(source, config),
+            delta=config.delta,
+            gap=config.gap,
+        )
+        known = {k: v for k, v in judgement.figures.items() if k not in _UNKNOWN}
+        compared = int(truth.poses.covers(poses.stamps).sum())
+        figures = {**known, "method": source.file, "compared": compared, **source.counts}
+        judgements[source.name] = msgspec.structs.replace(judgement, figures=figures)
+        notes += [f"{source.name}: {note}"] if note else []
+    verdict = conclude({k: j.figures for k, j in judgements.items()}, config.thresholds)
+    return judgements, msgspec.convert(verdict, Verdict), notes
+
+
+def write(
+    out: Path,
+    truth: Source,
+    judgements: dict[str, Judgement],
+    verdict: Verdict,
+    notes: Sequence[str],
+) -> Path:
+    """Write a folder as a run leaves it, with all figures and a report; return the report's path.
+
+    What an earlier judgement left in the folder goes to ``NAME.1``.
+
+    Raises:
+        ResultsError: There is something else in the folder.
+        OSError: It cannot be written.
+    """
+    if (out / "config.toml").exists():
+        raise ResultsError(f"{out}: expected no run's folder: name another with --out")
+    results.keep_earlier(out)
+    results.claim(out)
+    (out / "trajectories").mkdir()
+    write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
+    for name, judgement in judgements.items():
+        if judgement.estimate is not None:
+            path = out / "trajectories" / f"{file_name(name)}.tum"
+            write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
+    write_results(out, {}, judgements, msgspec.to_builtins(verdict))
+    facts = Facts(
+        name=out.name,
+        verdict=verdict,
+        environment={**environment(), "command": command_line(), "commit": commit()},
+        judged={"truth": truth.file, **{k: j.figures["method"] for k, j in judgements.items()}},
+        notes=list(notes),
+    )
+    text = msgspec.json.format(msgspec.json.encode(facts), indent=2)
+    results.write(out / "summary.json", text + b"\n")
+    return write_report(out)
+
+
+def _alignment(source: Source, config: JudgeConfig) -> How:
+    if config.alignment != "auto":
+        return config.alignment
+    if config.scale_free:
+        return "sim3"
+    if not source.frame_id:
+        return "se3"
+    return "none" if source.frame_id == "map" else "origin"
+
+
+def _compared(truth: Trajectory, source: Source, most: float) -> tuple[Trajectory, str]:
+    """Return the poses but those far from true ones, and a sentence on what is not compared."""
+    poses = source.poses
+    after = np.searchsorted(truth.stamps, poses.stamps)
+    ends = truth.stamps[np.clip([after - 1, after], 0, len(truth) - 1)]
+    inside = truth.covers(poses.stamps)
+    far = inside & (abs(ends - poses.stamps).min(axis=0) > most * SECOND)
+    if far.all():
+        raise ValueError(f"{source.file}: expected true poses within {most:g} s of its, found none")
+    said = [f"{(~inside).sum()} outside the truth's time"] if not inside.all() else []
+    said += [f"{far.sum()} more than {most:g} s from any true pose"] if far.any() else []
+    note = f"not compared, of {len(poses)} poses: {', '.join(said)}" if said else ""
+    return poses.take(~far), note
