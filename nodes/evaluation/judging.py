@@ -84,7 +84,7 @@ class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         found = []
         for name in self.__struct_fields__:
             limit, value = getattr(self, name), figures.get(name)
-            if limit is None or (value is None and name in _COUNTS):
+            if limit is None or (value is None and name in COUNTS):
                 continue
             side = "least" if name in AT_LEAST else "most"
             if value is None:
@@ -97,7 +97,7 @@ class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 AT_LEAST = {"coverage_percent", "frame_coverage_percent"}
 """Thresholds that are lower limits."""
 
-_COUNTS = {"restarts", "repeated_stamps", "future_stamps", "collisions"}
+COUNTS = {"restarts", "repeated_stamps", "future_stamps", "collisions"}
 """Figures that are counted; where there was nothing to count, none was found."""
 
 

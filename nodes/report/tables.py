@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from nodes.evaluation.judging import AT_LEAST
+from nodes.evaluation.judging import AT_LEAST, COUNTS
 from nodes.report.contents import Facts, Run
 from nodes.report.style import number
 
@@ -89,7 +89,7 @@ def figures(run: Run, *, main: bool) -> list[Row]:
     for name in names:
         values = [e.figures.get(name) for e in run.estimators]
         limit = asked.get(name)
-        if limit is None and all(value is None for value in values):
+        if (limit is None or name in COUNTS) and all(value is None for value in values):
             continue
         meaning, unit = MAIN.get(name) or (name.replace("_", " "), _unit(name))
         cells = [(show(value), _missed(name, value, limit)) for value in values]
@@ -234,7 +234,7 @@ def _unit(name: str) -> str:
 
 
 def _missed(name: str, value: Any, limit: float | None) -> bool:
-    if limit is None:
+    if limit is None or (value is None and name in COUNTS):
         return False
     if not isinstance(value, int | float):
         return True
