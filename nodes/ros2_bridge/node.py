@@ -13,6 +13,7 @@ import msgspec
 from events import (
     Announcement,
     CameraAnnouncement,
+    Command,
     DepthImage,
     EstimatorAnnouncement,
     Event,
@@ -27,6 +28,8 @@ from events import (
     PoseEstimate,
     Range,
     Setpoint,
+    VehicleAnnouncement,
+    VehicleEvent,
 )
 from nodes.ros2_bridge.attachment import Message
 from nodes.ros2_bridge.complaints import Complaints
@@ -37,6 +40,7 @@ from nodes.ros2_bridge.keys import NodeName
 from nodes.ros2_bridge.mappings import event_type
 from nodes.ros2_bridge.outgoing_topic import OutgoingTopic
 from nodes.ros2_bridge.publisher import Publisher
+from nodes.ros2_bridge.services import Services
 from nodes.ros2_bridge.session import Session, SessionError
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
 from nodes.ros_messages.calibration import camera_announcement
@@ -83,6 +87,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     pressures = Output(FluidPressure)
     magnetic_fields = Output(MagneticField)
     fixes = Output(NavSatFix)
+    commands = Output(Command)
     mapped_events = Output(Event)
     """What mappings of the user's own make."""
 
@@ -101,6 +106,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         """Of the outgoing topics, as are their publishers."""
         self._mapped: list[Publisher] = []
         self._cameras: list[CameraAnnouncement] = []
+        self._vehicles: list[str] = []
+        self._services: Services | None = None
         self._stamps: Stamps | None = None
         self._open = False
         self._line: HeldLine | None = None
@@ -111,7 +118,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             self._declare_mapped_events()
         # Messages of ROS come at their own time, unless time waits for them.
         self._unheld = [each.topic for each in self.config.subscriptions if not each.answers_to]
-        self.deterministic = not self._unheld  # type: ignore[misc]
+        steered = bool(self._unheld) or "vehicle" in self.config.services
+        self.deterministic = not steered  # type: ignore[misc]
 
     async def on_startup(self) -> None:
         """Join the network, and wait for the cameras that ROS has.
@@ -123,6 +131,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         config = self.config
         if config.time == "wall" and self.clock.kind != "real":
             self.log.fatal('time = "wall" needs clock = "real", found "%s"', self.clock.kind)
+        if config.paused and (why := self.stepping.fixed()):
+            self.log.fatal("paused: %s", why)
         if self._unheld and self.clock.kind != "real":
             self.log.warning(
                 "messages of ROS on %s come at their own time, so runs in lockstep will differ; "
@@ -195,6 +205,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         ours = {incoming.source for incoming in self._incoming}
         if isinstance(announcement, CameraAnnouncement | LidarAnnouncement):
             self._rates[announcement.source] = announcement.rate
+        if isinstance(announcement, VehicleAnnouncement):
+            self._vehicles.append(announcement.source)
         if self._publishing is not None and announcement.source not in ours:
             self._publishing.announced(announcement)
 
@@ -208,6 +220,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         assert publishing is not None
         assert session is not None
         self._open = True
+        if self.config.paused:  # before anybody can ask for anything
+            self.stepping.pause()
         self._fix_time()
         self._publish(Publishing.begin, publishing)
         for text in publishing.unannounced():
@@ -223,6 +237,9 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         for incoming in self._incoming:
             if not incoming.subscription.answers_to:
                 await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).take)
+        if self.config.services:
+            self._services = Services(self, session, self._store, self._complaints, self._send)
+            await self.offload(self._services.declare, self._vehicles)
         if self._line is not None:
             await self._line.begin()
 
@@ -248,6 +265,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         )
         for line in publishing.unused():
             self.log.warning("%s", line)
+        if self._services is not None:
+            await self._services.close()
         if not await self.offload(session.close):
             self.log.warning("a peer that stands still keeps the session from closing")
 
@@ -266,6 +285,12 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         """Publish what is small, at once."""
         if self._publishing is not None:
             self._publish(self._publishing.small, event)
+
+    @on(VehicleEvent)
+    def vehicle_events(self, event: VehicleEvent) -> None:
+        """Answer who asked a vehicle for what it now says is done."""
+        if self._services is not None:
+            self._services.told(event)
 
     def publications(self, event: Event) -> None:
         """Publish, beside the loop, what a mapping of the user's own makes of an event."""
@@ -362,7 +387,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             *((Image, self.images), (DepthImage, self.depth_images)),
             *((Imu, self.imu), (Odometry, self.odometry), (Range, self.ranges)),
             *((FluidPressure, self.pressures), (MagneticField, self.magnetic_fields)),
-            *((NavSatFix, self.fixes), (Event, self.mapped_events)),
+            *((NavSatFix, self.fixes), (Command, self.commands), (Event, self.mapped_events)),
         )
         sender: Any = next(out for kind, out in outputs if isinstance(event, kind))
         sender.send(event)

@@ -41,6 +41,9 @@ T = TypeVar("T")
 Take = Callable[[Message], None]
 """Called in a thread with each message."""
 
+Answer = Callable[[bytearray | str, bytes], None]
+"""Answers a request, in any thread: with a message and its attachment, or with an error."""
+
 WAIT_BEFORE_DROP = 300
 """Microseconds that a put waits for a peer that does not read; Zenoh's default is 1000."""
 
@@ -223,6 +226,28 @@ class Session:
         liveliness = self._session.liveliness()
         self._kept.append(liveliness.declare_subscriber(key, tell, history=True))
 
+    def serve(self, service: Topic, take: Callable[[Message, Answer], None]) -> None:
+        """Declare a service, and show it to ROS.
+
+        Args:
+            service: Its name, type, hash and quality of service.
+            take: Called in a thread of Zenoh's with each request; must not wait.
+        """
+        key = data_key(self._node.domain_id, service)
+
+        def answer(query: zenoh.Query, reply: bytearray | str, attachment: bytes) -> None:
+            with contextlib.suppress(zenoh.ZError), query:  # whoever asked may have gone
+                if isinstance(reply, str):
+                    query.reply_err(reply)
+                else:
+                    query.reply(key, reply, attachment=attachment)
+
+        def ask(query: zenoh.Query) -> None:
+            take(_message(query), functools.partial(answer, query))
+
+        self._kept.append(self._session.declare_queryable(key, ask, complete=True))
+        self._show(service, "SS")
+
     def first(self, topic: Topic, seconds: float, read: Callable[[Message], T | None]) -> T | None:
         """Wait in the caller's thread for a message of which `read` makes something.
 
@@ -320,13 +345,15 @@ def _read(subscriber: Any, take: Take) -> None:
             sample = subscriber.recv()
 
 
-def _message(sample: zenoh.Sample) -> Message:
+def _message(sample: zenoh.Sample | zenoh.Query) -> Message:
     payload = sample.payload
 
     def attached() -> bytes:
         found = sample.attachment
         return b"" if found is None else found.to_bytes()
 
+    if payload is None:  # a query needs none
+        return Message(0, bytes, attached)
     return Message(len(payload), payload.to_bytes, attached)
 
 

@@ -13,7 +13,9 @@ from nodes.ros_messages.topics import Qos, dds_type, topic_name
 from nodes.ros_messages.typestore import Distribution
 from runtime.hold import HoldConfig
 from runtime.paths import InputPath
-from runtime.units import Latency
+from runtime.units import Duration, Latency
+
+ServiceGroup = Literal["simulation", "vehicle"]
 
 
 class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -169,6 +171,11 @@ class Ros2BridgeConfig(PublishingConfig):
         definitions: Types that ROS 2 does not come with, and the ``.msg`` file of each.
         subscriptions: Topics of ROS 2 whose messages become events.
         publications: Topics to publish by functions of the user's own.
+        services: Groups of services to offer. ``simulation``: simulation_interfaces, by which ROS
+            pauses, steps and ends the run. ``vehicle``: ``std_srvs/Trigger`` as ``arm``,
+            ``disarm``, ``take_off`` and ``land`` below each vehicle's name.
+        step: Simulated time of one step of the service ``step_simulation``.
+        paused: Whether simulated time stands from the run's start until a service lets it go on.
     """
 
     domain_id: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
@@ -183,9 +190,18 @@ class Ros2BridgeConfig(PublishingConfig):
     definitions: dict[str, InputPath] = msgspec.field(default_factory=dict)
     subscriptions: tuple[Subscription, ...] = ()
     publications: tuple[OwnPublication, ...] = ()
+    services: tuple[ServiceGroup, ...] = ()
+    step: Duration = Duration(0.001)  # immutable
+    paused: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.services and self.keys != "rmw_zenoh":
+            raise ValueError(f'services: expected keys = "rmw_zenoh" for them, found "{self.keys}"')
+        if self.step < 1e-9:
+            raise ValueError(f"step: expected 1 ns or more, found {self.step:g} s")
+        if self.paused and "simulation" not in self.services:
+            raise ValueError('paused: expected services = ["simulation"] too, to let time go on')
         if "/" in self.node_name:
             raise ValueError(f"node_name: expected no slash, found {self.node_name!r}")
         check_name("node_name", f"/{self.node_name}")

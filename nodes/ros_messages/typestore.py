@@ -50,6 +50,7 @@ class TypeStore:
         self, distribution: Distribution = "jazzy", definitions: Mapping[str, str] | None = None
     ) -> None:
         try:
+            from rosbags.interfaces import Nodetype
             from rosbags.serde import SerdeError
             from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
@@ -59,6 +60,7 @@ class TypeStore:
                 f"the ROS 2 bridge needs rosbags: {install_command('ros2')}"
             ) from error
         self._error = SerdeError
+        self._node, self._parse = Nodetype, get_types_from_msg
         self._store = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
         self._hashed = distribution != "humble"
         for name, file in (definitions or {}).items():
@@ -69,6 +71,40 @@ class TypeStore:
                 raise ValueError(
                     f"definitions: {name}: expected a readable .msg file, found {file}: {error}"
                 ) from error
+
+    def add(self, type_: str, definition: str) -> None:
+        """Add a message, or a service.
+
+        A service's messages are ``…_Request`` and ``…_Response``; its hash is that of a type with
+        these and an event as its fields (REP 2016).
+
+        Args:
+            type_: ``std_srvs/srv/Trigger``.
+            definition: As in its ``.msg`` or ``.srv`` file, without default values.
+        """
+        package, folder, _ = type_.split("/")
+        plain, node = f"{package}/msg/Plain", self._node  # rosbags names what it parses so
+        if folder == "msg":
+            self._store.register({type_: self._parse(definition, plain)[plain]})
+            return
+        request, _, response = definition.partition("---")
+        types: Any = {
+            f"{type_}_Request": self._parse(request, plain)[plain],
+            f"{type_}_Response": self._parse(response, plain)[plain],
+        }
+        if self._hashed:
+            event: Any = [("info", (node.NAME, "service_msgs/msg/ServiceEventInfo"))]
+            event += [
+                (part.lower(), (node.SEQUENCE, ((node.NAME, f"{type_}_{part}"), 1)))
+                for part in ("Request", "Response")
+            ]
+            types[f"{type_}_Event"] = [], event
+        parts = [each.rpartition("_")[2] for each in types]
+        types[type_] = (
+            [],
+            [(f"{part.lower()}_message", (node.NAME, f"{type_}_{part}")) for part in parts],
+        )
+        self._store.register(types)
 
     def check(self, type_: str) -> None:
         """Make sure that a type is known, and what it is made of.

@@ -1,0 +1,120 @@
+"""The services of simulation_interfaces 2.1: what the simulator can, its state, and steps of time.
+
+Source: https://github.com/ros-simulation/simulation_interfaces. There is no action SimulateSteps,
+and no reset: a run has one beginning. GetSimulatorFeatures says so.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from nodes.ros2_bridge.service_server import ServiceServer
+from nodes.ros2_bridge.settings import Ros2BridgeConfig
+from nodes.ros_messages.services import SIMULATION
+from runtime import Node
+from runtime.schedule import SECOND
+
+# Of SimulatorFeatures.msg.
+STATE_GETTING, STATE_SETTING, STATE_PAUSE = 24, 25, 26
+STEP_SINGLE, STEP_MULTIPLE = 31, 32
+
+# Of SimulationState.msg.
+STOPPED, PLAYING, PAUSED, QUITTING = range(4)
+
+# Of Result.msg, and of SetSimulationState.srv.
+FEATURE_UNSUPPORTED, OK, OPERATION_FAILED = 0, 1, 4
+ALREADY_IN_TARGET_STATE, INCORRECT_TRANSITION = 101, 103
+
+LONGEST = 86_400 * SECOND
+"""Nanoseconds of the run's clock that one request may step."""
+
+
+class SimulationServices:
+    """Lets ROS see and set whether simulated time runs, and step it.
+
+    Args:
+        server: Answers requests.
+        node: The bridge.
+    """
+
+    def __init__(self, server: ServiceServer, node: Node[Ros2BridgeConfig]) -> None:
+        self._make = server.make
+        self._stepping = node.stepping
+        self._stop = node.stop
+        self._step = round(node.config.step * SECOND)
+        self._declare = server.declare
+
+    def declare(self) -> None:
+        """Declare the services; called in any thread."""
+        for name, kind, serve in (
+            ("get_simulator_features", "GetSimulatorFeatures", self._features),
+            ("get_simulation_state", "GetSimulationState", self._state),
+            ("set_simulation_state", "SetSimulationState", self._set_state),
+            ("step_simulation", "StepSimulation", self._steps),
+            ("reset_simulation", "ResetSimulation", self._reset),
+        ):
+            self._declare(name, f"{SIMULATION}/{kind}", serve)
+
+    async def _features(self, _: Any) -> dict[str, Any]:
+        found = [STATE_GETTING, STATE_SETTING]
+        why = self._stepping.fixed()
+        if not why:
+            found += [STATE_PAUSE, STEP_SINGLE, STEP_MULTIPLE]
+        info = why or f"a step is {self._step / SECOND:g} s of simulated time"
+        return {
+            "features": self._make(
+                "simulation_interfaces/msg/SimulatorFeatures",
+                features=np.array(found, np.uint16),
+                spawn_formats=[],
+                custom_info=info,
+            )
+        }
+
+    async def _state(self, _: Any) -> dict[str, Any]:
+        state = self._make("simulation_interfaces/msg/SimulationState", state=self._now())
+        return {"state": state, **self._result(OK)}
+
+    async def _set_state(self, request: Any) -> dict[str, Any]:
+        wanted = request.state.state
+        if wanted in {STOPPED, QUITTING}:
+            self._stop("ended by ROS")
+            return self._result(OK)
+        if wanted not in {PLAYING, PAUSED}:
+            return self._result(INCORRECT_TRANSITION, f"expected a state of 0 to 3, found {wanted}")
+        if wanted == self._now():
+            return self._result(ALREADY_IN_TARGET_STATE)
+        if why := self._stepping.fixed():
+            return self._result(FEATURE_UNSUPPORTED, why)
+        if wanted == PLAYING:
+            self._stepping.resume()
+        else:
+            self._stepping.pause()
+        return self._result(OK)
+
+    async def _steps(self, request: Any) -> dict[str, Any]:
+        if why := self._stepping.fixed():
+            return self._result(FEATURE_UNSUPPORTED, why)
+        if self._stepping.state != "paused":
+            return self._result(OPERATION_FAILED, "expected time to stand, found it running")
+        ns = request.steps * self._step
+        if not 0 < ns <= LONGEST:
+            most = LONGEST // self._step
+            what = f"expected 1 to {most} steps, found {request.steps}"
+            return self._result(OPERATION_FAILED, what)
+        gone = await self._stepping.step(ns)
+        if gone < ns:
+            what = f"ended after {gone / SECOND:g} of {ns / SECOND:g} s: by another request"
+            return self._result(OPERATION_FAILED, what)
+        return self._result(OK)
+
+    async def _reset(self, _: Any) -> dict[str, Any]:
+        return self._result(FEATURE_UNSUPPORTED, "a run begins once: end it, and start another")
+
+    def _now(self) -> int:
+        return PAUSED if self._stepping.state == "paused" else PLAYING
+
+    def _result(self, result: int, message: str = "") -> dict[str, Any]:
+        type_ = "simulation_interfaces/msg/Result"
+        return {"result": self._make(type_, result=result, error_message=message)}

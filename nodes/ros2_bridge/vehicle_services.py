@@ -1,0 +1,112 @@
+"""Services that arm, disarm, take off and land: ``std_srvs/Trigger``, for each vehicle."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from events import (
+    Arm,
+    Armed,
+    Command,
+    Disarm,
+    Disarmed,
+    Land,
+    Landed,
+    TakenOff,
+    Takeoff,
+    VehicleEvent,
+)
+from nodes.ros2_bridge.service_server import ServiceServer
+from nodes.ros_messages.services import TRIGGER
+from nodes.ros_messages.topics import ros_name
+from runtime import Node
+
+
+class _Order(NamedTuple):
+    """What a service sends, and when that is done.
+
+    Attributes:
+        command: What it sends.
+        done: What the vehicle then says.
+        limit: Seconds within which.
+        superfluous: Of a vehicle that is armed (true) or not (false) there is nothing to be done.
+    """
+
+    command: type[Command]
+    done: type[VehicleEvent]
+    limit: float
+    superfluous: bool | None = None
+
+
+_ORDERS = {
+    "arm": _Order(Arm, Armed, 1.0, superfluous=True),
+    "disarm": _Order(Disarm, Disarmed, 1.0, superfluous=False),
+    "take_off": _Order(Takeoff, TakenOff, 60.0),
+    "land": _Order(Land, Landed, 300.0, superfluous=False),
+}
+
+
+class VehicleServices:
+    """Sends commands to vehicles, and waits until they are carried out.
+
+    Args:
+        server: Answers requests.
+        node: The bridge.
+        send: Sends a command.
+    """
+
+    def __init__(
+        self,
+        server: ServiceServer,
+        node: Node[Any],
+        send: Callable[[Command], None],
+    ) -> None:
+        self._declare = server.declare
+        self._node = node
+        self._send = send
+        self._armed: dict[str, bool] = {}
+        """Of vehicles of which it is known."""
+        self._waiting: set[tuple[str, type[VehicleEvent], asyncio.Future[None]]] = set()
+
+    def declare(self, vehicle: str) -> None:
+        """Declare the services of a vehicle; called in any thread."""
+        if not self._node.restarts:
+            self._armed[vehicle] = False
+        for name, order in _ORDERS.items():
+
+            async def serve(_: Any, order: _Order = order) -> dict[str, Any]:
+                success, message = await self._give(vehicle, order)
+                return {"success": success, "message": message}
+
+            self._declare(f"{ros_name(vehicle)}/{name}", TRIGGER, serve)
+
+    def told(self, event: VehicleEvent) -> None:
+        """Note what a vehicle says has happened."""
+        if isinstance(event, Armed | Disarmed):
+            self._armed[event.source] = isinstance(event, Armed)
+        for vehicle, done, waiter in self._waiting:
+            if vehicle == event.source and isinstance(event, done) and not waiter.done():
+                waiter.set_result(None)
+
+    async def _give(self, vehicle: str, order: _Order) -> tuple[bool, str]:
+        """Return whether a command was carried out, and what there is to say of it."""
+        if self._armed.get(vehicle) is order.superfluous is not None:
+            return True, f"{vehicle} is {'armed' if order.superfluous else 'disarmed'} already"
+        waiter = asyncio.get_running_loop().create_future()
+        waiting = (vehicle, order.done, waiter)
+        self._waiting.add(waiting)
+        try:
+            now, source = self._node.clock.now(), self._node.name
+            self._send(order.command(stamp=now, source=source, vehicle=vehicle))
+            if self._node.stepping.state == "paused":  # whoever asked is the one who steps
+                return True, f"{order.command.__name__} is sent; time stands"
+            async with asyncio.timeout(order.limit):
+                await waiter
+        except TimeoutError:
+            name, done = order.command.__name__, order.done.__name__
+            return False, f"{vehicle} did not say {done} within {order.limit:g} s of {name}"
+        finally:
+            self._waiting.discard(waiting)
+        return True, order.done.__name__
