@@ -277,7 +277,7 @@ def test_mean_samples_integrate_to_the_very_motion(
     np.testing.assert_allclose(np.multiply(rates, 0.005), turn, atol=1e-12)
     halfway = multiply(start, half)
     gained = np.multiply(np.add(rotate(halfway, force), (0.0, 0.0, 9.81)), 0.005)
-    np.testing.assert_allclose(gained, np.subtract(after.velocity, before.velocity), atol=1e-12)
+    np.testing.assert_allclose(gained, np.subtract(after.velocity, before.velocity), atol=1e-11)
 
 
 def _turn(vector: tuple[float, ...]) -> tuple[float, float, float, float]:
