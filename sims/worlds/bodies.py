@@ -1,11 +1,15 @@
 """Bodies that move by themselves: people, cars, doors and boxes, on splines and hinges.
 
-Their settings are in ``map`` (NED); what is built of them, in MuJoCo's axes (NWU).
+Their settings are in ``map`` (NED); what is built of them, in MuJoCo's axes (NWU), from the shapes
+in ``bodies.xml``.
 """
 
 from __future__ import annotations
 
+import functools
 import math
+import pathlib
+import xml.etree.ElementTree as ET
 from itertools import accumulate, pairwise
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -174,25 +178,29 @@ def add_bodies(scene: Scene, node: str, specs: tuple[BodySpec, ...]) -> Dynamics
         body = scene.spec.worldbody.add_body(
             name=name, mocap=True, pos=flip_yz(place), quat=flip_yz_rotation(turn)
         )
-        _SHAPES[spec.kind](_Shape(scene.spec, body, name, spec))
+        shape = _Shape(scene.spec, body, name, spec)
+        for each in _shapes().iterfind(f"{spec.kind}/*"):
+            getattr(shape, each.tag)(each)
         motions.append(motion)
     return Dynamics(tuple(motions))
 
 
 class _Shape:
-    """Adds parts to a body; x is ahead, y left, z up, in shares of its length, width and height."""
+    """Adds the parts of ``bodies.xml`` to a body."""
 
     def __init__(self, world: Any, body: Any, name: str, spec: BodySpec) -> None:
         self._world = world
         self._body = body
         self._name = name
-        self.colour: Vector3 = spec.colour or COLOURS[spec.kind]
+        self._colour: Vector3 = spec.colour or COLOURS[spec.kind]
         self._size = spec.size or SIZES[spec.kind]
         self._parts = 0
 
-    def cloth(self, part: str, colour: Vector3, *, marks: Vector3 | None = None) -> str:
-        """Return a material with small marks on it, so that it is not smooth to a camera."""
-        name = f"{self._name}/{part}"
+    def cloth(self, given: ET.Element) -> None:
+        """Add a material with small marks on it, so that it is not smooth to a camera."""
+        name = f"{self._name}/{given.get('name')}"
+        shade = float(given.get("shade", 1.0))
+        colour = _numbers(given, "rgb") or [shade * each for each in self._colour]
         self._world.add_texture(
             name=name,
             type=mujoco.mjtTexture.mjTEXTURE_CUBE,
@@ -200,7 +208,7 @@ class _Shape:
             rgb1=colour,
             rgb2=[0.75 * each for each in colour],
             mark=mujoco.mjtMark.mjMARK_RANDOM,
-            markrgb=marks or [min(1.25 * each + 0.08, 1.0) for each in colour],
+            markrgb=_numbers(given, "marks") or [min(1.25 * each + 0.08, 1.0) for each in colour],
             random=0.06,
             width=64,
             height=64,
@@ -209,126 +217,51 @@ class _Shape:
         textures = list(material.textures)
         textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
         material.textures = textures
-        return name
 
-    def part(
-        self,
-        kind: Any,
-        half: Vector3,
-        place: Vector3,
-        *,
-        material: str = "",
-        rgb: Vector3 = (1.0, 1.0, 1.0),
-        quat: Quaternion = (1.0, 0.0, 0.0, 0.0),
-    ) -> None:
-        """Add a part: a primitive, solid and seen, of half lengths."""
-        self._parts += 1
-        length, width, height = self._size
-        self._body.add_geom(
-            name=f"{self._name}/part_{self._parts}",
-            type=kind,
-            size=[half[0] * length, half[1] * width, half[2] * height],
-            pos=[place[0] * length, place[1] * width, place[2] * height],
-            quat=quat,
-            material=material,
-            rgba=[*rgb, 1.0],
-            group=0,
+    def part(self, given: ET.Element) -> None:
+        """Add a primitive, solid and seen, of half lengths."""
+        self._geom(
+            given,
+            type=_TYPES[given.attrib["type"]],
+            size=self._scaled(given, "half"),
+            pos=self._scaled(given, "at"),
+            quat=_ACROSS if given.get("axis") == "across" else (1.0, 0.0, 0.0, 0.0),
+            rgba=[*(_numbers(given, "rgb") or (1.0, 1.0, 1.0)), 1.0],
         )
 
-    def limb(self, radius: float, top: Vector3, bottom: Vector3, *, material: str = "") -> None:
-        """Add a capsule between two places; its radius is a share of the width."""
-        self._parts += 1
-        ends = [
-            share * size
-            for end in (top, bottom)
-            for share, size in zip(end, self._size, strict=True)
-        ]
-        self._body.add_geom(
-            name=f"{self._name}/part_{self._parts}",
+    def limb(self, given: ET.Element) -> None:
+        """Add a capsule between two places."""
+        self._geom(
+            given,
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            fromto=ends,
-            size=[radius * self._size[1], 0.0, 0.0],
-            material=material,
-            group=0,
+            fromto=[*self._scaled(given, "top"), *self._scaled(given, "bottom")],
+            size=[float(given.attrib["radius"]) * self._size[1], 0.0, 0.0],
         )
 
+    def _geom(self, given: ET.Element, **options: Any) -> None:
+        self._parts += 1
+        cloth = given.get("material")
+        material = f"{self._name}/{cloth}" if cloth else ""
+        name = f"{self._name}/part_{self._parts}"
+        self._body.add_geom(name=name, material=material, group=0, **options)
 
-_BOX, _BALL = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID
-_WHEEL = mujoco.mjtGeom.mjGEOM_CYLINDER
-_SIDEWAYS: Quaternion = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
-
-
-def _person(shape: _Shape) -> None:
-    jacket = shape.cloth("jacket", shape.colour)
-    trousers = shape.cloth("trousers", (0.16, 0.19, 0.28))
-    skin = shape.cloth("skin", (0.72, 0.53, 0.42), marks=(0.66, 0.45, 0.36))
-    for side, ahead in ((1, 0.42), (-1, -0.42)):  # in the middle of a step
-        shape.limb(
-            0.15, (0.0, side * 0.18, 0.49), (ahead * 0.4, side * 0.18, 0.28), material=trousers
-        )
-        shape.limb(
-            0.12, (ahead * 0.4, side * 0.18, 0.28), (ahead, side * 0.18, 0.05), material=trousers
-        )
-        shape.part(
-            _BALL, (0.36, 0.1, 0.03), (ahead + 0.18, side * 0.18, 0.03), rgb=(0.1, 0.09, 0.08)
-        )
-        shape.limb(
-            0.1, (0.0, side * 0.42, 0.78), (-ahead * 0.4, side * 0.46, 0.62), material=jacket
-        )
-        shape.limb(
-            0.085,
-            (-ahead * 0.4, side * 0.46, 0.62),
-            (-ahead * 0.9, side * 0.44, 0.5),
-            material=jacket,
-        )
-        shape.part(_BALL, (0.13, 0.07, 0.03), (-ahead, side * 0.44, 0.475), material=skin)
-    shape.part(_BALL, (0.36, 0.4, 0.2), (0.0, 0.0, 0.66), material=jacket)
-    shape.limb(0.24, (0.0, 0.14, 0.76), (0.0, -0.14, 0.76), material=jacket)
-    shape.limb(0.11, (0.0, 0.0, 0.84), (0.03, 0.0, 0.87), material=skin)
-    shape.part(_BALL, (0.28, 0.145, 0.07), (0.04, 0.0, 0.925), material=skin)
-    shape.part(_BALL, (0.29, 0.155, 0.055), (-0.02, 0.0, 0.95), rgb=(0.2, 0.14, 0.09))
+    def _scaled(self, given: ET.Element, key: str) -> list[float]:
+        return [share * size for share, size in zip(_numbers(given, key), self._size, strict=True)]
 
 
-def _car(shape: _Shape) -> None:
-    paint = shape.cloth("paint", shape.colour)
-    glass = (0.09, 0.11, 0.13)
-    shape.part(_BOX, (0.49, 0.47, 0.2), (0.0, 0.0, 0.38), material=paint)
-    shape.part(_BOX, (0.5, 0.44, 0.07), (0.0, 0.0, 0.3), rgb=(0.16, 0.16, 0.17))
-    shape.part(_BOX, (0.27, 0.42, 0.17), (-0.05, 0.0, 0.74), rgb=glass)
-    shape.part(_BOX, (0.24, 0.43, 0.035), (-0.05, 0.0, 0.95), material=paint)
-    for x in (-0.31, -0.06, 0.21):  # pillars
-        for y in (-0.41, 0.41):
-            shape.part(_BOX, (0.012, 0.03, 0.18), (x, y, 0.75), material=paint)
-    for x in (-0.31, 0.31):
-        for y in (-0.43, 0.43):
-            shape.part(
-                _WHEEL, (0.078, 0.05, 0.0), (x, y, 0.22), rgb=(0.05, 0.05, 0.05), quat=_SIDEWAYS
-            )
-            shape.part(
-                _WHEEL, (0.045, 0.056, 0.0), (x, y, 0.22), rgb=(0.6, 0.6, 0.62), quat=_SIDEWAYS
-            )
-    for y in (-0.33, 0.33):
-        shape.part(_BALL, (0.012, 0.08, 0.05), (0.488, y, 0.45), rgb=(0.95, 0.94, 0.85))
-        shape.part(_BOX, (0.006, 0.09, 0.04), (-0.489, y, 0.47), rgb=(0.7, 0.08, 0.06))
-    shape.part(_BOX, (0.004, 0.16, 0.04), (-0.492, 0.0, 0.33), rgb=(0.9, 0.9, 0.86))
+@functools.cache
+def _shapes() -> ET.Element:
+    return ET.parse(pathlib.Path(__file__).with_name("bodies.xml")).getroot()  # noqa: S314  # ours
 
 
-def _door(shape: _Shape) -> None:
-    wood = shape.cloth("wood", shape.colour)
-    dark = shape.cloth("panel", tuple(0.8 * each for each in shape.colour))  # type: ignore[arg-type]
-    shape.part(_BOX, (0.5, 0.5, 0.5), (0.5, 0.0, 0.5), material=wood)
-    for low, high in ((0.06, 0.46), (0.54, 0.94)):
-        middle, half = (low + high) / 2, (high - low) / 2
-        shape.part(_BOX, (0.36, 0.58, half), (0.5, 0.0, middle), material=dark)
-    for side in (-1, 1):
-        shape.part(_BALL, (0.06, 0.4, 0.012), (0.92, side * 1.1, 0.5), rgb=(0.75, 0.72, 0.6))
+def _numbers(given: ET.Element, key: str) -> list[float]:
+    return [float(number) for number in given.get(key, "").split()]
 
 
-def _box(shape: _Shape) -> None:
-    board = shape.cloth("board", shape.colour, marks=(0.35, 0.26, 0.16))
-    tape = shape.cloth("tape", (0.80, 0.74, 0.58))
-    shape.part(_BOX, (0.5, 0.5, 0.5), (0.0, 0.0, 0.5), material=board)
-    shape.part(_BOX, (0.502, 0.08, 0.502), (0.0, 0.0, 0.5), material=tape)
-
-
-_SHAPES = {"person": _person, "car": _car, "door": _door, "box": _box}
+_TYPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+}
+_ACROSS: Quaternion = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
+"""Turns an upright cylinder to the side."""

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
+from sims.worlds.decals import tile
 from sims.worlds.model import Material, Model, Vector
 from sims.worlds.shapes import FACES, STEP, Window, arch, blob, box, cylinder, face_size, quad
 
@@ -69,6 +70,19 @@ class Builder(Model):
         self.look(f"{name}.look", box(size, faces), material, middle, turn, tilt)
         half = [length / 2.0 for length in size]
         self.solid(name, mujoco.mjtGeom.mjGEOM_BOX, half, middle, turn, tilt)
+
+    def crate(
+        self, name: str, material: Material, edge: float, place: Vector, turn: float | None = None
+    ) -> None:
+        """Add a cube, each side of which shows one of the nine images of a material at random.
+
+        Without a `turn` (degrees) it stands a little askew, at random.
+        """
+        windows = {
+            face: tile(int(self.random.integers(9)), 3, 3) for face in FACES if face != "bottom"
+        }
+        turn = float(self.random.uniform(-9, 9)) if turn is None else turn
+        self.box(name, material, (edge, edge, edge), place, turn=turn, windows=windows)
 
     def cylinder(
         self,

@@ -58,12 +58,7 @@ def _upright(random: np.random.Generator) -> Image:
 
 def _things(b: Builder, crates: Material, steel: Material) -> None:
     for number, (x, y, base, edge, turn) in enumerate(CRATES):
-        windows = {
-            face: decals.tile(int(b.random.integers(9)), 3, 3)
-            for face in ("front", "left", "back", "right", "top")
-        }
-        b.box(f"crate_{number}", crates, (edge, edge, edge), (x, y, base), turn=turn,
-              windows=windows)  # fmt: skip
+        b.crate(f"crate_{number}", crates, edge, (x, y, base), turn)
     for number, (x, y, colour) in enumerate(BARRELS):
         row = 0 if colour == "blue" else 1
         b.cylinder(
@@ -114,13 +109,8 @@ def _shelf(b: Builder, wood: Material, crates: Material) -> None:
         for slot, x in enumerate((-3.1, -2.4, -1.3, -0.5)):
             if b.random.uniform() < 0.75 and not b.bare:
                 edge = float(b.random.uniform(0.3, 0.46))
-                windows = {
-                    face: decals.tile(int(b.random.integers(9)), 3, 3)
-                    for face in ("front", "left", "back", "right", "top")
-                }
-                b.box(f"rack/box_{level}_{slot}", crates, (edge, edge, edge),
-                      (x, 5.7, height + 0.06), turn=float(b.random.uniform(-9, 9)),
-                      windows=windows)  # fmt: skip
+                place = (x, 5.7, height + 0.06)
+                b.crate(f"rack/box_{level}_{slot}", crates, edge, place)
 
 
 def _shell(b: Builder, posters: Material) -> None:

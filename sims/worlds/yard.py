@@ -102,12 +102,7 @@ def _containers_and_crates(b: Builder, steel: Material, crates: Material) -> Non
         b.box(f"container_{number}", steel, (6.06, 2.44, 2.59), (x, y, base), turn=turn,
               windows=windows)  # fmt: skip
     for number, (x, y, base, edge, turn) in enumerate(CRATES):
-        tiles = {
-            face: decals.tile(int(b.random.integers(9)), 3, 3)
-            for face in ("front", "left", "back", "right", "top")
-        }
-        b.box(f"crate_{number}", crates, (edge, edge, edge), (x, y, base), turn=turn,
-              windows=tiles)  # fmt: skip
+        b.crate(f"crate_{number}", crates, edge, (x, y, base), turn)
 
 
 def _masonry(b: Builder, red: Material, ashlar: Material, cast: Material) -> None:
