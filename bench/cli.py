@@ -144,6 +144,20 @@ def bridge(
 
 
 @app.command()
+def link(
+    json: Json = None,
+    samples: Annotated[int, typer.Option(min=30, help="Frames each way, in turns.")] = 1000,
+) -> None:
+    """Measure a frame to a program outside and back, beside a call of a worker."""
+    from bench.link import measure
+
+    with _status() as say:
+        say("native interface")
+        rows = measure(samples)
+    _finish(json, link=rows)
+
+
+@app.command()
 def recording(
     json: Json = None,
     seconds: Annotated[float, typer.Option(min=3.0, help="Length of each run.")] = 6.0,

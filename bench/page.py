@@ -71,7 +71,7 @@ def page(results: Results, plots: Mapping[str, Sequence[str]], folder: str) -> s
         _section(
             results,
             "Between processes, and beside the loop",
-            *("bridge", "ros_images", "recording", "flood"),
+            *("bridge", "link", "ros_images", "recording", "flood"),
             before="Each of these tables is a run of its own, whose sides were measured in turns.",
         ),
     ]

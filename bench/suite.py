@@ -7,7 +7,18 @@ from typing import Any
 
 import msgspec
 
-from bench import bridge, flood, idle, lockstep, parts, recording, ros_images, stall, throughput
+from bench import (
+    bridge,
+    flood,
+    idle,
+    link,
+    lockstep,
+    parts,
+    recording,
+    ros_images,
+    stall,
+    throughput,
+)
 from bench.driver import Outcome, Row, measure_all
 from bench.results import environment
 from bench.system import NODES, CaseName
@@ -25,6 +36,7 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
     lockstep: list[lockstep.LockstepRow]
     parts: list[parts.PartRow] = []
     bridge: list[bridge.BridgeRow] = []
+    link: list[link.LinkRow] = []
     ros_images: list[ros_images.RosImageRow] = []
     recording: list[recording.RecordingRow] = []
     flood: list[flood.FloodRow] = []
@@ -87,6 +99,7 @@ def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> d
     """Measure what goes on between processes and beside the loop, by field of `Results`."""
     return {
         "bridge": bridge.measure(200 if quick else 2000, progress),
+        "link": link.measure(100 if quick else 1000),
         "ros_images": ros_images.measure(50 if quick else 300),
         "recording": recording.measure(
             seconds=3.0 if quick else 5.0, repeats=1 if quick else 9, progress=progress

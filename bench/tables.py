@@ -138,6 +138,19 @@ TABLES = {
             Column("Zenoh's", "zenoh_p99_us", "us"),
         ),
     ),
+    "link": Table(
+        "An RGB-D frame to a program and its answer back, through the native interface and by a "
+        "worker's call",
+        (
+            Column("frame", "case"),
+            Column("bytes", "bytes", ","),
+            Column("µs", "link_us", "us"),
+            Column("worker's", "worker_us", "us"),
+            Column("ratio", "ratio", ".2f"),
+            Column("p99 µs", "link_p99_us", "us"),
+            Column("worker's", "worker_p99_us", "us"),
+        ),
+    ),
     "ros_images": Table(
         "An image as a message of ROS 2, by the bridge and by rosbags' `serialize_cdr`",
         (

@@ -316,7 +316,9 @@ class Endpoint:
                 )
             stamp, _ = program.owed.get(answer.sequence, (answer.stamp, 0))
             if stamp != answer.stamp:
-                raise LinkError(f"stamp: expected {stamp}, found {answer.stamp}")
+                raise LinkError(
+                    f"stamp: expected {stamp} of frame {answer.sequence}, found {answer.stamp}"
+                )
             done = [n for n in program.owed if self._skips and n < answer.sequence]
             for sequence in {*done, answer.sequence} & program.owed.keys():
                 program.free.append(program.owed.pop(sequence)[1])

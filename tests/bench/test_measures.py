@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import idle, lockstep, parts, stall, throughput
+from bench import idle, link, lockstep, parts, stall, throughput
 
 
 @pytest.mark.slow
@@ -83,3 +83,13 @@ def test_the_parts_of_a_frame_add_up() -> None:
     assert list(rows)[-2:] == ["rest", "all"]
     assert sum(row.ms for row in rows.values()) == pytest.approx(2 * rows["all"].ms)
     assert all(0 < rows[part].share < 1 for part in ("noise", "copies", "odometry", "hashing"))
+
+
+@pytest.mark.slow
+def test_a_frame_to_a_program_is_compared_with_a_call() -> None:
+    """Both carry the whole frame, so neither takes less than copying it would."""
+    (row,) = link.measure(30)
+    assert row.bytes == 512 * 512 * 7
+    assert row.ratio == pytest.approx(row.link_us / row.worker_us)
+    assert 20 < row.link_us <= row.link_p99_us
+    assert 20 < row.worker_us <= row.worker_p99_us

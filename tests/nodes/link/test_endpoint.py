@@ -211,7 +211,7 @@ def test_close_does_not_wait_for_a_program_that_reads_nothing(run: Noted) -> Non
     ("kind", "body", "named"),
     [
         (32, pose(5, 0), "sequence: expected below 1, found 5"),
-        (32, pose(0, 1), "stamp: expected 0, found 1"),
+        (32, pose(0, 1), "stamp: expected 0 of frame 0, found 1"),
         (33, b"", "DONE: expected 16 bytes, found 0"),
         (4, struct.pack("<II", 0, 0), "found type 4"),
         (17, b"", "found type 17"),
