@@ -139,10 +139,12 @@ class Endpoint:
             if program := self._ready():
                 return program.name
             found, self._problem = self._problem, ""
-            if self._program is not None:
-                found = found or f"found {self._program.name}, which did not say READY"
-        found = found or ("found none before the end" if self._closed else "found none")
-        raise LinkError(f"{self._path}: expected a program within {seconds:g} s, {found}")
+            if not found and self._program is not None:
+                found = f"found {self._program.name}, which did not say READY within {seconds:g} s"
+        found = (
+            found or f"found none {'before the end' if self._closed else f'within {seconds:g} s'}"
+        )
+        raise LinkError(f"{self._path}: expected a program, {found}")
 
     def send_imu(self, samples: npt.NDArray[Any]) -> bool:
         """Send a row of IMU samples (of type `SAMPLE`), and return whether a program is there.

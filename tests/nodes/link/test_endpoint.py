@@ -41,7 +41,7 @@ def done(sequence: int, stamp: int) -> bytes:
 
 
 def test_nobody_comes(run: Noted) -> None:
-    with pytest.raises(LinkError, match=r"expected a program within 0.01 s, found none"):
+    with pytest.raises(LinkError, match=r"expected a program, found none within 0.01 s"):
         run.endpoint.wait(0.01)
     assert not run.endpoint.send_frame(0, images())
     assert not run.endpoint.send_imu(np.zeros(1, SAMPLE))
