@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import xxhash
 
@@ -37,18 +37,18 @@ class Message(NamedTuple):
     Attributes:
         size: Bytes.
         read: Returns them.
-        attached: Returns those of its attachment; none if it has none.
+        attached: Returns what becomes those of its attachment, if there is one.
     """
 
     size: int
     read: Callable[[], bytes]
-    attached: Callable[[], bytes] = bytes
+    attached: Callable[[], Any] = bytes
 
     @property
     def attachment(self) -> Attachment | None:
         """Return its attachment; ``None`` if there is none, or what came is none."""
         try:
-            return unpack(self.attached())
+            return unpack(bytes(self.attached() or b""))
         except ValueError:
             return None
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 from typing import Any
 
-from events import Event
+from events import CameraAnnouncement, Event
+from nodes.ros2_bridge.attachment import Message
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.mappings import import_mapping
+from nodes.ros2_bridge.session import Session
 from nodes.ros2_bridge.settings import Ros2BridgeConfig, Subscription
+from nodes.ros_messages.calibration import camera_announcement
 from nodes.ros_messages.incoming import READERS, MessageContext, Reader
 from nodes.ros_messages.stamps import Stamps
 from nodes.ros_messages.topics import Qos, Topic, ros_name, topic_name
@@ -48,6 +53,30 @@ class IncomingTopic:
     def complain(self, kind: str, detail: str) -> None:
         """Count, and now and then log, something wrong with this topic."""
         self._complaints.add(self.topic.name, kind, detail)
+
+    def find_camera(
+        self, session: Session, images: tuple[str, ...], max_size: int
+    ) -> concurrent.futures.Future[CameraAnnouncement]:
+        """Subscribe to the calibration of a camera with these images; return the first, if any."""
+        found: concurrent.futures.Future[CameraAnnouncement] = concurrent.futures.Future()
+
+        def take(message: Message) -> None:
+            if found.done():
+                return
+            try:
+                if message.size > max_size:
+                    raise ValueError(f"expected {max_size} bytes or less, found {message.size}")
+                info = self._store.deserialize(message.read(), self.topic.type)
+                frame_id = self.subscription.frame_id
+                camera = camera_announcement(info, self.source, images, frame_id)
+            except ValueError as error:
+                self.complain("calibration refused", str(error))
+            else:
+                with contextlib.suppress(concurrent.futures.InvalidStateError):
+                    found.set_result(camera)
+
+        session.subscribe(self.topic, take, late=True)
+        return found
 
     def event(self, data: bytes, now: int, stamps: Stamps) -> Event | None:
         """Return what a message becomes; `None` if it is refused, or of no use."""

@@ -31,7 +31,6 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
-from nodes.ros2_bridge.attachment import Message
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.held import HeldEstimator, HeldLine, why_no_answers
 from nodes.ros2_bridge.inbox import Inbox
@@ -43,7 +42,6 @@ from nodes.ros2_bridge.publisher import Publisher
 from nodes.ros2_bridge.services import Services
 from nodes.ros2_bridge.session import Session, SessionError
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
-from nodes.ros_messages.calibration import camera_announcement
 from nodes.ros_messages.publishing import LARGE, SMALL, Publishing
 from nodes.ros_messages.stamps import Stamps, Time
 from nodes.ros_messages.typestore import TypeStore
@@ -181,9 +179,6 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         except FatalError:
             await self.offload(session.close)
             raise
-        except asyncio.CancelledError:
-            session.give_up()
-            raise
 
     def announce(self) -> Iterable[Announcement]:
         """Announce the estimators, cameras and pilots that are in ROS."""
@@ -235,7 +230,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             self._puts.append(put)
             self.start(self._publish_all(waiting, put))
         for incoming in self._incoming:
-            if not incoming.subscription.answers_to:
+            if not incoming.subscription.answers_to and incoming.subscription.use != "camera":
                 await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).take)
         if self.config.services:
             self._services = Services(self, session, self._store, self._complaints, self._send)
@@ -394,25 +389,17 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
         """Wait for a camera's calibration, and remember to announce it."""
-        timeout, topic = incoming.subscription.timeout, incoming.topic
-        images, frame_id = self._images_of(incoming.source), incoming.subscription.frame_id
-
-        def read(found: Message) -> CameraAnnouncement | None:
-            try:
-                if found.size > (most := self.config.max_message_size):
-                    raise ValueError(f"expected {most} bytes or less, found {found.size}")
-                message = self._store.deserialize(found.read(), topic.type)
-                return camera_announcement(message, incoming.source, images, frame_id)
-            except ValueError as error:
-                incoming.complain("calibration refused", str(error))
-                return None
-
-        found = await self.offload(session.first, topic, timeout, read)
-        if found is None:
+        timeout, images = incoming.subscription.timeout, self._images_of(incoming.source)
+        most = self.config.max_message_size
+        found = await self.offload(incoming.find_camera, session, images, most)
+        try:
+            self._cameras.append(await self.offload(found.result, timeout))
+        except TimeoutError:
             self.log.fatal(
-                "%s: expected a calibration within %g s, found none", topic.name, timeout
+                "%s: expected a calibration within %g s, found none", incoming.topic.name, timeout
             )
-        self._cameras.append(found)
+        finally:
+            found.cancel()
 
     def _images_of(self, source: str) -> tuple[str, ...]:
         kinds = {"image": "rgb", "depth": "depth"}

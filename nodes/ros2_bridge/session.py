@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import msgspec
 import zenoh
@@ -36,8 +36,6 @@ from nodes.ros2_bridge.keys import (
 from nodes.ros2_bridge.publisher import Publisher
 from nodes.ros_messages.topics import Topic
 
-T = TypeVar("T")
-
 Take = Callable[[Message], None]
 """Called in a thread with each message."""
 
@@ -52,9 +50,6 @@ WAITING = 64
 
 PAUSE = 0.001
 """Seconds between two looks at what has come: what comes faster is taken in handfuls."""
-
-HEARTBEAT = 0.5
-"""Seconds after which a kept message that nothing followed is told of, as rmw_zenoh_cpp does."""
 
 CLOSING = 3.0
 """Seconds."""
@@ -122,7 +117,6 @@ class Session:
             ) from error
         self.zid = str(self._session.info.zid())
         self._ids = itertools.count(1)
-        self._given_up = threading.Event()
         self._kept: list[Any] = []
         if keys == "rmw_zenoh":
             self._keep(node_token(node, self.zid, 0))
@@ -148,7 +142,8 @@ class Session:
         plain: Any = self._session.declare_publisher(key, **options)
         declared = plain
         if qos.transient_local:
-            heartbeat = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT)
+            # So often it is told what the last message was, as in rmw_publisher_data.cpp.
+            heartbeat = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
             declared = zenoh.ext.declare_advanced_publisher(
                 self._session,
                 key,
@@ -169,11 +164,31 @@ class Session:
             self._kept.append(self._session.declare_queryable(key, answer, complete=True))
         return publisher
 
-    def subscribe(self, topic: Topic, take: Take) -> None:
-        """Declare a subscription, and show it to ROS."""
+    def subscribe(self, topic: Topic, take: Take, *, late: bool = False) -> None:
+        """Declare a subscription, and show it to ROS.
+
+        Args:
+            topic: Its topic.
+            take: Called in a thread of the topic's own.
+            late: Whether messages that were sent before, and are kept, come too, as they do if the
+                topic is transient local.
+        """
         # Not called by Zenoh for each message: each call takes the interpreter from the loop, and
         # under a flood the loop would wait for it again and again.
-        subscriber = self._subscriber(topic, late=topic.qos.transient_local)
+        ext, key, qos = zenoh.ext, self._key(topic), topic.qos
+        channel: Any = zenoh.handlers.FifoChannel(WAITING)
+        if late or qos.transient_local:
+            recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+            subscriber: Any = ext.declare_advanced_subscriber(
+                self._session,
+                key,
+                channel,
+                history=ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth),
+                recovery=recovery if qos.reliable else None,
+                subscriber_detection=True,
+            )
+        else:
+            subscriber = self._session.declare_subscriber(key, channel)
         self._kept.append(subscriber)
         threading.Thread(
             target=_read, args=(subscriber, take), name=f"reads {topic.name}", daemon=True
@@ -248,31 +263,6 @@ class Session:
         self._kept.append(self._session.declare_queryable(key, ask, complete=True))
         self._show(service, "SS")
 
-    def first(self, topic: Topic, seconds: float, read: Callable[[Message], T | None]) -> T | None:
-        """Wait in the caller's thread for a message of which `read` makes something.
-
-        Args:
-            topic: Which; a message that was sent before, and is kept, counts too.
-            seconds: For how long; `None` is returned if nothing came, or after `give_up`.
-            read: Called as `Take` is; `None` for what is of no use.
-        """
-        end = time.monotonic() + seconds
-        subscriber = self._subscriber(topic, late=True)
-        try:
-            while True:
-                while (sample := subscriber.try_recv()) is not None:
-                    found = read(_message(sample))
-                    if found is not None:
-                        return found
-                if time.monotonic() >= end or self._given_up.wait(5 * PAUSE):
-                    return None
-        finally:
-            subscriber.undeclare()
-
-    def give_up(self) -> None:
-        """Have `first` return, in whatever thread it waits."""
-        self._given_up.set()
-
     def close(self) -> bool:
         """Leave, and tell whether that was done within `CLOSING`.
 
@@ -283,23 +273,6 @@ class Session:
         thread.start()
         thread.join(CLOSING)
         return not thread.is_alive()
-
-    def _subscriber(self, topic: Topic, *, late: bool) -> Any:
-        """Declare a subscriber; `late`: one that also gets messages that were sent before."""
-        key = self._key(topic)
-        channel: Any = zenoh.handlers.FifoChannel(WAITING)
-        if not late:
-            return self._session.declare_subscriber(key, channel)
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.qos.depth)
-        recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
-        return zenoh.ext.declare_advanced_subscriber(
-            self._session,
-            key,
-            channel,
-            history=history,
-            recovery=recovery if topic.qos.reliable else None,
-            subscriber_detection=True,
-        )
 
     def _key(self, topic: Topic) -> str:
         if self._keys == "ros2dds":
@@ -347,11 +320,7 @@ def _read(subscriber: Any, take: Take) -> None:
 
 def _message(sample: zenoh.Sample | zenoh.Query) -> Message:
     payload = sample.payload
-
-    def attached() -> bytes:
-        found = sample.attachment
-        return b"" if found is None else found.to_bytes()
-
+    attached = functools.partial(getattr, sample, "attachment")
     if payload is None:  # a query needs none
         return Message(0, bytes, attached)
     return Message(len(payload), payload.to_bytes, attached)

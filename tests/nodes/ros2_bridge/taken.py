@@ -53,7 +53,7 @@ class TakingSession:
         self.taken.append(Taken(topic))
         return self.taken[-1]
 
-    def subscribe(self, topic: Topic, take: Take) -> None:
+    def subscribe(self, topic: Topic, take: Take, *, late: bool = False) -> None:
         for message in self.said:
             take(Message(len(message), functools.partial(bytes, message)))
 

@@ -7,9 +7,10 @@ import queue
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
-from nodes.ros2_bridge.attachment import Message, gid, unpack
+from nodes.ros2_bridge.attachment import gid, unpack
 from nodes.ros2_bridge.keys import NodeName, data_key, endpoint_token, node_token
 from nodes.ros2_bridge.session import Session, SessionError, _configuration
 from nodes.ros_messages.topics import Qos, Topic
@@ -112,7 +113,7 @@ def test_what_a_file_leaves_out_is_as_without_it(tmp_path: Path) -> None:
 
 
 def test_what_was_said_before_is_heard_by_those_who_ask_for_it() -> None:
-    """As ROS's transient local: by a subscription that has it, and by one that waits."""
+    """As ROS's transient local: by a subscription that has it, and by one that comes late."""
     locator = f"tcp/127.0.0.1:{free_port()}"
     qos = Qos(transient_local=True, depth=2)
     kept = Topic(name="/kept", type="std_msgs/msg/Empty", hash="RIHS01_0", qos=qos)
@@ -126,13 +127,9 @@ def test_what_was_said_before_is_heard_by_those_who_ask_for_it() -> None:
         hearing.subscribe(kept, lambda message: heard.put(message.read()))
         assert [heard.get(timeout=10) for _ in range(2)] == [b"two", b"three"]
 
-        def three(message: Message) -> bytes | None:
-            return message.read() if message.size == 5 else None
-
-        assert hearing.first(kept, 10.0, three) == b"three"
-        assert hearing.first(kept, 0.0, lambda _: None) is None
-        hearing.give_up()
-        assert hearing.first(TOPIC, 1e6, three) is None
+        volatile = msgspec.structs.replace(kept, qos=Qos(depth=2))
+        hearing.subscribe(volatile, lambda message: heard.put(message.read()), late=True)
+        assert [heard.get(timeout=10) for _ in range(2)] == [b"two", b"three"]
     finally:
         hearing.close()
         speaking.close()
