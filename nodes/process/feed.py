@@ -52,6 +52,7 @@ class Feed:
     ) -> None:
         self.unanswered: dict[int, None] = {}
         """Stamps of the frames that are sent, or about to be."""
+        self.why_gone = ""
         self._hold, self._story, self._skips = hold, story, skips
         self._initialised = self._closed = False
         self._outbox: queue.SimpleQueue[tuple[Exposure, npt.NDArray[Any]] | None] = (
@@ -102,6 +103,7 @@ class Feed:
 
     def _lose(self, why: str) -> None:
         """Take note that the program is gone, and of another that takes its place."""
+        self.why_gone = why
         self._hold.gone(self._story(why))
         while not self._closed:
             with contextlib.suppress(LinkError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import types
 from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
@@ -37,21 +38,8 @@ _STORY = 0.5
 """Real seconds in which the exit code of a program is known that has closed its connection."""
 
 
-_EVENTS: dict[str, type[Image | DepthImage]] = {
-    "rgb": Image,
-    "grey": Image,
-    "depth": DepthImage,
-}
-
-
-class _Images(tuple[Any, ...]):
-    """Images of one stamp."""
-
-    __slots__ = ()
-
-    @classmethod
-    def _make(cls, images: Iterable[Any]) -> _Images:
-        return cls(images)
+_TOGETHER: Any = types.SimpleNamespace(_make=tuple)
+"""What a `Matcher` makes of the images of one stamp."""
 
 
 class Process(Estimator[ProcessConfig]):
@@ -152,10 +140,11 @@ class Process(Estimator[ProcessConfig]):
                 if lacking := self.needs - given - ({"grey"} if "rgb" in given else set()):
                     kinds = ", ".join(sorted(lacking))
                     yield f"cameras: expected {kinds} images of {name}, found none"
-            if self.camera and 0.0 < config.latency * self.camera.rate < 1.0 and _skips(config):
+            frames = config.latency * self.camera.rate if self.camera else 2.0
+            if config.hold.skips == "allowed" and frames <= 1.0 and self.clock.kind == "lockstep":
                 yield (
-                    'hold.skips: expected a latency of one frame or more with "allowed": a later '
-                    "answer cannot come while time waits for this one"
+                    'hold.skips: expected a latency above the camera\'s period with "allowed": no '
+                    "later frame goes out while time waits for this one"
                 )
         what = "build" if self.checking and config.build else "command"  # built later
         if words := getattr(config, what):
@@ -197,14 +186,14 @@ class Process(Estimator[ProcessConfig]):
             self.narrow("imu", rig.imu.source)
         kinds = [KINDS[kind][0] for kind in config.images]
         self._wanted = [(number, kind) for number, _ in enumerate(rig.cameras) for kind in kinds]
-        sources = [(_source(c, kind), _EVENTS[kind]) for c in rig.cameras for kind in config.images]
+        sources = [_source(camera, kind) for camera in rig.cameras for kind in config.images]
         fields = {f"image{n}": Field(event, "one") for n, (_, event) in enumerate(sources)}
-        self._matcher = Matcher(Stream(f"{self.name}.frames", 1, "error"), _Images, fields, 0)
+        self._matcher = Matcher(Stream(f"{self.name}.frames", 1, "error"), _TOGETHER, fields, 0)
         self._matcher.deliver = self._send
         self._slots = dict(zip(sources, self._matcher.slots.values(), strict=True))
         self._hold: Hold[LinkAnswer] = self.hold(self.name, config.hold, config.latency)
         real = self.clock.kind == "real"
-        slots = math.ceil((config.latency + config.hold.initialise) * rig.cameras[0].rate) + 2
+        slots = math.ceil(config.latency * rig.cameras[0].rate) + 2
         self._room = slots if real else math.inf
         if config.hold.on_missing == "continue" and not real:
             self._room = slots + _BEYOND
@@ -291,7 +280,7 @@ class Process(Estimator[ProcessConfig]):
         """Take note that the program has ended by itself."""
         story = f"{self.config.command[0]} {story}"
         if self._feed is not None:
-            self._hold.gone(story)
+            self._hold.gone("; ".join(filter(None, [self._feed.why_gone, story])))
             if not self._connected:
                 self._feed.close()
         elif self.config.hold.on_missing == "error":
@@ -345,11 +334,8 @@ class Process(Estimator[ProcessConfig]):
         }
 
 
-def _skips(config: ProcessConfig) -> bool:
-    return config.hold.skips == "allowed"
-
-
-def _source(camera: CameraAnnouncement, kind: str) -> str:
-    """Return the source of a camera's images of a kind."""
+def _source(camera: CameraAnnouncement, kind: str) -> tuple[str, type[Image | DepthImage]]:
+    """Return source and type of a camera's images of a kind."""
     both = kind == "grey" and {"rgb", "grey"} <= {*camera.images}
-    return f"{camera.source}/grey" if both else camera.source
+    source = f"{camera.source}/grey" if both else camera.source
+    return source, DepthImage if kind == "depth" else Image

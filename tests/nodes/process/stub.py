@@ -41,8 +41,6 @@ def main() -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         Path(modes["daemon"]).write_text(str(os.getpid()))
         time.sleep(600)
-    if "never" in modes:
-        time.sleep(600)
     if "early" in modes:
         sys.exit("no vocabulary")
     held: list[Frame] = []
