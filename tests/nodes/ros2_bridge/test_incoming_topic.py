@@ -85,6 +85,9 @@ def valid(type_: str) -> bytes:
             data = messages.odometry((3, 7), samples.odometry())
             odometry: Any = store.deserialize(bytes(data), "nav_msgs/msg/Odometry")
             inner = odometry.pose if "Covariance" in name else odometry.pose.pose
+            if name == "Path":
+                pose = make("geometry_msgs/msg/PoseStamped")(header=header, pose=inner)
+                return bytes(store.serialize(make(type_)(header=header, poses=[pose])))
             return bytes(store.serialize(make(type_)(header=header, pose=inner)))
 
 
