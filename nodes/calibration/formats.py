@@ -15,18 +15,16 @@ ORB-SLAM3's "Calibration_Tutorial.pdf", section 5; VSLAM-LAB's ``Datasets/Datase
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement
 from events.poses import inverse, pose_matrix, pose_tuples
-from nodes.dataset.recording import real
+from nodes.dataset.recording import real, templates
 from nodes.dataset.rig import Rig
 
 DEPTH_FACTOR = 5000.0
@@ -101,20 +99,6 @@ def write_files(rig: Rig, name: str) -> dict[str, str]:
     return found
 
 
-def templates(folder: Path) -> jinja2.Environment:
-    """Return what reads the templates of a folder, with the filters ``real`` and ``row``."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder),
-        autoescape=False,  # noqa: S701  # neither YAML nor JSON is HTML
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters |= {"real": real, "row": _row}
-    return environment
-
-
 def variables(rig: Rig, cameras: list[dict[str, Any]] | None = None) -> dict[str, Any]:
     """Return what every template may use: cameras, imu, stereo, gravity and depth_factor.
 
@@ -185,10 +169,6 @@ def _coefficients(camera: CameraAnnouncement, name: str) -> tuple[float, ...]:
             f"equidistant, found {found}; the format basalt has one"
         )
     return k[:most]
-
-
-def _row(values: Iterable[float]) -> str:
-    return f"[{', '.join(real(float(value)) for value in values)}]"
 
 
 Floats = npt.NDArray[np.float64]

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from events import CameraAnnouncement, DepthImage, Image, Imu, Odometry, Vector3
+from events import CameraAnnouncement, DepthImage, Image, Imu, ImuAnnouncement, Odometry, Vector3
 from events.frames import flip_yz, rotation_to_nwu
 from events.poses import pose_matrix
 from events.rotations import rotate
-from nodes.dataset.recording import ImageFile, Recording, RowFile, in_grey, real
+from nodes.dataset.recording import ImageFile, Recording, RowFile, in_grey
 from nodes.dataset.rig import WORLD_AXES, Rig
 from nodes.trajectory.formats import EUROC_HEADER, euroc_row
 from nodes.viewing.encoding import depth_in_steps
@@ -26,7 +26,7 @@ _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
 )
-_TRUTH = "mav0/state_groundtruth_estimate0"
+_TRUTH = "state_groundtruth_estimate0"
 _BODY = "body: x forward, y right, z down"
 
 
@@ -57,7 +57,7 @@ class Euroc(Recording):
                     f"{sensor}: expected a sensor on the body of {rig.cameras[0].source}, "
                     f"found it in the frame {parent!r}"
                 )
-        self.write("mav0/body.yaml", f'comment: "{rig.body}; {_BODY}"\n{self.epoch_line()}')
+        self.describe("mav0/body.yaml", "euroc.body.yaml", comment=f"{rig.body}; {_BODY}")
         self._images: dict[str, tuple[str, RowFile]] = {}
         self._depths: dict[str, tuple[str, RowFile]] = {}
         for number, camera in enumerate(rig.cameras):
@@ -66,16 +66,13 @@ class Euroc(Recording):
             source = f"{camera.source}/grey" if own_grey else camera.source
             self._images[source] = self._camera(f"cam{number}", camera, "camera")
             if "depth" in camera.images:
-                note = (
-                    f"depth_factor: {real(depth_factor)}  "
-                    "# steps per metre along the optical axis, 0 for none\n"
+                self._depths[camera.source] = self._camera(
+                    f"depth{number}", camera, "depth-camera", depth_factor
                 )
-                kind = "depth-camera"
-                self._depths[camera.source] = self._camera(f"depth{number}", camera, kind, note)
         if rig.imu is not None:
             self._imu = self.rows("mav0/imu0/data.csv", _IMU_HEADER)
-            self.write("mav0/imu0/sensor.yaml", self._imu_yaml())
-        self._truth = self.rows(f"{_TRUTH}/data.csv", f"{EUROC_HEADER}\n")
+            self._sensor("imu0", "imu", f"{rig.imu.source}; {_BODY}", rig.imu, imu=rig.imu)
+        self._truth = self.rows(f"mav0/{_TRUTH}/data.csv", f"{EUROC_HEADER}\n")
         self._velocity_known = False
         self._places: set[Vector3] = set()  # no more than two
         self._describe_truth("velocities as the vehicle sent them")
@@ -128,7 +125,22 @@ class Euroc(Recording):
 
     def _describe_truth(self, velocities: str) -> None:
         comment = f"{WORLD_AXES}; {_BODY}; true poses, {velocities}, biases not recorded (zeros)"
-        self.write(f"{_TRUTH}/sensor.yaml", _head("ground-truth", comment, np.eye(4)))
+        self._sensor(_TRUTH, "ground-truth", comment)
+
+    def _sensor(
+        self,
+        name: str,
+        kind: str,
+        comment: str,
+        mounted: CameraAnnouncement | ImuAnnouncement | None = None,
+        **more: Any,
+    ) -> None:
+        """Write a sensor.yaml: what it is, where it sits on the body, and more of some kinds."""
+        pose = np.eye(4)
+        if mounted is not None:
+            pose = pose_matrix(mounted.position, mounted.orientation)
+        what = {"kind": kind, "comment": comment, "pose": pose.tolist()} | more
+        self.describe(f"mav0/{name}/sensor.yaml", "euroc.sensor.yaml", **what)
 
     def _note(
         self,
@@ -145,43 +157,14 @@ class Euroc(Recording):
         return make(self.folder / "mav0" / name / "data" / f"{stamp}.png", event.data)
 
     def _camera(
-        self, name: str, camera: CameraAnnouncement, kind: str, more: str = ""
+        self, name: str, camera: CameraAnnouncement, kind: str, depth_factor: float = 0.0
     ) -> tuple[str, RowFile]:
         """Make the folder of a camera; return its name and its index."""
         (self.folder / "mav0" / name / "data").mkdir(parents=True)
-        info = camera.info
-        head = _head(
-            kind,
-            f"{camera.source}; x right, y down, z forward",
-            pose_matrix(camera.position, camera.orientation),
-        )
-        middle = ", ".join(map(real, (info.fx, info.fy, info.cx, info.cy)))
-        model, names, lens = _lens(camera)
-        text = (
-            f"rate_hz: {real(camera.rate)}\n"
-            f"resolution: [{info.width}, {info.height}]\n"
-            "camera_model: pinhole\n"
-            f"intrinsics: [{middle}]  # fu, fv, cu, cv\n"
-            f"distortion_model: {model}\n"
-            f"distortion_coefficients: [{', '.join(map(real, lens))}]  # {names}\n"
-        )
-        self.write(f"mav0/{name}/sensor.yaml", head + text + more)
+        comment = f"{camera.source}; x right, y down, z forward"
+        more = {"camera": camera, "lens": _lens(camera), "depth_factor": depth_factor}
+        self._sensor(name, kind, comment, camera, **more)
         return name, self.rows(f"mav0/{name}/data.csv", "#timestamp [ns],filename\n")
-
-    def _imu_yaml(self) -> str:
-        imu = self.rig.imu
-        assert imu is not None
-        mounting = pose_matrix(imu.position, imu.orientation)
-        return _head("imu", f"{imu.source}; {_BODY}", mounting) + (
-            f"rate_hz: {real(imu.rate)}\n"
-            "# continuous-time densities, as in Kalibr's files\n"
-            f"gyroscope_noise_density: {real(imu.gyroscope_noise_density)}  # rad/s/sqrt(Hz)\n"
-            f"gyroscope_random_walk: {real(imu.gyroscope_random_walk)}  # rad/s^2/sqrt(Hz)\n"
-            f"accelerometer_noise_density: {real(imu.accelerometer_noise_density)}"
-            "  # m/s^2/sqrt(Hz)\n"
-            f"accelerometer_random_walk: {real(imu.accelerometer_random_walk)}"
-            "  # m/s^3/sqrt(Hz)\n"
-        )
 
 
 def _lens(camera: CameraAnnouncement) -> tuple[str, str, tuple[float, ...]]:
@@ -198,18 +181,4 @@ def _lens(camera: CameraAnnouncement) -> tuple[str, str, tuple[float, ...]]:
         return name, "k1, k2, p1, p2" + ", k3" * more, lens if more else lens[:4]
     raise ValueError(
         f"{camera.source}: expected plumb_bob or equidistant distortion, found {model}"
-    )
-
-
-def _head(kind: str, comment: str, pose: npt.NDArray[np.float64]) -> str:
-    """Return the beginning of a sensor.yaml: what it is, and where it sits on the body."""
-    rows = ",\n         ".join(", ".join(map(real, row)) for row in pose.tolist())
-    return (
-        f"sensor_type: {kind}\n"
-        f'comment: "{comment}"\n\n'
-        "# sensor to body\n"
-        "T_BS:\n"
-        "  cols: 4\n"
-        "  rows: 4\n"
-        f"  data: [{rows}]\n\n"
     )

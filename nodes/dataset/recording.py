@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import cv2
+import jinja2
 import numpy as np
 import numpy.typing as npt
 
@@ -136,10 +137,6 @@ class Recording(ABC):
         for file in self.files:
             file.close()
 
-    def epoch_line(self) -> str:
-        """Return the line of a YAML file that says what was the run's time 0."""
-        return f"epoch_ns: {self.epoch}  # the run's time 0; all stamps are Unix time\n"
-
     def rows(self, name: str, header: str) -> RowFile:
         """Open a file of rows in the folder; its folder is made if need be."""
         path = self.folder / name
@@ -153,6 +150,11 @@ class Recording(ABC):
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
+
+    def describe(self, name: str, template: str, **values: Any) -> None:
+        """Write a file from a template beside this module, which also knows ``epoch``."""
+        found = templates(Path(__file__).parent).get_template(f"{template}.jinja")
+        self.write(name, found.render(values, epoch=self.epoch))
 
     def empty(self) -> list[str]:
         """Return the files that have no rows yet."""
@@ -171,3 +173,21 @@ def real(value: float) -> str:
     """Return a number as YAML 1.1 has it: ``2e-05`` would be a text, ``2.0e-05`` is none."""
     digits, e, exponent = repr(value).partition("e")
     return f"{digits if '.' in digits else digits + '.0'}{e}{exponent}"
+
+
+def templates(folder: Path) -> jinja2.Environment:
+    """Return what reads the templates of a folder; they have the filters ``real`` and ``row``."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(folder),
+        autoescape=False,  # noqa: S701  # neither YAML nor JSON is HTML
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {"real": real, "row": _row}
+    return environment
+
+
+def _row(values: Iterable[float]) -> str:
+    return f"[{', '.join(real(float(value)) for value in values)}]"

@@ -12,7 +12,7 @@ from pathlib import Path
 from events import DepthImage, Image, Imu, PoseStamped
 from events.frames import flip_yz, rotation_to_nwu
 from events.rotations import rotate
-from nodes.dataset.recording import ImageFile, Recording, RowFile, in_colour, real
+from nodes.dataset.recording import ImageFile, Recording, RowFile, in_colour
 from nodes.dataset.rig import WORLD_AXES, Rig
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.table import seconds_text
@@ -53,7 +53,7 @@ class TumRgbd(Recording):
                 "timestamp ax ay az",
             )  # fmt: skip
         self._unpaired: dict[int, str] = {}  # by stamp: rgb or depth, whichever came
-        self.write("camera.yaml", self._calibration())
+        self.describe("camera.yaml", "tum_rgbd.camera.yaml", camera=camera, factor=depth_factor)
 
     def image(self, event: Image) -> ImageFile | None:
         """Note an image of the camera: in colour if it has any."""
@@ -109,20 +109,6 @@ class TumRgbd(Recording):
     def _rows(self, name: str, *header: str) -> RowFile:
         """Open a file with a head of three lines: there are readers that skip just that many."""
         return self.rows(f"{name}.txt", "".join(f"# {line}\n" for line in header))
-
-    def _calibration(self) -> str:
-        info = self._camera.info
-        lens = ", ".join(map(real, info.distortion))
-        return (
-            f"# {self._camera.source}: pixel centres have whole coordinates\n"
-            f"width: {info.width}\nheight: {info.height}\n"
-            f"fx: {real(info.fx)}\nfy: {real(info.fy)}\ncx: {real(info.cx)}\ncy: {real(info.cy)}\n"
-            f"distortion_model: {info.distortion_model}\n"
-            f"distortion: [{lens}]  # as in ROS's camera_info\n"
-            f"rate_hz: {real(self._camera.rate)}\n"
-            f"depth_factor: {real(self.depth_factor)}\n"
-            f"{self.epoch_line()}"
-        )
 
 
 _OPTICAL = "x right, y down, z forward"

@@ -14,7 +14,7 @@ from typing import Any
 import jinja2
 
 from nodes import link
-from nodes.calibration.formats import templates
+from nodes.dataset.recording import templates
 from nodes.process.program import Program
 from nodes.process.settings import ProcessConfig
 from runtime.errors import VisnavError
