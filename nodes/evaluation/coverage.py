@@ -101,21 +101,10 @@ def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
 def choose_frames(cameras: Mapping[str, Stamps], poses: Stamps) -> Stamps | None:
     """Return the stamps of the camera that an estimator follows: most of its poses have them.
 
-    Args:
-        cameras: Stamps of the images by camera, in the order of their first images.
-        poses: Stamps of the estimator's poses.
-
-    Returns:
-        Strictly rising stamps; of cameras that fit as well as each other the first; `None` if
-        there is no camera.
+    Of cameras that fit as well as each other it is the first; `None` if no camera has images.
     """
-    best: Stamps | None = None
-    most = -1
-    for stamps in cameras.values():
-        shared = int(np.isin(poses, stamps).sum())
-        if len(stamps) and shared > most:
-            best, most = stamps, shared
-    return best
+    there = (stamps for stamps in cameras.values() if len(stamps))
+    return max(there, key=lambda stamps: int(np.isin(poses, stamps).sum()), default=None)
 
 
 def union(intervals: Sequence[Interval]) -> list[Interval]:

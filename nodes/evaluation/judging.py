@@ -19,6 +19,7 @@ from nodes.evaluation.metrics import (
     drift_percent,
     path_errors,
     position_errors,
+    rms,
     rotation_errors,
 )
 from nodes.evaluation.record import EstimatorRecord
@@ -236,8 +237,8 @@ def judge(
     of_ticks = errors_at_ticks(truth, whole, arrivals, rate) if len(arrivals) else None
     if of_ticks is not None:
         figures |= {
-            "available_rmse_m": _rms(of_ticks.position),
-            "available_rot_rmse_deg": float(np.degrees(_rms(of_ticks.rotation))),
+            "available_rmse_m": rms(of_ticks.position),
+            "available_rot_rmse_deg": float(np.degrees(rms(of_ticks.rotation))),
             "available_age_ms": float(np.mean(of_ticks.stamps - of_ticks.since)) / MILLISECOND,
         }
     return Judgement(figures, estimate, moved, of_images, of_ticks, coverage.lost)
@@ -246,11 +247,11 @@ def judge(
 def conclude(
     found: Mapping[str, dict[str, Any]], thresholds: Thresholds, faults: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return the verdict, as ``evaluation/verdict.json`` has it.
+    """Return the verdict on figures by estimator, as ``evaluation/verdict.json`` has it.
 
     Args:
-        found: Figures by estimator; see `judge`.
-        thresholds: What they may be.
+        found: See `judge`.
+        thresholds: What the figures may be.
         faults: Further reasons why all have failed.
     """
     estimators = {}
@@ -286,7 +287,7 @@ def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
         return {}
     there = truth.at(plan.stamps[rows])
     distances = position_errors(there.positions, plan.positions[rows])
-    return {"plan_rmse_m": _rms(distances), "plan_max_m": float(distances.max())}
+    return {"plan_rmse_m": rms(distances), "plan_max_m": float(distances.max())}
 
 
 def choose_alignment(record: EstimatorRecord) -> How:
@@ -329,7 +330,3 @@ def errors_at_ticks(
         position=position_errors(there.positions, estimate.positions[newest]),
         rotation=rotation_errors(there.orientations, estimate.orientations[newest]),
     )
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))

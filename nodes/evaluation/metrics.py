@@ -35,16 +35,16 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
     angles = rotation_errors(truth.orientations, estimate.orientations)
     x, y, z = (estimate.positions - truth.positions).T
     return {
-        "ate_rmse_m": _rms(errors),
+        "ate_rmse_m": rms(errors),
         "ate_mean_m": float(errors.mean()),
         "ate_median_m": float(np.median(errors)),
         "ate_std_m": float(errors.std()),
         "ate_max_m": float(errors.max()),
-        "ate_north_rmse_m": _rms(x),
-        "ate_east_rmse_m": _rms(y),
-        "ate_down_rmse_m": _rms(z),
+        "ate_north_rmse_m": rms(x),
+        "ate_east_rmse_m": rms(y),
+        "ate_down_rmse_m": rms(z),
         "mse_m2": float(np.mean(errors**2)),
-        "rot_rmse_deg": _rms(np.degrees(angles)),
+        "rot_rmse_deg": rms(np.degrees(angles)),
     }
 
 
@@ -60,9 +60,6 @@ def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> 
         estimate: The estimated ones, at the same stamps.
         delta: Length of true path in metres; a pair may miss it by a tenth.
 
-    Returns:
-        By name: root mean squares of the errors of position and of orientation, per length.
-
     Raises:
         ValueError: The stamps of the two differ, or no poses are that far apart.
     """
@@ -76,8 +73,8 @@ def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> 
         )
     shifts, angles = relative_errors(truth, estimate, first, last)
     return {
-        "rpe_trans_percent": 100.0 * _rms(shifts) / delta,
-        "rpe_rot_deg_per_m": _rms(np.degrees(angles)) / delta,
+        "rpe_trans_percent": 100.0 * rms(shifts) / delta,
+        "rpe_rot_deg_per_m": rms(np.degrees(angles)) / delta,
     }
 
 
@@ -187,5 +184,6 @@ def relative_errors(
     return np.asarray(shifts), np.asarray((true_turn.inv() * said_turn).magnitude())
 
 
-def _rms(values: Floats) -> float:
+def rms(values: Floats) -> float:
+    """Return the root mean square."""
     return math.sqrt(float(np.mean(values**2)))

@@ -56,11 +56,7 @@ class EstimatorRecord:
         return record
 
     def add(self, event: PoseEstimate, now: int | None) -> bool:
-        """Note an estimate that has come at a time (ns), if that is known.
-
-        Returns:
-            Whether it is part of the trajectory.
-        """
+        """Note an estimate and when it came (ns), if known; tell if it is of the trajectory."""
         if now is not None and event.stamp > now + _AHEAD:
             self.future += 1
             return False

@@ -5,8 +5,7 @@ trajectories/<estimator>.tum        the estimates as they were sent; likewise
 trajectories/plan.tum               where the pilot meant to be
 trajectories/truth.<vehicle>.tum    both of the second vehicle, the third, …
 trajectories/collisions.csv         what the vehicles hit, when and where
-evaluation/<estimator>.csv          errors of each estimate at the time of its image, and when it
-                                    came if that is known
+evaluation/<estimator>.csv          errors of each estimate at the time of its image
 evaluation/<estimator>.lost.csv     when it had no pose
 evaluation/<estimator>.ticks.csv    errors of the newest pose there was at each control tick (of a
                                     long run every second one, fourth, …)

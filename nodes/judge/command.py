@@ -61,14 +61,13 @@ def judge(
     from runtime.tools.cli.run import print_verdict
     from runtime.tools.cli.tables import verdict_table
 
-    limits = [each.partition("=") for each in threshold or ()]
     said = {
         "alignment": alignment,
         "scale_free": scale_free,
         "axes": axes or None,
         "max_difference": max_difference,
         "gap": gap,
-        "thresholds": {figure: given(limit) for figure, _, limit in limits},
+        "thresholds": {k: given(v) for k, _, v in (t.partition("=") for t in threshold or ())},
     }
     config = convert(said, judging.JudgeConfig, "judge")
     try:

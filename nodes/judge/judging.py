@@ -28,15 +28,9 @@ from runtime.errors import ResultsError
 from runtime.schedule import SECOND
 from runtime.summary import command_line, commit, environment
 
-_UNKNOWN = ("restarts", "repeated_stamps", "future_stamps")
-"""Figures that poses alone do not tell."""
-
 
 class JudgeConfig(EvaluationConfig):
-    """How to judge: as an evaluation does, but for ``auto``.
-
-    That alignment is ``sim3`` for scale-free estimates; if their source names their frame, as in a
-    run ``none`` in ``map`` and else ``origin``; otherwise ``se3``.
+    """How to judge: as an evaluation, but ``auto`` is ``se3`` where nobody says the frame.
 
     Attributes:
         scale_free: Whether the estimates' unit of length is their own.
@@ -56,19 +50,13 @@ def judge_all(
     frames: npt.NDArray[np.int64] | None,
     config: JudgeConfig,
 ) -> tuple[dict[str, Judgement], Verdict, list[str]]:
-    """Judge estimates by the truth.
-
-    Args:
-        truth: The true poses.
-        estimates: Of the same body.
-        frames: Stamps of the images (ns), if they are known; the flight is then theirs.
-        config: How.
+    """Judge estimates by the truth; the flight is that of the images, if their stamps are known.
 
     Returns:
         Judgements by name, the verdict, and sentences on what was not compared.
 
     Raises:
-        ValueError: Two have one name, or an estimate and the truth no time in common.
+        ValueError: Two have one name, or one is nowhere near to a true pose in time.
     """
     judgements: dict[str, Judgement] = {}
     notes = []
@@ -77,18 +65,21 @@ def judge_all(
             raise ValueError(
                 f"expected names that differ, found two {source.name}: NAME={source.file}"
             )
+        by_frame: dict[str, How] = {"": "se3", "map": "none"}
+        usual = "sim3" if config.scale_free else by_frame.get(source.frame_id, "origin")
         poses, note = _compared(truth.poses, source, config.max_difference)
         judgement = judge(
             EstimatorRecord.of(poses),
             truth.poses,
             cameras=None if frames is None else {"": frames},
-            alignment=_alignment(source, config),
+            alignment=usual if config.alignment == "auto" else config.alignment,
             delta=config.delta,
             gap=config.gap,
         )
-        known = {k: v for k, v in judgement.figures.items() if k not in _UNKNOWN}
-        compared = int(truth.poses.covers(poses.stamps).sum())
-        figures = {**known, "method": source.file, "compared": compared, **source.counts}
+        unknown = {"restarts", "repeated_stamps", "future_stamps"}
+        figures = {k: v for k, v in judgement.figures.items() if k not in unknown} | source.counts
+        figures["method"] = source.file
+        figures["compared"] = int(truth.poses.covers(poses.stamps).sum())
         judgements[source.name] = msgspec.structs.replace(judgement, figures=figures)
         notes += [f"{source.name}: {note}"] if note else []
     verdict = conclude({k: j.figures for k, j in judgements.items()}, config.thresholds)
@@ -102,13 +93,12 @@ def write(
     verdict: Verdict,
     notes: Sequence[str],
 ) -> Path:
-    """Write a folder as a run leaves it, with all figures and a report; return the report's path.
+    """Write a folder as a run leaves it, with figures and a report; return the report's path.
 
-    What an earlier judgement left in the folder goes to ``NAME.1``.
+    What an earlier judgement left there goes to ``NAME.1``.
 
     Raises:
-        ResultsError: There is something else in the folder.
-        OSError: It cannot be written.
+        ResultsError: There is something else in the folder, or it cannot be written.
     """
     if (out / "config.toml").exists():
         raise ResultsError(f"{out}: expected no run's folder: name another with --out")
@@ -117,9 +107,9 @@ def write(
     (out / "trajectories").mkdir()
     write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
     for name, judgement in judgements.items():
-        if judgement.estimate is not None:
-            path = out / "trajectories" / f"{file_name(name)}.tum"
-            write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
+        assert judgement.estimate is not None
+        path = out / "trajectories" / f"{file_name(name)}.tum"
+        write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
     write_results(out, {}, judgements, msgspec.to_builtins(verdict))
     facts = Facts(
         name=out.name,
@@ -131,16 +121,6 @@ def write(
     text = msgspec.json.format(msgspec.json.encode(facts), indent=2)
     results.write(out / "summary.json", text + b"\n")
     return write_report(out)
-
-
-def _alignment(source: Source, config: JudgeConfig) -> How:
-    if config.alignment != "auto":
-        return config.alignment
-    if config.scale_free:
-        return "sim3"
-    if not source.frame_id:
-        return "se3"
-    return "none" if source.frame_id == "map" else "origin"
 
 
 def _compared(truth: Trajectory, source: Source, most: float) -> tuple[Trajectory, str]:

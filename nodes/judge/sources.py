@@ -24,15 +24,14 @@ from runtime.schedule import SECOND
 Floats = npt.NDArray[np.float64]
 Axes = Literal["ned", "nwu", "enu", "optical"]
 
-_HALF_TURN = np.diag([1.0, -1.0, -1.0])
-_OPTICAL = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_SAME, _HALF_TURN, _OPTICAL = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)[[2, 0, 1, 3]]
 AXES: dict[Axes, tuple[Floats, Floats]] = {
-    "ned": (np.eye(3), np.eye(3)),
-    "nwu": (_HALF_TURN, np.eye(3)),
-    "enu": (np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), _HALF_TURN),
+    "ned": (_SAME, _SAME),
+    "nwu": (_HALF_TURN, _SAME),
+    "enu": (np.eye(4)[[1, 0, 2, 3]] * [1.0, 1.0, -1.0, 1.0], _HALF_TURN),
     "optical": (_OPTICAL, _OPTICAL),
 }
-"""Rotations of a file's world to NED, and of its body to the truth's body, shape (3, 3).
+"""Transforms from a file's world to NED, and from its body to the truth's body, shape (4, 4).
 
 ``ned``: our own files and TUM's; ``nwu``: z up, the body as it is, as EuRoC and VSLAM-LAB; ``enu``:
 REP 103, with a body FLU; ``optical``: both as a camera that looks ahead has them, as KITTI.
@@ -47,16 +46,13 @@ _SCALAR = re.compile(r"q\w*w\b")
 _FRAME = re.compile(r"# base_link \(FRD\) in (\S+), as it was sent")
 """First line of a run's estimate."""
 _LONGEST_STEP = 10 * 86_400 * SECOND
-"""Nanoseconds between two poses; more than that are stamps of different units or clocks."""
+"""Nanoseconds between two poses; more are stamps of different units or clocks."""
 
 
 class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """A trajectory from outside.
+    """A trajectory from outside: poses of the truth's body in a world NED.
 
     Attributes:
-        name: In tables.
-        file: Path of the file, or ``bag:/topic``.
-        poses: Of the truth's body in a world NED.
         frame_id: That the poses are in, if the source says so.
         counts: Figures that only a topic has: restarts and repeated stamps.
     """
@@ -86,9 +82,8 @@ def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = 
 
     Args:
         text: Where it is; ``NAME=`` before it gives it a name.
-        axes: Those of a file; if not given, those that its format usually has. A topic's are
-            those of REP 103 and 105.
-        times: Stamps of a KITTI file.
+        axes: Those of a file, if they are not its format's; a topic's are REP 103's.
+        times: File of the stamps of a KITTI file.
         camera: Transform from a camera's optical frame to the body, shape (4, 4), if the poses
             are the camera's: then the body's axes are of no account.
 
@@ -105,9 +100,9 @@ def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = 
         poses, child, record = read_topic(path, topic)
         name, frame_id = name or topic.strip("/"), record.frame_id
         counts = {"restarts": record.restarts, "repeated_stamps": record.repeated}
-        world, body = AXES["ned"][0], AXES["optical" if child == "optical" else "ned"][1]
+        world, body = _SAME, _OPTICAL if child == "optical" else _SAME
         if camera is not None and child == "body":  # as which a camera's poses were read, then
-            camera = camera @ _transform(_HALF_TURN)
+            camera = camera @ _HALF_TURN
     else:
         usual, frame_id, poses = _read_file(path, times)
         name, counts = name or path.stem, {}
@@ -118,9 +113,9 @@ def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = 
             f"{file}: pose {far[0] + 2}: expected stamps of one unit and one clock, found "
             f"{after:.3f} s after {before:.3f} s"
         )
-    mounted = _transform(body) if camera is None else camera
-    if not (np.array_equal(world, np.eye(3)) and np.array_equal(mounted, np.eye(4))):
-        matrices = _transform(world) @ poses.matrices() @ np.linalg.inv(mounted)
+    body = body if camera is None else camera
+    if world is not _SAME or body is not _SAME:
+        matrices = world @ poses.matrices() @ np.linalg.inv(body)
         poses = Trajectory.from_matrices(poses.stamps, matrices)
     return Source(name=name, file=file, poses=poses, frame_id=frame_id, counts=counts)
 
@@ -128,10 +123,8 @@ def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = 
 def read_mounting(text: str, run: str) -> Floats:
     """Return the transform from a camera's optical frame to the body, shape (4, 4).
 
-    Args:
-        text: ``tx ty tz qx qy qz qw`` (metres, the scalar last), a file in TUM's format with one
-            pose, or the name of a camera that a run has announced.
-        run: The folder of the truth's run.
+    It is given as ``tx ty tz qx qy qz qw`` (metres, the scalar last), as a file in TUM's format
+    with one pose, or by the name of a camera that the run in a folder has announced.
 
     Raises:
         ValueError: It is none of these.
@@ -143,16 +136,15 @@ def read_mounting(text: str, run: str) -> Floats:
         return mounting(Path(run), text)
     if len(row.fields) != 7:
         row.wrong('"tx ty tz qx qy qz qw", a file, or a camera of the run that is the truth', text)
-    x, y, z, *turn = row.numbers(0, 7)
-    pose = Trajectory(np.array([0]), np.array([[x, y, z]]), np.array([[turn[3], *turn[:3]]]))
+    values = np.array([row.numbers(0, 7)])
+    pose = Trajectory(np.array([0]), values[:, :3], values[:, [6, 3, 4, 5]])
     return np.asarray(pose.matrices()[0])
 
 
 def read_stamps(path: Path) -> npt.NDArray[np.int64]:
-    """Return the stamps (ns) of a list of images, or of a KITTI file: the first field of each row.
+    """Return the stamps (ns) of a list of images or of poses: the first field of each row.
 
-    Those of rows with commas are nanoseconds (EuRoC's ``cam0/data.csv``, VSLAM-LAB's ``rgb.csv``),
-    others are seconds (TUM's ``rgb.txt``, KITTI's ``times.txt``).
+    They are nanoseconds where there are commas (EuRoC, VSLAM-LAB), or else seconds (TUM, KITTI).
 
     Raises:
         ValueError: It cannot be read, or the stamps do not rise; the message names the line.
@@ -205,9 +197,3 @@ def _start(path: Path) -> tuple[int, list[str], str]:
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: expected {_FORMATS}, found: {error}") from None
     raise ValueError(f"{path}: expected {_FORMATS}, found no rows")
-
-
-def _transform(rotation: Floats) -> Floats:
-    transform = np.eye(4)
-    transform[:3, :3] = rotation
-    return transform

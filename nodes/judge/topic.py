@@ -68,11 +68,6 @@ def _poses(bag: Bag, topic: str) -> Iterator[tuple[str, Any]]:
 
 
 def _estimate(type_: str, message: Any) -> PoseEstimate:
-    """Return a message as an estimate.
-
-    Raises:
-        ValueError: It has no finite pose with a quaternion of length 1.
-    """
     q = (message.pose if type_ == _POSE else message.pose.pose).orientation
     length = float(np.linalg.norm([q.w, q.x, q.y, q.z]))
     if not abs(length - 1.0) < 0.01:

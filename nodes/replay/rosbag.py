@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -143,7 +144,9 @@ class RosBag(Reader):
             assert isinstance(event, Odometry)
             return msgspec.structs.replace(event, child_frame_id="base_link")
         if type_ == "geometry_msgs/msg/TransformStamped":
-            message = _AsPose(message)
+            moved = message.transform
+            where = SimpleNamespace(position=moved.translation, orientation=moved.rotation)
+            message = SimpleNamespace(header=message.header, pose=where)
         pose = estimate(message, context)
         assert isinstance(pose, PoseEstimate)
         return Odometry(
@@ -268,16 +271,6 @@ def _stamp(message: Any) -> int:
     """Return a header's stamp (ns); 0 if it has none."""
     stamp = message.header.stamp
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
-
-
-class _AsPose:
-    """A TransformStamped with the fields of a PoseStamped."""
-
-    def __init__(self, message: Any) -> None:
-        self.header = message.header
-        self.pose = self
-        self.position = message.transform.translation
-        self.orientation = message.transform.rotation
 
 
 def _compressed(use: Use, message: Any, context: MessageContext) -> Event:

@@ -14,7 +14,6 @@ from nodes.trajectory.formats import read_tum
 from runtime.schedule import SECOND
 
 Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 GAP = SECOND // 2
 """Silence that counts as lost (ns)."""

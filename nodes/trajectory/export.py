@@ -11,6 +11,7 @@ those of the left camera, from identity.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -93,10 +94,11 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
             written.append(path)
     if form == "kitti":
         return written
+    world = np.diag([1.0, -1.0, -1.0, 1.0]) if form == "euroc" else np.eye(4)
     for name, trajectory in (truths | estimates).items():
         comment = _COMMENT[form, TRUTH if name in truths else ""]
         comment = f"{comment}\nthe run's time 0 is {zero} ns"
-        placed = _placed(trajectory, zero, z_up=form == "euroc")
+        placed = Trajectory.from_matrices(trajectory.stamps + zero, world @ trajectory.matrices())
         if form == "euroc":
             written.append(folder / f"{name}.csv")
             write_euroc(written[-1], placed, comment + _VELOCITIES)
@@ -106,19 +108,11 @@ def export(run: Path, form: str, out: Path | None = None, epoch: int | str = EPO
     return written
 
 
-def _placed(trajectory: Trajectory, epoch: int, *, z_up: bool) -> Trajectory:
-    """Return a trajectory in Unix time, and in a parent frame that is turned by half a turn."""
-    turn = np.diag([1.0, -1.0, -1.0, 1.0] if z_up else np.ones(4))
-    return Trajectory.from_matrices(trajectory.stamps + epoch, turn @ trajectory.matrices())
-
-
 def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
     """Return the transform from a camera that a run announced to its body, shape (4, 4).
 
-    Args:
-        run: The run's folder.
-        camera: Its source; if empty, the first one on a body, or else one at the body's origin
-            that looks ahead.
+    If none is named it is the first one on a body, or else one at the body's origin that looks
+    ahead.
 
     Raises:
         ValueError: The run's summary is none, or there is no such camera.
@@ -129,17 +123,16 @@ def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
         announced = msgspec.json.decode(content, type=_Summary).announcements
     except (OSError, msgspec.DecodeError) as error:
         raise ValueError(f"{path}: expected the run's summary, found: {error}") from None
-    cameras = [
-        each
+    cameras = {
+        each.source: pose_matrix(each.position, each.orientation)
         for each in announced
         if each.type == "CameraAnnouncement" and each.parent_frame_id != "map"
-    ]
-    for each in cameras:
-        if camera in {"", each.source}:
-            return pose_matrix(each.position, each.orientation)
-    if camera:
-        found = ", ".join(each.source for each in cameras) or "none"
+    }
+    if camera and camera not in cameras:
+        found = ", ".join(cameras) or "none"
         raise ValueError(f"{path}: expected {camera!r} among the cameras on a body, found {found}")
+    if cameras:
+        return cameras[camera or next(iter(cameras))]
     return pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
 
 
@@ -192,15 +185,11 @@ def _truth_of(run: Path, estimate: str) -> str:
     if not path.is_file():
         return TRUTH
     found = msgspec.json.decode(path.read_bytes(), type=_Verdict).estimators
-    vehicles = {name.replace("/", "_"): each.vehicle for name, each in found.items()}
+    vehicles = {name.replace("/", "_"): each.get("vehicle", "") for name, each in found.items()}
     return f"{TRUTH}.{vehicles.get(estimate, '')}"
-
-
-class _Judged(msgspec.Struct):
-    vehicle: str = ""
 
 
 class _Verdict(msgspec.Struct):
     """What an export asks of a run's verdict."""
 
-    estimators: dict[str, _Judged] = {}
+    estimators: dict[str, dict[str, Any]] = {}

@@ -94,11 +94,6 @@ def euroc_rows(
 ) -> Iterator[tuple[Row, int, list[float]]]:
     """Yield the rows of a EuRoC ground truth with their stamps (ns) and all other values.
 
-    Args:
-        path: The file.
-        columns: How many there may be.
-        tolerance: How far from 1 the length of a quaternion may be.
-
     Raises:
         ValueError: It cannot be read or holds something else; the message names the line.
     """

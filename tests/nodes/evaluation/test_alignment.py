@@ -79,11 +79,6 @@ def test_a_straight_flight_cannot_be_aligned_by_its_positions(direction: list[fl
     assert align(line, truth, "origin").scale == 1.0
 
 
-def test_an_unknown_alignment_is_named() -> None:
-    with pytest.raises(ValueError, match=r"expected one of none, origin, se3, sim3, found 'so3'"):
-        align(walk(), walk(), "so3")  # type: ignore[arg-type]
-
-
 def test_the_truth_is_interpolated_at_the_estimates_stamps() -> None:
     truth = walk(11)
     stamps = np.array([-1, 0, 25_000_000, 500_000_000, 500_000_001])
