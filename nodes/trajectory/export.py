@@ -123,17 +123,16 @@ def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
         announced = msgspec.json.decode(content, type=_Summary).announcements
     except (OSError, msgspec.DecodeError) as error:
         raise ValueError(f"{path}: expected the run's summary, found: {error}") from None
-    cameras = {
-        each.source: pose_matrix(each.position, each.orientation)
+    found = [
+        (each.source, pose_matrix(each.position, each.orientation))
         for each in announced
         if each.type == "CameraAnnouncement" and each.parent_frame_id != "map"
-    }
-    if camera and camera not in cameras:
-        found = ", ".join(cameras) or "none"
-        raise ValueError(f"{path}: expected {camera!r} among the cameras on a body, found {found}")
-    if cameras:
-        return cameras[camera or next(iter(cameras))]
-    return pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
+    ]
+    chosen = [mounted for source, mounted in found if camera in {"", source}]
+    if camera and not chosen:
+        there = ", ".join(source for source, _ in found) or "none"
+        raise ValueError(f"{path}: expected {camera!r} among the cameras on a body, found {there}")
+    return chosen[0] if chosen else pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
 
 
 class _Announced(msgspec.Struct):
