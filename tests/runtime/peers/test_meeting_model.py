@@ -1,0 +1,216 @@
+"""Whatever is late, cut, or killed while processes meet, in the end all begin, and know all."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import defaultdict, deque
+from typing import Any
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from events import Image
+from runtime.peers.authentication import derive
+from runtime.peers.handshake import Handshakes
+from runtime.peers.peers import Peers
+from runtime.sender import Listener
+from tests.runtime.peers import samples
+
+NODES = ("asker", "one", "other")
+CONFIG = samples.settings(
+    ("asker", "Asker", {"on_error": "restart"}),
+    ("one", "Answerer", {"on_error": "restart"}),
+    ("other", "Answerer", {"on_error": "restart"}),
+    shared=False,
+    meet="x/y",
+)
+KEY = derive(b"secret", "run", "test")
+
+
+class Still:
+    """A clock that is neither that of lockstep nor that of real time."""
+
+    def now(self) -> int:
+        return 0
+
+
+class Machine:
+    """One process: its part in the meeting, step by step."""
+
+    def __init__(self, wire: Wire, node: str, id_: str) -> None:
+        self.id = id_
+        self.node = node
+        self.begun = False
+        self.heard: list[str] = []
+        self.steps = asyncio.Semaphore(0)
+        self.peers = Peers(CONFIG, [node], Still(), self)  # type: ignore[arg-type]
+        self.membership = self.peers._membership
+        self.membership.meet = self._meet  # type: ignore[method-assign]
+        self._wire = wire
+        self.handshakes = Handshakes(KEY, self, self.membership)  # type: ignore[arg-type]
+        self.membership._handshakes = self.handshakes
+        self.task = asyncio.get_running_loop().create_task(self._start())
+
+    async def _meet(self) -> int:
+        await self.membership.waiting.until(lambda: not self.membership._missing())
+        return self.membership.number()
+
+    async def _start(self) -> None:
+        await self.peers.meet()
+        await self.steps.acquire()
+        offer = samples.Offer(stamp=0, source=self.node, rate=1.0)
+        self.heard = [each.source for each in await self.peers.announce({self.node: [offer]})]
+        await self.steps.acquire()
+        self.connect()
+        reference = await self.peers._start.begin()
+        present, absent = self.membership.present(), [*self.membership.waiting.absent.values()]
+        assert self.peers._remote is not None
+        assert {*self.peers._remote._wanted} >= {member.number for member in present}
+        assert reference is not None or not absent
+        self.connect()
+        self.peers.nodes_run()
+        assert {*self.membership.hello.lost} >= {n for member in absent for n in member.nodes}
+        self.begun = True
+
+    # In the place of a run, and of a session with Zenoh.
+
+    def connect(self) -> None:
+        listener = Listener(self.node, lambda _: None, (samples.Asked, Image))
+        self.peers.connect([listener], lambda *_: None)
+
+    def stop(self, reason: str, *_: Any, **__: Any) -> None:
+        raise AssertionError(reason)
+
+    def put(self, other: str, message: bytes, payload: bytes) -> None:
+        self._wire.under_way[self.id, other].append((message, payload))
+
+
+class Wire:
+    """Three machines, who sees whom, and what is on its way."""
+
+    def __init__(self) -> None:
+        self.under_way: dict[tuple[str, str], deque[tuple[bytes, bytes]]] = defaultdict(deque)
+        self.sees: set[tuple[str, str]] = set()
+        self._ids = map(str, itertools.count())
+        self.machines = {node: Machine(self, node, next(self._ids)) for node in NODES}
+        for one, other in itertools.permutations(NODES, 2):
+            self.see(one, other)
+
+    def deliver(self, sender: str, to: str) -> None:
+        a, b = self.machines[sender], self.machines[to]
+        if self.under_way[a.id, b.id]:
+            self.see(to, sender)  # of whom a message comes, that it is there was heard before
+            b.membership._receive(a.id, *self.under_way[a.id, b.id].popleft())
+
+    def see(self, one: str, other: str) -> None:
+        a, b = self.machines[one], self.machines[other]
+        if one != other and (a.id, b.id) not in self.sees:
+            self.sees.add((a.id, b.id))
+            a.handshakes.on_presence(b.id, True)
+
+    def cut(self, one: str, other: str) -> None:
+        """One loses sight of the other; what is on the way to it is lost."""
+        a, b = self.machines[one], self.machines[other]
+        self.under_way[b.id, a.id].clear()
+        if (a.id, b.id) in self.sees:
+            self.sees.discard((a.id, b.id))
+            a.handshakes.on_presence(b.id, False)
+
+    async def kill(self, node: str) -> None:
+        """Start a process again, with all that it was and said gone."""
+        self.machines[node].task.cancel()
+        for other in NODES:
+            if other != node:
+                self.cut(other, node)
+        self.machines[node] = Machine(self, node, next(self._ids))
+        await asyncio.sleep(0)
+
+    async def do(self, what: str, one: str, other: str) -> None:
+        match what:
+            case "step":
+                self.machines[one].steps.release()
+            case "kill":
+                await self.kill(one)
+            case "round":
+                await self.round()
+            case "greet":
+                self.machines[one].handshakes.greet_again()
+            case "deliver" | "see" | "cut" if one != other:
+                getattr(self, what)(one, other)
+        for _ in range(8):  # of what tasks do, each part takes one turn of the loop
+            await asyncio.sleep(0)
+
+    async def round(self) -> None:
+        """Let everything that is on its way arrive."""
+        for link, messages in list(self.under_way.items()):
+            for _ in range(len(messages)):
+                for one, other in itertools.permutations(NODES, 2):
+                    if link == (self.machines[one].id, self.machines[other].id):
+                        await self.do("deliver", one, other)
+
+    async def settle(self) -> None:
+        """Let all see one another, and everything arrive."""
+        after = 0  # rounds since all began: links that were cut are made anew in some
+        for _ in range(100):
+            after += all(machine.begun for machine in self.machines.values())
+            if after == 6:
+                return
+            for machine in self.machines.values():
+                machine.steps.release()
+                machine.handshakes.greet_again()
+            for one, other in itertools.permutations(NODES, 2):
+                await self.do("see", one, other)
+                while self.under_way[self.machines[one].id, self.machines[other].id]:
+                    await self.do("deliver", one, other)
+
+
+WHO = st.sampled_from(NODES)
+WHAT = ["round"] * 4 + ["step"] * 4 + ["deliver"] * 3 + ["cut", "see"] * 2 + ["kill", "greet"]
+OPS = st.lists(st.tuples(st.sampled_from(WHAT), WHO, WHO), max_size=50)
+
+
+def check(wire: Wire) -> None:
+    for node, machine in wire.machines.items():
+        peers = machine.peers
+        assert not machine.task.done() or machine.task.exception() is None
+        assert machine.begun, f"{node} has not begun"
+        assert machine.heard == [*NODES]
+        assert machine.membership.complete()
+        assert not machine.membership.waiting.absent
+        assert not peers._returning, f"{node} has not taken all back"
+        assert peers._remote is not None
+        wanted = peers._remote._wanted
+        assert len(wanted) == 2
+        assert all(wanted.values()), f"{node} does not know what others want"
+
+
+def play(ops: list[tuple[str, str, str]], *, settled: int = 0) -> None:
+    async def main() -> None:
+        wire = Wire()
+        for _ in range(settled):
+            await wire.settle()
+        for op in ops:
+            await wire.do(*op)
+        await wire.settle()
+        check(wire)
+        for machine in wire.machines.values():
+            for member in machine.handshakes.members():
+                member.outbox.close()
+
+    asyncio.run(main())
+
+
+@settings(max_examples=40, deadline=None)
+@given(OPS)
+@example([])
+def test_all_begin_whatever_happens_while_they_meet(ops: list[tuple[str, str, str]]) -> None:
+    play(ops)
+
+
+@settings(max_examples=25, deadline=None)
+@given(OPS)
+@example([("kill", "one", "one")])
+@example([("cut", "one", "asker"), ("cut", "asker", "one")])
+def test_who_is_lost_in_the_run_is_taken_back(ops: list[tuple[str, str, str]]) -> None:
+    play(ops, settled=1)
