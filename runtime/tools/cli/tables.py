@@ -48,7 +48,7 @@ def run_tables(summary: Summary) -> Iterator[Table]:
         yield _numbers(workers)
     # The eight of its columns for which a terminal has room.
     title = "systems outside the process: frames"
-    names = ("system", "sent", "answered", "init", "skipped", "lost", "late", "ms", "reproducible")
+    names = ("system", "sent", "answered", "init", "skipped", "lost", "late", "real ms", "repeats")
     outside = Table(*names, title=title)
     for name, system in sorted(summary.outside.items()):
         row = system.row()
