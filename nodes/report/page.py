@@ -123,7 +123,7 @@ def render(
         curves=curves,
         frames=frames,
         clouds=clouds,
-        verdicts=[_verdict(e.name, e.figures, e.color) for e in run.estimators],
+        verdicts=[_verdict(*each) for each in _judged(run)],
     )
 
 
@@ -143,6 +143,14 @@ def embedded(path: Path, title: str, caption: str, photo: bool) -> dict[str, str
         "caption": caption,
         "source": f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}",
     }
+
+
+def _judged(run: Run) -> list[tuple[str, dict[str, Any], str]]:
+    """Return name, figures and colour of each estimator, and of all else that was judged."""
+    found = [(each.name, each.figures, each.color) for each in run.estimators]
+    summary = {} if run.facts.verdict is None else run.facts.verdict.estimators
+    known = {name for name, _, _ in found}
+    return found + [(name, each, "inherit") for name, each in summary.items() if name not in known]
 
 
 def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:

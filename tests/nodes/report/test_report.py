@@ -17,6 +17,8 @@ from nodes.report.folder import read_run
 from nodes.report.page import write_report
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
+from runtime.answers import Answers
+from runtime.summary import OutsideSummary
 from tests.nodes.report.folders import evaluated, frame, ply, recorded, summary, walk
 
 LIMITS = Thresholds(ate_rmse_m=1e-4, lost_seconds=100.0)
@@ -249,3 +251,26 @@ def test_hostile_names_are_shown_as_they_are(tmp_path: Path) -> None:
     assert not {"script", "b", "i", "u", "s", "h6", "marquee", "blink", "h5", "h4"} & set(page.tags)
     for text in (name, "<b>bold</b>", "<i>m</i>", "<marquee>", "</pre><h5>"):
         assert text in page.text
+
+
+def test_a_system_that_lost_frames_is_told_at_the_top_and_in_a_table(tmp_path: Path) -> None:
+    answers = Answers(latency=0.015)
+    for stamp in range(3):
+        answers.owed(stamp)
+        answers.took_in("images", bytes([stamp]))
+        answers.settled(stamp, stamp, "lost" if stamp == 1 else "answered", 0.004)
+    answers.why_not["frames were lost after 10 s of real time"] = None
+    truth = walk(2)
+    verdict = evaluated(tmp_path, truth, {"slam": recorded(truth)}, Thresholds(), truth)
+    summary(tmp_path, verdict)
+    written = msgspec.json.decode((tmp_path / "summary.json").read_bytes())
+    lost = {"passed": False, "failed": ["lost_frames: expected at most 0, found 1"]}
+    written["verdict"]["estimators"]["slam (answers)"] = lost
+    written["outside"] = {"slam": msgspec.to_builtins(OutsideSummary.of(answers))}
+    written["not_deterministic"] = ["slam"]
+    (tmp_path / "summary.json").write_bytes(msgspec.json.encode(written))
+    page = Page(write_report(tmp_path, formats=()))
+    assert "failed slam (answers) lost_frames: expected at most 0, found 1" in page.text
+    assert "slam 3 – 2 0 0 0 1 0 0 0 0 15 4" in page.text
+    assert "no: frames were lost after 10 s of real time" in page.text
+    assert f"digest of what slam was sent {answers.inputs()}" in page.text
