@@ -1,0 +1,114 @@
+"""The example's estimator as a process of its own: judged to the same digest, and killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.nodes.ros2_bridge.network import free_port
+
+pytest.importorskip("zenoh_ros2_sdk")
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+
+ROOT = Path(__file__).parents[3]
+SMALL = ("camera.width=160", "camera.height=120", "report.figures=[]")
+
+
+@contextmanager
+def started(*command: str, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, *command],
+        cwd=ROOT,
+        env=os.environ | environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+@contextmanager
+def judged(
+    folder: Path, *changes: str, hold: str = "{}"
+) -> Iterator[tuple[subprocess.Popen[str], subprocess.Popen[str]]]:
+    """Start the example's run and its estimator, which is not the run's to start here."""
+    text = (ROOT / "examples" / "outside_ros2.toml").read_text()
+    before, _, after = text.partition('[[nodes]]\nname = "estimator"')
+    text = before + "[[nodes]]" + after.partition("[[nodes]]")[2]
+    text = text.replace('latency = "15ms"', f'latency = "15ms"\nhold = {hold}')
+    folder.mkdir()
+    (folder / "run.toml").write_text(text)
+    endpoint = json.dumps([f"tcp/127.0.0.1:{free_port()}"])
+    settings = [word for each in (*SMALL, *changes) for word in ("--set", each)]
+    run = ["-m", "runtime", "run", str(folder / "run.toml"), "--out", str(folder / "out")]
+    override = f"connect/endpoints={endpoint}"
+    with (
+        started(*run, "--set", f"ros2.listen={endpoint}", *settings) as running,
+        started("examples/outside_ros2.py", ZENOH_CONFIG_OVERRIDE=override) as estimator,
+    ):
+        yield running, estimator
+
+
+def summary(folder: Path) -> Any:
+    return json.loads((folder / "out" / "summary.json").read_text())
+
+
+def fly(folder: Path) -> Any:
+    with judged(folder, "run.duration=5s") as (run, _):
+        output, _ = run.communicate(timeout=180)
+    assert run.returncode in {0, 1}, output  # it is not about how good it is
+    return summary(folder)
+
+
+def test_it_is_judged_to_the_same_digest_also_with_both_cores_busy(tmp_path: Path) -> None:
+    quiet = fly(tmp_path / "quiet")
+    with started("-c", "while True: pass"), started("-c", "while True: pass"):
+        busy = fly(tmp_path / "busy")
+    found = quiet["outside"]["slam"]
+    assert found["answered"] + found["empty"] == found["sent"] > 100
+    assert found["answered"] > 100
+    assert found["reproducible"]
+    assert found["inputs"] == busy["outside"]["slam"]["inputs"]
+    assert quiet["digest"] == busy["digest"]
+
+
+@pytest.mark.parametrize(("policy", "code"), [("error", 2), ("lost", 1), ("continue", 1)])
+def test_killing_it_has_the_policy_s_result_within_a_second(
+    policy: str, code: int, tmp_path: Path
+) -> None:
+    hold = f'{{ on_missing = "{policy}", max_wait = "100s" }}'
+    with judged(tmp_path / "run", "run.duration=12s", "run.speed=1.0", hold=hold) as (
+        run,
+        estimator,
+    ):
+        assert run.stdout is not None
+        for line in run.stdout:
+            if " frames" in line and " 0 frames" not in line:  # it is under way
+                break
+        estimator.kill()
+        begin = time.monotonic()
+        told = next(line for line in run.stdout if "nobody publishes" in line)
+        taken = time.monotonic() - begin
+        rest = run.stdout.read()
+        assert run.wait(60) == code, rest
+    assert taken < 1.0, told
+    if policy != "error":
+        found = summary(tmp_path / "run")["outside"]["slam"]
+        assert found["lost"] > 0
+        assert found["answered"] > 0
