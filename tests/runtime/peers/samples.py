@@ -18,6 +18,7 @@ from runtime import Input, Node, NodeConfig, Output, RefusedError, Tick, every, 
 from runtime.config.model import Config
 from runtime.config.reading import parse
 from runtime.execute import execute
+from runtime.hold import Hold, HoldConfig
 from runtime.summary import Summary
 from runtime.supervisor import Supervisor
 
@@ -113,6 +114,26 @@ class Answerer(Node[AnswererConfig]):
                     count=question.count,
                     heard=(*self.offers, *seen),
                 )
+            )
+
+
+class Outside(Answerer):
+    """Has its answers from a system outside, for which time is held."""
+
+    async def on_startup(self) -> None:
+        self.outside: Hold[int] = self.hold(self.name, HoldConfig(), self.config.takes)
+
+    async def run(self) -> None:
+        async for question in self.questions:
+            seen = tuple(self.heard)
+            self.heard.clear()
+            owed = self.outside.owe(question.stamp)
+            call = (question.stamp, question.count)
+            threading.Timer(0.001 * (question.count % 3), self.outside.answer, call).start()
+            count = await owed
+            assert count is not None
+            self.answers.send(
+                Answered(stamp=question.stamp, source=self.name, count=count, heard=seen)
             )
 
 

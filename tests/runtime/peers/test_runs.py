@@ -45,6 +45,17 @@ def test_in_lockstep_the_digest_is_that_of_one_process(onlys: tuple[str, ...]) -
         ]
 
 
+def test_time_is_held_in_all_processes_for_a_system_outside_of_one() -> None:
+    config = settings(
+        ("asker", "Asker", {}), ("one", "Answerer", {}), ("slam", "Outside", {"takes": 0.03})
+    )
+    alone = execute(config)
+    for summary in apart(config, "asker,one", "slam"):
+        assert summary.digests == alone.digests
+        assert summary.outside["slam"].answered == alone.outside["slam"].answered > 0
+        assert summary.outside["slam"].reproducible
+
+
 def test_in_real_time_everything_crosses_too() -> None:
     config = settings(*THREE, clock="real", duration=0.6)
     one, other = apart(config, "asker", "one,other")
