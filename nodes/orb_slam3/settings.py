@@ -2,17 +2,20 @@
 
 They are in the older of the two forms that ORB-SLAM3 1.0 reads (the parsers of its
 ``Tracking.cc``): only this one has a parameter with which RGB-D with an IMU initializes without a
-quick motion. Every required parameter is given, since it ends the process if one is missing.
+quick motion. Every required parameter is given, since it ends the process if one is missing;
+the file is the template ``settings.yaml.jinja``.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
 
 from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
 from events.poses import pose_matrix
+from nodes.dataset.recording import templates
 
 Mode = Literal["rgbd", "monocular", "rgbd_inertial", "monocular_inertial"]
 
@@ -87,38 +90,21 @@ def make_settings(
         )
     if unknown := unknown_lens(mode, info):
         raise ValueError(f"{camera.source}: {unknown}")
-    fisheye = info.distortion_model == "equidistant"
-    lines = [
-        "%YAML:1.0",
-        f'Camera.type: "{"KannalaBrandt8" if fisheye else "PinHole"}"',
-        f"Camera.fx: {_real(info.fx)}",
-        f"Camera.fy: {_real(info.fy)}",
-        f"Camera.cx: {_real(info.cx)}",
-        f"Camera.cy: {_real(info.cy)}",
-        *_distortion(info),
-        f"Camera.width: {info.width}",
-        f"Camera.height: {info.height}",
-        f"Camera.fps: {_real(camera.rate)}",
-        "Camera.RGB: 1",
-        f"ORBextractor.nFeatures: {orb.features}",
-        f"ORBextractor.scaleFactor: {_real(orb.scale_factor)}",
-        f"ORBextractor.nLevels: {orb.levels}",
-        f"ORBextractor.iniThFAST: {orb.fast_threshold}",
-        f"ORBextractor.minThFAST: {min(orb.min_fast_threshold, orb.fast_threshold)}",
-        f"loopClosing: {int(orb.loop_closing)}",
-        *_VIEWER,
-    ]
-    if "rgbd" in mode:
-        lines += [
-            f"Camera.bf: {_real(orb.baseline * info.fx)}",
-            f"ThDepth: {_real(orb.close_depth / orb.baseline)}",  # counted in baselines
-            "DepthMapFactor: 1.0",  # our depth is in metres
-        ]
     if "inertial" in mode:
-        lines += _inertial(mode, camera, imu)
+        _check_mounting(mode, camera, imu)
+    environment = templates(Path(__file__).parent)
+    environment.filters["real"] = _real
+    text = environment.get_template("settings.yaml.jinja").render(
+        mode=mode,
+        camera=camera,
+        lens=_distortion(info),
+        imu=imu,
+        pose=pose_matrix(camera.position, camera.orientation).ravel().tolist(),
+        orb=orb,
+    )
     return Settings(
         mode=mode,
-        text="\n".join(lines) + "\n",
+        text=text,
         width=info.width,
         height=info.height,
         intrinsics=(info.fx, info.fy, info.cx, info.cy),
@@ -138,18 +124,17 @@ def unknown_lens(mode: Mode, info: CameraInfo) -> str:
     return ""
 
 
-def _distortion(info: CameraInfo) -> list[str]:
+def _distortion(info: CameraInfo) -> dict[str, float]:
+    """Return a lens's coefficients by ORB-SLAM3's names."""
     if info.distortion_model == "equidistant":
-        values = dict(zip(("k1", "k2", "k3", "k4"), info.distortion, strict=True))
-    else:
-        k1, k2, p1, p2, k3 = info.distortion[:5]
-        if any(info.distortion):
-            k1 = k1 or 1e-12  # at 0, ORB-SLAM3 takes it that there is no distortion at all
-        values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
-    return [f"Camera.{name}: {_real(value)}" for name, value in values.items()]
+        return dict(zip(("k1", "k2", "k3", "k4"), info.distortion, strict=True))
+    k1, k2, p1, p2, k3 = info.distortion[:5]
+    if any(info.distortion):
+        k1 = k1 or 1e-12  # at 0, ORB-SLAM3 takes it that there is no distortion at all
+    return {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
 
 
-def _inertial(mode: Mode, camera: CameraAnnouncement, imu: ImuAnnouncement | None) -> list[str]:
+def _check_mounting(mode: Mode, camera: CameraAnnouncement, imu: ImuAnnouncement | None) -> None:
     if imu is None:
         raise ValueError(f"mode {mode!r}: expected an IMU beside {camera.source}, found none")
     if imu.frame_id != camera.parent_frame_id:
@@ -157,21 +142,6 @@ def _inertial(mode: Mode, camera: CameraAnnouncement, imu: ImuAnnouncement | Non
             f"mode {mode!r}: expected an IMU in {camera.parent_frame_id}, on which "
             f"{camera.source} is mounted, found {imu.source} in {imu.frame_id}"
         )
-    pose = pose_matrix(camera.position, camera.orientation)
-    return [
-        # A noise of 0 would make its covariances singular.
-        f"IMU.NoiseGyro: {_real(max(imu.gyroscope_noise_density, 1e-5))}",
-        f"IMU.NoiseAcc: {_real(max(imu.accelerometer_noise_density, 1e-4))}",
-        f"IMU.GyroWalk: {_real(max(imu.gyroscope_random_walk, 1e-7))}",
-        f"IMU.AccWalk: {_real(max(imu.accelerometer_random_walk, 1e-6))}",
-        f"IMU.Frequency: {max(round(imu.rate), 1)}",
-        "IMU.fastInit: 1",  # or it would wait until the vehicle is shaken
-        "Tbc: !!opencv-matrix",
-        "   rows: 4",
-        "   cols: 4",
-        "   dt: f",
-        f"   data: [{', '.join(_real(value) for value in pose.ravel().tolist())}]",
-    ]
 
 
 def _real(value: float) -> str:
@@ -179,18 +149,3 @@ def _real(value: float) -> str:
     text = f"{value:.9g}"
     mantissa, e, exponent = text.partition("e")
     return text if "." in mantissa else f"{mantissa}.0{e}{exponent}"
-
-
-_VIEWER = (
-    "Viewer.KeyFrameSize: 0.05",
-    "Viewer.KeyFrameLineWidth: 1.0",
-    "Viewer.GraphLineWidth: 0.9",
-    "Viewer.PointSize: 2.0",
-    "Viewer.CameraSize: 0.08",
-    "Viewer.CameraLineWidth: 3.0",
-    "Viewer.ViewpointX: 0.0",
-    "Viewer.ViewpointY: -0.7",
-    "Viewer.ViewpointZ: -1.8",
-    "Viewer.ViewpointF: 500.0",
-)
-"""Required, although the viewer stays off."""
