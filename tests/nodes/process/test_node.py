@@ -97,12 +97,11 @@ GOES_WRONG: dict[str, tuple[list[str], dict[str, Any], str]] = {
         {},
         r"POSE\.pose: expected finite numbers, found nan; .*python.* (still runs|ended)",
     ),
-    "future": (["future"], {}, r"stamp: expected \d+, found 1\d{9}; .*python.* (still runs|ended)"),
+    "future": (["future"], {}, r"stamp: expected .*, found 1\d{9}; .*python.* (still runs|ended)"),
     "does not connect": (
         [],
         {"timeout": 1.0, "command": ["sh", "-c", "echo loading; sleep 600"]},
-        r"link\.socket: expected a program within 1 s, found none; sh still runs; its last output:"
-        r"\nloading",
+        r"link\.socket: expected a program.* none.*; sh still runs; its last output:\nloading",
     ),
     "ends at once": (
         ["early"],
