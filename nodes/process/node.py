@@ -283,11 +283,16 @@ class Process(Estimator[ProcessConfig]):
             self._hold.gone("; ".join(filter(None, [self._feed.why_gone, story])))
             if not self._connected:
                 self._feed.close()
-        elif self.config.hold.on_missing == "error":
+        elif self._ends_the_run():
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._end.set_result, story)
         else:
             self.log.warning("%s", story)
+
+    def _ends_the_run(self) -> bool:
+        """Tell whether the bridge that feeds a program cannot do without its answers."""
+        held = [each.hold for each in getattr(self._bridge, "subscriptions", ()) if each.answers_to]
+        return not held or any(hold.on_missing == "error" for hold in held)
 
     def _story(self, why: str) -> str:
         """Return why a program is not connected, and what else is known of it."""

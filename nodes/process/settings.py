@@ -51,7 +51,7 @@ class ProcessConfig(EstimatorConfig):
         method: Name of the method, for the report; if empty, that of the program.
         scale_free: Whether the unit of its poses is its own, as that of a single camera is.
         hold: How long simulated time waits for its answers, and what if none comes. Of a program
-            that ROS 2 feeds, only whether its end is an error.
+            that ROS 2 feeds, that stands at the subscriptions of the bridge.
         files: What is written before it starts.
         timeout: Real seconds within which it must have connected.
         grace: Real seconds that it gets to end after the last frame, and again after SIGTERM.

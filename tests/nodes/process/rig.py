@@ -177,10 +177,13 @@ def fly(
     duration: float = 0.5,
     clock: Any = "lockstep",
     handlers: list[logging.Handler] | None = None,
+    others: tuple[NodeSpec, ...] = (),
     **eyes: Any,
 ) -> Summary:
     """Run the rig and a node for a while."""
     settings = RunConfig(duration=Duration(duration), seed=3, clock=clock)
     return execute(
-        Config(run=settings, nodes=(spec(Eyes, "drone", eyes), node)), out, handlers=handlers
+        Config(run=settings, nodes=(spec(Eyes, "drone", eyes), *others, node)),
+        out,
+        handlers=handlers,
     )

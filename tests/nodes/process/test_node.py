@@ -14,11 +14,13 @@ from typing import Any
 
 import pytest
 
+from nodes.ros2_bridge import Ros2Bridge
 from runtime.errors import ConfigError, VisnavError
 from runtime.summary import Summary
 from runtime.testing import spec
 from tests.nodes.process.rig import ROOT, STUB, AsWorker, fly, program
 from tests.nodes.process.test_program import alive, gone_soon
+from tests.runtime.peers.samples import free_port
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -317,3 +319,34 @@ def test_one_that_is_started_by_hand_may_go_and_come_back(tmp_path: Path) -> Non
     assert outside.answered > 10
     assert outside.lost > 0
     assert not any(alive(pid) for pid in pids)
+
+
+def test_one_that_a_bridge_feeds_is_told_where_and_its_end_is_the_bridges_to_judge(
+    tmp_path: Path,
+) -> None:
+    port = free_port()
+    words = ["sh", "-c", "env | grep -E 'ROS_|RMW|ZENOH'; exit 4"]
+    held = {
+        "topic": "/slam/pose",
+        "type": "geometry_msgs/msg/PoseStamped",
+        "as": "estimate",
+        "source": "slam",
+        "answers_to": "drone/camera",
+        "latency": 0.015,
+        "timeout": 0.5,
+        "hold": {"on_missing": "lost"},
+    }
+    settings: dict[str, Any] = {"connect": [], "listen": [f"tcp/127.0.0.1:{port}"], "domain_id": 7}
+    bridge = spec(Ros2Bridge, "ros2", settings)
+    with pytest.raises(VisnavError, match="slam: sh ended with exit code 4; its last output:") as e:
+        fly(program(feed="ros2", command=words), tmp_path, 60.0, others=(bridge,), clock="real")
+    for expected in (
+        "ROS_DOMAIN_ID=7",
+        "RMW_IMPLEMENTATION=rmw_zenoh_cpp",
+        f'ZENOH_CONFIG_OVERRIDE=connect/endpoints=["tcp/127.0.0.1:{port}"]',
+    ):
+        assert expected in str(e.value)
+    bridge = spec(Ros2Bridge, "ros2", settings | {"subscriptions": [held]})
+    with pytest.raises(VisnavError, match="ros2: "):  # that nobody publishes poses
+        fly(program(feed="ros2", command=words), tmp_path, 60.0, others=(bridge,))
+    assert "sh ended with exit code 4" in (tmp_path / "log.txt").read_text()
