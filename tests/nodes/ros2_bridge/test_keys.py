@@ -52,6 +52,24 @@ def test_the_tokens_of_endpoints_are_those_of_the_design_document() -> None:
     )
 
 
+@pytest.mark.parametrize("kind", [*get_args(Kind)])
+def test_the_tokens_of_a_client_that_nobody_here_wrote_are_ours(kind: Kind) -> None:
+    entity = pytest.importorskip("zenoh_ros2_sdk.entity")
+    keys = pytest.importorskip("zenoh_ros2_sdk.keyexpr")
+    theirs = entity.NodeEntity(3, TALKER, 0, "talker", "/fleet")
+    node, topic = NodeName(name="talker", namespace="/fleet", domain_id=3), chatter()
+    if kind == "NN":
+        key = keys.node_liveliness_keyexpr(theirs)
+        assert key == node_token(node, TALKER, 0)
+    else:
+        of = (topic.name, dds_type(topic.type), topic.hash, topic.qos.text())
+        endpoint = entity.EndpointEntity(theirs, 7, entity.EntityKind(kind), *of)
+        key = keys.endpoint_liveliness_keyexpr(endpoint)
+        assert key == endpoint_token(node, TALKER, 0, 7, kind, topic)
+    name = "" if kind == "NN" else topic.name
+    assert parse_token(key) == Token(key=key, kind=kind, node=node, zid=TALKER, topic=name)
+
+
 def test_slashes_within_a_component_become_percent_signs() -> None:
     node = NodeName(name="eye", namespace="/fleet/one", domain_id=7)
     topic = Topic(name="/fleet/one/image", type="a/msg/B", hash="h")
