@@ -233,8 +233,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             if not incoming.subscription.answers_to and incoming.subscription.use != "camera":
                 await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).take)
         if self.config.services:
-            self._services = Services(self, session, self._store, self._complaints, self._send)
-            await self.offload(self._services.declare, self._vehicles)
+            self._services = Services(self._send, self, session, self._store, self._complaints)
+            await self.offload(self._services.offer, self._vehicles)
         if self._line is not None:
             await self._line.begin()
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import functools
 import threading
 import time
 from collections.abc import Awaitable, Callable
@@ -25,6 +26,8 @@ from runtime.errors import VisnavError
 Serve = Callable[[Any], Awaitable[dict[str, Any]]]
 """Given a request, returns the fields of the response; a `VisnavError` becomes an error reply."""
 
+Finish = Callable[[bytearray | str], None]
+
 WAITING = 64
 """Requests that wait to be answered, at most."""
 
@@ -37,10 +40,6 @@ class ServiceServer:
         session: Where requests come from.
         store: Of the types.
         complaints: Notes what is wrong.
-
-    Attributes:
-        answered: How many requests got a response.
-        closed: Whether requests are taken no more.
     """
 
     def __init__(
@@ -50,49 +49,39 @@ class ServiceServer:
         store: TypeStore,
         complaints: Complaints,
     ) -> None:
-        self.answered = 0
-        self.closed = False
-        self._node = node
+        self.node = node
+        self.store = store
         self._session = session
-        self._store = store
         self._complaints = complaints
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
-        self._waiting = 0
-        # Not `Node.offload`: while time stands, what is awaited of it does not come.
+        self._waiting = self._answered = 0
+        self._closed = False
+        # Not `Node.offload`: simulated time need not wait for whoever asked.
         self._out = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="answers")
 
-    def make(self, type_: str, **fields: Any) -> Any:
-        """Return a message, for a field of a response."""
-        return self._store.message(type_)(**fields)
-
     def declare(self, name: str, type_: str, serve: Serve) -> None:
-        """Declare a service; called in any thread.
+        """Declare a service, relative to the namespace; called in any thread.
 
-        Args:
-            name: Relative to the namespace, or with a leading slash.
-            type_: ``std_srvs/srv/Trigger``.
-            serve: Answers; called on the loop as a task of the node.
+        Requests are answered by `serve` on the loop, as a task of the node.
         """
         for part in ("_Request", "_Response"):  # the first of each takes milliseconds
-            written = self._store.serialize(self._store.zero(type_ + part))
-            self._store.deserialize(bytes(written), type_ + part)
-        full = topic_name(self._node.config.namespace, name)
+            written = self.store.serialize(self.store.zero(type_ + part))
+            self.store.deserialize(bytes(written), type_ + part)
+        name = topic_name(self.node.config.namespace, name)
+        service = Topic(name=name, type=type_, hash=self.store.hash(type_))
+        self._session.serve(service, functools.partial(self._take, service, serve))
 
-        def take(message: Message, answer: Answer) -> None:
-            self._take(full, type_, serve, message, answer)
+    async def close(self) -> None:
+        """Take no more requests, and wait until all answers are sent."""
+        self._closed = True
+        await self.node.offload(self._out.shutdown)
+        self.node.log.info("%d requests answered", self._answered)
 
-        service = Topic(name=full, type=type_, hash=self._store.hash(type_))
-        self._session.serve(service, take)
-
-    def close(self) -> None:
-        """Wait until all answers are sent; called in a thread, once requests are taken no more."""
-        self._out.shutdown()
-
-    def _take(self, name: str, type_: str, serve: Serve, message: Message, answer: Answer) -> None:
+    def _take(self, service: Topic, serve: Serve, message: Message, answer: Answer) -> None:
         """Read a request, in a thread of Zenoh's, and hand it to the loop."""
         wrong, request, attachment = "", None, message.attachment
-        most = self._node.config.max_message_size
+        most = self.node.config.max_message_size
         with self._lock:
             self._waiting += 1
             waiting = self._waiting
@@ -104,48 +93,38 @@ class ServiceServer:
             wrong = f"expected {most} bytes or less, found {message.size}"
         else:
             try:
-                request = self._store.deserialize(message.read(), f"{type_}_Request")
+                request = self.store.deserialize(message.read(), f"{service.type}_Request")
             except MessageError as error:
-                wrong = f"expected a {type_}_Request: {error}"
+                wrong = f"expected a {service.type}_Request: {error}"
+        finish = functools.partial(self._finish, service.name, answer, attachment)
         if wrong:
-            self._done(name, answer, wrong)
+            finish(wrong)
             return
         with contextlib.suppress(RuntimeError):  # the loop has been closed
-            self._loop.call_soon_threadsafe(
-                self._begin, name, type_, serve, request, attachment, answer
-            )
+            self._loop.call_soon_threadsafe(self._begin, service.type, serve, request, finish)
 
-    def _begin(self, name: str, *request: Any) -> None:
-        if not self.closed:
-            self._node.start(self._answer(name, *request))
+    def _begin(self, *request: Any) -> None:
+        if not self._closed:
+            self.node.start(self._answer(*request))
 
-    async def _answer(
-        self,
-        name: str,
-        type_: str,
-        serve: Serve,
-        request: Any,
-        attachment: Attachment,
-        answer: Answer,
-    ) -> None:
+    async def _answer(self, type_: str, serve: Serve, request: Any, finish: Finish) -> None:
         reply: bytearray | str = "the run has ended"
         try:
-            response = self._store.message(f"{type_}_Response")(**await serve(request))
-            reply = self._store.serialize(response)
-            self.answered += 1
-        except VisnavError as error:
-            reply = str(error)
+            response = self.store.message(f"{type_}_Response")(**await serve(request))
+            reply = self.store.serialize(response)
+            self._answered += 1
         except Exception as error:  # what comes from outside must not end the run
-            reply = f"{type(error).__name__}: {error}"
+            reply = str(error) if isinstance(error, VisnavError) else repr(error)
         finally:  # cancelled, too: whoever asked must not wait for ever
-            self._done(name, answer, reply, pack(attachment._replace(stamp=time.time_ns())))
+            finish(reply)
 
-    def _done(
-        self, name: str, answer: Answer, reply: bytearray | str, attachment: bytes = b""
+    def _finish(
+        self, name: str, answer: Answer, request: Attachment | None, reply: bytearray | str
     ) -> None:
         if isinstance(reply, str):
             self._complaints.add(name, "request refused", reply)
         with self._lock:
             self._waiting -= 1
+        attachment = b"" if request is None else pack(request._replace(stamp=time.time_ns()))
         with contextlib.suppress(RuntimeError):  # closed, and with it soon the session
             self._out.submit(answer, reply, attachment)

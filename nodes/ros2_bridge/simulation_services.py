@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 
 from nodes.ros2_bridge.service_server import ServiceServer
-from nodes.ros2_bridge.settings import Ros2BridgeConfig
 from nodes.ros_messages.services import SIMULATION
-from runtime import Node
 from runtime.schedule import SECOND
 
 # Of SimulatorFeatures.msg.
@@ -32,19 +30,12 @@ LONGEST = 86_400 * SECOND
 
 
 class SimulationServices:
-    """Lets ROS see and set whether simulated time runs, and step it.
+    """Lets ROS see and set whether simulated time runs, and step it."""
 
-    Args:
-        server: Answers requests.
-        node: The bridge.
-    """
-
-    def __init__(self, server: ServiceServer, node: Node[Ros2BridgeConfig]) -> None:
-        self._make = server.make
-        self._stepping = node.stepping
-        self._stop = node.stop
-        self._step = round(node.config.step * SECOND)
-        self._declare = server.declare
+    def __init__(self, server: ServiceServer) -> None:
+        self._server = server
+        self._stepping = server.node.stepping
+        self._step = round(server.node.config.step * SECOND)
 
     def declare(self) -> None:
         """Declare the services; called in any thread."""
@@ -55,7 +46,7 @@ class SimulationServices:
             ("step_simulation", "StepSimulation", self._steps),
             ("reset_simulation", "ResetSimulation", self._reset),
         ):
-            self._declare(name, f"{SIMULATION}/{kind}", serve)
+            self._server.declare(name, f"{SIMULATION}/{kind}", serve)
 
     async def _features(self, _: Any) -> dict[str, Any]:
         found = [STATE_GETTING, STATE_SETTING]
@@ -63,23 +54,19 @@ class SimulationServices:
         if not why:
             found += [STATE_PAUSE, STEP_SINGLE, STEP_MULTIPLE]
         info = why or f"a step is {self._step / SECOND:g} s of simulated time"
-        return {
-            "features": self._make(
-                "simulation_interfaces/msg/SimulatorFeatures",
-                features=np.array(found, np.uint16),
-                spawn_formats=[],
-                custom_info=info,
-            )
-        }
+        features = np.array(found, np.uint16)
+        kind = "SimulatorFeatures"
+        made = self._make(kind, features=features, spawn_formats=[], custom_info=info)
+        return {"features": made}
 
     async def _state(self, _: Any) -> dict[str, Any]:
-        state = self._make("simulation_interfaces/msg/SimulationState", state=self._now())
+        state = self._make("SimulationState", state=self._now())
         return {"state": state, **self._result(OK)}
 
     async def _set_state(self, request: Any) -> dict[str, Any]:
         wanted = request.state.state
         if wanted in {STOPPED, QUITTING}:
-            self._stop("ended by ROS")
+            self._server.node.stop("ended by ROS")
             return self._result(OK)
         if wanted not in {PLAYING, PAUSED}:
             return self._result(INCORRECT_TRANSITION, f"expected a state of 0 to 3, found {wanted}")
@@ -115,6 +102,8 @@ class SimulationServices:
     def _now(self) -> int:
         return PAUSED if self._stepping.state == "paused" else PLAYING
 
+    def _make(self, kind: str, **fields: Any) -> Any:
+        return self._server.store.message(f"simulation_interfaces/msg/{kind}")(**fields)
+
     def _result(self, result: int, message: str = "") -> dict[str, Any]:
-        type_ = "simulation_interfaces/msg/Result"
-        return {"result": self._make(type_, result=result, error_message=message)}
+        return {"result": self._make("Result", result=result, error_message=message)}

@@ -6,32 +6,17 @@ import asyncio
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from events import (
-    Arm,
-    Armed,
-    Command,
-    Disarm,
-    Disarmed,
-    Land,
-    Landed,
-    TakenOff,
-    Takeoff,
-    VehicleEvent,
-)
+import events
+from events import Command, VehicleEvent
 from nodes.ros2_bridge.service_server import ServiceServer
 from nodes.ros_messages.services import TRIGGER
 from nodes.ros_messages.topics import ros_name
-from runtime import Node
 
 
 class _Order(NamedTuple):
-    """What a service sends, and when that is done.
+    """What is sent, what the vehicle says when it is done, and within how many seconds.
 
-    Attributes:
-        command: What it sends.
-        done: What the vehicle then says.
-        limit: Seconds within which.
-        superfluous: Of a vehicle that is armed (true) or not (false) there is nothing to be done.
+    It is superfluous if the vehicle is armed (true), or if it is not (false).
     """
 
     command: type[Command]
@@ -41,30 +26,19 @@ class _Order(NamedTuple):
 
 
 _ORDERS = {
-    "arm": _Order(Arm, Armed, 1.0, superfluous=True),
-    "disarm": _Order(Disarm, Disarmed, 1.0, superfluous=False),
-    "take_off": _Order(Takeoff, TakenOff, 60.0),
-    "land": _Order(Land, Landed, 300.0, superfluous=False),
+    "arm": _Order(events.Arm, events.Armed, 1.0, superfluous=True),
+    "disarm": _Order(events.Disarm, events.Disarmed, 1.0, superfluous=False),
+    "take_off": _Order(events.Takeoff, events.TakenOff, 60.0),
+    "land": _Order(events.Land, events.Landed, 300.0, superfluous=False),
 }
 
 
 class VehicleServices:
-    """Sends commands to vehicles, and waits until they are carried out.
+    """Sends commands to vehicles, and waits until they are carried out."""
 
-    Args:
-        server: Answers requests.
-        node: The bridge.
-        send: Sends a command.
-    """
-
-    def __init__(
-        self,
-        server: ServiceServer,
-        node: Node[Any],
-        send: Callable[[Command], None],
-    ) -> None:
-        self._declare = server.declare
-        self._node = node
+    def __init__(self, server: ServiceServer, send: Callable[[Command], None]) -> None:
+        self._server = server
+        self._node = server.node
         self._send = send
         self._armed: dict[str, bool] = {}
         """Of vehicles of which it is known."""
@@ -80,12 +54,12 @@ class VehicleServices:
                 success, message = await self._give(vehicle, order)
                 return {"success": success, "message": message}
 
-            self._declare(f"{ros_name(vehicle)}/{name}", TRIGGER, serve)
+            self._server.declare(f"{ros_name(vehicle)}/{name}", TRIGGER, serve)
 
     def told(self, event: VehicleEvent) -> None:
         """Note what a vehicle says has happened."""
-        if isinstance(event, Armed | Disarmed):
-            self._armed[event.source] = isinstance(event, Armed)
+        if isinstance(event, events.Armed | events.Disarmed):
+            self._armed[event.source] = isinstance(event, events.Armed)
         for vehicle, done, waiter in self._waiting:
             if vehicle == event.source and isinstance(event, done) and not waiter.done():
                 waiter.set_result(None)

@@ -1,13 +1,12 @@
 """Definitions of services that rosbags does not come with, as in their packages' ``.srv`` files.
 
 Comments, constants and default values are left out: the hash of a type does not depend on them.
-Sources: std_srvs and rcl_interfaces of ROS 2 Jazzy, simulation_interfaces 2.1.0.
+Sources: std_srvs of ROS 2 Jazzy, simulation_interfaces 2.1.0.
 """
 
 from __future__ import annotations
 
 SIMULATION = "simulation_interfaces/srv"
-PARAMETERS = "rcl_interfaces/srv"
 TRIGGER = "std_srvs/srv/Trigger"
 
 DEFINITIONS = {
@@ -22,12 +21,5 @@ DEFINITIONS = {
     f"{SIMULATION}/SetSimulationState": "SimulationState state\n---\nResult result",
     f"{SIMULATION}/StepSimulation": "uint64 steps\n---\nResult result",
     f"{SIMULATION}/ResetSimulation": "uint8 scope\n---\nResult result",
-    f"{PARAMETERS}/ListParameters": (
-        "string[] prefixes\nuint64 depth\n---\nListParametersResult result"
-    ),
-    f"{PARAMETERS}/GetParameters": "string[] names\n---\nParameterValue[] values",
-    f"{PARAMETERS}/GetParameterTypes": "string[] names\n---\nuint8[] types",
-    f"{PARAMETERS}/DescribeParameters": "string[] names\n---\nParameterDescriptor[] descriptors",
-    f"{PARAMETERS}/SetParameters": "Parameter[] parameters\n---\nSetParametersResult[] results",
 }
 """By type; request and response of a service are divided by ``---``."""
