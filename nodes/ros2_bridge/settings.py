@@ -25,12 +25,12 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         topic: Relative to the namespace, or with a leading slash.
         type: ``geometry_msgs/msg/PoseStamped``.
         use: ``as`` in the file: what a message becomes. ``estimate`` (from PoseStamped,
-            PoseWithCovarianceStamped or Odometry), ``odometry`` (Odometry), ``velocity`` (Twist,
-            TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``, ``depth`` (Image),
-            ``imu`` (Imu), ``range`` (Range), ``pressure`` (FluidPressure), ``magnetic_field``
-            (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the run waits for the
-            first one, and a camera is announced), ``done`` (Header or Time: an estimator will
-            say no more about the image of this stamp).
+            PoseWithCovarianceStamped, Odometry or the end of a Path), ``odometry`` (Odometry),
+            ``velocity`` (Twist, TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``,
+            ``depth`` (Image), ``imu`` (Imu), ``range`` (Range), ``pressure`` (FluidPressure),
+            ``magnetic_field`` (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the
+            run waits for the first one, and a camera is announced), ``done`` (Header or Time: an
+            estimator will say no more about the image of this stamp).
         mapping: Instead: ``module:function``, which takes a message and a `MessageContext` and
             returns an event, or None.
         source: Of the events; if empty, the node's name and the topic.
