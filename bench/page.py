@@ -60,14 +60,7 @@ def _goals(results: Results) -> Iterator[tuple[Any, ...]]:
         (what, peer, n, ("small", "visnav", mode, n), ("small", peer, peer_mode, n), mark)
         for what, mode, peer, peer_mode, counts, mark in (
             ("small, handlers", "handler", "plain calls", "handler", nodes, "≤ 1.3"),
-            (
-                "small, streams",
-                "stream",
-                "asyncio.Queue (uvloop)",
-                "stream",
-                (2, 16, 128),
-                "≤ 0.33",
-            ),
+            ("small, streams", "stream", queue, "stream", (2, 16, 128), "≤ 0.33"),
             ("small, handlers", "handler", ros, "handler", (2,), "≤ 0.05"),
             ("small, handlers", "handler", ros, "handler", (128,), "≤ 0.2"),
             ("small, handlers", "handler", "roscpp, one process", "handler", (2, 128), "as it is"),
