@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
 
 import msgspec
 
@@ -23,34 +22,8 @@ from events import (
 from nodes.ros_messages.settings import PublishingConfig, TopicGroup
 from nodes.ros_messages.topics import Qos, ros_name, topic_name
 
-TopicKind = Literal[
-    "image",
-    "mono",
-    "info",
-    "compressed",
-    "depth",
-    "depth_info",
-    "compressed_depth",
-    "segmentation",
-    "cloud",
-    "imu",
-    "odometry",
-    "pose",
-    "estimate",
-    "score",
-    "range",
-    "pressure",
-    "magnetic",
-    "fix",
-    "fix_velocity",
-    "lidar",
-    "wind",
-    "body_pose",
-    "path",
-    "tf",
-    "tf_static",
-    "clock",
-]
+TopicKind = str
+"""A kind of topic: a key of `TOPICS`."""
 
 TOPICS: dict[TopicKind, tuple[str, str, TopicGroup]] = {
     "image": ("{}/image_raw", "sensor_msgs/msg/Image", "images"),

@@ -6,7 +6,7 @@ textures are drawn from a seed, and nothing repeats for long.
 
 from sims.worlds.dynamics import Dynamics, Motion, Scene
 from sims.worlds.loading import WORLDS, WorldError, load_scene, load_world
-from sims.worlds.tours import CLEARANCE, TOURS, tour_length
+from sims.worlds.tours import CLEARANCE, TOURS
 
 __all__ = [
     "CLEARANCE",
@@ -18,5 +18,4 @@ __all__ = [
     "WorldError",
     "load_scene",
     "load_world",
-    "tour_length",
 ]
