@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+from collections.abc import Iterator
 from typing import Any
 
-from events import CameraAnnouncement, Event
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    EstimatorAnnouncement,
+    Event,
+    PilotAnnouncement,
+)
 from nodes.ros2_bridge.attachment import Message
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.mappings import import_mapping
@@ -53,6 +60,17 @@ class IncomingTopic:
     def complain(self, kind: str, detail: str) -> None:
         """Count, and now and then log, something wrong with this topic."""
         self._complaints.add(self.topic.name, kind, detail)
+
+    def announce(self) -> Iterator[Announcement]:
+        """Announce the estimator or the pilot whose messages these are."""
+        given = self.subscription
+        if given.use in {"velocity", "position", "pose"}:
+            yield PilotAnnouncement(stamp=0, source=self.source, vehicle=given.vehicle)
+        if given.use == "estimate":
+            method, scale_free = f"ROS 2: {self.topic.name}", given.scale_free
+            yield EstimatorAnnouncement(
+                stamp=0, source=self.source, method=method, scale_free=scale_free
+            )
 
     def find_camera(
         self, session: Session, images: tuple[str, ...], max_size: int

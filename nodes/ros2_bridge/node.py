@@ -15,7 +15,6 @@ from events import (
     CameraAnnouncement,
     Command,
     DepthImage,
-    EstimatorAnnouncement,
     Event,
     FluidPressure,
     Image,
@@ -24,7 +23,6 @@ from events import (
     MagneticField,
     NavSatFix,
     Odometry,
-    PilotAnnouncement,
     PoseEstimate,
     Range,
     Setpoint,
@@ -99,10 +97,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         self._incoming: list[IncomingTopic] = []
         self._unread: list[Stream[bytes]] = []
         """Images from ROS that wait to be read."""
-        self._outgoing: list[tuple[OutgoingTopic, Stream[Event]]] = []
-        self._puts: list[Callable[[Any], None]] = []
-        """Of the outgoing topics, as are their publishers."""
-        self._mapped: list[Publisher] = []
+        self._outgoing: list[OutgoingTopic] = []
         self._cameras: list[CameraAnnouncement] = []
         self._vehicles: list[str] = []
         self._services: Services | None = None
@@ -145,10 +140,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                 for each in config.subscriptions
             ]
             self._outgoing = [
-                (
-                    OutgoingTopic(each, config, self._store, self._complaints),
-                    Stream(f"{self.name}.{each.topic}", each.depth, "drop_oldest", soon=True),
-                )
+                OutgoingTopic(each, config, self._store, self._complaints)
                 for each in config.publications
             ]
             if self.checking:
@@ -184,16 +176,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         """Announce the estimators, cameras and pilots that are in ROS."""
         yield from self._cameras
         for incoming in self._incoming:
-            if incoming.subscription.use in {"velocity", "position", "pose"}:
-                vehicle = incoming.subscription.vehicle
-                yield PilotAnnouncement(stamp=0, source=incoming.source, vehicle=vehicle)
-            if incoming.subscription.use == "estimate":
-                yield EstimatorAnnouncement(
-                    stamp=0,
-                    source=incoming.source,
-                    method=f"ROS 2: {incoming.topic.name}",
-                    scale_free=incoming.subscription.scale_free,
-                )
+            yield from incoming.announce()
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Declare the topics of what is announced."""
@@ -223,12 +206,10 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             self.log.warning("%s", text)
         for kind, events in self._queues.items():
             self.start(self._publish_all(events, publishing.large[kind]))
-        for outgoing, waiting in self._outgoing:
-            publisher = (self._line or session).publisher(outgoing.topic)
-            self._mapped.append(publisher)
-            put = functools.partial(outgoing.put, publisher, publishing.builder)
-            self._puts.append(put)
-            self.start(self._publish_all(waiting, put))
+        for outgoing in self._outgoing:
+            outgoing.publisher = (self._line or session).publisher(outgoing.topic)
+            put = functools.partial(outgoing.put, publishing.builder)
+            self.start(self._publish_all(outgoing.waiting, put))
         for incoming in self._incoming:
             if not incoming.subscription.answers_to and incoming.subscription.use != "camera":
                 await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).take)
@@ -246,7 +227,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             return
         if self._line is not None:
             await self._line.close()
-        sent = [each for each in publishing.publishers + self._mapped if each.sent]
+        mapped = [each.publisher for each in self._outgoing if each.publisher is not None]
+        sent = [each for each in publishing.publishers + mapped if each.sent]
         refused = sum(self._complaints.counts.values()) + sum(each.dropped for each in self._unread)
         self.log.info(
             "%d messages published on %d topics (%d images, %d others dropped); "
@@ -254,7 +236,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             sum(each.sent for each in sent),
             len(sent),
             sum(each.dropped for each in (*self._queues.values(), self._line) if each),
-            sum(waiting.dropped for _, waiting in self._outgoing),
+            sum(each.waiting.dropped for each in self._outgoing),
             sum(incoming.received for incoming in self._incoming),
             refused,
         )
@@ -289,12 +271,13 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     def publications(self, event: Event) -> None:
         """Publish, beside the loop, what a mapping of the user's own makes of an event."""
-        for number, (outgoing, waiting) in enumerate(self._outgoing):
+        for outgoing in self._outgoing:
             if outgoing.wants(event):
-                if self._line is None or not self._puts:  # `run` has not begun
-                    waiting.offer(event)
+                if self._line is None or self._publishing is None:
+                    outgoing.waiting.offer(event)
                 else:
-                    self._line.publish(self._puts[number], event)
+                    put = functools.partial(outgoing.put, self._publishing.builder)
+                    self._line.publish(put, event)
 
     @every(hz="clock_rate")
     def publish_clock(self, tick: Tick) -> None:  # noqa: ARG002

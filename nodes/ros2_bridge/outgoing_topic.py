@@ -6,11 +6,12 @@ from events import Event
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.incoming_topic import topic
 from nodes.ros2_bridge.mappings import event_type, import_mapping
+from nodes.ros2_bridge.publisher import Publisher
 from nodes.ros2_bridge.settings import OwnPublication, Ros2BridgeConfig
 from nodes.ros_messages.builder import MessageBuilder
-from nodes.ros_messages.publishing import Publisher
 from nodes.ros_messages.topics import topic_name
 from nodes.ros_messages.typestore import TypeStore
+from runtime import Stream
 
 
 class OutgoingTopic:
@@ -21,6 +22,10 @@ class OutgoingTopic:
         config: The bridge's settings.
         store: Of the types.
         complaints: Notes what is wrong.
+
+    Attributes:
+        waiting: Events that wait to be published.
+        publisher: Of the topic, once it is declared.
 
     Raises:
         ValueError: The type is not known, or the event or the mapping cannot be imported.
@@ -34,6 +39,8 @@ class OutgoingTopic:
         complaints: Complaints,
     ) -> None:
         self.publication = publication
+        self.waiting = Stream[Event](publication.topic, publication.depth, "drop_oldest", soon=True)
+        self.publisher: Publisher | None = None
         name = topic_name(config.namespace, publication.topic)
         self.topic = topic(store, name, publication.type, publication.qos)
         self._store = store
@@ -48,10 +55,10 @@ class OutgoingTopic:
             not source or event.source == source or event.source.startswith(f"{source}/")
         )
 
-    def put(self, publisher: Publisher, builder: MessageBuilder, event: Event) -> None:
+    def put(self, builder: MessageBuilder, event: Event) -> None:
         """Put the message of an event, if there is one."""
-        if (message := self.message(event, builder)) is not None:
-            publisher.put(message)
+        if self.publisher is not None and (message := self.message(event, builder)) is not None:
+            self.publisher.put(message)
 
     def message(self, event: Event, builder: MessageBuilder) -> bytearray | None:
         """Return the message of an event; `None` if there is none, or none can be made."""
