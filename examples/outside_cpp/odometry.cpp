@@ -6,19 +6,15 @@
 // I. Matthews, "Lucas-Kanade 20 years on", 2004). One thread: equal images give equal poses.
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <cstdio>
-#include <utility>
-#include <vector>
-
 #include "visnav_link.hpp"
 
 using Vector6 = std::array<double, 6>;
+
 // A rigid motion, 3 rows of 4.
 struct Motion {
     std::array<double, 12> m{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0};
-
     std::array<double, 3> operator()(double x, double y, double z) const {
         return {m[0] * x + m[1] * y + m[2] * z + m[3], m[4] * x + m[5] * y + m[6] * z + m[7],
                 m[8] * x + m[9] * y + m[10] * z + m[11]};
@@ -34,8 +30,8 @@ struct Motion {
         x0 /= length, x1 /= length, x2 /= length;
         const double shear = x0 * y0 + x1 * y1 + x2 * y2;
         y0 -= shear * x0, y1 -= shear * x1, y2 -= shear * x2;
-        const double other = std::hypot(y0, y1, y2);
-        y0 /= other, y1 /= other, y2 /= other;
+        const double height = std::hypot(y0, y1, y2);
+        y0 /= height, y1 /= height, y2 /= height;
         z0 = x1 * y2 - x2 * y1, z1 = x2 * y0 - x0 * y2, z2 = x0 * y1 - x1 * y0;
         return c;
     }
@@ -71,23 +67,18 @@ struct Pixel {
     Vector6 derivative;
 };
 
-// Reduce an image by a factor: means of grey levels, and of depths where they are of one surface.
-Level reduced(const Level& from, int factor) {
-    Level to{from.width / factor, from.height / factor, from.fx / factor, from.fy / factor,
-             (from.cx - (factor - 1) / 2.0) / factor, (from.cy - (factor - 1) / 2.0) / factor,
-             {}, {}};
+// Halve an image: means of grey levels, and of depths where they are of one surface.
+Level halved(const Level& from) {
+    Level to{from.width / 2, from.height / 2, from.fx / 2, from.fy / 2,
+             (from.cx - 0.5) / 2, (from.cy - 0.5) / 2, {}, {}};
     for (int v = 0; v < to.height; ++v)
         for (int u = 0; u < to.width; ++u) {
-            float grey = 0, depth = 0, least = INFINITY, most = 0, area = float(factor * factor);
-            for (int i = 0; i < factor * factor; ++i) {
-                const int at = (v * factor + i / factor) * from.width + u * factor + i % factor;
-                grey += from.grey[at];
-                depth += from.depth[at];
-                least = std::min(least, from.depth[at]);
-                most = std::max(most, from.depth[at]);
-            }
-            to.grey.push_back(grey / area);
-            to.depth.push_back(least > 0 && most < 1.05f * least ? depth / area : 0.0f);
+            const int at = 2 * v * from.width + 2 * u, below = at + from.width;
+            const float *g = from.grey.data(), *d = from.depth.data();
+            const auto [least, most] = std::minmax({d[at], d[at + 1], d[below], d[below + 1]});
+            const bool one = least > 0 && most < 1.05f * least;
+            to.grey.push_back((g[at] + g[at + 1] + g[below] + g[below + 1]) / 4);
+            to.depth.push_back(one ? (d[at] + d[at + 1] + d[below] + d[below + 1]) / 4 : 0);
         }
     return to;
 }
@@ -98,8 +89,8 @@ Level read(const visnav::Frame& frame, const visnav::Camera& camera) {
     for (int v = 0; v < found.height; ++v) {
         const auto* rgb = colours.row<std::uint8_t>(v);
         const auto* depth = depths.row<float>(v);
-        for (int u = 0; u < found.width; ++u) {
-            found.grey.push_back(0.25f * float(rgb[3 * u] + 2 * rgb[3 * u + 1] + rgb[3 * u + 2]));
+        for (int u = 0; u < found.width; ++u, rgb += 3) {
+            found.grey.push_back(0.25f * float(rgb[0] + 2 * rgb[1] + rgb[2]));
             found.depth.push_back(std::isfinite(depth[u]) ? depth[u] : 0.0f);
         }
     }
@@ -115,11 +106,11 @@ std::vector<Pixel> pixels(const Level& level) {
             const double z = level.depth[at], du = level.grey[at + 1] - level.grey[at - 1];
             const double dv = level.grey[at + level.width] - level.grey[at - level.width];
             if (z <= 0 || du * du + dv * dv < 36) continue;
-            const double gu = 0.5 * level.fx * du, gv = 0.5 * level.fy * dv;
-            const double x = (u - level.cx) / level.fx, y = (v - level.cy) / level.fy;
+            const double gu = 0.5 * level.fx * du, x = (u - level.cx) / level.fx;
+            const double gv = 0.5 * level.fy * dv, y = (v - level.cy) / level.fy;
             found.push_back({x * z, y * z, z, level.grey[at],
-                             {gu / z, gv / z, -(gu * x + gv * y) / z, -gu * x * y - gv * (1 + y * y),
-                              gu * (1 + x * x) + gv * x * y, gv * x - gu * y}});
+                             {gu / z, gv / z, -(gu * x + gv * y) / z,
+                              -gu * x * y - gv * (1 + y * y), gu * (1 + x * x) + gv * x * y, gv * x - gu * y}});
         }
     return found;
 }
@@ -148,7 +139,7 @@ double align(const std::vector<Pixel>& key, const Level& image, Motion& motion) 
     for (int iteration = 0; iteration < 10; ++iteration) {
         std::array<Vector6, 6> a{};
         Vector6 b{};
-        std::size_t fit = 0;
+        int fit = 0;
         for (const Pixel& pixel : key) {
             const auto [x, y, z] = motion(pixel.x, pixel.y, pixel.z);
             const double u = image.fx * x / z + image.cx, v = image.fy * y / z + image.cy;
@@ -169,8 +160,8 @@ double align(const std::vector<Pixel>& key, const Level& image, Motion& motion) 
                 for (int j = i; j < 6; ++j) a[i][j] += scaled * pixel.derivative[j];
             }
         }
-        share = double(fit) / double(std::max<std::size_t>(key.size(), 1));
         if (!solve(a, b)) return 0;
+        share = double(fit) / double(key.size());
         const Motion step = Motion::of(b);
         motion = motion * step.inverse();
         if (step.distance() < 1e-4 && step.angle() < 1e-4) break;
@@ -181,27 +172,24 @@ double align(const std::vector<Pixel>& key, const Level& image, Motion& motion) 
 int main() try {
     visnav::Link link("dense odometry");
     const visnav::Camera camera = link.camera(0);
-    for (const double each : camera.distortion)
-        if (each != 0) throw visnav::Error("expected images without distortion");
+    if (camera.distortion != std::vector<double>(5)) throw visnav::Error("expected no distortion");
     link.ready();
     std::vector<std::vector<Pixel>> key;  // from coarse to fine
     Motion key_pose, motion, velocity;    // the motion is from the key frame to the image
     while (const auto frame = link.next()) {
-        const Level half = reduced(read(*frame, camera), 2), fine = reduced(half, 2);
-        const std::vector<Level> levels{reduced(fine, 2), fine, half};
+        const Level half = halved(read(*frame, camera)), quarter = halved(half);
+        const std::vector<Level> levels{halved(quarter), quarter, half};
         const Motion before = motion;
         motion = velocity * motion;
-        double share = key.empty() ? 0 : 1;
+        double share = 0;
         for (std::size_t n = 0; n < key.size(); ++n) share = align(key[n], levels[n], motion);
         const bool lost = !key.empty() && share < 0.25;
         if (lost) motion = before;
-        velocity = lost ? Motion{} : motion * before.inverse();
+        velocity = motion * before.inverse();
         const Motion pose = key_pose * motion.inverse();
-        if (lost) link.lost(*frame);
-        else link.pose(*frame, {pose.m});
+        lost ? link.lost(*frame) : link.pose(*frame, {pose.m});
         if (share < 0.7 || motion.distance() > 0.3 || motion.angle() > 0.15) {
-            key.clear();
-            for (const Level& level : levels) key.push_back(pixels(level));
+            key = {pixels(levels[0]), pixels(levels[1]), pixels(levels[2])};
             key_pose = pose;
             motion = {};
         }

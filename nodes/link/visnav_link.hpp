@@ -57,7 +57,6 @@ struct Image {
     int height, width;
     std::size_t stride;                 // bytes from row to row
     const std::uint8_t* data;
-
     template <class T> const T* row(int v) const {
         return reinterpret_cast<const T*>(data + stride * static_cast<std::size_t>(v));
     }
@@ -69,7 +68,6 @@ struct Frame {
     std::int64_t stamp = 0;             // ns
     std::vector<Image> images;
     std::vector<Imu> imu;               // what came since the frame before
-
     const Image& image(const std::string& kind, std::uint32_t camera = 0) const {
         for (const Image& each : images)
             if (each.camera == camera && each.kind == kind) return each;
@@ -80,7 +78,6 @@ struct Frame {
 // From the optical camera (or the body: see Link::ready) to a frame that stays the same.
 struct Pose {
     std::array<double, 12> matrix{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0};  // 3 rows of 4
-
     static Pose from_quaternion(double px, double py, double pz, double x, double y, double z,
                                 double w) {
         const double s = 2.0 / (x * x + y * y + z * z + w * w);
@@ -168,20 +165,15 @@ public:
         socket_.reset(::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0));
         if (::connect(socket_.fd, reinterpret_cast<sockaddr*>(&address), sizeof address) != 0)
             throw Error("expected the socket of a run at '" + path + "': " + std::strerror(errno));
-        std::string hello("VISNAVLK");
-        words(hello, version, 0);
-        send(1, hello + name);
+        send(1, "VISNAVLK" + words(version, 0) + name);
         welcome();
     }
-    Link(const Link&) = delete;
-    Link& operator=(const Link&) = delete;
     ~Link() {
         send(5, "");
         if (memory_) ::munmap(memory_, size_);
     }
 
     const Description& description() const { return description_; }
-
     Camera camera(std::size_t index) const {
         const std::string place = "cameras." + std::to_string(index) + '.', info = place + "info.";
         const auto get = [&](const std::string& name) { return description_.number(name); };
@@ -198,9 +190,7 @@ public:
 
     // Tell the run to begin, and whose poses come: of the optical camera 0, or of the body (FRD).
     void ready(PoseOf of = PoseOf::camera) {
-        std::string body;
-        words(body, of, 0);
-        send(4, body);
+        send(4, words(of, 0));
     }
 
     // Wait for the next frame, with the IMU samples since the one before; nothing: the run ended.
@@ -222,10 +212,9 @@ public:
     void pose(const Frame& frame, const Pose& pose, Status status = Status::tracked,
               const std::vector<float>& points = {}, std::vector<std::uint8_t> inliers = {},
               const double* covariance = nullptr) {
-        std::string body = answer(frame);
         const std::size_t count = points.size() / 2;
         inliers.resize(count, 1);
-        words(body, status, covariance != nullptr, count, 0);
+        std::string body = answer(frame) + words(status, covariance != nullptr, count, 0);
         append(body, pose.matrix.data(), sizeof pose.matrix);
         append(body, covariance, covariance ? 36 * sizeof(double) : 0);
         append(body, points.data(), 2 * count * sizeof(float));
@@ -246,13 +235,12 @@ private:
         }
         ~File() { reset(-1); }
     };
-
     static void append(std::string& body, const void* data, std::size_t size) {
         if (size) body.append(static_cast<const char*>(data), size);
     }
-    template <class... T> static void words(std::string& body, T... values) {
-        for (const std::uint32_t each : {static_cast<std::uint32_t>(values)...})
-            append(body, &each, sizeof each);
+    template <class... T> static std::string words(T... values) {
+        const std::uint32_t all[] = {static_cast<std::uint32_t>(values)...};
+        return {reinterpret_cast<const char*>(all), sizeof all};
     }
     template <class T> static T get(const std::string& body, std::size_t at) {
         T value{};
@@ -267,9 +255,7 @@ private:
         return body;
     }
     void send(std::uint32_t type, const std::string& body) {
-        std::string message;
-        words(message, body.size(), type);
-        message += body;
+        const std::string message = words(body.size(), type) + body;
         const std::lock_guard<std::mutex> lock(sending_);
         for (std::size_t at = 0; at < message.size();) {
             const ssize_t sent =
