@@ -18,13 +18,14 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 import uvloop
 
-from nodes.link import Endpoint
+from nodes.link import Endpoint, LinkAnswer
 from nodes.link.client import Link
 from runtime.real_clock import RealClock
 from runtime.workers.worker import Worker
@@ -42,8 +43,6 @@ class LinkRow(msgspec.Struct, frozen=True, kw_only=True):
         link_us: Median microseconds through the native interface and back.
         worker_us: The same of a worker's call.
         ratio: The first to the second.
-        link_p99_us: 99th percentile of the first.
-        worker_p99_us: Of the second.
     """
 
     case: str
@@ -52,8 +51,6 @@ class LinkRow(msgspec.Struct, frozen=True, kw_only=True):
     link_us: float
     worker_us: float
     ratio: float
-    link_p99_us: float
-    worker_p99_us: float
 
 
 class Taker:
@@ -68,72 +65,55 @@ def measure(samples: int = 1000) -> list[LinkRow]:
     drawn = np.random.default_rng(0)
     colours = drawn.integers(0, 256, (512, 512, 3), np.uint8)
     depth = drawn.uniform(0.3, 20.0, (512, 512)).astype(np.float32)
-    arrived: list[Callable[[], None]] = []
-    with tempfile.TemporaryDirectory() as folder:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner,
+    ):
         path = Path(folder) / "link.socket"
+        answers: asyncio.Queue[LinkAnswer] = asyncio.Queue()
+        wake = runner.get_loop().call_soon_threadsafe
+
+        def take(answer: LinkAnswer) -> None:
+            wake(answers.put_nowait, answer)
+
         endpoint = Endpoint(
             path,
             {"cameras": [{"body_from_camera": np.eye(4).tolist()}]},
             slots=2,
             slot_bytes=colours.nbytes + depth.nbytes,
-            answered=lambda _: arrived[0](),
+            answered=take,
             gone=lambda _: None,
             logged=lambda _: None,
         )
+
+        async def by_link() -> None:
+            endpoint.send_frame(0, [(0, "rgb8", colours), (0, "depth32f", depth)])
+            await answers.get()
+
         endpoint.listen()
         environment = {**os.environ, "VISNAV_SOCKET": str(path)}
-        command = [sys.executable, "-m", "bench.link"]
-        with subprocess.Popen(command, env=environment) as program:
+        with subprocess.Popen([sys.executable, "-m", "bench.link"], env=environment):
             try:
                 endpoint.wait(60.0)
-                with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-                    times = runner.run(_measure(endpoint, arrived, colours, depth, samples))
+                times = runner.run(_measure(by_link, (colours, depth), samples))
             finally:
                 endpoint.close()
-                program.wait()
-    (link, worker), (link_p99, worker_p99) = np.percentile(times, (50, 99), axis=1) / 1e3
-    return [
-        LinkRow(
-            case="512×512 rgb8, depth32f",
-            bytes=colours.nbytes + depth.nbytes,
-            samples=samples,
-            link_us=link,
-            worker_us=worker,
-            ratio=link / worker,
-            link_p99_us=link_p99,
-            worker_p99_us=worker_p99,
-        )
-    ]
+    link, worker = np.median(times, axis=1) / 1e3
+    size = colours.nbytes + depth.nbytes
+    case = "512×512 rgb8, depth32f"
+    microseconds = {"link_us": link, "worker_us": worker, "ratio": link / worker}
+    return [LinkRow(case=case, bytes=size, samples=samples, **microseconds)]
 
 
 async def _measure(
-    endpoint: Endpoint,
-    arrived: list[Callable[[], None]],
-    colours: npt.NDArray[np.uint8],
-    depth: npt.NDArray[np.float32],
-    samples: int,
+    by_link: Callable[[], Awaitable[None]], frame: tuple[Any, Any], samples: int
 ) -> list[list[int]]:
     """Return the times (ns) through the link and by a worker."""
-    loop = asyncio.get_running_loop()
-    answers: asyncio.Queue[None] = asyncio.Queue()
-
-    def arrive() -> None:
-        loop.call_soon_threadsafe(answers.put_nowait, None)
-
-    arrived.append(arrive)
-
-    async def by_link() -> None:
-        endpoint.send_frame(0, [(0, "rgb8", colours), (0, "depth32f", depth)])
-        await answers.get()
-
-    async def by_worker() -> None:
-        await worker.call(Taker.take, colours, depth)
-
-    clock = RealClock(loop)
+    clock = RealClock(asyncio.get_running_loop())
     worker = Worker("taker", clock, Taker, niceness=0)
     try:
         await worker.ready()
-        return await _in_turns([by_link, by_worker], samples)
+        return await _in_turns([by_link, lambda: worker.call(Taker.take, *frame)], samples)
     finally:
         await asyncio.to_thread(worker.close)
         clock.close()

@@ -147,8 +147,6 @@ TABLES = {
             Column("µs", "link_us", "us"),
             Column("worker's", "worker_us", "us"),
             Column("ratio", "ratio", ".2f"),
-            Column("p99 µs", "link_p99_us", "us"),
-            Column("worker's", "worker_p99_us", "us"),
         ),
     ),
     "ros_images": Table(

@@ -33,6 +33,8 @@ GREETING = wire.GREETING.pack(wire.MAGIC, wire.VERSION, 0)
 
 READERS = {wire.POSE: read_pose, wire.DONE: read_done}
 
+POSE_OF = {number.to_bytes(4, "little"): name for name, number in wire.POSE_OF.items()}
+
 ALIGNMENT = 64
 """Images begin at multiples of this (bytes); a slot has room for the gaps between 16 of them."""
 
@@ -138,12 +140,9 @@ class Endpoint:
             self._changed.wait_for(lambda: self._ready() or self._problem or self._closed, seconds)
             if program := self._ready():
                 return program.name
-            found, self._problem = self._problem, ""
-            if not found and self._program is not None:
+            found, self._problem = self._problem or f"found none within {seconds:g} s", ""
+            if self._program is not None:
                 found = f"found {self._program.name}, which did not say READY within {seconds:g} s"
-        found = (
-            found or f"found none {'before the end' if self._closed else f'within {seconds:g} s'}"
-        )
         raise LinkError(f"{self._path}: expected a program, {found}")
 
     def send_imu(self, samples: npt.NDArray[Any]) -> bool:
@@ -152,8 +151,7 @@ class Endpoint:
         Blocks while the program reads nothing and the connection is full.
         """
         program = self._program
-        if samples.dtype != wire.SAMPLE or samples.ndim != 1:
-            raise ValueError(f"expected a row of {wire.SAMPLE}, found {samples.dtype}")
+        assert samples.dtype == wire.SAMPLE
         return program is not None and program.send(wire.IMU, samples.tobytes())
 
     def send_frame(
@@ -235,29 +233,28 @@ class Endpoint:
     def _serve(self, connection: socket.socket) -> None:
         program = _Program(connection, self._slots)  # without a name: it only looks who is here
         self._programs.append(program)
-        problem = "its connection has ended"
-        kind, head = wire.BYE, b""
+        problem, wrong = "its connection has ended", False
         with connection:
             try:
                 self._greet(program)
                 self._read(program)
             except (LinkError, wire.ProtocolError) as error:
-                problem = str(error)
-                if not program.pose_of:
-                    kind, head = wire.REFUSED, GREETING
-            except (EOFError, TimeoutError) as error:
+                problem, wrong = str(error), True
+            except EOFError as error:
                 problem = str(error) or problem
-            except OSError:
+            except OSError:  # no HELLO in time, or the same as EOFError
                 pass
             with self._changed:
                 program.gone = True
                 if self._program is program:
                     self._program = None
-                if program.name and not program.pose_of:
+                if program.name and not program.pose_of and self._program is None:
                     self._problem = f"found {program.name}: {problem}"
                 closed = self._closed
                 self._changed.notify_all()
-            program.end(kind, head, problem.encode())
+            refused = wrong and not program.pose_of
+            head = (wire.REFUSED, GREETING) if refused else (wire.BYE,)
+            program.end(*head, problem.encode())
         self._programs.remove(program)
         if program.pose_of and not closed:
             self._gone(f"{program.name}: {problem}")
@@ -294,39 +291,29 @@ class Endpoint:
             if kind == wire.LOG:
                 self._logged(wire.text_of(body))
             elif kind == wire.READY and not program.pose_of:
-                self._take_ready(program, body)
+                if body[4:] != bytes(4) or bytes(body[:4]) not in POSE_OF:
+                    raise LinkError(f"READY.pose_of: expected 0 or 1, found {bytes(body)!r}")
+                with self._changed:
+                    program.pose_of = POSE_OF[bytes(body[:4])]
+                    self._changed.notify_all()
             elif kind in READERS and program.pose_of:
                 self._take(program, READERS[kind](body))
             else:
                 raise LinkError(f"expected READY once, POSE, DONE, LOG or BYE, found type {kind}")
 
-    def _take_ready(self, program: _Program, body: bytearray) -> None:
-        codes = {code: name for name, code in wire.POSE_OF.items()}
-        number = int.from_bytes(body[:4], "little")
-        if len(body) != 8 or number not in codes:
-            raise LinkError(f"READY.pose_of: expected one of {[*codes]}, found {bytes(body)!r}")
-        with self._changed:
-            program.pose_of = codes[number]
-            self._changed.notify_all()
-
     def _take(self, program: _Program, answer: LinkAnswer) -> None:
         """Pass an answer on, and free the slot of its frame."""
         with self._changed:
-            if answer.sequence >= program.sequence:
-                raise LinkError(
-                    f"sequence: expected below {program.sequence}, found {answer.sequence}"
-                )
-            stamp, _ = program.owed.get(answer.sequence, (answer.stamp, 0))
+            n = answer.sequence
+            if n >= program.sequence:
+                raise LinkError(f"sequence: expected below {program.sequence}, found {n}")
+            stamp, _ = program.owed.get(n, (answer.stamp, 0))
             if stamp != answer.stamp:
-                raise LinkError(
-                    f"stamp: expected {stamp} of frame {answer.sequence}, found {answer.stamp}"
-                )
-            done = [n for n in program.owed if self._skips and n < answer.sequence]
-            for sequence in {*done, answer.sequence} & program.owed.keys():
-                program.free.append(program.owed.pop(sequence)[1])
+                raise LinkError(f"stamp: expected {stamp} of frame {n}, found {answer.stamp}")
+            for other in [m for m in program.owed if m == n or (self._skips and m < n)]:
+                program.free.append(program.owed.pop(other)[1])
             self._changed.notify_all()
-        if answer.pose is not None:
-            pose = answer.pose
+        if (pose := answer.pose) is not None:
             if program.pose_of == "body":
                 pose = pose @ self._body_from_camera
             if program.origin is None:
@@ -346,9 +333,8 @@ def _bound(path: Path) -> socket.socket:
         listener.listen(4)
     except OSError as error:  # a run or a file is there, the folder is missing, it is too long
         listener.close()
-        raise LinkError(
-            f"{path}: expected a place for a socket, found: {error.strerror or error}"
-        ) from None
+        problem = f"expected a place for a socket, found: {error.strerror or error}"
+        raise LinkError(f"{path}: {problem}") from None
     return listener
 
 
