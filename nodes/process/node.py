@@ -73,7 +73,7 @@ class Process(Estimator[ProcessConfig]):
         self._slots: dict[tuple[str, type], Slot] = {}
         self._feed: Feed | None = None
         self._program: Program | None = None
-        self._connected = False
+        self._connected = self._closing = False
         self._pose: npt.NDArray[np.float64] = np.eye(4)
         self._unsent = 0
         found = (s.config for s in self.siblings(Node) if isinstance(s.config, PublishingConfig))
@@ -257,17 +257,20 @@ class Process(Estimator[ProcessConfig]):
     async def on_shutdown(self) -> None:
         """Say goodbye to the program, and end it if it does not end."""
         if self._unsent:
-            self.log.warning("%d frames were not sent: the program had no room", self._unsent)
+            self.log.warning(
+                "%d frames were not sent: the program was gone or had no room", self._unsent
+            )
         if missed := sum(self._matcher.missed.values()) if self._slots else 0:
             self.log.warning("%d exposures lacked an image", missed)
         await self.offload(self._close)
 
     def _close(self) -> None:
+        self._closing = True
         if self._feed is not None:
             self._feed.close()
         if self._program is not None:
-            if self._connected:  # so it knows that this is the end
-                self._program.wait(self.config.grace)
+            if self._connected and self._program.wait(self.config.grace) and self._program.code:
+                self.log.warning("%s %s", self.config.command[0], self._program.story())
             self._program.close()
         self._launch.close()
 
@@ -278,6 +281,8 @@ class Process(Estimator[ProcessConfig]):
 
     def _note_end(self, story: str) -> None:
         """Take note that the program has ended by itself."""
+        if self._closing:  # as it was told
+            return
         story = f"{self.config.command[0]} {story}"
         if self._feed is not None:
             self._hold.gone("; ".join(filter(None, [self._feed.why_gone, story])))

@@ -85,6 +85,9 @@ def main() -> None:
                     link.pose(frame, pose_of(frame) * 2 - np.eye(4))
     if "deaf" in modes:
         time.sleep(600)
+    if "fails" in modes:
+        print("no disk", flush=True)
+        sys.exit(3)
 
 
 def first_time() -> bool:
