@@ -2,13 +2,13 @@
 
 Read the core in this order:
 
-- What an author writes: `node`, with its declarations in `ports`, `bundles`
+- What an author writes: `node` (its `host` is the run), with its declarations in `ports`, `bundles`
   and `declarations`.
 - How an event gets from node to node: `sender`, `streams`, `links`, `graph`; and what makes it
   quick: `tasks`, `task_factory`.
 - Time: `schedule`, `clock`, `lockstep`, `real_clock`, `time_limits`.
 - A run: `node_runner`, `node_host`, `startup`, `run_state`, `supervisor`, `execute`, `event_loop`.
-- What a run leaves: `digest`, `summary`, `results`, `logs`.
+- What a run leaves: `digest`, `summary` (with `part_summaries`, `environment`), `results`, `logs`.
 - `config`: the file; `units` and `paths` are types of settings.
 - `workers`: objects in processes of their own. `hold`, `answers`: systems that are outside.
 - `watchdogs`, `code_location`: who blocks the loop or holds up the run.

@@ -9,7 +9,6 @@ arguments and need not call ``super().__init__``).
 
 from __future__ import annotations
 
-import concurrent.futures
 import functools
 import zlib
 from collections.abc import Callable, Coroutine, Iterable, Mapping
@@ -18,9 +17,7 @@ from typing import (
     Any,
     ClassVar,
     Generic,
-    NamedTuple,
     ParamSpec,
-    Protocol,
     dataclass_transform,
     get_args,
 )
@@ -34,6 +31,7 @@ from runtime.bundles import Matcher
 from runtime.clock import Clock
 from runtime.declarations import Declared, read_declarations
 from runtime.hold import Hold, HoldConfig
+from runtime.host import Host, Sibling
 from runtime.json_values import plain
 from runtime.logs import NodeLogger
 from runtime.schedule import SECOND, Tick, Ticker
@@ -63,74 +61,6 @@ class NodeConfig(msgspec.Struct, metaclass=_ConfigMeta, frozen=True, kw_only=Tru
 
 
 C = TypeVar("C", bound=NodeConfig, default=NodeConfig)
-
-
-class Sibling(NamedTuple):
-    """A node of the run, as the file describes it.
-
-    Attributes:
-        name: As in the file.
-        node: Its class.
-        config: Its settings.
-        sources: Ports that the file narrows to a source.
-        here: Whether it runs in this process.
-    """
-
-    name: str
-    node: type[Node[Any]]
-    config: Any
-    sources: Mapping[str, str]
-    here: bool
-
-
-class Host(Protocol):
-    """What a run does for its nodes; see the methods of `Node` that call these.
-
-    Attributes:
-        siblings: All nodes of the run, in file order.
-        shared: What nodes of this process share, by name.
-        stepping: Pauses and steps simulated time.
-    """
-
-    seed: int
-    clock: Clock
-    out: Path | None
-    checking: bool
-    siblings: tuple[Sibling, ...]
-    shared: dict[str, Any]
-    stepping: Stepping
-
-    def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
-        """Run a coroutine as part of a node."""
-
-    def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
-        """Call a function of a node at a rate."""
-
-    async def worker(
-        self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
-    ) -> Worker[W]:
-        """Make a worker that ends with the node."""
-
-    def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:
-        """Make the hold of an outside system, which ends with the node."""
-
-    def offload(
-        self, node: Node[Any], call: functools.partial[Any]
-    ) -> concurrent.futures.Future[Any]:
-        """Run a function of a node in a thread."""
-
-    @property
-    def stop(self) -> Callable[[str], None]:
-        """Ends the run in order, for a reason."""
-
-    def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
-        """Put a verdict into the summary."""
-
-    def note_environment(self, name: str, value: str) -> None:
-        """Put what the run depends on into the summary."""
-
-    def after_run(self, call: Callable[[Path], Any]) -> None:
-        """Call a function once the summary is written."""
 
 
 class Node(Generic[C]):

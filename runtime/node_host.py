@@ -17,8 +17,9 @@ from typing_extensions import TypeVar
 from runtime.answers import Answers
 from runtime.config.model import Config
 from runtime.hold import Hold, HoldConfig
+from runtime.host import Sibling
 from runtime.instruments import Instruments
-from runtime.node import Node, Sibling
+from runtime.node import Node
 from runtime.node_runner import Create, NodeRunner
 from runtime.parameter_server import ParameterServer
 from runtime.run_state import RunState

@@ -18,9 +18,10 @@ from runtime import code_location
 from runtime.config.model import NodeSpec
 from runtime.errors import NodeError, NodeTimeoutError, RefusedError, VisnavError
 from runtime.hold import Hold
+from runtime.host import Host
 from runtime.json_values import plain
 from runtime.links import Link
-from runtime.node import Host, Node, make_node, streams
+from runtime.node import Node, make_node, streams
 from runtime.schedule import Ticker
 from runtime.time_limits import ended
 from runtime.workers.worker import Worker

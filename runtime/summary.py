@@ -2,205 +2,28 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import os
-import platform
-import re
-import shlex
-import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import msgspec
 
-from runtime.answers import Answers, Outcome, Wrong
+from runtime.answers import Answers
 from runtime.digest import Digest, combined
+from runtime.environment import command_line, commit, environment
 from runtime.json_values import plain
 from runtime.node import matchers, senders, streams
+from runtime.part_summaries import (
+    LinkSummary,
+    OutsideSummary,
+    StreamSummary,
+    TickSummary,
+    WorkerSummary,
+)
 from runtime.run_state import RunState
 from runtime.schedule import SECOND
 from runtime.watchdogs.loop import Stall
-from runtime.workers.costs import Costs
-
-
-class TickSummary(msgspec.Struct, frozen=True):
-    """How punctual one ticker was; microseconds of the run's clock."""
-
-    hz: float
-    calls: int
-    late_p50_us: float
-    late_p99_us: float
-    late_max_us: float
-    missed: int
-
-
-class StreamSummary(msgspec.Struct, frozen=True):
-    """How full one input got, and what it dropped.
-
-    For a bundle, `missed` says how often a set did not come about, by the field that was missing.
-    """
-
-    bound: int
-    peak: int
-    dropped: int
-    missed: dict[str, int] = {}
-
-
-class LinkSummary(msgspec.Struct, frozen=True):
-    """How many events a link lost, and how many it left out to keep to its rate."""
-
-    lost: int
-    thinned: int
-
-
-class WorkerSummary(msgspec.Struct, frozen=True):
-    """What the calls of a worker cost this machine.
-
-    Attributes:
-        latency_ms: That the file declares, on the run's clock; `None` if it differs by call.
-        calls: That were answered.
-        wall_p50_ms: Real time of a call in the worker's process: median.
-        wall_p95_ms: 95th percentile.
-        wall_max_ms: Longest.
-        cpu_p50_ms: Processor time of all threads of that process from one call's end to the
-            next one's: median.
-        cpu_p95_ms: 95th percentile.
-        cpu_max_ms: Most.
-        peak_rss_mb: Most memory that one of the processes has had; `None` if unknown.
-        processes: How many there were at once.
-    """
-
-    latency_ms: float | None
-    calls: int
-    wall_p50_ms: float
-    wall_p95_ms: float
-    wall_max_ms: float
-    cpu_p50_ms: float
-    cpu_p95_ms: float
-    cpu_max_ms: float
-    peak_rss_mb: float | None
-    processes: int
-
-    @classmethod
-    def of(cls, costs: Costs) -> WorkerSummary:
-        """Sum up what there is."""
-        return cls(
-            latency_ms=None if costs.latency is None else round(costs.latency * 1e3, 6),
-            calls=costs.calls,
-            wall_p50_ms=costs.wall.quantile(0.5) / 1e6,
-            wall_p95_ms=costs.wall.quantile(0.95) / 1e6,
-            wall_max_ms=costs.wall.maximum / 1e6,
-            cpu_p50_ms=costs.cpu.quantile(0.5) / 1e6,
-            cpu_p95_ms=costs.cpu.quantile(0.95) / 1e6,
-            cpu_max_ms=costs.cpu.maximum / 1e6,
-            peak_rss_mb=costs.peak / 1e6 or None,
-            processes=costs.processes,
-        )
-
-    def row(self) -> list[str]:
-        """Return it as a table shows it, under `WORKER_COLUMNS`."""
-        wall = (self.wall_p50_ms, self.wall_p95_ms, self.wall_max_ms)
-        cpu = (self.cpu_p50_ms, self.cpu_p95_ms, self.cpu_max_ms)
-        return [
-            "varies" if self.latency_ms is None else f"{self.latency_ms:g}",
-            f"{self.calls}",
-            *(f"{each:.3g}" if each < 100 else f"{each:.0f}" for each in wall + cpu),
-            "" if self.peak_rss_mb is None else f"{self.peak_rss_mb:.0f}",
-            f"{self.processes}",
-        ]
-
-
-WORKER_COLUMNS = (
-    *("latency ms", "calls", "real p50 ms", "p95 ms", "max ms"),
-    *("CPU p50 ms", "p95 ms", "max ms", "peak MB", "processes"),
-)
-
-
-class OutsideSummary(msgspec.Struct, frozen=True):
-    """How a system outside the process answered what it was sent.
-
-    Attributes:
-        latency_ms: Declared, on the run's clock; `None` if it differs by frame.
-        sent: Frames that went out.
-        received: Frames that the system confirmed; `None` if it cannot say.
-        answered: Frames with an answer.
-        empty: Frames with an answer that held nothing, such as no pose.
-        initialising: Frames without an answer, from before the first one, as was allowed.
-        skipped: Frames that the system left out, as a later answer says.
-        lost: Frames for which none came in time.
-        open: Frames on their way when the run ended.
-        late: Answers to frames that were given up.
-        repeated: Second answers to a frame.
-        unknown: Answers whose stamp is no frame's.
-        initialisation_s: From the first frame to the first that was answered.
-        wall_p50_ms: Real time from a frame to its answer: median.
-        wall_p99_ms: 99th percentile.
-        inputs: Digest of all that the system was sent; equal if it got the same.
-        reproducible: Whether an equal run gives the same, if the system answers the same.
-        why_not: Why it may not.
-    """
-
-    latency_ms: float | None
-    sent: int
-    received: int | None
-    answered: int
-    empty: int
-    initialising: int
-    skipped: int
-    lost: int
-    open: int
-    late: int
-    repeated: int
-    unknown: int
-    initialisation_s: float | None
-    wall_p50_ms: float | None
-    wall_p99_ms: float | None
-    inputs: str | None
-    reproducible: bool
-    why_not: list[str]
-
-    @classmethod
-    def of(cls, answers: Answers) -> OutsideSummary:
-        """Sum up what there is."""
-        counts = {name: answers.counts[name] for name in (*get_args(Outcome), *get_args(Wrong))}
-        p50, p99 = answers.latency_quantiles(0.5, 0.99)
-        return cls(
-            latency_ms=None if answers.latency is None else round(answers.latency * 1e3, 6),
-            sent=answers.sent,
-            received=answers.received,
-            open=answers.sent - sum(counts[name] for name in get_args(Outcome)),
-            initialisation_s=answers.initialisation,
-            wall_p50_ms=None if p50 is None else p50 * 1e3,
-            wall_p99_ms=None if p99 is None else p99 * 1e3,
-            inputs=answers.inputs(),
-            reproducible=not answers.why_not,
-            why_not=list(answers.why_not),
-            **counts,
-        )
-
-    def row(self) -> list[str]:
-        """Return it as a table shows it, under `OUTSIDE_COLUMNS`."""
-        return [
-            *(f"{self.sent}", "–" if self.received is None else f"{self.received}"),
-            *(str(each) for each in (self.answered, self.empty, self.initialising, self.skipped)),
-            *(str(each) for each in (self.lost, self.late, self.repeated, self.unknown)),
-            *(
-                "–" if each is None else f"{each:.3g}"
-                for each in (self.initialisation_s, self.latency_ms, self.wall_p50_ms)
-            ),
-            "yes" if self.reproducible else f"no: {'; '.join(self.why_not)}",
-        ]
-
-
-OUTSIDE_COLUMNS = (
-    *("sent", "received", "answered", "empty", "initialising", "skipped"),
-    *("lost", "late", "repeated", "of no frame"),
-    *("initialised s", "latency ms", "real p50 ms", "reproducible"),
-)
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -446,56 +269,3 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
             for field in ("outputs", "drops", "streams", "links", "ticks", "workers", "outside")
         },
     )
-
-
-def environment() -> dict[str, str]:
-    """Return what a figure depends on: machine, Python and the libraries' versions."""
-    libraries = [
-        "visnav-runtime",
-        "numpy",
-        "mujoco",
-        "opencv-python-headless",
-        "scipy",
-        "uvloop",
-        "msgspec",
-    ]
-    versions = {}
-    for library in libraries:
-        try:
-            versions[library] = importlib.metadata.version(library)
-        except importlib.metadata.PackageNotFoundError:
-            versions[library] = "not installed"
-    return {
-        "system": f"{platform.system()} {platform.release().partition('-')[0]}",
-        "processor": platform.machine(),
-        "cores": str(os.cpu_count()),
-        "python": platform.python_version(),
-        **versions,
-    }
-
-
-_SECRET = re.compile(r"(secret\s*=\s*)(?!\W*(?:file|env):).*", re.DOTALL)
-"""A secret in a setting of the command line, unless it only says where the secret is."""
-
-
-def command_line() -> str:
-    """Return the command that started this process, without Python's folder and secrets."""
-    program, *arguments = sys.orig_argv
-    shown = [_SECRET.sub(r"\1…", each) for each in arguments]
-    return shlex.join([Path(program).name, *shown])
-
-
-def commit(folder: Path | None = None) -> str:
-    """Return the commit of a folder's files, with ``-dirty`` if they differ; empty without git.
-
-    Args:
-        folder: Somewhere in a repository; the current folder if not given.
-    """
-    command = ["git", "describe", "--always", "--dirty"]
-    try:
-        done = subprocess.run(  # noqa: S603
-            command, cwd=folder, capture_output=True, text=True, check=True, timeout=5.0
-        )
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return done.stdout.strip()

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from events import Command, PathAnnouncement, PilotAnnouncement, Setpoint
 from runtime.errors import suggest
-from runtime.node import Sibling
+from runtime.host import Sibling
 
 Order = Command | Setpoint | PathAnnouncement | PilotAnnouncement
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from runtime import Node
-from runtime.node import Sibling
+from runtime.host import Sibling
 from sims.cameras import model_to_bytes
 from sims.vehicle import Simulation
 from sims.vehicle.air import Air

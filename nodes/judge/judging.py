@@ -24,9 +24,9 @@ from nodes.report.page import write_report
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
 from runtime import Duration, results
+from runtime.environment import command_line, commit, environment
 from runtime.errors import ResultsError
 from runtime.schedule import SECOND
-from runtime.summary import command_line, commit, environment
 
 
 class JudgeConfig(EvaluationConfig):

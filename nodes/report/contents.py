@@ -12,7 +12,7 @@ import numpy.typing as npt
 from nodes.evaluation.coverage import Interval
 from nodes.evaluation.judging import Errors
 from nodes.trajectory import Trajectory
-from runtime.summary import (
+from runtime.part_summaries import (
     LinkSummary,
     OutsideSummary,
     StreamSummary,

@@ -12,15 +12,61 @@ from typing import Any
 
 import numpy as np
 
-from events import Quaternion, Vector3
+from events import Odometry, PoseEstimate, Quaternion, Vector3
+from events.frames import convert_rotation, convert_vector
+from nodes.ros_messages.frame_names import FrameNames
+from nodes.ros_messages.settings import PublishingConfig
 from nodes.ros_messages.stamps import Time
 from nodes.ros_messages.typestore import TypeStore
+from runtime.schedule import SECOND
 
 _COUNT = struct.Struct("<I")
 _CDR = 4
 """Bytes before a message, from which alignment is not counted."""
 _POSE = 56
 """Seven float64: position, and the quaternion's x, y, z, w."""
+
+
+class Paths:
+    """The paths of all vehicles and estimates.
+
+    Args:
+        store: Of the types.
+        names: Of frames, as ROS calls them.
+        config: How far apart poses are, how many there are, and how often a path is sent.
+    """
+
+    def __init__(self, store: TypeStore, names: FrameNames, config: PublishingConfig) -> None:
+        self._store = store
+        self._names = names
+        self._config = config
+        self._paths: dict[str, tuple[PathMessage, int]] = {}
+        """By source: the path, and when it is to be sent again (ns)."""
+
+    def message(self, event: Odometry | PoseEstimate, time: Time) -> bytearray | None:
+        """Add a pose to the path of its source; return the path if that is due.
+
+        Args:
+            event: The pose.
+            time: Of its stamp, in messages: seconds and nanoseconds.
+        """
+        config, frame = self._config, self._names.name(event.frame_id, event.source)
+        path, due = self._paths.get(event.source, (None, event.stamp))
+        if path is None or path.frame != frame:
+            path = PathMessage(self._store, frame, config.path_step, config.path_length)
+            self._paths[event.source] = (path, due)
+        axes = self._names.axes(event.frame_id)
+        position = convert_vector(axes, event.position)
+        far = path.far(position)
+        if not far and event.stamp < due:
+            return None
+        rotation = convert_rotation(axes, self._names.axes(event.child_frame_id), event.orientation)
+        if far:
+            path.add(time, position, rotation)
+        if event.stamp < due:
+            return None
+        self._paths[event.source] = (path, event.stamp + round(SECOND / config.path_rate))
+        return path.message(time, position, rotation)
 
 
 class PathMessage:

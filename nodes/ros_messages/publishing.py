@@ -36,13 +36,13 @@ from events import (
     VehicleAnnouncement,
     Wind,
 )
-from events.frames import convert_points, convert_rotation, convert_vector
+from events.frames import convert_points
 from nodes.ros_messages.builder import MessageBuilder
 from nodes.ros_messages.depth import CompressedDepthWriter
 from nodes.ros_messages.frame_names import FrameNames
 from nodes.ros_messages.images import CloudWriter, CompressedWriter, ImageWriter
 from nodes.ros_messages.messages import Messages, Transform
-from nodes.ros_messages.paths import PathMessage
+from nodes.ros_messages.paths import Paths
 from nodes.ros_messages.publications import (
     TOPICS,
     Publication,
@@ -55,7 +55,6 @@ from nodes.ros_messages.stamps import Time
 from nodes.ros_messages.topics import Topic, topic_name
 from nodes.ros_messages.transforms import Transforms
 from nodes.ros_messages.typestore import TypeStore
-from runtime.schedule import SECOND
 
 LARGE: tuple[type[Event], ...] = (
     Image,
@@ -130,8 +129,7 @@ class Publishing(Generic[P]):
         self._publishers: dict[tuple[TopicKind, str], P | None] = {}
         self._writers: dict[tuple[TopicKind, str, str, str], Any] = {}
         """By kind and source of the topic, frame and encoding."""
-        self._paths: dict[str, tuple[PathMessage, int]] = {}
-        """By source: the path, and when it is to be sent again (ns)."""
+        self._paths = Paths(store, self._names, config)
         self._lock = threading.Lock()
         self.large: dict[type[Event], Callable[[Any], None]] = {
             Image: self._image,
@@ -356,27 +354,11 @@ class Publishing(Generic[P]):
             publisher.put(make(self._time(event.stamp), event))
 
     def _path(self, event: Odometry | PoseEstimate) -> None:
-        """Add a pose to the path of its source, and put the path if that is due."""
-        publisher = self._publisher("path", event.source)
-        if publisher is None:
-            return
-        config, frame = self._config, self._names.name(event.frame_id, event.source)
-        path, due = self._paths.get(event.source, (None, event.stamp))
-        if path is None or path.frame != frame:
-            path = PathMessage(self._store, frame, config.path_step, config.path_length)
-            self._paths[event.source] = (path, due)
-        axes = self._names.axes(event.frame_id)
-        position = convert_vector(axes, event.position)
-        far = path.far(position)
-        if not far and event.stamp < due:
-            return
-        rotation = convert_rotation(axes, self._names.axes(event.child_frame_id), event.orientation)
-        time = self._time(event.stamp)
-        if far:
-            path.add(time, position, rotation)
-        if event.stamp >= due:
-            publisher.put(path.message(time, position, rotation))
-            self._paths[event.source] = (path, event.stamp + round(SECOND / config.path_rate))
+        """Put the path of a source if that is due."""
+        if publisher := self._publisher("path", event.source):
+            message = self._paths.message(event, self._time(event.stamp))
+            if message is not None:
+                publisher.put(message)
 
     def _tf(self, stamp: int, transforms: Sequence[Transform]) -> None:
         if transforms and (publisher := self._publisher("tf", "")):

@@ -11,8 +11,9 @@ from typing import Any, TypeVar
 from events import Event
 from runtime.clock import Clock
 from runtime.hold import Hold, HoldConfig
+from runtime.host import Sibling
 from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.node import Node, NodeConfig, Sibling, make_node
+from runtime.node import Node, NodeConfig, make_node
 from runtime.schedule import Tick, Ticker
 from runtime.stepping import Stepping
 from runtime.workers.worker import Worker

@@ -13,9 +13,10 @@ import pytest
 
 from runtime import Duration, Input, Node
 from runtime.config.model import Config, RunConfig
+from runtime.environment import command_line, commit
 from runtime.errors import ResultsError
 from runtime.execute import execute
-from runtime.summary import Summary, command_line, commit
+from runtime.summary import Summary
 from runtime.testing import run_nodes, spec
 from runtime.tools.cli.tables import run_tables
 from tests.runtime.samples import Diarist, Failing, Painter, Ping, Reader, Speaker

@@ -23,7 +23,8 @@ from events import (
 from runtime import every
 from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.errors import NodeError, RefusedError
-from runtime.node import Sibling, make_node
+from runtime.host import Sibling
+from runtime.node import make_node
 from runtime.testing import NodeResult, run_in_lockstep, run_nodes, spec
 from runtime.tools.preflight import of_nodes
 from runtime.units import Duration

@@ -11,7 +11,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from runtime.summary import Summary, TickSummary
+from runtime.part_summaries import TickSummary
+from runtime.summary import Summary
 from runtime.tools.cli.graph import layers
 from tests.runtime.tools.samples_cli import ROOT, command, command_here, config_file, summary
 
