@@ -6,7 +6,7 @@ import concurrent.futures
 import functools
 from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from typing_extensions import TypeVar
 
@@ -15,9 +15,6 @@ from runtime.hold import Hold, HoldConfig
 from runtime.schedule import Tick, Ticker
 from runtime.stepping import Stepping
 from runtime.workers.worker import Worker
-
-if TYPE_CHECKING:
-    from runtime.node import Node
 
 W = TypeVar("W")
 
@@ -34,14 +31,14 @@ class Sibling(NamedTuple):
     """
 
     name: str
-    node: type[Node[Any]]
+    node: type[Any]
     config: Any
     sources: Mapping[str, str]
     here: bool
 
 
 class Host(Protocol):
-    """What a run does for its nodes; see the methods of `Node` that call these.
+    """What a run does for its nodes; see the methods of `Node` that call these, with themselves.
 
     Attributes:
         siblings: All nodes of the run, in file order.
@@ -57,23 +54,21 @@ class Host(Protocol):
     shared: dict[str, Any]
     stepping: Stepping
 
-    def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
+    def start(self, node: Any, coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as part of a node."""
 
-    def every(self, node: Node[Any], hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
+    def every(self, node: Any, hz: float, call: Callable[[Tick], Any], name: str) -> Ticker:
         """Call a function of a node at a rate."""
 
     async def worker(
-        self, node: Node[Any], factory: Callable[..., W], args: tuple[Any, ...], **options: Any
+        self, node: Any, factory: Callable[..., W], args: tuple[Any, ...], **options: Any
     ) -> Worker[W]:
         """Make a worker that ends with the node."""
 
-    def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:
+    def hold(self, node: Any, name: str, config: HoldConfig, latency: float) -> Hold[Any]:
         """Make the hold of an outside system, which ends with the node."""
 
-    def offload(
-        self, node: Node[Any], call: functools.partial[Any]
-    ) -> concurrent.futures.Future[Any]:
+    def offload(self, node: Any, call: functools.partial[Any]) -> concurrent.futures.Future[Any]:
         """Run a function of a node in a thread."""
 
     @property

@@ -29,7 +29,7 @@ class Addressee:
         self._ports = ports
         self._simulators = simulators
         self._known = [each.name for each in simulators]
-        vehicles = [each.name for each in simulators if each.node.vehicle]  # type: ignore[attr-defined]
+        vehicles = [each.name for each in simulators if each.node.vehicle]
         self._vehicles = vehicles or self._known
         self._refused: set[tuple[str, str]] = set()
 

@@ -76,7 +76,7 @@ class SharedWorld:
         self.name = named[0].config.world if named else "hall"
         self.named_by = named[0].name if named else ""
         self._inhabitants = inhabitants
-        self.vehicles = [each.name for each in inhabitants if each.node.vehicle]  # type: ignore[attr-defined]
+        self.vehicles = [each.name for each in inhabitants if each.node.vehicle]
         self._bare = bare
         self._seed = seed
         self._built = False
@@ -129,7 +129,7 @@ class SharedWorld:
         spec, dynamics = load_scene(self.name, bare=self._bare)
         wind = None
         for each in self._inhabitants:
-            node: type[Inhabitant] = each.node  # type: ignore[assignment]
+            node: type[Inhabitant] = each.node
             added = node.populate(Scene(spec, dynamics), each.name, each.config)
             dynamics = dynamics.joined(added)
             wind = node.wind_of(each.config) or wind

@@ -171,8 +171,6 @@ class Wire:
 WHO = st.sampled_from(NODES)
 WHAT = ["round"] * 2 + ["step"] * 3 + ["drain"] * 4
 WHAT += ["deliver", "cut", "see"] * 2 + ["kill", "greet"]
-    ["round"] * 2 + ["step"] * 3 + ["drain"] * 4 + ["deliver", "cut", "see"] * 2 + ["kill", "greet"]
-)
 OPS = st.lists(st.tuples(st.sampled_from(WHAT), WHO, WHO), max_size=25)
 STEPS = st.tuples(*[st.integers(0, 3)] * 3)
 """How far each process is before all that: met, announced, ready, begun."""
