@@ -142,7 +142,9 @@ def test_answers_are_what_they_say_however_they_come(
     result, _ = fly(behaviour, **changes)
     assert estimates(result) == expected
     answers = result.outside["slam"]
-    assert dict(answers.counts) == counts
+    repeated = counts.get("repeated", 0)  # of which the last one may come after the end
+    assert answers.counts.get("repeated", 0) in {repeated, max(repeated - 1, 0)}
+    assert {**answers.counts, "repeated": 0} == {**counts, "repeated": 0}
     assert answers.inputs() == reference.outside["slam"].inputs()
     assert not answers.why_not
     if expected == ALL:
