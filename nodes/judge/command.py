@@ -61,23 +61,23 @@ def judge(
     from runtime.tools.cli.run import print_verdict
     from runtime.tools.cli.tables import verdict_table
 
-    said = {
-        "alignment": alignment,
-        "scale_free": scale_free,
-        "axes": axes or None,
-        "max_difference": max_difference,
-        "gap": gap,
-        "thresholds": {k: given(v) for k, _, v in (t.partition("=") for t in threshold or ())},
-    }
-    config = convert(said, judging.JudgeConfig, "judge")
     try:
+        said = {
+            "alignment": alignment,
+            "scale_free": scale_free,
+            "axes": axes or None,
+            "max_difference": max_difference,
+            "gap": gap,
+            "thresholds": {k: given(v) for k, _, v in (t.partition("=") for t in threshold or ())},
+        }
+        config = convert(said, judging.JudgeConfig, "judge")
         true = sources.read_truth(truth, times)
         camera = sources.read_mounting(body_from_camera, truth) if body_from_camera else None
         found = [sources.read(each, config.axes, times, camera) for each in estimate]
         stamps = sources.read_stamps(Path(frames)) if frames else None
         judgements, verdict, notes = judging.judge_all(true, found, stamps, config)
         page = judging.write(Path(out or f"judged/{name}"), true, judgements, verdict, notes)
-    except (ValueError, OSError) as error:
+    except ValueError as error:
         raise ConfigError(str(error)) from None
     for note in notes:
         warn(note)

@@ -61,10 +61,8 @@ def judge_all(
     judgements: dict[str, Judgement] = {}
     notes = []
     for source in estimates:
-        if source.name in judgements:
-            raise ValueError(
-                f"expected names that differ, found two {source.name}: NAME={source.file}"
-            )
+        if source.name in {*judgements, "truth", "plan"}:
+            raise ValueError(f"{source.file}: expected a name of its own, NAME={source.file}")
         by_frame: dict[str, How] = {"": "se3", "map": "none"}
         usual = "sim3" if config.scale_free else by_frame.get(source.frame_id, "origin")
         poses, note = _compared(truth.poses, source, config.max_difference)

@@ -194,6 +194,6 @@ def _start(path: Path) -> tuple[int, list[str], str]:
                 if line and not (line[0] == "#" or line[0].isalpha()):
                     return number, head, line
                 head += [line] if line else []
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise ValueError(f"{path}: expected {_FORMATS}, found: {error}") from None
     raise ValueError(f"{path}: expected {_FORMATS}, found no rows")

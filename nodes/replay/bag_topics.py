@@ -58,9 +58,10 @@ def chosen(
     there = ", ".join(f"{name} ({type_})" for name, (type_, _) in sorted(found.items()))
     for topic in wanted:
         if topic.topic not in found:
+            fit = [f"{k} ({v})" for k, (v, _) in sorted(found.items()) if v in TYPES[topic.use]]
             raise ReplayError(
                 f"topics: expected one of the bag's, found {topic.topic!r}"
-                f"{suggest(topic.topic, found)}; there are: {there}"
+                f"{suggest(topic.topic, found)}; {topic.use} can be: {', '.join(fit) or 'none'}"
             )
         type_ = found[topic.topic][0]
         if type_ not in TYPES[topic.use]:

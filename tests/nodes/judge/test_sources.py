@@ -128,6 +128,14 @@ def test_each_bad_input_has_its_sentence(text: str, message: str, tmp_path: Path
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("missing", ["--truth", "--estimate", "--frames"])
+def test_a_file_that_is_not_there_is_named(missing: str, tmp_path: Path) -> None:
+    write_tum(tmp_path / "t", walk(5))
+    files = {"--truth": "t", "--estimate": "t", "--frames": "t"} | {missing: "nothing"}
+    done = said(tmp_path, *(word for pair in files.items() for word in pair))
+    assert (done.returncode, done.stderr) == (2, "error: nothing: No such file or directory\n")
+
+
 def test_kittis_poses_and_stamps_are_as_many(tmp_path: Path) -> None:
     write_all(tmp_path / "k", walk(5))
     (tmp_path / "times").write_text("0\n1\n2\n")
@@ -199,8 +207,11 @@ def test_a_truth_too_sparse_to_judge_by_is_an_error(tmp_path: Path) -> None:
 def test_two_estimates_of_one_name_need_another(tmp_path: Path) -> None:
     write_tum(tmp_path / "vo.tum", walk(5))
     one = read(str(tmp_path / "vo.tum"), None)
-    with pytest.raises(ValueError, match=r"expected names that differ, found two vo: NAME=/"):
+    with pytest.raises(ValueError, match=r"vo\.tum: expected a name of its own, NAME=/"):
         judging.judge_all(one, [one, one], None, judging.JudgeConfig())
+    truth = read(f"truth={tmp_path / 'vo.tum'}", None)  # whose file it would overwrite
+    with pytest.raises(ValueError, match="expected a name of its own"):
+        judging.judge_all(one, [truth], None, judging.JudgeConfig())
 
 
 @pytest.mark.parametrize(
