@@ -30,7 +30,9 @@ from nodes.ros2_bridge.service_server import WAITING
 from nodes.ros_messages.services import DEFINITIONS, SIMULATION, TRIGGER
 from nodes.ros_messages.typestore import TypeStore
 from runtime import Node, Output, on
+from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.errors import ConfigError, FatalError
+from runtime.execute import execute
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from tests.nodes.ros2_bridge.network import free_port, zenoh_session
 from tests.nodes.ros_messages import samples
@@ -131,9 +133,16 @@ class Client:
         return result.result, result.error_message
 
 
+def simulated(nodes: list[NodeSpec]) -> NodeResult:
+    return run_nodes(nodes, duration=1e6)
+
+
 def driven(
-    drive: Callable[[Client], None], vehicle: type[Vehicle] = Vehicle, **config: Any
-) -> NodeResult:
+    drive: Callable[[Client], None],
+    vehicle: type[Vehicle] = Vehicle,
+    run: Callable[[list[NodeSpec]], Any] = simulated,
+    **config: Any,
+) -> Any:
     """Run a vehicle and the bridge while a client drives them from a thread."""
     locator = f"tcp/127.0.0.1:{free_port()}"
     failed: list[BaseException] = []
@@ -152,9 +161,7 @@ def driven(
     with zenoh_session(listen=locator) as session:
         thread = threading.Thread(target=guarded, args=(Client(session),))
         thread.start()
-        result = run_nodes(
-            [spec(vehicle, "vehicle"), spec(Ros2Bridge, "ros2", settings)], duration=1e6
-        )
+        result = run([spec(vehicle, "vehicle"), spec(Ros2Bridge, "ros2", settings)])
         thread.join()
     if failed:
         raise failed[0]
@@ -208,6 +215,21 @@ def test_time_is_paused_stepped_and_resumed_by_services() -> None:
         assert "a run begins once" in reset.result.error_message
 
     assert driven(drive, step="2ms").reason == "ended by ROS"
+
+
+def test_time_that_is_real_is_neither_paused_nor_stepped() -> None:
+    def drive(client: Client) -> None:
+        features = client.call("/get_simulator_features", f"{SIMULATION}/GetSimulatorFeatures")
+        assert features.features.features.tolist() == [24, 25]
+        assert client.set_state(1) == 101
+        assert client.set_state(2) == 0
+        assert client.step(1) == (0, features.features.custom_info)
+        assert "the run is in real time" in features.features.custom_info
+
+    def run(nodes: list[NodeSpec]) -> str:
+        return execute(Config(run=RunConfig(clock="real"), nodes=tuple(nodes))).reason
+
+    assert driven(drive, run=run, paused=False) == "ended by ROS"
 
 
 def test_a_step_ends_at_exactly_its_time() -> None:
@@ -367,9 +389,6 @@ def test_settings_that_make_no_sense_are_refused(config: dict[str, Any], why: st
 
 
 def test_runs_in_real_time_cannot_begin_paused() -> None:
-    from runtime.config.model import Config, RunConfig
-    from runtime.execute import execute
-
     config = {"services": ["simulation"], "paused": True, "connect": [], "listen": []}
     run = RunConfig(clock="real")
     with pytest.raises(FatalError, match="paused: the run is in real time"):
