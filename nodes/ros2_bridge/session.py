@@ -167,11 +167,7 @@ class Session:
     def subscribe(self, topic: Topic, take: Take, *, late: bool = False) -> None:
         """Declare a subscription, and show it to ROS.
 
-        Args:
-            topic: Its topic.
-            take: Called in a thread of the topic's own.
-            late: Whether messages that were sent before, and are kept, come too, as they do if the
-                topic is transient local.
+        With `late`, messages that were sent before and are kept come too, as for transient local.
         """
         # Not called by Zenoh for each message: each call takes the interpreter from the loop, and
         # under a flood the loop would wait for it again and again.
