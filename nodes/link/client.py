@@ -34,24 +34,14 @@ HELLO, WELCOME, REFUSED, READY, BYE = 1, 2, 3, 4, 5
 IMU, FRAME = 16, 17
 POSE, DONE, LOG = 32, 33, 34
 
-HEADER = struct.Struct("<II")
-"""Before each message: length of its body (bytes), type."""
-GREETING = struct.Struct("<8sII")
-"""Begins HELLO, WELCOME and REFUSED: magic, version, 0."""
-MEMORY = struct.Struct("<Q")
-"""Follows in WELCOME: size of the shared memory (bytes)."""
-FRAME_HEAD = struct.Struct("<QqII")
-"""Begins FRAME: sequence, stamp (ns), number of images, 0."""
-IMAGE_HEAD = struct.Struct("<IIIIIIQ")
-"""For each image: camera, kind, height, width, stride (bytes), 0, offset in the shared memory."""
-POSE_HEAD = struct.Struct("<QqIIII")
-"""Begins POSE: sequence, stamp (ns), status, 1 if a covariance follows, number of points, 0."""
-DONE_BODY = struct.Struct("<Qq")
-"""DONE: sequence, stamp (ns)."""
-LONGEST = 1 << 24
-"""No body is longer (bytes)."""
-LONGEST_TEXT = 4096
-"""Bytes of a name, a reason or a line of the log; the rest is left out."""
+HEADER = struct.Struct("<II")  # of each message: length of its body (bytes), type
+GREETING = struct.Struct("<8sII")  # begins HELLO, WELCOME and REFUSED: magic, version, 0
+MEMORY = struct.Struct("<Q")  # follows in WELCOME: size of the shared memory (bytes)
+FRAME_HEAD = struct.Struct("<QqII")  # sequence, stamp (ns), number of images, 0
+IMAGE_HEAD = struct.Struct("<IIIIIIQ")  # camera, kind, height, width, stride (bytes), 0, offset
+POSE_HEAD = struct.Struct("<QqIIII")  # sequence, stamp, status, covariance?, number of points, 0
+DONE_BODY = struct.Struct("<Qq")  # sequence, stamp (ns)
+LONGEST, LONGEST_TEXT = 1 << 24, 4096  # bytes of a body; of a name, a reason, a line of the log
 
 SAMPLE = np.dtype(
     [("stamp", "<i8"), ("angular_velocity", "<f8", 3), ("linear_acceleration", "<f8", 3)]
@@ -129,17 +119,15 @@ class Link:
         self._sending = threading.Lock()
         self._expected = 0
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            self._socket.connect(path)
-        except OSError as error:
-            self._socket.close()
-            raise ProtocolError(f"expected the socket of a run at {path!r}: {error}") from None
-        try:
+        with contextlib.ExitStack() as unless_joined:
+            unless_joined.callback(self._socket.close)
+            try:
+                self._socket.connect(path)
+            except OSError as error:
+                raise ProtocolError(f"expected the socket of a run at {path!r}: {error}") from None
             self._send(HELLO, GREETING.pack(MAGIC, VERSION, 0) + name.encode())
             self.description = self._welcome()
-        except BaseException:
-            self._socket.close()
-            raise
+            unless_joined.pop_all()
 
     description: dict[str, Any]
     """Cameras, IMU and clock of the run."""
@@ -177,7 +165,7 @@ class Link:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames, each with the IMU samples since the one before, until the run ends."""
-        samples: list[npt.NDArray[Any]] = [np.empty(0, SAMPLE)]
+        samples = [np.empty(0, SAMPLE)]
         while (received := self.receive()) is not None:
             if isinstance(received, Frame):
                 yield received._replace(imu=np.concatenate(samples))
