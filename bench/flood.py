@@ -18,16 +18,14 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from bench.flooder import TWIST
-from bench.takeoff import TakeoffNode
+from bench.lateness import BEATS, PROBE, LateRow, figures
 from nodes.ros2_bridge.keys import data_key
 from nodes.ros_messages.topics import Topic
 from nodes.ros_messages.typestore import TypeStore
-from runtime import NodeConfig, Tick, every
 from runtime.config.reading import parse
 from runtime.execute import execute
 
@@ -38,41 +36,18 @@ EDGE_NS = 30_000_000
 """At either end of a window, ticks are left out for so long: what was sent may be under way."""
 
 
-class FloodRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Windows of one kind.
+class FloodRow(LateRow, frozen=True, kw_only=True):
+    """Windows of one kind; `ratio_p99` is the median of the pairs', to the quiet window's.
 
     Attributes:
         case: ``quiet`` or ``flood``.
-        ticks: How many were measured.
         messages_per_second: That came.
-        late_p50_us: Median lateness of the 400 Hz tick, microseconds.
-        late_p99_us: Median of the windows' 99th percentiles.
-        late_max_us: Maximum of all.
-        ratio_p50: Median of the pairs' ratios of medians, to the quiet window's.
-        ratio_p99: The same of the 99th percentiles.
+        ratio_p50: Median of the pairs' ratios of medians.
     """
 
     case: str
-    ticks: int
     messages_per_second: float
-    late_p50_us: float
-    late_p99_us: float
-    late_max_us: float
     ratio_p50: float
-    ratio_p99: float
-
-
-_late: list[tuple[int, int]] = []
-"""When a tick came (monotonic clock) and how late, ns."""
-
-
-class Probe(TakeoffNode[NodeConfig]):
-    """Measures how late a 400 Hz tick comes, and sends the vehicle up."""
-
-    @every(hz=400)
-    def tick(self, tick: Tick) -> None:
-        """Note how late it is."""
-        _late.append((time.monotonic_ns(), tick.late))
 
 
 def measure(
@@ -89,7 +64,7 @@ def measure(
         progress: Called with what is being measured.
     """
     progress(f"{windows} windows of {WINDOW:g} s, every other with {rate:g} messages a second")
-    _late.clear()
+    BEATS.clear()
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -138,7 +113,7 @@ def _settings(port: int, seconds: float) -> dict[str, Any]:
     return {
         "run": {"clock": "real", "duration": seconds, "log": "error"},
         "nodes": [
-            {"name": "probe", "type": f"{__name__}:Probe"},
+            PROBE,
             {"name": "drone", "type": "sims.multirotor:Multirotor"},
             {
                 "name": "ros2",
@@ -156,7 +131,6 @@ def _row(
 ) -> FloodRow:
     lates = [_lateness(window) for window in windows]
     befores = [_lateness(window) for window in quiet]
-    p50, p99 = ([float(np.percentile(late, q)) for late in lates] for q in (50, 99))
     ratios = [
         np.percentile(late, [50, 99]) / np.percentile(before, [50, 99])
         for late, before in zip(lates, befores, strict=False)
@@ -165,19 +139,15 @@ def _row(
     seconds = sum(end - begin for begin, end, _ in windows) / 1e9
     return FloodRow(
         case=case,
-        ticks=sum(map(len, lates)),
         messages_per_second=sum(sent for *_, sent in windows) / seconds,
-        late_p50_us=float(np.median(p50)),
-        late_p99_us=float(np.median(p99)),
-        late_max_us=float(max(late.max() for late in lates)),
         ratio_p50=ratio_p50,
         ratio_p99=ratio_p99,
+        **figures(lates),
     )
 
 
 def _lateness(window: tuple[int, int, int]) -> npt.NDArray[np.float64]:
-    """Return how late the ticks of a window were, microseconds."""
+    """Return how late the ticks of a window were, nanoseconds."""
     begin, end, _ = window
-    ticks = np.array(_late, np.int64)
-    inside = (ticks[:, 0] > begin + EDGE_NS) & (ticks[:, 0] < end - EDGE_NS)
-    return np.asarray(ticks[inside, 1] / 1e3)
+    inside = (beat.late for beat in BEATS if begin + EDGE_NS < beat.at < end - EDGE_NS)
+    return np.array([*inside], np.float64)

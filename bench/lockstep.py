@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bench.takeoff import TakeoffNode
+from bench.lateness import TakeoffNode
 from events import Takeoff, VelocitySetpoint
 from runtime import NodeConfig, Output, Tick, every
 from runtime.config.reading import parse

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bench.takeoff import TakeoffNode
+from bench.lateness import TakeoffNode
 from events import DepthImage, Image
 from runtime import NodeConfig
 from runtime.config.reading import parse

@@ -11,37 +11,27 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from bench.takeoff import TakeoffNode
-from runtime import NodeConfig, Tick, every
+from bench.lateness import BEATS, PROBE, LateRow, figures
 from runtime.config.reading import parse
 from runtime.execute import execute
 
 
-class RecordingRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Runs of one kind.
+class RecordingRow(LateRow, frozen=True, kw_only=True):
+    """Runs of one kind; `ratio_p99` is the median of the pairs' ratios.
 
     Attributes:
         case: Which.
-        ticks: How many were measured.
-        late_p50_us: Median lateness of the 400 Hz tick, microseconds.
-        late_p99_us: Its 99th percentile: the median of the runs'.
-        late_max_us: Its maximum.
-        ratio_p99: Median of the pairs' ratios of 99th percentiles, to the run without a recorder.
         frames: Pairs of images that came, in all runs.
         megabytes: Written, in all runs.
         dropped: Events that are not in the recordings.
     """
 
     case: str
-    ticks: int
-    late_p50_us: float
-    late_p99_us: float
-    late_max_us: float
-    ratio_p99: float
     frames: int
     megabytes: float
     dropped: int
@@ -56,24 +46,8 @@ class _Run(msgspec.Struct):
     dropped: int = 0
 
 
-_run = _Run()
-
-
-class ProbeConfig(NodeConfig):
-    """Settings of the probe."""
-
-    warm_up: float = 1.5
-
-
-class Probe(TakeoffNode[ProbeConfig]):
-    """Measures how late a 400 Hz tick comes, and sends the vehicle up."""
-
-    @every(hz=400)
-    def tick(self, tick: Tick) -> None:
-        """Note how late it is."""
-        if tick.stamp > self.config.warm_up * 1e9:
-            _run.late.append(tick.late)
-
+WARM_UP = 1_500_000_000
+"""Nanoseconds of each run that are left out."""
 
 CASES: dict[str, dict[str, object] | None] = {
     "no recorder": None,
@@ -106,16 +80,13 @@ def measure(
     return [
         RecordingRow(
             case=case,
-            ticks=sum(len(run.late) for run in runs),
-            late_p50_us=float(np.median(np.concatenate([run.late for run in runs]))) / 1e3,
-            late_p99_us=float(np.median([_p99(run) for run in runs])) / 1e3,
-            late_max_us=max(max(run.late) for run in runs) / 1e3,
             ratio_p99=float(
                 np.median([_p99(run) / base for run, base in zip(runs, plain, strict=True)])
             ),
             frames=sum(run.frames for run in runs),
             megabytes=sum(run.megabytes for run in runs),
             dropped=sum(run.dropped for run in runs),
+            **figures([run.late for run in runs]),
         )
         for case, runs in found.items()
     ]
@@ -126,12 +97,11 @@ def _p99(run: _Run) -> float:
 
 
 def _measure(recorder: dict[str, object] | None, seconds: float, rate: float) -> _Run:
-    global _run
-    _run = _Run(late=[])
+    BEATS.clear()
     camera = {"name": "camera", "images": ["rgb", "depth"], "rate": rate}
-    nodes: list[dict[str, object]] = [
+    nodes: list[dict[str, Any]] = [
         {"name": "drone", "type": "sims.multirotor:Multirotor", "cameras": [camera]},
-        {"name": "probe", "type": "bench.recording:Probe"},
+        PROBE,
     ]
     if recorder is not None:
         table = {"name": "recorder", "type": "nodes.mcap_recorder:McapRecorder"}
@@ -140,8 +110,11 @@ def _measure(recorder: dict[str, object] | None, seconds: float, rate: float) ->
     with tempfile.TemporaryDirectory() as folder:
         summary = execute(parse({"run": run, "nodes": nodes}, "bench recording"), Path(folder))
         files = Path(folder).glob("*.mcap")
-        _run.megabytes = sum(file.stat().st_size for file in files) / 1e6
-    _run.frames = summary.events.get("DepthImage", 0)
-    _run.dropped = sum(summary.drops.values())
+        megabytes = sum(file.stat().st_size for file in files) / 1e6
     time.sleep(0.5)  # what the last run leaves to do must not fall on the next
-    return _run
+    return _Run(
+        late=[beat.late for beat in BEATS if beat.stamp > WARM_UP],
+        frames=summary.events.get("DepthImage", 0),
+        megabytes=megabytes,
+        dropped=sum(summary.drops.values()),
+    )

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import itertools
 import random
 import socket
 import time
@@ -27,8 +28,8 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from bench.lateness import BEATS, PROBE, Beat, LateRow, figures
 from bench.slow_server import slow_server
-from bench.takeoff import TakeoffNode
 from events import Odometry
 from runtime import Input, Node, NodeConfig, Tick, Worker, every
 from runtime.config.reading import parse
@@ -37,19 +38,16 @@ from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_b
 from sims.worlds import load_world
 
 Mode = Literal["none", "inline", "thread", "worker", "fetch inline", "fetch"]
+WARM_UP = 1_000_000_000
+"""Nanoseconds of each run that are left out."""
 MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker", "fetch inline", "fetch")
 
 
-class StallRow(msgspec.Struct, frozen=True, kw_only=True):
+class StallRow(LateRow, frozen=True, kw_only=True):
     """One way of fetching images.
 
     Attributes:
         mode: Which.
-        ticks: How many ticks were measured.
-        late_p50_us: Median lateness of the 400 Hz tick, microseconds.
-        late_p99_us: Its 99th percentile.
-        late_max_us: Its maximum.
-        ratio_p99: Of the 99th percentile, to that of the first mode.
         missed: Ticks left out because an earlier one came too late.
         update_mean_ms: Mean time from one tick to the next, milliseconds.
         update_median_ms: Its median.
@@ -59,17 +57,12 @@ class StallRow(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     mode: str
-    ticks: int
-    late_p50_us: float
-    late_p99_us: float
-    late_max_us: float
     missed: int
     update_mean_ms: float
     update_median_ms: float
     update_sd_ms: float
     frames: int
     fetch_ms_median: float
-    ratio_p99: float = 1.0
 
 
 class _Samples(msgspec.Struct):
@@ -80,33 +73,16 @@ class _Samples(msgspec.Struct):
     fetch: list[int] = []
     missed: int = 0
 
+    def add(self, beats: list[Beat]) -> None:
+        """Add a run's ticks, after a second of warm-up."""
+        for before, beat in itertools.pairwise(beats):
+            if beat.stamp > WARM_UP:
+                self.late.append(beat.late)
+                self.missed += beat.missed
+                self.update.append(beat.at - before.at)
+
 
 _collected: dict[str, _Samples] = {}
-
-
-class ProbeConfig(NodeConfig):
-    """Settings of the probe: the mode it collects for, and seconds to leave out at the start."""
-
-    mode: Mode
-    warm_up: float = 1.0
-
-
-class Probe(TakeoffNode[ProbeConfig]):
-    """Measures how late a 400 Hz tick comes, and sends the vehicle up."""
-
-    def __init__(self) -> None:
-        self._samples = _collected.setdefault(self.config.mode, _Samples())
-        self._last = 0
-
-    @every(hz=400)
-    def tick(self, tick: Tick) -> None:
-        """Note how late it is."""
-        now = time.monotonic_ns()
-        if tick.stamp > self.config.warm_up * 1e9:
-            self._samples.late.append(tick.late)
-            self._samples.missed += tick.missed
-            self._samples.update.append(now - self._last)
-        self._last = now
 
 
 class CameraConfig(NodeConfig):
@@ -117,7 +93,6 @@ class CameraConfig(NodeConfig):
     height: int = 512
     rate: float = 10.0
     world: str = "hall"
-    warm_up: float = 1.0
     port: int = 0
 
 
@@ -189,7 +164,7 @@ class Camera(Node[CameraConfig]):
             return
         asked = time.monotonic_ns()
         await self._fetch(here.stamp, pose_to_qpos(here.position, here.orientation), ("eye",))
-        if tick.stamp > self.config.warm_up * 1e9:
+        if tick.stamp > WARM_UP:
             self._samples.fetch.append(time.monotonic_ns() - asked)
 
     async def on_shutdown(self) -> None:
@@ -244,7 +219,9 @@ def measure(
             shuffle(order)
             for mode in order:
                 progress(f"round {round_ + 1} of {repeats}: {mode}")
+                BEATS.clear()
                 execute(parse(_settings(mode, seconds, rate, size, port), "bench stall"))
+                _collected.setdefault(mode, _Samples()).add(BEATS)
     rows = [_row(mode, _collected[mode]) for mode in modes]
     return [
         msgspec.structs.replace(row, ratio_p99=row.late_p99_us / rows[0].late_p99_us)
@@ -253,15 +230,14 @@ def measure(
 
 
 def _settings(mode: Mode, seconds: float, rate: float, size: int, port: int) -> dict[str, Any]:
-    here = __name__
     return {
         "run": {"clock": "real", "duration": seconds + 1.0, "log": "error"},
         "nodes": [
-            {"name": "probe", "type": f"{here}:Probe", "mode": mode},
+            PROBE,
             {"name": "drone", "type": "sims.multirotor:Multirotor"},
             {
                 "name": "camera",
-                "type": f"{here}:Camera",
+                "type": f"{__name__}:Camera",
                 "mode": mode,
                 "rate": rate,
                 "width": size,
@@ -273,19 +249,14 @@ def _settings(mode: Mode, seconds: float, rate: float, size: int, port: int) -> 
 
 
 def _row(mode: str, samples: _Samples) -> StallRow:
-    late = np.array(samples.late) / 1e3
     update = np.array(samples.update) / 1e6
-    p50, p99 = np.percentile(late, [50, 99]).tolist()
     return StallRow(
         mode=mode,
-        ticks=len(late),
-        late_p50_us=p50,
-        late_p99_us=p99,
-        late_max_us=float(late.max()),
         missed=samples.missed,
         update_mean_ms=float(update.mean()),
         update_median_ms=float(np.median(update)),
         update_sd_ms=float(update.std()),
         frames=len(samples.fetch),
         fetch_ms_median=float(np.median(samples.fetch) / 1e6) if samples.fetch else 0.0,
+        **figures([samples.late]),
     )
