@@ -45,13 +45,9 @@ _LOOK = 0.01
 
 
 class HeldEstimator:
-    """One estimator: whether it is there, which images it is owed for, and its answers.
+    """One estimator: whether it is there, to which images it owes answers, and what it answers.
 
-    Args:
-        topics: Its subscriptions: that to its estimates first, and what says what it is done with.
-        hold: Who waits for its answers.
-        stamps: How times in messages become stamps.
-        config: The node's settings.
+    Its `topics` are that of its estimates, and the one that says what it is done with, if any.
     """
 
     def __init__(
@@ -141,6 +137,20 @@ class HeldEstimator:
         if self._came and not self._there:
             self._gone = True
             self.hold.gone(f"nobody publishes {self._topics[0].topic.name} any more")
+
+
+def held_estimators(
+    node: Node[Ros2BridgeConfig], incoming: Sequence[IncomingTopic], stamps: Callable[[], Stamps]
+) -> list[HeldEstimator]:
+    """Return the estimators among a node's subscriptions that owe answers, each with its hold."""
+    found = []
+    for each in incoming:
+        given = each.subscription
+        if given.use == "estimate" and given.answers_to:
+            told = [other for other in incoming if given.is_told_by(other.subscription)]
+            hold = node.hold(each.source, given.hold, given.latency)
+            found.append(HeldEstimator([each, *told], hold, stamps(), node.config))
+    return found
 
 
 class HeldLine:
@@ -293,27 +303,21 @@ class HeldLine:
 def why_no_answers(
     config: Ros2BridgeConfig, rates: Mapping[str, float], *, lockstep: bool
 ) -> Iterator[str]:
-    """Yield why estimators could never answer as their subscriptions say.
-
-    Args:
-        config: The node's settings.
-        rates: Of the cameras and lidars that are announced, by source.
-        lockstep: Whether time stands for the answers.
-    """
+    """Yield why estimators could never answer, given the announced rates of cameras and lidars."""
     for each in config.subscriptions:
         source, latency = each.answers_to, float(each.latency)
         if not source or each.use == "done":
             continue
-        told = any(each.is_told_by(other) for other in config.subscriptions)
         if source not in rates:
             yield (
                 f"{each.topic}: answers_to: expected a camera or lidar that is announced, found "
                 f'"{source}" (there are: {", ".join(rates) or "none"}){suggest(source, rates)}'
             )
+        elif any(each.is_told_by(other) for other in config.subscriptions):
+            continue
         elif (
-            lockstep
-            and each.hold.skips == "allowed"
-            and not (told or each.hold.latencies)
+            (lockstep and each.hold.skips == "allowed")
+            and not each.hold.latencies
             and 0 < rates[source] * latency <= 1
         ):
             yield (

@@ -30,7 +30,7 @@ from events import (
     VehicleEvent,
 )
 from nodes.ros2_bridge.complaints import Complaints
-from nodes.ros2_bridge.held import HeldEstimator, HeldLine, why_no_answers
+from nodes.ros2_bridge.held import HeldLine, held_estimators, why_no_answers
 from nodes.ros2_bridge.inbox import Inbox
 from nodes.ros2_bridge.incoming_topic import IncomingTopic
 from nodes.ros2_bridge.keys import NodeName
@@ -161,7 +161,9 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         except (ValueError, SessionError) as error:
             self.log.fatal("%s", error)
         self._session = session
-        self._hold_for_estimators(session)
+        estimators = held_estimators(self, self._incoming, self._fix_time)
+        if estimators:
+            self._line = HeldLine(self, session, estimators, self._send)
         self._publishing = Publishing(self._line or session, self._store, config, self._time)
         await self.offload(self._publishing.warm_up)
         try:
@@ -310,19 +312,6 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         else:
             self._line.publish(put, what)
 
-    def _hold_for_estimators(self, session: Session) -> None:
-        """Make the line and the holds, if there are estimators that owe answers."""
-        estimators = []
-        for each in self._incoming:
-            given = each.subscription
-            if given.use == "estimate" and given.answers_to:
-                told = [done for done in self._incoming if given.is_told_by(done.subscription)]
-                hold = self.hold(each.source, given.hold, given.latency)
-                stamps = self._fix_time()
-                estimators.append(HeldEstimator([each, *told], hold, stamps, self.config))
-        if estimators:
-            self._line = HeldLine(self, session, estimators, self._send)
-
     async def _publish_all(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
         async for event in events:
             await self.offload(put, event)
@@ -360,15 +349,10 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         )
 
     def _send(self, event: Event) -> None:
-        outputs = (
-            *((PoseEstimate, self.estimates), (Setpoint, self.setpoints)),
-            *((Image, self.images), (DepthImage, self.depth_images)),
-            *((Imu, self.imu), (Odometry, self.odometry), (Range, self.ranges)),
-            *((FluidPressure, self.pressures), (MagneticField, self.magnetic_fields)),
-            *((NavSatFix, self.fixes), (Command, self.commands), (Event, self.mapped_events)),
-        )
-        sender: Any = next(out for kind, out in outputs if isinstance(event, kind))
-        sender.send(event)
+        """Send an event by the first output that is for its type."""
+        outputs = self.declared.outputs.items()
+        port = next(port for port, output in outputs if isinstance(event, output.event))
+        getattr(self, port).send(event)
 
     async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
         """Wait for a camera's calibration, and remember to announce it."""
