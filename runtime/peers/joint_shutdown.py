@@ -81,12 +81,18 @@ class JointShutdown:
         )
         self.at_work = bool(node)
 
-    def take_summary(self, member: Member, message: FinalSummary) -> None:
-        """Take in another process's part of the summary.
+    def receive(
+        self, member: Member, message: FinalSummary | SummaryReceived | StillWorking
+    ) -> None:
+        """Take in another process's part of the summary, or that it has ours.
 
         Raises:
-            WireError: It is none.
+            WireError: It is no summary.
         """
+        if isinstance(message, SummaryReceived):
+            member.has_our_summary = True
+        if not isinstance(message, FinalSummary):
+            return
         try:
             member.final_summary = msgspec.json.decode(message.part, type=Summary)
         except (msgspec.DecodeError, RecursionError) as error:

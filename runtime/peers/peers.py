@@ -82,8 +82,9 @@ class Peers:
         self._loop: LockstepLoop | None = None
         self._token: TimeTokenHolder | None = None
         self._early: list[tuple[Member, OfTheRun, Event | None]] = []
-        self._begun = self._suspended = self._ends = False
-        self._returning: set[int] = set()
+        self._begun = self._ends = False
+        self._awaited: set[int] = set()  # in lockstep, time stands until they are back
+        self._returning, self._new = set[int](), set[int]()  # not yet ready; not yet gathered
         self._apart: set[int] = set()
         self._ended_here: list[str] = []
         self._follower: ClockFollower | None = None
@@ -178,9 +179,9 @@ class Peers:
             for member, message, _ in early:
                 if isinstance(message, NodeEnded):
                     self._do(member.number, message, None)
-        elif self._suspended:
+        elif self._awaited:
             self._membership.broadcast(stop)
-            self._gather()
+            self._gather(at_once=True)
         elif not from_peer:
             self._broadcast_in_order(stop)
         self.shutdown.begin()
@@ -214,16 +215,12 @@ class Peers:
         """
         self.shutdown.received_at = time.monotonic()
         match message:
-            case EventMessage() if (
-                self._begun and self._token is None
-            ):  # first, since there are many
+            case EventMessage() if self._begun and self._token is None:  # first: there are many
                 self._do(member.number, message, event)
             case Announcements():
                 self._start.hear(member, message)
-            case FinalSummary():
-                self.shutdown.take_summary(member, message)
-            case SummaryReceived():
-                member.has_our_summary = True
+            case FinalSummary() | SummaryReceived() | StillWorking():
+                self.shutdown.receive(member, message)
             case FirstUpdate():
                 member.begin = message
                 member.running = True
@@ -240,13 +237,11 @@ class Peers:
                 self._remote.wants(member.number, message.wanted)
                 if self._begun:
                     self._run.connect()
-            case StillWorking():
-                pass
             case Stop() if not self._begun or message.serial < 0:
                 if message.apart:
                     self._go_on_without(member)
-                elif self._suspended:  # it is no use to wait for a return
-                    self._gather()
+                elif self._awaited:  # it is no use to wait for a return
+                    self._gather(at_once=True)
                 self._do(member.number, message, None)
             case NodeEnded() if message.node not in member.nodes:
                 raise WireError(f"expected one of its nodes, found {message.node!r}")
@@ -266,13 +261,12 @@ class Peers:
         """Deal with the loss of a process as its nodes' `on_error` says."""
         lost = set(member.nodes) - self.shutdown.ended_nodes
         self.shutdown.ended_nodes |= lost
-        name = name_of(member.nodes)
-        if member.number in self._returning and not self._ends:  # not yet taken back: wait on
+        gone = PeerError(f"{name_of(member.nodes)}: {member.over} ({member.place})")
+        if member.number in self._returning and not self._ends:
             self._returning.discard(member.number)
-            log.error("%s: lost again", name)
+            log.error("%s: waiting for its return again", gone)
             self._membership.settle(lost=member.nodes)
             return
-        gone = PeerError(f"{name}: {member.over} ({member.place})")
         if self._ends or not lost:
             if lost:
                 log.warning("%s: the run ends without it", gone)
@@ -281,7 +275,7 @@ class Peers:
                     self._membership.broadcast(
                         msgspec.structs.replace(self._membership.ended, apart=False)
                     )
-            self._gather()
+            self._gather(at_once=self._ends)
             return
         if self._follower is not None and self._follower.member is member:
             self._follower.go_on_alone()
@@ -291,12 +285,12 @@ class Peers:
         if "stop" in rules:
             log.error("%s", gone, extra={"reported": True})
             self._gather()
-            self._run.stop(f"{name} lost", gone)
+            self._run.stop(f"{name_of(member.nodes)} lost", gone)
         elif "restart" in rules:
             log.error("%s: waiting for its return", gone)
             self._membership.settle(lost=member.nodes)
             if self._token is not None:
-                self._suspended = True
+                self._awaited.add(member.number)
                 self._token.suspend()
         else:
             log.error("%s: left out from here on", gone)
@@ -349,19 +343,30 @@ class Peers:
             self._follow(member)
         self.shutdown.ended_nodes -= {*member.nodes}
         self._apart.discard(member.number)
-        self._gather(new=(member.number,))
+        self._awaited.discard(member.number)
+        self._gather(member.number)
         self._run.connect()
 
-    def _gather(self, new: tuple[int, ...] = ()) -> None:
-        """In lockstep, share the turns among the processes present."""
+    def _gather(self, *new: int, at_once: bool = False) -> None:
+        """In lockstep, share turns among the processes present, once none is awaited (any more).
+
+        Those in `new` were not there before.
+        """
         if self._token is None or self._loop is None or not self._begun:
             return
-        self._suspended = False
+        self._new.update(new)
+        if at_once:
+            self._awaited.clear()
+        if self._awaited:
+            return
         present = [m for m in self._membership.present() if m.number not in self._apart]
         self._loop.gate = self._token if present else None
         if present:
             numbers = [self._membership.me, *(m.number for m in present)]
-            self._token.gather(numbers, [self._membership.id, *(m.id for m in present)], new)
+            self._token.gather(
+                numbers, [self._membership.id, *(m.id for m in present)], [*self._new]
+            )
+        self._new.clear()
 
     def _go_on_without(self, member: Member) -> None:
         """Take a process out of the turns: it has not begun, or has given up."""

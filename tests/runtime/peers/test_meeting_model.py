@@ -217,3 +217,42 @@ def test_all_begin_whatever_happens(
                 member.outbox.close()
 
     asyncio.run(main())
+
+
+class Token:
+    """In the place of a holder of the turn: notes what is asked of it."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, list[int]]] = []
+
+    def suspend(self) -> None:
+        self.asked.append(("suspend", []))
+
+    def gather(self, numbers: list[int], ids: list[str], new: list[int]) -> None:
+        assert len(ids) == len(numbers)
+        self.asked.append(("gather", sorted(new)))
+
+
+def test_in_lockstep_time_stands_until_all_that_were_lost_are_back() -> None:
+    """Also if one comes back, and is lost again before it is ready."""
+
+    async def main() -> None:
+        wire = Wire()
+        await wire.settle()
+        peers = wire.machines["asker"].peers
+        token = Token()
+        peers._token, peers._loop = token, wire  # type: ignore[assignment]
+        await wire.kill("one")
+        await wire.kill("other")
+        await wire.do("see", "asker", "one")
+        for _ in range(3):
+            await wire.do("see", "one", "asker")
+            await wire.round()
+        assert 1 in peers._returning
+        await wire.kill("one")
+        assert {what for what, _ in token.asked} == {"suspend"}
+        await wire.settle()
+        assert token.asked[-1] == ("gather", [1, 2])
+        assert [what for what, _ in token.asked].count("gather") == 1
+
+    asyncio.run(main())
