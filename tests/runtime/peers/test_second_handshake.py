@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from runtime.peers.joint_start import JointStart
 from runtime.peers.membership import Membership
 from runtime.peers.messages import Message
 from tests.runtime.peers.samples import Offer, Process, settings
+from tests.runtime.peers.test_losses import Rig
 from tests.runtime.peers.test_runs import THREE
 
 CLOCKS = ["lockstep", "real"]
@@ -172,3 +174,34 @@ def test_who_comes_back_with_other_announcements_ends_the_run(
         assert "to announce what it had announced before, found something" in str(
             process.done().error
         )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_twenty_pairs_that_start_under_load_all_run_to_their_end(tmp_path: Path) -> None:
+    """Ten processes at a time on few cores: links fail for want of a word in time."""
+    digests = set()
+    for wave in range(4):
+        rigs = [Rig(tmp_path / f"{wave}-{number}") for number in range(5)]
+        try:
+            for rig in rigs:
+                rig.folder.mkdir()
+                rig.write(clock="lockstep", on_error="restart", duration="0.2s")
+                text = rig.file.read_text(encoding="utf-8")
+                rig.file.write_text(text.replace('Asker"', 'Asker"\non_error = "restart"'))
+                rig.start("one,other", "there")
+                rig.start("asker", "here")
+            for rig in rigs:
+                for process in rig.started:
+                    said, _ = process.communicate(timeout=200)
+                    assert process.returncode == 0, said
+                summary = rig.summary("here")
+                assert summary.reason == "duration"
+                if "found again" not in said:  # else a link failed in the run, and took events
+                    digests.add(summary.digest)
+        finally:
+            for rig in rigs:
+                for process in rig.started:
+                    process.kill()
+                    process.communicate()
+    assert len(digests) == 1
