@@ -27,14 +27,15 @@ def main(control: socket.socket, grace: float, command: list[str]) -> None:
     prctl = ctypes.CDLL(None).prctl
     prctl(PR_SET_CHILD_SUBREAPER, 1)
     try:
-        program = subprocess.Popen(  # noqa: S603  # what the user's file says
+        child = subprocess.Popen(  # noqa: S603  # what the user's file says
             command,
             process_group=0,
             preexec_fn=lambda: prctl(PR_SET_PDEATHSIG, signal.SIGKILL),
-        ).pid
+        )
     except OSError as error:
         control.sendall(f"cannot be started: {error.strerror}\n".encode())
         return
+    program = child.pid  # `child` stays to the end: without it, Python would wait for the program
     ends = select.poll()
     ends.register(os.pidfd_open(program), select.POLLIN)
     ends.register(control, select.POLLIN)

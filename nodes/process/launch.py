@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
-import string
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -108,7 +108,8 @@ class Launch:
         return {**os.environ, **places, **self._ours, **self._config.environment}
 
     def _expanded(self, word: str) -> str:
-        return string.Template(word).safe_substitute(self.environment())
+        known = self.environment()
+        return re.sub(r"\$(?:(\w+)|{(\w+)})", lambda m: known.get(m[1] or m[2], m[0]), word)
 
     def texts(self, known: Mapping[str, Any]) -> dict[Path, str]:
         """Return the files that are to be written, with their texts.

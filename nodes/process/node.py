@@ -174,7 +174,10 @@ class Process(Estimator[ProcessConfig]):
         try:
             name = await self.offload(self._feed.connect, float(config.timeout))
         except LinkError as error:
-            raise ProgramError(self._story(str(error))) from None
+            over = self._program is not None and self._program.wait(0)
+            raise ProgramError(
+                self._story("it has not connected" if over else str(error))
+            ) from None
         self._connected = True
         self.log.info("%s is connected", name)
 

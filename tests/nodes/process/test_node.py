@@ -16,9 +16,11 @@ from typing import Any
 import pytest
 
 from nodes.ros2_bridge import Ros2Bridge
+from runtime.config.reading import load
 from runtime.errors import ConfigError, VisnavError
 from runtime.summary import Summary
 from runtime.testing import spec
+from runtime.tools.preflight import of_nodes
 from tests.nodes.process.rig import ROOT, STUB, AsWorker, fly, program
 from tests.nodes.process.test_program import alive, gone_soon
 from tests.runtime.peers.samples import free_port
@@ -114,7 +116,7 @@ GOES_WRONG: dict[str, tuple[list[str], dict[str, Any], str]] = {
     "ends at once": (
         ["early"],
         {},
-        r"ended with exit code 1; its last output:\nbegan early\nno voc",
+        r"it has not connected; .* exit code 1; its last output:\nbegan early\nno voc",
     ),
 }
 
@@ -267,6 +269,44 @@ def test_a_template_gets_what_was_announced(tmp_path: Path) -> None:
         "drone/camera 4.000000000000001 [0.0, 0.0, 1.0, 0.2]\n"
         f"200.0 drone/imu drone /drone/camera/image_raw /drone/imu {folder / 'link.socket'}\n"
     )
+
+
+CHECKED = """
+[[nodes]]
+name = "drone"
+type = "sims.multirotor:Multirotor"
+[[nodes.cameras]]
+name = "camera"
+[[nodes]]
+name = "slam"
+type = "nodes.process:Process"
+folder = "mine"
+build = ["touch", "built"]
+command = ["./made_by_the_build"]
+[[nodes.files]]
+path = "settings.yaml"
+template = "mine/settings.jinja"
+"""
+
+
+def test_a_check_finds_what_is_wrong_beside_the_file_and_starts_nothing(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "run.toml").write_text(CHECKED)
+    (tmp_path / "mine" / "settings.jinja").write_text("{{ cameras[0].rate }} {{ vehicle.mass }}")
+    assert of_nodes(load(tmp_path / "run.toml")).errors == []
+    (tmp_path / "mine" / "settings.jinja").write_text("{{ cameras[1].rate }}")
+    (error,) = of_nodes(load(tmp_path / "run.toml", ["slam.build=['no-make']"])).errors
+    assert "build: expected a program that can be executed, found none at no-make" in error
+    assert f"{tmp_path / 'mine' / 'settings.jinja'}: " in error
+    assert not (tmp_path / "mine" / "built").exists()
+    assert not (tmp_path / "programs").exists()
+
+
+def test_variables_stand_in_commands_and_a_shell_keeps_its_own(tmp_path: Path) -> None:
+    words = ["sh", "-c", "echo $OMP_NUM_THREADS ${VISNAV_FOLDER} $NOT_SET. $$; exit 9"]
+    folder = tmp_path / "programs" / "slam"
+    with pytest.raises(VisnavError, match=rf"exit code 9; its last output:\n1 {folder} \. \d+$"):
+        fly(program(command=words), tmp_path)
 
 
 def test_a_mistake_in_a_template_is_told_with_its_line(tmp_path: Path) -> None:
