@@ -56,7 +56,6 @@ def judge(
     from runtime.config.override import given
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
-    from runtime.summary import Verdict
     from runtime.tools.cli.common import warn
     from runtime.tools.cli.run import print_verdict
     from runtime.tools.cli.tables import verdict_table
@@ -81,8 +80,8 @@ def judge(
         raise ConfigError(str(error)) from None
     for note in notes:
         warn(note)
-    console, shown = Console(), Verdict(verdict.passed, verdict.estimators)
-    console.print(verdict_table(shown))
-    print_verdict(console, shown)
+    console = Console()
+    console.print(verdict_table(verdict))
+    print_verdict(console, verdict)
     console.print(f"results in [bold]{page.parent}[/bold]: open {page.name}", highlight=False)
     raise typer.Exit(1 if verdict.passed is False else 0)

@@ -102,13 +102,12 @@ def write(
         raise ResultsError(f"{out}: expected no run's folder: name another with --out")
     results.keep_earlier(out)
     results.claim(out)
-    (out / "trajectories").mkdir()
+    write_results(out, {}, judgements, msgspec.to_builtins(verdict))
     write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
     for name, judgement in judgements.items():
         assert judgement.estimate is not None
         path = out / "trajectories" / f"{file_name(name)}.tum"
         write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
-    write_results(out, {}, judgements, msgspec.to_builtins(verdict))
     facts = Facts(
         name=out.name,
         verdict=verdict,

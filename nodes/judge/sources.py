@@ -43,10 +43,8 @@ _FORMATS = (
 )
 _SCALAR = re.compile(r"q\w*w\b")
 """Of a header: the column of a quaternion's scalar part."""
-_FRAME = re.compile(r"# base_link \(FRD\) in (\S+), as it was sent")
-"""First line of a run's estimate."""
-_LONGEST_STEP = 10 * 86_400 * SECOND
-"""Nanoseconds between two poses; more are stamps of different units or clocks."""
+_FRAME = re.compile(r"# base_link \(FRD\) in (\S+), as it was sent")  # of a run's estimate
+_LONGEST_STEP = 10 * 86_400 * SECOND  # more are stamps of different units or clocks
 
 
 class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):

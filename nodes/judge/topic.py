@@ -6,7 +6,6 @@ Of a ``nav_msgs/msg/Path``, which each time holds all poses so far, the last mes
 from __future__ import annotations
 
 import contextlib
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,7 @@ from nodes.ros_messages.typestore import Bag
 from nodes.trajectory import Trajectory
 
 _PATH, _POSE = "nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped"
-_NEVER = 1 << 62
-"""Stands for the stamp of a message that has none."""
+_NEVER = 1 << 62  # stands for the stamp of a message that has none
 
 
 def read_topic(path: Path, topic: str) -> tuple[Trajectory, Axes, EstimatorRecord]:
@@ -56,14 +54,12 @@ def read_topic(path: Path, topic: str) -> tuple[Trajectory, Axes, EstimatorRecor
 
 def _poses(bag: Bag, topic: str) -> Iterator[tuple[str, Any]]:
     """Yield the messages with one pose each, and their types."""
-    messages = ((type_, message) for _, type_, _, message in bag.messages([topic]))
-    first = next(messages, None)
-    if first is None or first[0] != _PATH:
-        yield from (first, *messages) if first else ()
-        return
-    for _, last in deque((first, *messages), maxlen=1):
-        for pose in last.poses:
-            pose.header.frame_id = pose.header.frame_id or last.header.frame_id
+    path = bag.topics()[topic][0] == _PATH
+    for _, type_, _, message in bag.messages([topic], newest=path):
+        if not path:
+            yield type_, message
+        for pose in message.poses if path else ():
+            pose.header.frame_id = pose.header.frame_id or message.header.frame_id
             yield _POSE, pose
 
 

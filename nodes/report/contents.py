@@ -12,6 +12,7 @@ import numpy.typing as npt
 from nodes.evaluation.coverage import Interval
 from nodes.evaluation.judging import Errors
 from nodes.trajectory import Trajectory
+from runtime import summary
 from runtime.part_summaries import (
     LinkSummary,
     OutsideSummary,
@@ -51,12 +52,10 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     notes: list[str] = []
 
 
-class Verdict(msgspec.Struct, frozen=True):
+class Verdict(summary.Verdict, frozen=True):
     """What ``evaluation/verdict.json`` holds, and without thresholds the summary."""
 
-    passed: bool | None
-    estimators: dict[str, dict[str, Any]]
-    thresholds: dict[str, float | None] = {}
+    thresholds: dict[str, float | None] = msgspec.field(default_factory=dict)
 
 
 class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):

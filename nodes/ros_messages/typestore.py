@@ -6,6 +6,7 @@ have the names in ROS's files.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -232,7 +233,11 @@ class Bag:
         }
 
     def messages(
-        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+        self,
+        topics: Collection[str],
+        start: int | None = None,
+        stop: int | None = None,
+        newest: bool = False,
     ) -> Iterator[tuple[str, str, int, Any]]:
         """Yield topic, type, time of receipt (ns) and message, in the order of receipt.
 
@@ -240,6 +245,7 @@ class Bag:
             topics: Which.
             start: Messages received before it (ns) are left out.
             stop: So are those received at it and after.
+            newest: Only the last of all; no other is decoded.
 
         Raises:
             ValueError: A message, or the bag, is damaged.
@@ -248,7 +254,8 @@ class Bag:
         if not chosen:
             return
         try:
-            for connection, time, data in self._reader.messages(chosen, start, stop):
+            found = self._reader.messages(chosen, start, stop)
+            for connection, time, data in deque(found, maxlen=1) if newest else found:
                 message = self._reader.deserialize(data, connection.msgtype)
                 yield connection.topic, connection.msgtype, time, message
         except self._errors as error:
