@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Callable
 from typing import Any
 
@@ -40,9 +40,8 @@ def event_type(publication: OwnPublication) -> type[Event]:
 
 
 def _imported(topic: str, setting: str, path: str) -> Any:
-    module, _, name = path.partition(":")
     try:
-        return getattr(importlib.import_module(module), name)
+        return pkgutil.resolve_name(path)
     except (ImportError, AttributeError) as error:
         raise ValueError(
             f"{topic}: {setting}: expected something that can be imported, found {path!r}: {error}"

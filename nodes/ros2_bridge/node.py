@@ -41,7 +41,7 @@ from nodes.ros2_bridge.services import Services
 from nodes.ros2_bridge.session import Session, SessionError
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
 from nodes.ros_messages.publishing import LARGE, SMALL, Publishing
-from nodes.ros_messages.stamps import Stamps, Time
+from nodes.ros_messages.stamps import Stamps
 from nodes.ros_messages.typestore import TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
 from runtime.errors import FatalError, UncheckableError
@@ -164,7 +164,9 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         estimators = held_estimators(self, self._incoming, self._fix_time)
         if estimators:
             self._line = HeldLine(self, session, estimators, self._send)
-        self._publishing = Publishing(self._line or session, self._store, config, self._time)
+        self._publishing = Publishing(
+            self._line or session, self._store, config, lambda stamp: self._fix_time().out(stamp)
+        )
         await self.offload(self._publishing.warm_up)
         try:
             for topic in self._incoming:
@@ -356,8 +358,10 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
         """Wait for a camera's calibration, and remember to announce it."""
-        timeout, images = incoming.subscription.timeout, self._images_of(incoming.source)
-        most = self.config.max_message_size
+        timeout, most = incoming.subscription.timeout, self.config.max_message_size
+        kinds = {"image": "rgb", "depth": "depth"}
+        uses = [each.subscription.use for each in self._incoming if each.source == incoming.source]
+        images = tuple(kinds[use] for use in uses if use in kinds)
         found = await self.offload(incoming.find_camera, session, images, most)
         try:
             self._cameras.append(await self.offload(found.result, timeout))
@@ -368,17 +372,9 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         finally:
             found.cancel()
 
-    def _images_of(self, source: str) -> tuple[str, ...]:
-        kinds = {"image": "rgb", "depth": "depth"}
-        uses = [each.subscription.use for each in self._incoming if each.source == source]
-        return tuple(kinds[use] for use in uses if use in kinds)
-
     def _fix_time(self) -> Stamps:
         """Return how stamps become times in messages, which is fixed with the first message."""
         if self._stamps is None:
             wall = self.config.time == "wall"
             self._stamps = Stamps(time.time_ns() - self.clock.now() if wall else 0)
         return self._stamps
-
-    def _time(self, stamp: int) -> Time:
-        return self._fix_time().out(stamp)
