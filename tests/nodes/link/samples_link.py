@@ -17,7 +17,7 @@ from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
 from nodes.link import Endpoint, LinkAnswer, describe
 
 HEADER_PATH = Path(__file__).parents[3] / "nodes" / "link"
-LIMIT = 20.0
+LIMIT = 40.0
 """Real seconds after which what should come counts as not coming."""
 
 CAMERA = CameraAnnouncement(

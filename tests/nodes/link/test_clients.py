@@ -20,6 +20,7 @@ from nodes.link.client import SAMPLE
 from tests.nodes.link.samples_link import CAMERA, HEADER_PATH, LIMIT, compiled, images, listening
 
 HERE = Path(__file__).parent
+pytestmark = pytest.mark.timeout(180)  # a compiler with sanitizers has much to do
 NO_COMPILER = shutil.which("c++") is None
 
 

@@ -27,6 +27,7 @@ WALLS = np.array([3.0, 1.5, 4.0])
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.timeout(300),  # a compiler with sanitizers has much to do
     pytest.mark.skipif(shutil.which("c++") is None, reason="c++: not found"),
 ]
 
@@ -103,6 +104,15 @@ def test_it_tracks_twice_alike(tmp_path: Path) -> None:
     assert [a.pose.tobytes() for a in again if a.pose is not None] == [
         a.pose.tobytes() for a in first if a.pose is not None
     ]
+
+
+def test_the_program_on_the_page_compiles(tmp_path: Path) -> None:
+    page = (SOURCE.parents[2] / "docs" / "reference" / "link.md").read_text(encoding="utf-8")
+    block = page.partition("```cpp\n")[2].partition("```")[0]
+    images = "const visnav::Image&, const visnav::Image&"
+    track = f"std::optional<visnav::Pose> track({images}, const std::vector<visnav::Imu>&);\n"
+    (tmp_path / "page.cpp").write_text('#include "visnav_link.hpp"\n' + track + block)
+    compiled(tmp_path / "page.cpp", tmp_path, "-c")
 
 
 def test_it_says_that_it_is_lost(tmp_path: Path) -> None:
