@@ -16,7 +16,7 @@ from tests.nodes.ros2_bridge.network import free_port
 
 pytest.importorskip("zenoh_ros2_sdk")
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 SIMULATION = "simulation_interfaces/srv"
 RESULT = "\n---\nsimulation_interfaces/Result result"
@@ -35,6 +35,7 @@ FILE = """
 name = "served"
 duration = "{duration}s"
 stall = 0
+startup_limit = "5min"
 
 [[nodes]]
 name = "drone"
@@ -66,7 +67,7 @@ class Client:
 
     def call(self, name: str, type_: str, **fields: Any) -> Any:
         self._asked += 1
-        asked = {"id": self._asked, "name": name, "type": type_, "fields": fields, "seconds": 120}
+        asked = {"id": self._asked, "name": name, "type": type_, "fields": fields, "seconds": 300}
         asked["definition"] = DEFINITIONS[type_]
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -107,7 +108,7 @@ def client(folder: Path, more: str, duration: float) -> Iterator[Client]:
     ):
         try:
             yield Client(process)
-            assert run.wait(120) == 0
+            assert run.wait(200) == 0
         finally:
             run.kill()
             process.kill()
@@ -157,11 +158,13 @@ def test_replies_say_what_vehicles_have_done(tmp_path: Path) -> None:
 
 def test_a_run_stepped_from_outside_has_the_digest_of_one_never_paused(tmp_path: Path) -> None:
     quiet = tmp_path / "quiet"
-    subprocess.run(command(quiet, free_port(), PILOT, 6.0), check=True, timeout=120)
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
-    stepped = tmp_path / "stepped"
+    subprocess.run(command(quiet, free_port(), PILOT, 6.0), check=True, timeout=300)
+    stepped, busy = tmp_path / "stepped", list[subprocess.Popen[bytes]]()
     try:
         with client(stepped, PAUSED + PILOT, 6.0) as there:
+            there.step(2)  # so it has started, which takes long enough as it is
+            burn = [sys.executable, "-c", "while True: pass"]
+            busy += [subprocess.Popen(burn), subprocess.Popen(burn)]
             for steps in (1, 7, 100, 1, 333, 1000):
                 there.step(steps)
             there.set_state(1)
