@@ -185,6 +185,7 @@ class HeldLine:
         self._waiting: queue.SimpleQueue[tuple[Callable[..., object], object] | None]
         self._waiting = queue.SimpleQueue()
         self._there: concurrent.futures.Future[str] = concurrent.futures.Future()
+        self._there.set_running_or_notify_cancel()  # a run that ends meanwhile does not cancel it
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="publishes", daemon=True)
 
@@ -195,8 +196,11 @@ class HeldLine:
         self._publishers.append(made)
         return made
 
-    async def begin(self) -> None:
+    async def begin(self, first: Callable[[], object]) -> None:
         """Wait for the estimators, while time stands, and begin to publish.
+
+        Args:
+            first: Puts what holds for the whole run.
 
         Raises:
             FatalError: They are not there in time.
@@ -204,6 +208,7 @@ class HeldLine:
         self._thread.start()
         if missing := await self._node.clock.beside(self._there):
             self._node.log.fatal("expected %s, found none", missing)
+        self._waiting.put((lambda _: first(), None))
         early, self._early = self._early or [], None
         for publish in early:
             publish()

@@ -205,7 +205,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         if self.config.paused:  # before anybody can ask for anything
             self.stepping.pause()
         self._fix_time()
-        self._publish(Publishing.begin, publishing)
+        if self._line is None:
+            publishing.begin()
         for text in publishing.unannounced():
             self.log.warning("%s", text)
         for kind, events in self._queues.items():
@@ -221,7 +222,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             self._services = Services(self._send, self, session, self._store, self._complaints)
             await self.offload(self._services.offer, self._vehicles)
         if self._line is not None:
-            await self._line.begin()
+            await self._line.begin(publishing.begin)
 
     async def on_shutdown(self) -> None:
         """Leave the network, and log how many messages were published and received."""

@@ -95,6 +95,10 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 f'{self.topic}: answers_to: expected as = "estimate" or "done", and reliable, '
                 f'found as = "{self.use}", reliable = {str(self.reliable).lower()}'
             )
+        if not self.answers_to and (self.needs or self.hold != HoldConfig()):
+            raise ValueError(
+                f"{self.topic}: needs, hold: expected answers_to beside them, found none"
+            )
         if self.use == "done" and not self.answers_to:
             raise ValueError(f'{self.topic}: as = "done": expected answers_to, found none')
 

@@ -251,7 +251,12 @@ def test_what_could_never_be_answered_is_refused_before_the_run(
         ({"as": "velocity", "type": "geometry_msgs/msg/Twist"}, 'as = "estimate" or "done"'),
         ({"reliable": False}, "and reliable"),
         ({"hold": {"skips": "some"}}, "skips"),
-        ({"answers_to": "", "as": "done", "type": "std_msgs/msg/Header"}, "expected answers_to"),
+        (
+            {"answers_to": "", "as": "done", "type": "std_msgs/msg/Header", "needs": []},
+            "expected answers_to, found none",
+        ),
+        ({"answers_to": ""}, "needs, hold: expected answers_to beside them"),
+        ({"answers_to": "", "needs": [], "hold": {"max_wait": 3}}, "needs, hold: expected"),
         ({"as": "done", "type": "std_msgs/msg/Header"}, "expected one estimate with the same"),
     ],
 )
