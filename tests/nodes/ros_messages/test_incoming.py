@@ -83,6 +83,18 @@ def test_a_pose_in_the_map_becomes_an_estimate_in_ned() -> None:
     np.testing.assert_allclose(event.orientation, (S, 0, 0, S))  # facing east
 
 
+def test_the_end_of_a_path_becomes_an_estimate() -> None:
+    head = pose().header
+    path = make("nav_msgs/msg/Path", header=head, poses=[pose(""), pose("", stamp=(4, 0))])
+    event = read(path, "estimate")
+    assert isinstance(event, PoseEstimate)
+    assert (event.stamp, event.frame_id) == (4_000_000_000, "map")
+    assert event.position == (2.0, 1.0, -3.0)
+    path.poses.clear()
+    with pytest.raises(ValueError, match="poses: expected one or more, found none"):
+        read(path, "estimate")
+
+
 def test_a_pose_in_odom_becomes_an_estimate_from_the_start() -> None:
     event = read(pose("odom", wxyz=(0.0, 0.0, 0.0, 2.0)), "estimate")
     assert event.frame_id == "odom"
