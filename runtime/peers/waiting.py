@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 from runtime.errors import PeerError, VisnavError
+from runtime.lockstep import LockstepLoop
 from runtime.peers.compatibility import name_of
 from runtime.peers.member import Member
+from runtime.peers.messages import Key
 from runtime.time_limits import real_time_limit
 
 log = logging.getLogger("visnav.runtime")
@@ -46,7 +49,7 @@ class Waiting:
         whom: Callable[[Member], bool] | None = None,
         limit: float = math.inf,
     ) -> None:
-        """Wait for something that others bring about.
+        """Wait for something that others bring about; simulated time stands until the run begins.
 
         Args:
             condition: Looked at whenever something has come.
@@ -68,12 +71,13 @@ class Waiting:
             future = asyncio.get_running_loop().create_future()
             self._futures.add(future)
             try:
-                if whom is None:
-                    await future
-                else:
-                    left = self._time_left(begin, limit)
-                    async with real_time_limit(min(NAMED_EVERY, max(left, 0.0))):
+                with contextlib.nullcontext() if despite else _time_stands():
+                    if whom is None:
                         await future
+                    else:
+                        left = self._time_left(begin, limit)
+                        async with real_time_limit(min(NAMED_EVERY, max(left, 0.0))):
+                            await future
             except TimeoutError:
                 assert whom is not None
                 self._name(whom, limit, late=self._time_left(begin, limit) <= 0)
@@ -130,3 +134,24 @@ class Waiting:
 
 def _loss(member: Member) -> str:
     return f"{name_of(member.nodes)}: {member.over} ({member.place})"
+
+
+class _Closed:
+    """A gate of simulated time that nothing passes."""
+
+    def may_go(self, key: Key) -> bool:  # noqa: ARG002
+        return False
+
+
+@contextlib.contextmanager
+def _time_stands() -> Iterator[None]:
+    """Hold simulated time: how long others take must not decide what is due before they come."""
+    loop = asyncio.get_running_loop()
+    if not isinstance(loop, LockstepLoop):
+        yield
+        return
+    before, loop.gate = loop.gate, _Closed()
+    try:
+        yield
+    finally:
+        loop.gate = before

@@ -274,3 +274,14 @@ class Slow(Slowly, Asker):
 
 class SlowAnswerer(Slowly, Answerer):
     """Answers, slowly."""
+
+
+class Restless(Asker):
+    """Asks, and looks at the time again and again from its start-up on."""
+
+    async def on_startup(self) -> None:
+        self.start(self._look())
+
+    async def _look(self) -> None:
+        while True:
+            await self.clock.sleep(0.01)

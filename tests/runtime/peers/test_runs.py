@@ -103,3 +103,12 @@ def test_an_error_in_one_process_ends_all_and_says_whose_it_is() -> None:
     assert "refuser: no more" in str(there.done().error)
     assert isinstance(here.done().error, PeerError)
     assert "at refuser: refuser: no more" in str(here.error)
+
+
+def test_simulated_time_does_not_pass_while_processes_wait_for_one_another() -> None:
+    """What is due meanwhile, as in a task that a node has begun, waits for the first update."""
+    config = settings(("asker", "Restless", {}), ("one", "SlowAnswerer", {}), duration=0.2)
+    alone = execute(config)
+    for summary in apart(config, "asker", "one"):
+        assert summary.digest == alone.digest
+        assert summary.sim_seconds == alone.sim_seconds
