@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from tests.nodes.ros2_bridge.network import free_port
+from tests.nodes.ros2_bridge.network import bridged_run, free_port
+from tests.nodes.ros2_bridge.outside import Outside
 
 pytest.importorskip("zenoh_ros2_sdk")
 
@@ -111,3 +112,43 @@ def test_killing_it_has_the_policy_s_result_within_a_second(
         found = summary(tmp_path / "run")["outside"]["slam"]
         assert found["lost"] > 0
         assert found["answered"] > 0
+
+
+def test_the_run_of_the_example_starts_it(tmp_path: Path) -> None:
+    endpoint = json.dumps([f"tcp/127.0.0.1:{free_port()}"])
+    command = json.dumps([sys.executable, "outside_ros2.py"])
+    changes = (*SMALL, f"ros2.listen={endpoint}", f"estimator.command={command}")
+    settings = [word for each in (*changes, "run.duration=3s") for word in ("--set", each)]
+    run = ["-m", "runtime", "run", "examples/outside_ros2.toml", "--out", str(tmp_path / "out")]
+    with started(*run, *settings) as running:
+        output, _ = running.communicate(timeout=400)
+    assert running.returncode in {0, 1}, output
+    found = summary(tmp_path)["outside"]["slam"]
+    assert found["answered"] + found["empty"] == found["sent"] > 80
+
+
+REAL = """
+[[nodes.subscriptions]]
+topic = "/slam/pose"
+type = "geometry_msgs/msg/PoseStamped"
+as = "estimate"
+source = "slam"
+answers_to = "drone/camera"
+timeout = 60.0
+"""
+
+
+def test_in_real_time_nothing_is_held_and_the_run_says_so(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with bridged_run(folder, enough=1, more=REAL) as (run, port):
+        stub = Outside("at_once", connect=f"tcp/127.0.0.1:{port}")
+        try:
+            output, _ = run.communicate(timeout=100)
+        finally:
+            stub.leave()
+    assert run.returncode == 0, output
+    found = json.loads((folder / "summary.json").read_text())["outside"]["slam"]
+    assert found["answered"] > 0
+    assert found["why_not"] == ["the clock is real"]
+    heard = json.loads((folder / "heard.json").read_text())
+    assert heard["PoseEstimate"]["source"] == "slam"
