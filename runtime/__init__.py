@@ -10,7 +10,7 @@ Read the core in this order:
 - A run: `node_runner`, `node_host`, `startup`, `run_state`, `supervisor`, `execute`, `event_loop`.
 - What a run leaves: `digest`, `summary` (with `part_summaries`, `environment`), `results`, `logs`.
 - `config`: the file; `units` and `paths` are types of settings.
-- `workers`: objects in processes of their own. `hold`, `answers`: systems that are outside.
+- `workers`: objects in processes of their own. `hold`, `owed`, `answers`: systems that are outside.
 - `watchdogs`, `code_location`: who blocks the loop or holds up the run.
 - `parameter_server`: settings that change in a run. `instruments`: hooks for who looks on.
 - `wire` and `peers`: events as bytes, and a run in several processes.

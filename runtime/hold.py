@@ -20,11 +20,9 @@ answer to a later frame says that those before it were skipped.
 
 from __future__ import annotations
 
-import asyncio
-import concurrent.futures
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -34,6 +32,7 @@ from typing_extensions import Buffer
 from runtime.answers import Answers, Outcome, Wrong, read_latencies
 from runtime.clock import Clock
 from runtime.errors import MissingAnswerError
+from runtime.owed import LET_GO, Owed, future
 from runtime.paths import InputPath
 from runtime.schedule import SECOND
 from runtime.units import Duration
@@ -83,36 +82,6 @@ class HoldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     tolerance_ns: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 1000
     latencies: InputPath = ""
     latency_factor: Annotated[float, msgspec.Meta(gt=0)] = 1.0
-
-
-class Owed(Generic[T]):
-    """The answer to one frame, to be awaited once: its content, or `None` if there is none.
-
-    Raises:
-        MissingAnswerError: There is none, and by `HoldConfig.on_missing` that is an error.
-    """
-
-    __slots__ = ("_clock", "due", "later", "since", "stamp", "work")
-
-    def __init__(self, clock: Clock, stamp: int, due: int, since: float) -> None:
-        self._clock = clock
-        self.stamp = stamp
-        self.due = due
-        self.since = since
-        self.work = _future()
-        self.later: concurrent.futures.Future[Any] | None = None
-        """Its answer, once time waits for it no more."""
-
-    def __await__(self) -> Generator[Any, None, T | None]:
-        return self._answer().__await__()
-
-    async def _answer(self) -> T | None:
-        latency = max(self.due - self._clock.now(), 0)
-        result = await self._clock.beside(self.work, latency)
-        if self.later is not None and result is _LET_GO:
-            result = await asyncio.wrap_future(self.later)
-        found: T | None = result
-        return found
 
 
 class Hold(Generic[T]):
@@ -345,8 +314,8 @@ class Hold(Generic[T]):
 
     def _release(self, owed: Owed[T]) -> None:
         """Let time go on without an answer, which may still come."""
-        owed.later = _future()
-        owed.work.set_result(_LET_GO)
+        owed.later = future()
+        owed.work.set_result(LET_GO)
 
     def _give_up(self, owed: Owed[T]) -> None:
         missing = (
@@ -415,12 +384,6 @@ class Hold(Generic[T]):
             self.look()
 
 
-def _future() -> concurrent.futures.Future[Any]:
-    future: concurrent.futures.Future[Any] = concurrent.futures.Future()
-    future.set_running_or_notify_cancel()  # a reader that stops waiting does not cancel it
-    return future
-
-
 def _nearest(stamp: int, known: Mapping[int, Any], tolerance: int) -> int | None:
     """Return the known stamp that another one means."""
     if stamp in known:
@@ -431,7 +394,3 @@ def _nearest(stamp: int, known: Mapping[int, Any], tolerance: int) -> int | None
 
 def _seconds(stamp: int) -> str:
     return f"{stamp / SECOND:.6f} s"
-
-
-_LET_GO: Any = object()
-"""The outcome of a wait that has ended without an answer, which may still come."""

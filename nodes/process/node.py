@@ -28,7 +28,8 @@ from nodes.ros_messages.publications import TopicKind, publication
 from nodes.ros_messages.settings import PublishingConfig
 from runtime import Node, on
 from runtime.bundles import Field, Matcher, Slot
-from runtime.hold import Hold, Owed
+from runtime.hold import Hold
+from runtime.owed import Owed
 from runtime.streams import Stream
 
 _BEYOND = 64

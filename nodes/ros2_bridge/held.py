@@ -29,7 +29,8 @@ from nodes.ros_messages.stamps import Stamps
 from nodes.ros_messages.topics import Topic, topic_name
 from runtime import Node
 from runtime.errors import MissingAnswerError, suggest
-from runtime.hold import Hold, Owed
+from runtime.hold import Hold
+from runtime.owed import Owed
 
 WAITING = 64
 """Messages that may wait to be published in real time; with so many, images are dropped."""

@@ -14,7 +14,8 @@ from runtime import Duration, Input, Node, NodeConfig, Output
 from runtime.config.model import Config, OnError, RunConfig
 from runtime.errors import VisnavError
 from runtime.execute import execute
-from runtime.hold import Hold, HoldConfig, Owed
+from runtime.hold import Hold, HoldConfig
+from runtime.owed import Owed
 from runtime.summary import Summary
 from runtime.testing import spec
 from runtime.tools.cli.tables import run_tables
