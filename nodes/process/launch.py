@@ -127,7 +127,8 @@ class Launch:
                 ready = templates(template.parent).get_template(template.name)
                 found[self.folder / file.path] = ready.render(known)
             except jinja2.TemplateNotFound as error:
-                raise ProgramError(f"files: {template}: expected a template, found none") from error
+                missing = template.with_name(str(error) or template.name)
+                raise ProgramError(f"files: {missing}: expected a template, found none") from None
             except (jinja2.TemplateError, ValueError, TypeError, ArithmeticError) as error:
                 line = getattr(error, "lineno", None)
                 where = f"{template}: line {line}" if line else str(template)
