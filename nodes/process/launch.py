@@ -127,7 +127,7 @@ class Launch:
                 ready = templates(template.parent).get_template(template.name)
                 found[self.folder / file.path] = ready.render(known)
             except jinja2.TemplateNotFound as error:
-                missing = template.with_name(str(error) or template.name)
+                missing = template.parent / str(error.name)
                 raise ProgramError(f"files: {missing}: expected a template, found none") from None
             except (jinja2.TemplateError, ValueError, TypeError, ArithmeticError) as error:
                 line = getattr(error, "lineno", None)
