@@ -249,6 +249,7 @@ class Hold(Generic[T]):
         with self._changed:
             if self._gone:
                 self._log(f"{self.name}: it is there again")
+                self._not_reproducible("when it came back was up to real time")
             self._gone, self._let_go, self._in_a_row = "", False, 0
             self._began = self._heard = None
 
