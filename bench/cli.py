@@ -158,6 +158,20 @@ def link(
 
 
 @app.command()
+def held(
+    json: Json = None,
+    seconds: Annotated[float, typer.Option(min=2.0, help="Simulated, of each flight.")] = 8.0,
+    repeats: Annotated[int, typer.Option(min=1, help="Flights of each side, in turns.")] = 5,
+) -> None:
+    """Measure a flight with an odometry outside that is held for, beside the same in a worker."""
+    from bench.held import measure
+
+    with _status() as say:
+        rows = measure(seconds=seconds, repeats=repeats, progress=say)
+    _finish(json, held=rows)
+
+
+@app.command()
 def recording(
     json: Json = None,
     seconds: Annotated[float, typer.Option(min=3.0, help="Length of each run.")] = 6.0,

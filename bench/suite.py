@@ -10,6 +10,7 @@ import msgspec
 from bench import (
     bridge,
     flood,
+    held,
     idle,
     link,
     lockstep,
@@ -37,6 +38,7 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
     parts: list[parts.PartRow] = []
     bridge: list[bridge.BridgeRow] = []
     link: list[link.LinkRow] = []
+    held: list[held.HeldRow] = []
     ros_images: list[ros_images.RosImageRow] = []
     recording: list[recording.RecordingRow] = []
     flood: list[flood.FloodRow] = []
@@ -100,6 +102,9 @@ def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> d
     return {
         "bridge": bridge.measure(200 if quick else 2000, progress),
         "link": link.measure(100 if quick else 1000),
+        "held": held.measure(
+            seconds=2.0 if quick else 8.0, repeats=1 if quick else 5, progress=progress
+        ),
         "ros_images": ros_images.measure(50 if quick else 300),
         "recording": recording.measure(
             seconds=3.0 if quick else 5.0, repeats=1 if quick else 9, progress=progress

@@ -149,6 +149,18 @@ TABLES = {
             Column("ratio", "ratio", ".2f"),
         ),
     ),
+    "held": Table(
+        "A flight in lockstep with 512×512 RGB-D at 30 Hz, with an odometry in a program outside "
+        "and in a worker: simulated seconds a second",
+        (
+            Column("way", "case"),
+            Column("flights each", "rounds"),
+            Column("outside", "outside_speed", ".2f"),
+            Column("worker", "worker_speed", ".2f"),
+            Column("ratio", "ratio", ".2f"),
+            Column("equal estimates", "equal"),
+        ),
+    ),
     "ros_images": Table(
         "An image as a message of ROS 2, by the bridge and by rosbags' `serialize_cdr`",
         (
