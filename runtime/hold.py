@@ -94,7 +94,7 @@ class Hold(Generic[T]):
         latency: Seconds of the run's clock from a frame to its answer.
         answers: Where to note what became of each frame.
         log: Takes what the run's log should say, in any thread.
-        wall: Real seconds.
+        wall: Real seconds, but for those in which the run is paused.
 
     Raises:
         ConfigError: There are no latencies in the file that `config` names.

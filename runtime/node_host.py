@@ -143,7 +143,13 @@ class NodeHost:
         known = self.state.outside.get(name)
         answers = self.state.outside.setdefault(name, Answers())
         hold: Hold[Any] = Hold(
-            name, self.clock, config, latency, answers=answers, log=node.log.warning
+            name,
+            self.clock,
+            config,
+            latency,
+            answers=answers,
+            log=node.log.warning,
+            wall=self.stepping.real_seconds,
         )
         self.state.runners[node.name].holds.append(hold)
         if known is None:

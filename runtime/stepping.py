@@ -9,6 +9,7 @@ in a run that is paused and stepped and in one that is not: they have equal dige
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
 from typing import Literal
 
@@ -26,10 +27,20 @@ class Stepping:
     Args:
         clock: The run's clock.
         over: Tells whether the run is ending, which takes simulated time and cannot be paused.
+        wall: Real seconds.
     """
 
-    def __init__(self, clock: Clock, over: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        over: Callable[[], bool] = lambda: False,
+        wall: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._over = over
+        self._wall = wall
+        self._pauses: tuple[float | None, float] = None, 0.0
+        """Since when time stands (`wall`), if it does, and for how long it stood before; read and
+        written at once, as other threads read it."""
         self._loop = clock._loop if isinstance(clock, LockstepClock) else None
         self._limit = 0
         """The time (ns) up to which the loop may go while this is its gate."""
@@ -67,6 +78,8 @@ class Stepping:
             return True
         assert self._loop is not None
         self._loop.now = max(self._loop.now, self._limit)  # nothing need be due there
+        since, before = self._pauses
+        self._pauses = self._wall() if since is None else since, before
         self._end_steps()
         return False
 
@@ -87,6 +100,7 @@ class Stepping:
             CommandError: Time cannot be controlled.
         """
         loop = self._checked()
+        self._go_on()
         loop.gate = None
         loop._wall_origin = None  # else it would hurry to make up for the pause
         self._end_steps()
@@ -109,6 +123,7 @@ class Stepping:
         loop = self._checked()
         if ns is not None and ns < 1:
             raise ValueError(f"expected a step of 1 ns or more, found {ns}")
+        self._go_on()
         begin = max(loop.now, self._limit) if loop.gate is self else loop.now
         self._limit = max(_next_due(loop), begin) if ns is None else begin + ns
         loop.gate = self
@@ -129,6 +144,16 @@ class Stepping:
         loop = self._checked()
         loop._pace = 0.0 if factor is None else 1.0 / (factor * SECOND)
         loop._wall_origin = None
+
+    def real_seconds(self) -> float:
+        """Return real seconds, but for those in which time stood; in any thread."""
+        since, before = self._pauses
+        return (self._wall() if since is None else since) - before
+
+    def _go_on(self) -> None:
+        since, before = self._pauses
+        if since is not None:
+            self._pauses = None, before + self._wall() - since
 
     def _end_steps(self) -> None:
         assert self._loop is not None

@@ -291,3 +291,34 @@ def test_a_step_goes_forward(ns: int) -> None:
             Stepping(LockstepClock(loop)).step(ns)
     finally:
         loop.close()
+
+
+def test_real_seconds_are_not_counted_while_time_stands() -> None:
+    """So a system outside is not given up for a pause, however long."""
+    wall = [100.0]
+
+    async def main() -> None:
+        loop, clock = running_loop()
+        stepping = Stepping(clock, wall=lambda: wall[0])
+        found: list[float] = []
+
+        def note(later: float) -> None:
+            wall[0] += later
+            found.append(stepping.real_seconds())
+
+        def then(call: Callable[[], object]) -> Callable[[], None]:
+            def noted() -> None:
+                note(50.0)
+                call()
+                note(1.0)
+
+            return noted
+
+        Outside(loop, [then(lambda: stepping.step(5 * MS)), then(stepping.resume)])
+        note(1.0)
+        stepping.pause()
+        note(1.0)  # it is still on its way to where it stands
+        await clock.sleep(0.01)
+        assert found == [101.0, 102.0, 102.0, 103.0, 103.0, 104.0]
+
+    run_in_lockstep(main())
