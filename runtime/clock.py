@@ -58,5 +58,11 @@ class Clock(ABC):
     def start(self) -> None:  # noqa: B027  # simulated time has nothing to start
         """Let time run, from 0: the first update is now."""
 
+    def hurry(self) -> None:  # noqa: B027  # real time has no order to keep
+        """End soon: nothing that is due waits for slower work any more, as it would in order.
+
+        For a run that ends by an error or by a signal: neither comes at a promised time.
+        """
+
     def close(self) -> None:  # noqa: B027  # most clocks hold nothing
         """Give back what the clock holds."""

@@ -34,6 +34,8 @@ from runtime.self_test import PYTHON, passes
 R = TypeVar("R")
 _Work = concurrent.futures.Future[Any]
 _Ready = list[tuple[selectors.SelectorKey, int]]
+_Held = tuple[int, int, _Work, asyncio.Future[Any]]
+"""Work done elsewhere: when it is due (ns), its order, its outcome, and who awaits that."""
 
 _NEVER = 1 << 62
 _POLL_EVERY = 64
@@ -83,7 +85,9 @@ class LockstepLoop(asyncio.SelectorEventLoop):
         self.schedule = Schedule()
         self.now = 0
         self.gate: Gate | None = None
-        self._held: list[tuple[int, int, _Work, asyncio.Future[Any]]] = []
+        self.hurried = False
+        """Whether work that is due is taken as it is done, out of its order: see `Clock.hurry`."""
+        self._held: list[_Held] = []
         self._orders = itertools.count()
         self._jumps = 0
         self._pace = 0.0 if speed is None else 1.0 / (speed * SECOND)
@@ -205,7 +209,7 @@ class LockstepLoop(asyncio.SelectorEventLoop):
                     self.now = due
                 return []
             if held <= due:
-                if not (held_work[0][2].done() or held_work[0][3].cancelled()):
+                if not _is_over(held_work[0]) and not (self.hurried and self._take_over(due)):
                     return wait(None)
                 self.now = due
                 _, _, work, future = heapq.heappop(held_work)
@@ -217,6 +221,15 @@ class LockstepLoop(asyncio.SelectorEventLoop):
                 return []
         self._jumps += 1
         return wait(0) if self._jumps % _POLL_EVERY == 0 or timeout == 0 else []
+
+    def _take_over(self, due: int) -> bool:
+        """Put work that is over before what else is due; tell if there is any."""
+        over = [work for work in self._held if work[0] <= due and _is_over(work)]
+        if over:
+            self._held.remove(first := min(over))
+            heapq.heapify(self._held)
+            heapq.heappush(self._held, (first[0], -1, *first[2:]))
+        return bool(over)
 
     def _key(self, due: int, timer: int, held: int) -> tuple[int, int, int]:
         """Return the place of what is due next among what is due in all processes."""
@@ -284,10 +297,18 @@ class LockstepClock(Clock):
         """Return simulated nanoseconds since the run began."""
         return self._loop.now
 
+    def hurry(self) -> None:
+        """Take work that is due as it is done, from here on."""
+        self._loop.hurried = True
+
     async def beside(self, work: concurrent.futures.Future[R], latency: int = 0) -> R:
         """Await work done elsewhere; its result comes exactly `latency` ns from now."""
         result: R = await self._loop.hold(work, self._loop.now + latency)
         return result
+
+
+def _is_over(held: _Held) -> bool:
+    return held[2].done() or held[3].cancelled()
 
 
 def _settle(future: asyncio.Future[Any], work: _Work) -> None:

@@ -135,6 +135,8 @@ class Supervisor:
         state.reason = reason
         state.error = error
         state.stopped, state.stopped_at = time.monotonic(), state.clock.now()
+        if error is not None or state.stop_requested:
+            state.clock.hurry()
         self._ended.set()
         if self._startup is not None and not self._startup.done():
             self._startup.cancel()

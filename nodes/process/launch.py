@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -104,6 +105,7 @@ class Launch:
             "VISNAV_FOLDER": str(self.folder),
             "VISNAV_SOCKET": str(self.socket),
             "VISNAV_INCLUDE": str(Path(link.__file__).parent),
+            "VISNAV_PYTHON": sys.executable,
         }
         return {**os.environ, **places, **self._ours, **self._config.environment}
 

@@ -40,8 +40,8 @@ class ProcessConfig(EstimatorConfig):
         build: A command that is run before, in the same folder; the run ends if it fails.
         folder: Working folder; if empty, that in which the run is started.
         environment: Variables beside those of the run, ``VISNAV_FOLDER`` (where the program may
-            write, in the run's folder), ``VISNAV_SOCKET`` and ``VISNAV_INCLUDE`` (with
-            visnav_link.hpp and client.py).
+            write, in the run's folder), ``VISNAV_SOCKET``, ``VISNAV_INCLUDE`` (with
+            visnav_link.hpp and client.py) and ``VISNAV_PYTHON`` (the run's own interpreter).
         feed: ``link``: the program connects to ``$VISNAV_SOCKET``, see docs/reference/link.md.
             ``ros2``: a `Ros2Bridge` of the run feeds it, and holds for its answers.
         images: Kinds of image that it gets, of each camera.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import queue
 import threading
 from pathlib import Path
@@ -158,3 +159,33 @@ def test_going_on_without_answers_is_said(tmp_path: Path) -> None:
     counts = found.outside["slam"]
     assert (counts.answered, counts.open, counts.reproducible) == (4, 6, False)
     assert found.not_deterministic == ["slam"]
+
+
+class Absent(Node):
+    """Waits for ever, at one instant, for a system that does not come; then something fails."""
+
+    async def on_startup(self) -> None:
+        self.came: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+    async def run(self) -> None:
+        self.start(self.fail())
+        await self.clock.beside(self.came)
+
+    async def fail(self) -> None:
+        raise ValueError("no such program")
+
+
+class Careful(Node):
+    """Has something to write at the end."""
+
+    async def on_shutdown(self) -> None:
+        assert self.out is not None
+        await self.offload((self.out / "results.csv").touch)
+
+
+def test_nobody_waits_at_the_end_for_what_does_not_come(tmp_path: Path) -> None:
+    settings = RunConfig(duration=Duration(1.0), shutdown_limit=Duration(40.0))
+    nodes = (spec(Absent, "absent"), spec(Careful, "careful"))
+    with pytest.raises(VisnavError, match="absent: ValueError: no such program"):
+        execute(Config(run=settings, nodes=nodes), tmp_path)
+    assert (tmp_path / "results.csv").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import threading
 import time
 from collections.abc import Callable, Coroutine
@@ -163,3 +164,34 @@ def test_threads_without_latency_freeze_time() -> None:
         return clock.now()
 
     assert run_clock(main) == 0
+
+
+def test_in_a_hurry_what_is_due_waits_for_no_slower_work() -> None:
+    """As when a run is to end while a system outside is still waited for, for ever."""
+    order: list[str] = []
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, LockstepLoop)
+        clock = LockstepClock(loop)
+
+        async def wait(name: str, work: concurrent.futures.Future[None], latency: int) -> None:
+            await clock.beside(work, latency)
+            order.append(name)
+
+        names = ("never", "one", "two", "later")
+        works = {name: concurrent.futures.Future[None]() for name in names}
+        tasks = [asyncio.create_task(wait(n, w, 5 * (n == "later"))) for n, w in works.items()]
+        await asyncio.sleep(0)
+        for name in reversed(names[1:]):
+            works[name].set_result(None)
+        loop.call_soon(clock.hurry)
+        await asyncio.wait(tasks[1:3])
+        assert order == ["one", "two"]
+        assert loop.now == 0
+        works["never"].set_result(None)
+        await asyncio.wait(tasks)
+        assert order == ["one", "two", "never", "later"]
+        assert loop.now == 5
+
+    run_in_lockstep(main())
