@@ -18,7 +18,7 @@ from nodes.ros2_bridge.attachment import Attachment, Message, pack
 from nodes.ros2_bridge.complaints import Complaints
 from nodes.ros2_bridge.session import Answer, Session
 from nodes.ros2_bridge.settings import Ros2BridgeConfig
-from nodes.ros_messages.topics import Topic, topic_name
+from nodes.ros_messages.topics import Qos, Topic, topic_name
 from nodes.ros_messages.typestore import MessageError, TypeStore
 from runtime import Node
 from runtime.errors import VisnavError
@@ -53,7 +53,7 @@ class ServiceServer:
         self.store = store
         self._session = session
         self._complaints = complaints
-        self._loop = asyncio.get_running_loop()
+        self.loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
         self._waiting = self._answered = 0
         self._closed = False
@@ -71,6 +71,14 @@ class ServiceServer:
         name = topic_name(self.node.config.namespace, name)
         service = Topic(name=name, type=type_, hash=self.store.hash(type_))
         self._session.serve(service, functools.partial(self._take, service, serve))
+
+    def publisher(self, name: str, type_: str, qos: Qos) -> Callable[..., None]:
+        """Declare a topic, and return what publishes messages of given fields, in their turn."""
+        self.store.serialize(self.store.zero(type_))  # the first takes milliseconds
+        name = topic_name(self.node.config.namespace, name)
+        topic = Topic(name=name, type=type_, hash=self.store.hash(type_), qos=qos)
+        make, put = self.store.message(type_), self._session.publisher(topic).put
+        return lambda **fields: self._send(put, self.store.serialize(make(**fields)))
 
     async def close(self) -> None:
         """Take no more requests, and wait until all answers are sent."""
@@ -101,7 +109,7 @@ class ServiceServer:
             finish(wrong)
             return
         with contextlib.suppress(RuntimeError):  # the loop has been closed
-            self._loop.call_soon_threadsafe(self._begin, service.type, serve, request, finish)
+            self.loop.call_soon_threadsafe(self._begin, service.type, serve, request, finish)
 
     def _begin(self, *request: Any) -> None:
         if not self._closed:
@@ -126,5 +134,8 @@ class ServiceServer:
         with self._lock:
             self._waiting -= 1
         attachment = b"" if request is None else pack(request._replace(stamp=time.time_ns()))
+        self._send(answer, reply, attachment)
+
+    def _send(self, *call: Any) -> None:
         with contextlib.suppress(RuntimeError):  # closed, and with it soon the session
-            self._out.submit(answer, reply, attachment)
+            self._out.submit(*call)

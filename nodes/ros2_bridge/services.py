@@ -7,6 +7,7 @@ from typing import Any
 
 from events import Command
 from nodes.ros2_bridge.service_server import ServiceServer
+from nodes.ros2_bridge.simulate_steps import SimulateSteps
 from nodes.ros2_bridge.simulation_services import SimulationServices
 from nodes.ros2_bridge.vehicle_services import VehicleServices
 from nodes.ros_messages.services import DEFINITIONS
@@ -25,7 +26,9 @@ class Services(ServiceServer):
         for type_, definition in DEFINITIONS.items():
             self.store.add(type_, definition)
         if "simulation" in self.node.config.services:
-            SimulationServices(self).declare()
+            simulation = SimulationServices(self)
+            SimulateSteps(self, simulation).declare()
+            simulation.declare()
         if "vehicle" in self.node.config.services:
             for vehicle in vehicles:
                 self._vehicles.declare(vehicle)

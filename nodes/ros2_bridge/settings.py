@@ -178,7 +178,7 @@ class Ros2BridgeConfig(PublishingConfig):
         services: Groups of services to offer. ``simulation``: simulation_interfaces, by which ROS
             pauses, steps and ends the run. ``vehicle``: ``std_srvs/Trigger`` as ``arm``,
             ``disarm``, ``take_off`` and ``land`` below each vehicle's name.
-        step: Simulated time of one step of the service ``step_simulation``.
+        step: Simulated time of one step of ``step_simulation`` and ``simulate_steps``.
         paused: Whether simulated time stands from the run's start until a service lets it go on.
     """
 

@@ -74,7 +74,7 @@ class TypeStore:
                 ) from error
 
     def add(self, type_: str, definition: str) -> None:
-        """Add a message, or a service.
+        """Add a message, or a service, be they part of an action or not.
 
         A service's messages are ``…_Request`` and ``…_Response``; its hash is that of a type with
         these and an event as its fields (REP 2016).
@@ -83,9 +83,8 @@ class TypeStore:
             type_: ``std_srvs/srv/Trigger``.
             definition: As in its ``.msg`` or ``.srv`` file, without default values.
         """
-        package, folder, _ = type_.split("/")
-        plain, node = f"{package}/msg/Plain", self._node  # rosbags names what it parses so
-        if folder == "msg":
+        plain, node = f"{type_.split('/')[0]}/msg/Plain", self._node  # rosbags names it so
+        if "---" not in definition:
             self._store.register({type_: self._parse(definition, plain)[plain]})
             return
         request, _, response = definition.partition("---")

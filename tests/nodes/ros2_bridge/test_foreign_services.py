@@ -122,7 +122,7 @@ def steer(folder: Path) -> Any:
     """Fly by services alone, of a run that begins paused; return its summary."""
     with client(folder, PAUSED, 30.0) as there:
         features = there.call("/get_simulator_features", f"{SIMULATION}/GetSimulatorFeatures")
-        assert features["features"]["features"] == {"size": 5, "first": [24, 25, 26, 31]}
+        assert features["features"]["features"] == {"size": 6, "first": [24, 25, 26, 31]}
         state = there.call("/get_simulation_state", f"{SIMULATION}/GetSimulationState")
         assert state["state"]["state"] == 2
         reset = there.call("/reset_simulation", f"{SIMULATION}/ResetSimulation", scope=0)
@@ -174,3 +174,25 @@ def test_a_run_stepped_from_outside_has_the_digest_of_one_never_paused(tmp_path:
             each.wait()
     assert summary(stepped)["digest"] == summary(quiet)["digest"]
     assert summary(stepped)["sim_seconds"] == summary(quiet)["sim_seconds"] == 6.0
+
+
+def test_a_run_stepped_by_the_action_has_the_digest_of_one_never_paused(tmp_path: Path) -> None:
+    quiet, stepped, port = tmp_path / "quiet", tmp_path / "stepped", free_port()
+    subprocess.run(command(quiet, free_port(), PILOT, 20.0), check=True, timeout=300)
+    steps = [str(each) for each in (1, 7, 1333, 100_000)]
+    acts = [sys.executable, "-m", f"{__package__}.sdk_action", str(port), *steps]
+    with subprocess.Popen(command(stepped, port, PAUSED + PILOT, 20.0)) as run:
+        try:
+            acted = subprocess.run(acts, check=True, stdout=subprocess.PIPE, timeout=400)
+            assert run.wait(200) == 0
+        finally:
+            run.kill()
+    heard = json.loads(acted.stdout.splitlines()[-1])
+    assert heard["results"] == [[4, 1], [4, 1], [4, 1], [5, 4]]
+    for each in ([1, 0], [7, 0], [1333, 0]):
+        assert each in heard["feedback"]
+    assert sum(heard["feedback"][-1]) == 100_000
+    assert heard["statuses"][0] == [2]
+    assert heard["statuses"][-3:] == [[4, 4, 4, each] for each in (2, 3, 5)]
+    assert summary(stepped)["digest"] == summary(quiet)["digest"]
+    assert summary(stepped)["sim_seconds"] == summary(quiet)["sim_seconds"] < 20.0

@@ -197,7 +197,7 @@ def test_services_have_the_hashes_that_ros_gives_them(
 def test_time_is_paused_stepped_and_resumed_by_services() -> None:
     def drive(client: Client) -> None:
         features = client.call("/get_simulator_features", f"{SIMULATION}/GetSimulatorFeatures")
-        assert features.features.features.tolist() == [24, 25, 26, 31, 32]
+        assert features.features.features.tolist() == [24, 25, 26, 31, 32, 33]
         assert features.features.custom_info == "a step is 0.002 s of simulated time"
         assert client.state() == 2
         assert client.set_state(2) == 101
