@@ -14,14 +14,14 @@ def main() -> None:
     """Run the command line, if the packages found are those installed together with this file."""
     try:
         _check_runtime()
-        from runtime.tools.cli import main as command_line
+        from runtime.tools.cli import program
     except KeyboardInterrupt:  # importing takes a moment
         print("error: interrupted", file=sys.stderr)
         sys.exit(130)
     except ImportError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    command_line()
+    program()
 
 
 def _check_runtime() -> None:

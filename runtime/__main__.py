@@ -4,9 +4,9 @@ import sys
 
 if __name__ == "__main__":
     try:
-        from runtime.tools.cli import main
+        from runtime.tools.cli import program
 
-        main()
+        program()
     except KeyboardInterrupt:  # importing takes a moment
         print("error: interrupted", file=sys.stderr)
         sys.exit(130)

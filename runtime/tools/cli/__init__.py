@@ -7,6 +7,8 @@ one line on standard error and exit code 2.
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import io
 import os
 import sys
@@ -47,6 +49,24 @@ def main() -> None:
         from runtime.tools.cli.run import leave_behind
 
         leave_behind(2, f"error: {_described(error)}")
+
+
+def program() -> None:
+    """Be the program: run the command line, and end the process with all that Zenoh still does.
+
+    Python stops threads that call it while it ends, and one that it stops in Zenoh's code aborts
+    the process.
+    """
+    try:
+        main()
+    except SystemExit as end:
+        if "zenoh" not in sys.modules or not isinstance(end.code, int | None):
+            raise
+        atexit._run_exitfuncs()
+        with contextlib.suppress(OSError, ValueError):  # nobody reads it any more
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(end.code or 0)
 
 
 def interrupted() -> NoReturn:

@@ -131,7 +131,9 @@ def test_feedback_comes_while_steps_go_on_and_cancel_lets_time_stand() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, FOREVER)
         first, second = action.feedback(), action.feedback()
-        assert 0 < first[1] < second[1] < FOREVER
+        while second[1] == first[1]:  # on a busy machine no step may fit between the two
+            second = action.feedback()
+        assert 0 <= first[1] < second[1] < FOREVER
         assert action.client.state() == 1
         assert action.cancel(9) == (2, [])
         assert action.cancel(1) == (0, [1])
