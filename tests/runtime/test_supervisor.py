@@ -101,6 +101,7 @@ def test_getting_ready_that_takes_too_long_or_fails_ends_the_run(clock: str) -> 
 def test_no_event_is_missed_by_who_gets_ready(clock: str) -> None:
     """However long it takes: the clock starts after it."""
     heard: list[int] = []
+    sent: list[int] = []
 
     class Slow(Node):
         pings = Input(Ping, keep="latest")
@@ -116,10 +117,11 @@ def test_no_event_is_missed_by_who_gets_ready(clock: str) -> None:
 
         @every(hz=100)
         def tick(self, tick: Tick) -> None:
+            sent.append(tick.index)  # not from 0 where the machine is busy: late ticks are skipped
             self.pings.send(Ping(stamp=tick.index, source=self.name))
 
     supervise([spec(Source, "source"), spec(Slow, "slow")], clock=clock, duration=0.2)
-    assert heard == [0]
+    assert heard == sent[:1]
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
