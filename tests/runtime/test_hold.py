@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.answers import Answers, read_latencies
-from runtime.errors import ConfigError, MissingAnswerError
+from runtime.answers import Answers
+from runtime.errors import MissingAnswerError
 from runtime.hold import BEHIND, IN_A_ROW, Hold, HoldConfig
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.real_clock import RealClock
@@ -389,26 +389,6 @@ class TestLatencies:
         assert came[3][0] == max(3 * PERIOD + 10 * MS, dues[2])
         assert hold.answers.latency is None
 
-    @pytest.mark.parametrize(
-        ("text", "found"),
-        [
-            ("", "columns stamp_ns,outcome,latency_ms"),
-            ("stamp_ns,outcome,latency_ms\n1,answered,-4\n", "line 2: expected a latency ≥ 0"),
-            ("stamp_ns,outcome,latency_ms\n1,answered,nan\n", "line 2: expected a latency ≥ 0"),
-            ("stamp_ns,outcome,latency_ms\n1,lost,\n", "at least one answered frame"),
-            ("stamp_ns,outcome,latency_ms\n1,2\n", "line 2"),
-        ],
-    )
-    def test_a_wrong_file_is_refused(self, tmp_path: Path, text: str, found: str) -> None:
-        file = tmp_path / "slam.csv"
-        file.write_text(text)
-        with pytest.raises(ConfigError, match=found):
-            read_latencies(file)
-
-    def test_a_missing_file_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="No such file"):
-            read_latencies(tmp_path / "slam.csv")
-
 
 async def test_in_real_time_nothing_is_held_and_skips_are_counted() -> None:
     clock = RealClock(asyncio.get_running_loop())
@@ -422,18 +402,6 @@ async def test_in_real_time_nothing_is_held_and_skips_are_counted() -> None:
     assert list(hold.answers.why_not) == ["the clock is real"]
     hold.close()
     clock.close()
-
-
-def test_the_digest_of_inputs_is_that_of_their_bytes_by_stream() -> None:
-    first, second = Answers(), Answers()
-    first.took_in("image", b"abc")
-    first.took_in("imu", bytearray(b"d"))
-    second.took_in("imu", memoryview(b"d"))
-    second.took_in("image", b"abc")
-    assert first.inputs() == second.inputs()
-    second.took_in("image", b"")
-    assert first.inputs() != second.inputs()
-    assert Answers().inputs() is None
 
 
 async def _value(owed: Any) -> Any:
