@@ -45,6 +45,7 @@ from events.estimates import (
     TrackingEvent,
     TrackingLost,
     TrackingRegained,
+    TrajectoryEstimate,
 )
 from events.geometry import Odometry, PoseStamped, TransformStamped, Wind
 from events.lifecycle import ParameterChanged, Shutdown
@@ -121,6 +122,7 @@ __all__ = [
     "TrackingEvent",
     "TrackingLost",
     "TrackingRegained",
+    "TrajectoryEstimate",
     "TransformStamped",
     "Vector3",
     "VehicleAnnouncement",

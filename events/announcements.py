@@ -367,7 +367,13 @@ class EstimatorAnnouncement(Announcement):
     Attributes:
         method: What it is, in a word or two: ``features``, ``ORB-SLAM3 rgbd``.
         scale_free: True if its unit of length is its own (monocular).
+        reads: Kinds of data that it computes with: ``grey``, ``depth``, ``imu``, ``lidar``.
+        eyes: Number of cameras whose images it takes together: 2 is a stereo rig.
+        lenses: Distortion models that it can compute with, besides an ideal camera.
     """
 
     method: str
     scale_free: bool = False
+    reads: tuple[str, ...] = ()
+    eyes: int = 1
+    lenses: tuple[str, ...] = ()

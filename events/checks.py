@@ -16,7 +16,12 @@ UNIT_TOLERANCE = 1e-3
 """By how much the norm of a quaternion may differ from 1."""
 
 _LEAST, _MOST = 1.0 - UNIT_TOLERANCE, 1.0 + UNIT_TOLERANCE
-_LENGTHS = {tuple[float, float, float]: 3, tuple[float, float, float, float]: 4, float: 0}
+_LENGTHS = {
+    tuple[float, float, float]: 3,
+    tuple[float, float, float] | None: 3,
+    tuple[float, float, float, float]: 4,
+    float: 0,
+}
 
 
 def check(event: Any, *vectors: tuple[float, ...]) -> None:
@@ -66,8 +71,9 @@ def _check_all(event: Any) -> None:
         )
     for field in msgspec.structs.fields(event):
         length = _LENGTHS.get(field.type)
-        if length is not None:
-            _check_numbers(f"{where}.{field.name}", getattr(event, field.name), length)
+        value = getattr(event, field.name)
+        if length is not None and not (value is None and field.default is None):
+            _check_numbers(f"{where}.{field.name}", value, length)
 
 
 def _check_numbers(where: str, value: Any, length: int) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Category, Event, Quaternion, Vector3
-from events.checks import check, check_pose
+from events.checks import UNIT_TOLERANCE, check, check_pose
 from events.sensors import publish
 
 
@@ -27,6 +27,8 @@ class PoseEstimate(Event):
         position: Metres in the parent frame; the estimator's own unit if it is scale-free.
         orientation: Unit quaternion (w, x, y, z), Hamilton's: rotation from the child to the parent
             frame.
+        velocity: Of the body in the parent frame, metres per second; `None` if the estimator does
+            not know it.
         covariance: Covariance of (x, y, z, roll, pitch, yaw), m², m rad and rad², in the parent
             frame as in ROS's ``PoseWithCovariance``: 36 numbers, row by row; empty if unknown.
     """
@@ -37,10 +39,57 @@ class PoseEstimate(Event):
     child_frame_id: str = "base_link"
     position: Vector3
     orientation: Quaternion
+    velocity: Vector3 | None = None
     covariance: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         check_pose(self, self.position, self.orientation)
+        if self.velocity is not None:
+            check(self, self.velocity)
+
+
+class TrajectoryEstimate(Event, eq=False):
+    """The whole trajectory as an estimator sees it now, after loop closures and other corrections.
+
+    The last one of a run is judged beside the poses as they were said (`PoseEstimate`). Frames and
+    units are those of the estimator's poses.
+
+    Attributes:
+        frame_id: Parent frame, as in `PoseEstimate`.
+        child_frame_id: Frame of the body.
+        stamps: int64 nanoseconds, strictly rising, shape (n,): as those of the poses.
+        positions: float64 metres in the parent frame, shape (n, 3).
+        orientations: float64 unit quaternions (w, x, y, z), shape (n, 4).
+    """
+
+    category: ClassVar[Category] = Category.ESTIMATE
+
+    frame_id: str = "odom"
+    child_frame_id: str = "base_link"
+    stamps: npt.NDArray[np.int64]
+    positions: npt.NDArray[np.float64]
+    orientations: npt.NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        check(self)
+        name = type(self).__name__
+        publish(name, "stamps", self.stamps, np.int64, {1})
+        publish(name, "positions", self.positions, np.float64, {2})
+        publish(name, "orientations", self.orientations, np.float64, {2})
+        count = len(self.stamps)
+        shapes = self.positions.shape, self.orientations.shape
+        if shapes != ((count, 3), (count, 4)):
+            raise TypeError(
+                f"{name}: expected positions of shape ({count}, 3) and orientations of shape "
+                f"({count}, 4), as many as stamps, found {shapes[0]} and {shapes[1]}"
+            )
+        if not np.isfinite(self.positions).all():
+            raise ValueError(f"{name}.positions: expected finite numbers, found others")
+        norms = np.linalg.norm(self.orientations, axis=1)
+        if not (np.abs(norms - 1.0) <= UNIT_TOLERANCE).all():
+            raise ValueError(f"{name}.orientations: expected unit quaternions, found others")
+        if not (np.diff(self.stamps) > 0).all():
+            raise ValueError(f"{name}.stamps: expected them to rise strictly, found others")
 
 
 class TrackingEvent(Event):

@@ -1,7 +1,7 @@
 """What an author of nodes writes: a class with ports, and the phases it needs.
 
     construct → on_startup → announce, on_announcement → check → on_ready → run, handlers, ticks
-    → on_shutdown
+    → on_end → on_shutdown
 
 Every phase is optional. All that a node may use is there before its ``__init__`` (which takes no
 arguments and need not call ``super().__init__``).
@@ -177,6 +177,13 @@ class Node(Generic[C]):
 
     async def run(self) -> None:
         """Do what the node does; returning is allowed. Cancelled when the run ends."""
+
+    async def on_end(self) -> None:
+        """Send last words; called in file order when the run is to end, before any node shuts down.
+
+        Unlike what is sent in `on_shutdown`, they reach all nodes, those after this one in the
+        file, too (in a run of several processes: those of this one). Ticks have stopped.
+        """
 
     async def on_shutdown(self) -> None:
         """Finish: flush and close. May send; nodes before this one in the file still receive it."""

@@ -158,6 +158,14 @@ class NodeRunner:
         assert self.node is not None
         await self._within(limit, "on_ready", self.node.on_ready())
 
+    async def end(self, limit: float) -> list[NodeError]:
+        """Let the node say its last words, within so many real seconds; return what went wrong."""
+        node = self.node
+        if node is None or not self.started or type(node).on_end is Node.on_end:
+            return []
+        async with self.shutdown_lock:
+            return await self._last_step(limit, "on_end", node.on_end())
+
     async def shut_down(self, limit: float) -> list[NodeError]:
         """End ticks, tasks, node and workers; whatever goes wrong, the other steps follow.
 
@@ -177,13 +185,7 @@ class NodeRunner:
         self.holds.clear()
         wrong += await self._end_tasks(limit)
         if node is not None and self.started:
-            try:
-                await self._within(limit, "on_shutdown", node.on_shutdown())
-            except BaseException as error:
-                if isinstance(error, asyncio.CancelledError) and _is_cancelled():
-                    raise
-                wrong.append(wrap(self.spec.name, error))
-                log_error(wrong[-1], last=False)
+            wrong += await self._last_step(limit, "on_shutdown", node.on_shutdown())
             wrong += await self._end_tasks(limit)  # those that it started meanwhile
         workers = [asyncio.create_task(asyncio.to_thread(worker.close)) for worker in self.workers]
         wrong += await self._end_by(limit, "its workers", workers)
@@ -195,6 +197,20 @@ class NodeRunner:
             for stream in streams(node).values():
                 stream.close()
         return wrong
+
+    async def _last_step(
+        self, limit: float, what: str, coro: Coroutine[Any, Any, Any]
+    ) -> list[NodeError]:
+        """Run a step of the end, which goes on whatever happens in it; return what went wrong."""
+        try:
+            await self._within(limit, what, coro)
+        except BaseException as error:
+            if isinstance(error, asyncio.CancelledError) and _is_cancelled():
+                raise
+            wrong = wrap(self.spec.name, error)
+            log_error(wrong, last=False)
+            return [wrong]
+        return []
 
     async def _within(self, limit: float, what: str, coro: Coroutine[Any, Any, Any]) -> None:
         """Run a step of the node as a task of its own, which is left behind if it does not end.

@@ -4,7 +4,7 @@
     announce, received by all; check; on_ready, in file order
     connect; ticks and run() begin: the first update
     …
-    cancel run(), on_shutdown: in reverse order, always, each with a time limit
+    on_end, in file order; cancel run(), on_shutdown, in reverse order: always, with time limits
 
 The run owns every task, and every wait for one has a limit: a node that does not end is named and
 left behind. What an exception in a node does is up to the node's `on_error`.
@@ -334,6 +334,9 @@ class Supervisor:
             await asyncio.wait(self._restarts)
         if not self.state.running:  # what has started may still send farewells to what has, too
             self.connect()
+        for runner in self.state.runners.values():
+            for error in await runner.end(self.state.shutdown_limit()):
+                self.state.note_error(error)
         for name, runner in reversed(self.state.runners.items()):
             await self._wait_to_end(name)
             await self._shut_down(runner)

@@ -5,9 +5,12 @@ from nodes.estimation.estimator import (
     Estimator,
     EstimatorConfig,
     RgbdFrame,
-    TrackingResult,
+    RgbdInertialFrame,
+    StereoFrame,
+    StereoInertialFrame,
 )
 from nodes.estimation.mount import Mount
+from nodes.estimation.result import TrackingResult
 
 __all__ = [
     "WORKER_ENVIRONMENT",
@@ -15,5 +18,8 @@ __all__ = [
     "EstimatorConfig",
     "Mount",
     "RgbdFrame",
+    "RgbdInertialFrame",
+    "StereoFrame",
+    "StereoInertialFrame",
     "TrackingResult",
 ]

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from typing_extensions import TypeVar
@@ -23,18 +22,23 @@ from events import (
     DepthImage,
     EstimatorAnnouncement,
     Image,
+    Imu,
+    ImuAnnouncement,
     PoseEstimate,
     TakenOff,
     TrackedFeatures,
     TrackingEvent,
     TrackingLost,
     TrackingRegained,
+    TrajectoryEstimate,
     VehicleAnnouncement,
     VehicleEvent,
 )
+from events.camera_info import COEFFICIENTS
 from nodes.estimation.mount import Mount
+from nodes.estimation.result import TrackingResult
+from nodes.estimation.rig import SensorChoice
 from runtime import Node, NodeConfig, Output, on
-from runtime.errors import suggest
 from runtime.units import Latency
 
 WORKER_ENVIRONMENT = {
@@ -53,6 +57,29 @@ class RgbdFrame(NamedTuple):
 
     image: Image
     depth: DepthImage
+
+
+class RgbdInertialFrame(NamedTuple):
+    """The same, and the samples of the IMU since the frame before."""
+
+    image: Image
+    depth: DepthImage
+    imu: tuple[Imu, ...]
+
+
+class StereoFrame(NamedTuple):
+    """The images of both cameras of a stereo rig, of one exposure."""
+
+    left: Image
+    right: Image
+
+
+class StereoInertialFrame(NamedTuple):
+    """The same, and the samples of the IMU since the frame before."""
+
+    left: Image
+    right: Image
+    imu: tuple[Imu, ...]
 
 
 class EstimatorConfig(NodeConfig):
@@ -75,9 +102,10 @@ C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
 class Estimator(Node[C], ABC):
     """Base of the nodes that estimate poses from images.
 
-    A subclass declares its input as ``frames``, a `Bundle` of one camera's images; names in `needs`
-    the kinds of image that it takes; starts its tracker in `on_ready`, when `the_camera` is known;
-    and in `run` calls `publish` with a `TrackingResult` for each image::
+    A subclass declares its input as ``frames``, a `Bundle` of one camera's images (of a stereo rig
+    with the fields ``left`` and ``right``, with an IMU one more, ``imu``); says in `needs`, `eyes`,
+    `inertial` and `lenses` what it takes; starts its tracker in `on_ready`, when `the_camera` is
+    known; and in `run` calls `publish` with a `TrackingResult` for each image::
 
         class MyEstimator(Estimator):
             needs = frozenset({"grey", "depth"})
@@ -122,8 +150,14 @@ class Estimator(Node[C], ABC):
 
     needs: frozenset[str] = frozenset()
     """Kinds of image that the camera must give, all of them; ``rgb`` serves for ``grey``, too."""
-    pinhole_only: bool = False
-    """Whether the images must be without distortion; see `refusal` for other conditions."""
+    eyes: int = 1
+    """Number of cameras whose images it takes together; 2 for a stereo rig, whose left camera is
+    that of the poses."""
+    inertial: bool = False
+    """Whether it needs an IMU on the vehicle that carries the camera."""
+    lenses: frozenset[str] = frozenset(COEFFICIENTS)
+    """Distortion models that it can compute with, besides an ideal camera; see `refusal` for other
+    conditions."""
     method: str = ""
     """Name of the method, for the report."""
     scale_free: bool = False
@@ -132,53 +166,66 @@ class Estimator(Node[C], ABC):
     estimates = Output(PoseEstimate)
     tracking_events = Output(TrackingEvent)
     features = Output(TrackedFeatures)
+    trajectories = Output(TrajectoryEstimate)
 
-    camera: CameraAnnouncement | None = None
+    cameras: tuple[CameraAnnouncement, ...] = ()
+    """The cameras whose images are read, as many as `eyes`, the left one first."""
+    imu_announcement: ImuAnnouncement | None = None
+    """The IMU whose samples are read, if it is `inertial`."""
     _vehicles: tuple[VehicleAnnouncement, ...] = ()
-    _cameras: tuple[str, ...] = ()
-    _refusals: tuple[str, ...] = ()
+    _choice: SensorChoice | None = None
     _mount: Mount | None = None
     _lost = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
 
+    @property
+    def camera(self) -> CameraAnnouncement | None:
+        """The camera whose pose is estimated; `None` before it is known."""
+        return self.cameras[0] if self.cameras else None
+
     def announce(self) -> Iterable[Announcement]:
-        """Announce the estimates."""
+        """Announce the estimates, and what they are computed from."""
         yield EstimatorAnnouncement(
-            stamp=0, source=self.name, method=self.method, scale_free=self.scale_free
+            stamp=0,
+            source=self.name,
+            method=self.method,
+            scale_free=self.scale_free,
+            reads=(*sorted(self.needs), *(["imu"] if self.inertial else [])),
+            eyes=self.eyes,
+            lenses=tuple(sorted(self.lenses)),
         )
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Take the first camera that gives what is needed, or the one that the file names."""
+        """Take the first sensors that give what is needed, or those that the file names.
+
+        The file names a camera as ``frames``, those of a stereo rig as ``frames.left`` and
+        ``frames.right``, and an IMU as ``frames.imu``.
+        """
         if isinstance(announcement, VehicleAnnouncement):
             self._vehicles += (announcement,)
-        if not isinstance(announcement, CameraAnnouncement) or self.camera is not None:
-            return
-        self._cameras += (announcement.source,)
-        named = self.sources.get("frames")
-        if named is not None and named != announcement.source:
-            return
-        gives = {*announcement.images} | ({"grey"} if "rgb" in announcement.images else set())
-        if lacking := self.needs - gives:
-            if named is None:
-                return
-            raise ValueError(
-                f"expected a camera with {', '.join(sorted(self.needs))} images, "
-                f"found none with {', '.join(sorted(lacking))}"
-            )
-        if refusal := self.refusal(announcement):
-            self._refusals += (f"{announcement.source}: {refusal}",)
-            return
-        self.camera = announcement
-        self.narrow("frames", announcement.source)
+        if self._choice is None:
+            named = dict(self.sources)
+            self._choice = SensorChoice(self.needs, self.eyes, self.inertial, named, self.refusal)
+        self._choice.announced(announcement)
+        if not self.cameras and self._choice.cameras:
+            self.cameras = self._choice.cameras
+            ports = ("frames",) if self.eyes == 1 else ("frames.left", "frames.right")
+            for port, camera in zip(ports, self.cameras, strict=True):
+                self.narrow(port, camera.source)
+        if self.imu_announcement is None and self._choice.imu is not None:
+            self.imu_announcement = self._choice.imu
+            self.narrow("frames.imu", self._choice.imu.source)
 
     def refusal(self, camera: CameraAnnouncement) -> str:
         """Return why a camera's images are of no use here, in a sentence; empty if they are."""
-        if not self.pinhole_only or camera.info.is_pinhole:
+        model = camera.info.distortion_model
+        if camera.info.is_pinhole or model in self.lenses:
             return ""
         coefficients = ", ".join(f"{value:g}" for value in camera.info.distortion)
+        known = f" or with {', '.join(sorted(self.lenses))}" if self.lenses else ""
         return (
-            "expected images without distortion (a camera sends them as well with "
-            f"undistorted = true), found {camera.info.distortion_model} with {coefficients}"
+            f"expected images without distortion{known} (a camera sends them as well with "
+            f"undistorted = true), found {model} with {coefficients}"
         )
 
     @on(Armed, TakenOff)
@@ -187,9 +234,9 @@ class Estimator(Node[C], ABC):
         self._armed_at = {event.source: event.stamp, **self._armed_at}
 
     def check(self) -> Iterable[str]:
-        """Return the error if no camera gives what is needed."""
-        if self.camera is None:
-            yield self._no_camera()
+        """Return the error if no camera gives what is needed, or there is no IMU for it."""
+        if missing := self._missing():
+            yield missing
 
     @abstractmethod
     async def run(self) -> None:
@@ -202,7 +249,7 @@ class Estimator(Node[C], ABC):
             FatalError: No camera gives what is needed.
         """
         if self.camera is None:
-            self.log.fatal("%s", self._no_camera())
+            self.log.fatal("%s", self._missing())
         return self.camera
 
     def exposed_at(self, image: Image | DepthImage) -> int:
@@ -212,16 +259,9 @@ class Estimator(Node[C], ABC):
         """
         return image.stamp - round(self.the_camera().time_offset * 1e9)
 
-    def _no_camera(self) -> str:
-        if self._refusals:
-            return "; ".join(self._refusals)
-        named = self.sources.get("frames")
-        called = f" called {named}" if named else ""
-        found = ", ".join(self._cameras) or "none"
-        return (
-            f"expected a camera with {', '.join(sorted(self.needs))} images{called}, "
-            f"found {found}{suggest(named or '', self._cameras)}"
-        )
+    def _missing(self) -> str:
+        choice = self._choice or SensorChoice(self.needs, self.eyes, self.inertial, {}, str)
+        return choice.missing()
 
     def publish(
         self, image: Image | DepthImage, result: TrackingResult, origin: int | None = None
@@ -260,7 +300,21 @@ class Estimator(Node[C], ABC):
         if not result.lost:
             if self._mount is None:
                 self._mount = self._mounting(stamp if origin is None else origin)
-            self.estimates.send(self._mount.estimate(stamp, self.name, result.pose))
+            self.estimates.send(self._mount.estimate(stamp, self.name, result))
+
+    def publish_trajectory(
+        self, stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float64]
+    ) -> None:
+        """Send the trajectory as the tracker sees it now, after loop closures; see `on_end`.
+
+        Args:
+            stamps: When the images were exposed (`exposed_at`), ns, strictly rising, shape (n,).
+            poses: The optical camera as in `TrackingResult`, shape (n, 4, 4).
+        """
+        if self._mount is not None and len(stamps):
+            self.trajectories.send(
+                self._mount.trajectory(self.clock.now(), self.name, stamps, poses)
+            )
 
     def _mounting(self, origin: int) -> Mount:
         """Return the mount for a tracker whose poses start at an image of this stamp."""
@@ -293,22 +347,3 @@ class Estimator(Node[C], ABC):
     def _odom(self) -> str:
         """Return the frame of estimates whose origin is unknown."""
         return f"odom_{self.restarts}" if self.restarts else "odom"
-
-
-class TrackingResult(msgspec.Struct, frozen=True, eq=False):
-    """What a tracker finds in one image: the pose of the camera, and the features it is from.
-
-    Attributes:
-        pose: The optical camera at this image in the optical camera at the first one: the transform
-            from this frame to that one, shape (4, 4). Metres, or the tracker's own unit.
-        lost: Whether the pose is not known; `pose` is then the last known one.
-        reason: Why tracking was lost, or how it was regained.
-        points: Features that were tracked: column and row, float32 pixels, shape (n, 2).
-        inliers: Which of them agree with the pose: bool, shape (n,).
-    """
-
-    pose: npt.NDArray[np.float64]
-    lost: bool = False
-    reason: str = ""
-    points: npt.NDArray[np.float32] = np.empty((0, 2), np.float32)
-    inliers: npt.NDArray[np.bool_] = np.empty(0, np.bool_)

@@ -33,7 +33,7 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
     """Estimates the pose of a single camera, in a unit of length of its own."""
 
     needs = frozenset({"grey"})
-    pinhole_only = True
+    lenses = frozenset()
     method = "monocular odometry"
     scale_free = True
 

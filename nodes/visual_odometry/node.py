@@ -57,7 +57,7 @@ class VisualOdometry(Estimator[VisualOdometryConfig]):
     """Estimates the pose of a camera with depth from its images alone."""
 
     needs = frozenset({"grey", "depth"})
-    pinhole_only = True
+    lenses = frozenset()
 
     frames = Bundle(RgbdFrame, keep="latest")
 

@@ -32,6 +32,7 @@ VALID: dict[Any, Any] = {
     float: 0.5,
     bool: False,
     Vector3: (1.0, -2.0, 3.0),
+    Vector3 | None: (1.0, -2.0, 3.0),
     Quaternion: (0.5, -0.5, 0.5, 0.5),
     tuple[str, ...]: ("rgb",),
     tuple[float, ...]: (),
@@ -46,6 +47,9 @@ ARRAYS: dict[str, Any] = {
     "intensities": np.zeros(2, np.float32),
     "times": np.zeros(2, np.float32),
     "rings": np.zeros(2, np.uint16),
+    "stamps": np.arange(2),
+    "positions": np.zeros((2, 3)),
+    "orientations": np.tile((1.0, 0.0, 0.0, 0.0), (2, 1)),
 }
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=32)
 
@@ -67,8 +71,8 @@ def fields_of(cls: type[Event]) -> dict[str, Any]:
 def wrong_values(type_: Any, name: str) -> Iterator[Any]:
     if name == "stamp":
         yield from (1.0, True, np.int64(1), np.float64(1), None, "1", nan)
-    if type_ in {Vector3, Quaternion}:
-        size = 3 if type_ == Vector3 else 4
+    if type_ in {Vector3, Vector3 | None, Quaternion}:
+        size = 4 if type_ == Quaternion else 3
         for number in (nan, inf, -inf, None, "1"):
             yield (number, *(0.5,) * (size - 1))
             yield (*(0.5,) * (size - 1), number)

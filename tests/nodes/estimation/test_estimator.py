@@ -15,18 +15,22 @@ from events import (
     CameraAnnouncement,
     CameraInfo,
     DepthImage,
+    EstimatorAnnouncement,
     Event,
     Image,
+    Imu,
+    ImuAnnouncement,
     PoseEstimate,
     TakenOff,
     TrackedFeatures,
     TrackingEvent,
     TrackingLost,
     TrackingRegained,
+    TrajectoryEstimate,
     VehicleAnnouncement,
 )
 from events.poses import pose_matrix, pose_tuples
-from nodes.estimation import Estimator, RgbdFrame, TrackingResult
+from nodes.estimation import Estimator, RgbdFrame, StereoInertialFrame, TrackingResult
 from runtime import Bundle
 from runtime.errors import NodeError, RefusedError
 from runtime.testing import NodeResult, run_nodes, spec
@@ -300,7 +304,7 @@ def test_whatever_happens_an_estimate_in_map_is_true(
 class PinholeOnly(Scripted):
     """Cannot compute with a lens."""
 
-    pinhole_only = True
+    lenses = frozenset()
 
 
 BARREL = CameraInfo(
@@ -346,3 +350,98 @@ def test_estimates_are_on_the_clock_of_the_imu() -> None:
     assert [each.stamp for each in result.of(PoseEstimate)] == [70 * MS]
     assert [each.stamp for each in result.of(TrackingLost)] == [170 * MS]
     assert [each.stamp for each in result.of(TrackedFeatures)] == [100 * MS, 200 * MS]
+
+
+class StereoInertial(Estimator):
+    """Moves a metre with each pair of images, and knows its velocity and how sure it is."""
+
+    needs = frozenset({"grey"})
+    eyes = 2
+    inertial = True
+    frames = Bundle(StereoInertialFrame)
+
+    async def run(self) -> None:
+        async for left, _, samples in self.frames:
+            assert len(samples) == 1
+            pose = np.eye(4)
+            pose[2, 3] = left.stamp / MS
+            velocity = np.array([0.0, 0.0, 1.0])
+            covariance = np.diag([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+            self.publish(left, TrackingResult(pose, velocity=velocity, covariance=covariance))
+
+    async def on_end(self) -> None:
+        self.publish_trajectory(np.array([MS, 2 * MS]), np.stack([np.eye(4)] * 2))
+
+
+def imu(source: str = "drone/imu") -> Event:
+    return ImuAnnouncement(
+        stamp=0,
+        source=source,
+        rate=100.0,
+        frame_id="base_link",
+        gyroscope_noise_density=0.0,
+        gyroscope_random_walk=0.0,
+        accelerometer_noise_density=0.0,
+        accelerometer_random_walk=0.0,
+    )
+
+
+def rig(name: str) -> list[Event]:
+    left, right = f"{name}_left", f"{name}_right"
+    return [camera(right, "grey", stereo=left, baseline=0.1), camera(left, "grey")]
+
+
+def sample(stamp: int, source: str = "drone/imu") -> Event:
+    rest = {"angular_velocity": (0.0, 0.0, 0.0), "linear_acceleration": (0.0, 0.0, -9.81)}
+    return Imu(stamp=stamp, source=source, frame_id="base_link", **rest)
+
+
+def test_a_stereo_rig_and_the_imu_of_its_vehicle_are_chosen() -> None:
+    others = [imu("other/imu"), camera("drone/mono", "grey")]
+    flown = [
+        event
+        for k in (1, 2)
+        for event in (
+            sample(k * MS, "other/imu"),
+            sample(k * MS),
+            *(rgbd(k * MS, f"drone/{each}")[0] for each in ("mono", "eye_left", "eye_right")),
+        )
+    ]
+    result = run_nodes(
+        [spec(StereoInertial, "est")],
+        inputs=[vehicle(), *others, *rig("drone/eye"), imu(), *flown],
+        duration=1.0,
+    )
+    (said,) = (e for e in result.sent if isinstance(e, EstimatorAnnouncement))
+    assert (said.reads, said.eyes) == (("grey", "imu"), 2)
+    estimates = result.of(PoseEstimate)
+    assert [e.stamp for e in estimates] == [MS, 2 * MS]
+    np.testing.assert_allclose(estimates[1].position, (1.0, 4.0, -0.1), atol=1e-9)  # it looks east
+    assert estimates[1].velocity == pytest.approx((0.0, 1.0, 0.0))
+    variances = np.reshape(estimates[1].covariance, (6, 6)).diagonal()
+    np.testing.assert_allclose(variances, (1.0, 3.0, 2.0, 0, 0, 0), atol=1e-9)
+    (final,) = result.of(TrajectoryEstimate)
+    assert final.stamps.tolist() == [MS, 2 * MS]
+    np.testing.assert_allclose(final.positions, [(1.0, 2.0, -0.1)] * 2, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("announced", "expected"),
+    [
+        ([camera("drone/mono", "grey"), imu()], "expected a stereo rig with grey images, found"),
+        ([*rig("drone/eye")], "expected an IMU beside drone/eye_left, found none"),
+        ([*rig("drone/eye"), imu("other/imu")], "beside drone/eye_left, found other/imu"),
+    ],
+)
+def test_what_is_missing_of_a_rig_is_named(announced: list[Event], expected: str) -> None:
+    with pytest.raises(NodeError, match=expected):
+        run_nodes([spec(StereoInertial, "est")], inputs=announced, duration=1.0)
+
+
+def test_the_file_may_name_both_cameras() -> None:
+    named = {"frames.left": "drone/b", "frames.right": "drone/a", "frames.imu": "drone/imu2"}
+    announced = [camera("drone/a", "grey"), camera("drone/b", "grey"), imu(), imu("drone/imu2")]
+    flown = [sample(MS, "drone/imu2"), rgbd(MS, "drone/a")[0], rgbd(MS, "drone/b")[0]]
+    nodes = [spec(StereoInertial, "est", inputs=named)]
+    result = run_nodes(nodes, inputs=[*announced, *flown], duration=1.0)
+    assert len(result.of(PoseEstimate)) == 1

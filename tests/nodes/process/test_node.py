@@ -70,6 +70,8 @@ def test_what_it_is_sent_depends_on_nothing_that_it_does(
     assert (outside.lost, outside.unknown) == (0, 0)
     if "latency" in settings:  # what is on its way at the end may be answered or not
         return
+    if "repeated" in counted:  # the last one may come when the run has ended
+        counted = {"repeated": min(max(outside.repeated, FRAMES - 1), FRAMES)}
     for name, value in ({"answered": FRAMES, "empty": 0, "open": 0} | counted).items():
         assert (name, getattr(outside, name)) == (name, value)
     if not counted or "repeated" in counted:
