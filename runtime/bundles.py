@@ -2,7 +2,7 @@
 
 It is declared with `Bundle`; at run time a `Matcher` does the work. A set that is not completed, or
 that the reader skips, leaves its tuples to the next one. (A set that is lost by a link before the
-bundle takes them along.)
+bundle takes them along.) Stamps rise from set to set: what comes twice, or late, makes no set.
 """
 
 from __future__ import annotations
@@ -129,7 +129,8 @@ class Matcher(Generic[B]):
         tolerance: Nanoseconds by which stamps may differ.
 
     Attributes:
-        missed: How often a set did not come about because an event of this field was missing.
+        missed: How often a set did not come about because an event of this field was missing, or
+            (of the first field) not later than that of the set before.
     """
 
     def __init__(
@@ -146,6 +147,7 @@ class Matcher(Generic[B]):
         self.missed = dict.fromkeys(fields, 0)
         self._set_type = set_type
         self._tolerance = tolerance
+        self._newest: int | None = None
         self._first, *self._others = self.slots.values()
         self._tuples = [at for at, slot in enumerate(self.slots.values()) if slot.kind == "all"]
         if self._tuples:
@@ -174,6 +176,10 @@ class Matcher(Generic[B]):
         """Deliver all sets that are decided; called whenever an event has come."""
         first = self._first.events
         while first:
+            if self._newest is not None and first[0].stamp <= self._newest:
+                self._first.pop()
+                self.missed[self._first.field] += 1
+                continue
             parts: list[Any] = [first[0]]
             missing = None
             for slot in self._others:
@@ -191,6 +197,7 @@ class Matcher(Generic[B]):
                 if missing is None or slot.kind != "all":
                     slot.forget(stamp, self._tolerance)
             if missing is None:
+                self._newest = stamp
                 self.deliver(self._set_type._make(parts))  # type: ignore[attr-defined]
             else:
                 self.missed[missing] += 1

@@ -134,6 +134,13 @@ def test_a_tuple_gathers_all_since_the_set_before_up_to_the_stamp() -> None:
     assert ms == [(10, None, (2, 6, 10)), (20, None, (14, 18))]
 
 
+def test_what_comes_twice_or_late_makes_no_set_and_is_counted() -> None:
+    sent = [each for ms in (10, 10, 20, 15, 30) for each in (*at(A, ms), *at(B, ms))]
+    result = run_nodes([spec(Reader, "n")], inputs=sent)
+    assert found(result) == [(ms * MS, ms * MS) for ms in (10, 20, 30)]
+    assert result.drops["n.sets"].missed == {"a": 2}
+
+
 def test_what_may_be_missing_is_taken_if_it_is_there() -> None:
     result = read(Rich, at(A, 10, 20), at(B, 10), at(C, 10, 20))
     assert [b for _, b, _ in found(result)] == [10 * MS, None]

@@ -31,7 +31,7 @@ RELIEF: tuple[Tile, ...] = (
 BOARD: tuple[Tile, ...] = ((20.0, -99.0, 99.0, -99.0, 99.0), (2.0, -9.0, 0.4, -9.0, 9.0))
 """A board that ends on the right, and something far behind it."""
 _METRE = 120.0
-"""Pixels of texture to a metre, two metres away."""
+"""Pixels of texture to a metre, two metres away, for the focal length of `INFO`."""
 
 
 @cache
@@ -56,8 +56,15 @@ def pose(
 
 def look(camera: Floats, tiles: tuple[Tile, ...] = RELIEF) -> Grey:
     """Return what a camera of this pose (camera to world) sees."""
-    columns, rows = np.meshgrid(np.arange(INFO.width), np.arange(INFO.height))
-    x, y = (columns - INFO.cx) / INFO.fx, (rows - INFO.cy) / INFO.fy
+    return look_with_depth(camera, INFO, tiles)[0]
+
+
+def look_with_depth(
+    camera: Floats, info: CameraInfo, tiles: tuple[Tile, ...]
+) -> tuple[Grey, npt.NDArray[np.float32]]:
+    """Return what another camera sees, and its depth along the optical axis, in metres."""
+    columns, rows = np.meshgrid(np.arange(info.width), np.arange(info.height))
+    x, y = (columns - info.cx) / info.fx, (rows - info.cy) / info.fy
     right, down, ahead = (row[0] * x + row[1] * y + row[2] for row in camera[:3, :3])
     right, down = right / ahead, down / ahead
     u, v, nearest = np.zeros(x.shape), np.zeros(x.shape), np.full(x.shape, np.inf)
@@ -70,11 +77,12 @@ def look(camera: Floats, tiles: tuple[Tile, ...] = RELIEF) -> Grey:
         # Another piece of texture at each distance, and as fine in the image.
         np.copyto(u, 2.0 * tile_u / distance + distance, where=hit)
         np.copyto(v, 2.0 * tile_v / distance, where=hit)
+    scale = _METRE * info.fx / INFO.fx
     drawn = cv2.remap(
         _texture(),
-        (512 + _METRE * u).astype(np.float32),
-        (512 + _METRE * v).astype(np.float32),
+        (512 + scale * u).astype(np.float32),
+        (512 + scale * v).astype(np.float32),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REFLECT,
     )
-    return np.rint(drawn).astype(np.uint8)
+    return np.rint(drawn).astype(np.uint8), (nearest / ahead).astype(np.float32)

@@ -1,0 +1,56 @@
+"""All estimators of the project pass the suite of `tests.nodes.estimation.conformance`.
+
+One entry in `CASES` for each; its rig is what it announces to read.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from nodes.monocular_odometry import MonocularOdometry
+from nodes.visual_odometry import VisualOdometry
+from tests.nodes.estimation.conformance import (
+    Case,
+    Lack,
+    faults,
+    lacks,
+    refusal_faults,
+    run,
+)
+
+CASES = {
+    "features": Case(VisualOdometry),
+    "dense": Case(VisualOdometry, {"method": "dense"}, width=160),
+    "monocular": Case(MonocularOdometry, begins=14),
+}
+"""By a name for the test; those that need more than the project itself are slow."""
+
+
+def cases() -> list[Any]:
+    return [
+        pytest.param(case, id=name, marks=[pytest.mark.slow] if case.slow else [])
+        for name, case in CASES.items()
+    ]
+
+
+@pytest.mark.parametrize("case", cases())
+def test_it_passes_the_suite_and_equal_input_gives_equal_output(case: Case) -> None:
+    record = run(case)
+    assert not faults(record, case)
+    if case.node.deterministic:
+        assert run(case).outcome() == record.outcome()
+
+
+def refusals() -> list[Any]:
+    return [
+        pytest.param(case, lack, id=f"{name}, {lack.name} missing")
+        for name, case in CASES.items()
+        for lack in lacks(case)
+    ]
+
+
+@pytest.mark.parametrize(("case", "lack"), refusals())
+def test_what_it_cannot_do_it_refuses_in_a_sentence(case: Case, lack: Lack) -> None:
+    assert not [*refusal_faults(case, lack)]
