@@ -33,6 +33,9 @@ def sweep(
     seeds: Annotated[
         int, typer.Option(min=1, help="Run each combination with so many seeds, from the file's.")
     ] = 1,
+    repeat: Annotated[
+        int, typer.Option(min=1, help="Run it with each seed so often: is it the same each time?")
+    ] = 1,
     overrides: Overrides = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for results; sweeps/<name> if not given.")
@@ -62,7 +65,9 @@ def sweep(
     from runtime.tools.cli.run import look_at
     from runtime.tools.sweep.console import Display, summary_table
 
-    plan = sweeping.make_plan(config, vary or [], overrides=overrides or [], seeds=seeds, out=out)
+    plan = sweeping.make_plan(
+        config, vary or [], overrides=overrides or [], seeds=seeds, repeats=repeat, out=out
+    )
     changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
     look_at(load(config, [*(overrides or []), *changes]))
     children = sweeping.Children()

@@ -1,6 +1,6 @@
 """A sweep: one file run with many settings and seeds, each run in a process of its own.
 
-    config.toml, --vary, --seeds  →  Plan of Jobs  →  Executor  →  Rows  →  tables and plots
+    config.toml, --vary, --seeds, --repeat → Plan of Jobs → Executor → Rows → tables and plots
 
 Read in this order: `values` (what ``--vary`` says), `plan` (which runs there are), `process` (one
 run), `rows` (what is remembered of it), `console` (all runs, and what a terminal shows meanwhile),
@@ -24,7 +24,7 @@ is shared. The rows come back in any case.
 
 from runtime.tools.sweep.console import Watch, sweep
 from runtime.tools.sweep.page import write_page
-from runtime.tools.sweep.plan import Job, Plan, make_plan
+from runtime.tools.sweep.plan import Job, Plan, make_job, make_plan
 from runtime.tools.sweep.plots import draw_plots
 from runtime.tools.sweep.process import Children, run_job
 from runtime.tools.sweep.rows import Row
@@ -37,6 +37,7 @@ __all__ = [
     "Row",
     "Watch",
     "draw_plots",
+    "make_job",
     "make_plan",
     "run_job",
     "summarise",

@@ -188,20 +188,23 @@ class _State(ProgressColumn):
 
 
 def summary_table(plan: Plan, combinations: Sequence[Combination]) -> Table:
-    """Return the medians of the main figures that there are; `write_tables` has their ranges."""
+    """Return the main figures that there are; `write_tables` has their quartiles, too."""
     names = [n for n in MAIN_FIGURES if any(n in each.figures for each in combinations)]
-    table = Table(title="medians over the seeds", title_justify="left")
+    table = Table(title="median (least to most) of the runs", title_justify="left")
     for parameter in plan.parameters:
         table.add_column(parameter.path, overflow="fold")
     table.add_column("estimator")
-    for name in ["runs", "failed", "passed", *names]:
+    repeated = any(each.repeatable for each in combinations)
+    for name in ["runs", "failed", "missed", "passed", *names]:
         table.add_column(name.replace("_", " "), justify="right")
+    if repeated:
+        table.add_column("repeatable")
     for each in combinations:
         passed = "" if each.passed is None else f"{each.passed}"
-        counts = [f"{each.runs}", f"{each.failed}", passed]
-        figures = [f"{each.figures[n].median:.4g}" if n in each.figures else "" for n in names]
+        counts = [f"{each.runs}", f"{each.failed}", f"{each.missed}", passed]
+        figures = [str(each.figures.get(name, "")) for name in names]
         words = map(Text, [*each.settings, each.estimator])
-        table.add_row(*words, *counts, *figures)
+        table.add_row(*words, *counts, *figures, *[each.repeatable] * repeated)
     return table
 
 

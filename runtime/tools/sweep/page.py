@@ -25,29 +25,38 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
     for each in combinations:
         spreads = [each.figures.get(name) for name in figures]
         cells = [
-            (f"{s.median:.4g}", f"{s.least:.4g} to {s.most:.4g}") if s else ("", "")
+            (f"{s.median:.4g}", f"{s.first:.4g} to {s.third:.4g}", f"{s.least:.4g} to {s.most:.4g}")
+            if s
+            else ("", "", "")
             for s in spreads
         ]
-        counts = [each.runs, each.failed, "" if each.passed is None else each.passed]
-        summary.append(([*each.settings, each.estimator], counts, cells))
-    runs = []
+        judged = "" if each.passed is None else each.passed
+        counts = [each.runs, _share(each.failed, each.runs), _share(each.missed, each.runs), judged]
+        summary.append(([*each.settings, each.estimator], counts, cells, each.repeatable))
+    runs, repeated = [], any(job.repeat > 1 for job in plan.jobs)
     for job, row in in_order(plan, rows):
         report = Path(job.out) / "report.html"
         link = report.relative_to(plan.out).as_posix() if report.is_file() else ""
         state = {True: "passed", False: "failed", None: "not judged"}[row["passed"]]
         settings = [text for _, text in job.settings]
-        runs.append(([*settings, job.seed], row["error"] or state, link, bool(row["error"])))
+        own = [job.seed, *[job.repeat] * repeated]
+        runs.append(([*settings, *own], row["error"] or state, link, bool(row["error"])))
     page = _template().render(
         name=plan.out.name,
         parameters=[parameter.path for parameter in plan.parameters],
         figures=[name.replace("_", " ") for name in figures],
         summary=summary,
+        repeated=repeated,
         runs=runs,
         plots=[f"plots/{path.name}" for path in sorted((plan.out / "plots").glob("*.png"))],
     )
     path = plan.out / "index.html"
     write(path, page.encode())
     return path
+
+
+def _share(count: int, runs: int) -> str:
+    return f"{count} ({count / runs:.0%})" if count else "0"
 
 
 def _template() -> jinja2.Template:

@@ -20,11 +20,13 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     """One run, with all that another machine needs to know of it.
 
     Attributes:
-        id: Of these settings and this seed, in this sweep or any other.
+        id: Of these settings, this seed and this repeat, in this sweep or any other.
         text: The settings as TOML, defaults and seed included.
         folder: Of the file that they come from; modules of its nodes are looked for there.
         settings: What is varied, as path and value, in the order of the parameters.
         seed: Of the run's random numbers.
+        repeat: The how manieth run with these settings and this seed; they differ if something
+            in it does not depend on these alone.
         out: Absolute path of the folder for the run's results.
     """
 
@@ -34,10 +36,12 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[tuple[str, str], ...]
     seed: int
     out: str
+    repeat: int = 1
 
     def __str__(self) -> str:
         """Return what tells it from the others of its sweep."""
-        return " ".join([*(f"{path}={text}" for path, text in self.settings), f"seed={self.seed}"])
+        words = [*(f"{path}={text}" for path, text in self.settings), f"seed={self.seed}"]
+        return " ".join(words + [f"repeat={self.repeat}"] * (self.repeat > 1))
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,7 +49,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         parameters: What is varied.
-        jobs: All runs: the first parameter changes slowest, the seed quickest.
+        jobs: All runs: the first parameter changes slowest, then the seed, the repeat quickest.
         out: Absolute path of the folder for everything.
     """
 
@@ -60,6 +64,7 @@ def make_plan(
     *,
     overrides: Sequence[str] = (),
     seeds: int = 1,
+    repeats: int = 1,
     out: Path | None = None,
 ) -> Plan:
     """Plan a sweep.
@@ -69,14 +74,16 @@ def make_plan(
         vary: ``PATH=V1,V2,…``, the paths as in `overrides`.
         overrides: ``node.key=value`` or ``run.key=value``, the same for all runs.
         seeds: How many seeds each combination is run with, from the file's on.
+        repeats: How often it is run with each seed.
         out: Folder for everything; ``sweeps/<name of the run>`` if not given.
 
     Raises:
         ConfigError: Something is wrong with the file, a path or a value, or two combinations
             come to the same settings.
     """
-    if seeds < 1:
-        raise ConfigError(f"--seeds: expected at least 1, found {seeds}")
+    for option, count in (("--seeds", seeds), ("--repeat", repeats)):
+        if count < 1:
+            raise ConfigError(f"{option}: expected at least 1, found {count}")
     parameters = tuple(parameter(change) for change in vary)
     _refuse_repeated([p.path for p in parameters], [o.partition("=")[0] for o in overrides])
     loaded = []
@@ -87,8 +94,9 @@ def make_plan(
     out = (out or Path("sweeps") / first.name).absolute()
     jobs: dict[str, Job] = {}
     for settings, resolved in loaded:
-        for seed in range(first.seed, first.seed + seeds):
-            job = _job(resolved, settings, seed, config.resolve().parent, out)
+        runs = itertools.product(range(first.seed, first.seed + seeds), range(1, repeats + 1))
+        for seed, repeat in runs:
+            job = make_job(resolved, settings, seed, config.resolve().parent, out, repeat)
             if job.id in jobs:
                 raise ConfigError(
                     f"--vary: expected combinations that differ, found the same settings for "
@@ -118,12 +126,27 @@ def _load(config: Path, overrides: Sequence[str], settings: tuple[tuple[str, str
         raise ConfigError(f"with {' '.join(changes)}: {error}") from error
 
 
-def _job(
-    config: Config, settings: tuple[tuple[str, str], ...], seed: int, folder: Path, out: Path
+def make_job(
+    config: Config,
+    settings: tuple[tuple[str, str], ...],
+    seed: int,
+    folder: Path,
+    out: Path,
+    repeat: int = 1,
 ) -> Job:
+    """Make one run of a sweep.
+
+    Args:
+        config: Its settings, but for the seed.
+        settings: What tells it from the others, as pairs of name and value.
+        seed: Of its random numbers.
+        folder: Where modules of its nodes are looked for.
+        out: Absolute path of the sweep's folder.
+        repeat: The how manieth run with these settings and this seed.
+    """
     config = msgspec.structs.replace(config, run=msgspec.structs.replace(config.run, seed=seed))
     text = tomli_w.dumps(to_builtins(config))
-    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    key = hashlib.sha256(text.encode()).hexdigest()[:16] + f"-{repeat}" * (repeat > 1)
     return Job(
         id=key,
         text=text,
@@ -131,4 +154,5 @@ def _job(
         settings=settings,
         seed=seed,
         out=str(out / "runs" / key),
+        repeat=repeat,
     )

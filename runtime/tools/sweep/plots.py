@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from runtime.tools.sweep.plan import Plan
 from runtime.tools.sweep.rows import Row
-from runtime.tools.sweep.tables import in_order, numbers
+from runtime.tools.sweep.tables import Spread, in_order, numbers
 from runtime.tools.sweep.values import Parameter, axis
 
 PLOTTED = {
@@ -22,6 +22,7 @@ PLOTTED = {
 }
 """Figure to what it is called on its axis."""
 
+_SHARES = "failures (% of the runs)"
 _MOST_LINES = 8
 
 
@@ -31,23 +32,21 @@ class Line(msgspec.Struct, frozen=True):
     Attributes:
         label: What tells it from the others; empty if it is the only one.
         texts: The values.
-        middle: The median of all runs there.
-        low: Lower edge of the band about it: the least, or of many runs together the quartile.
-        high: Upper edge.
+        spreads: Of the figure at each of them.
     """
 
     label: str
     texts: tuple[str, ...]
-    middle: tuple[float, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    spreads: tuple[Spread, ...]
 
 
 def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
-    """Draw a plot for each parameter into ``plots/``, if the runs have something to show."""
+    """Draw a plot for each parameter into ``plots/``, if the runs have something to show.
+
+    A line is the median, with the quartiles as its band, and bars from the least to the most; the
+    last panel has the share of the runs that came to nothing, and that missed a threshold.
+    """
     own = [row for _, row in in_order(plan, rows)]
-    failures = sum(bool(row["error"]) for row in own)
-    note = f"{failures} of {len(own)} runs failed and are not shown" if failures else ""
     drawn = []
     for parameter in plan.parameters:
         found = {name: lines(plan, own, parameter, name) for name in PLOTTED}
@@ -55,7 +54,7 @@ def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
         if found:
             path = plan.out / "plots" / (re.sub(r"[^\w.-]", "_", parameter.path) + ".png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            _draw(parameter, found, note, path)
+            _draw(parameter, found, _shares(parameter, own), path)
             drawn.append(path)
     return drawn
 
@@ -63,8 +62,8 @@ def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
 def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) -> list[Line]:
     """Return what a figure did with a parameter.
 
-    One line for each combination of the other parameters and each estimator, with the range of
-    the seeds as its band; if these are more than 8, one for each estimator, with the quartiles.
+    One line for each combination of the other parameters and each estimator; if these are more
+    than 8, one for each estimator.
     """
     points: dict[tuple[str, tuple[str, ...]], dict[str, list[float]]] = {}
     for job, row in in_order(plan, rows):
@@ -78,7 +77,7 @@ def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) ->
     if len(points) <= _MOST_LINES:
         several = len({estimator for estimator, _ in points}) > 1
         return [
-            _line(", ".join([estimator] * several + [*others]), line, parameter, _range)
+            _line(", ".join([estimator] * several + [*others]), line, parameter)
             for (estimator, others), line in points.items()
         ]
     merged: dict[str, dict[str, list[float]]] = {}
@@ -86,57 +85,76 @@ def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) ->
         for text, found in line.items():
             merged.setdefault(estimator, {}).setdefault(text, []).extend(found)
     return [
-        _line(f"{estimator}, all others".lstrip(", "), line, parameter, _quartiles)
+        _line(f"{estimator}, all others".lstrip(", "), line, parameter)
         for estimator, line in merged.items()
     ]
 
 
-def _line(label: str, found: dict[str, list[float]], parameter: Parameter, band: Any) -> Line:
+def _line(label: str, found: dict[str, list[float]], parameter: Parameter) -> Line:
     texts = tuple(text for text in parameter.texts if text in found)
-    edges = [band(found[text]) for text in texts]
-    return Line(
-        label=label,
-        texts=texts,
-        middle=tuple(statistics.median(found[text]) for text in texts),
-        low=tuple(low for low, _ in edges),
-        high=tuple(high for _, high in edges),
-    )
+    return Line(label, texts, tuple(Spread.of(found[text]) for text in texts))
 
 
-def _range(values: list[float]) -> tuple[float, float]:
-    return min(values), max(values)
+def _shares(parameter: Parameter, rows: Sequence[Row]) -> dict[str, list[float]]:
+    """Return the percentages of runs that failed and that missed, at each value; none if all 0."""
+    groups = [[r for r in rows if r["parameters"][parameter.path] == t] for t in parameter.texts]
+    shares = {
+        "failed": [_percent(bool(row["error"]) for row in group) for group in groups],
+        "missed a threshold": [
+            _percent(row["passed"] is False for row in group) for group in groups
+        ],
+    }
+    return shares if any(map(any, shares.values())) else {}
 
 
-def _quartiles(values: list[float]) -> tuple[float, float]:
-    if len(values) < 2:
-        return values[0], values[0]
-    first, _, third = statistics.quantiles(values, n=4, method="inclusive")
-    return first, third
+def _percent(found: Iterable[bool]) -> float:
+    each = [*found]
+    return 100.0 * sum(each) / max(len(each), 1)
 
 
-def _draw(parameter: Parameter, found: dict[str, list[Line]], note: str, path: Path) -> None:
+def _draw(
+    parameter: Parameter,
+    found: dict[str, list[Line]],
+    shares: dict[str, list[float]],
+    path: Path,
+) -> None:
     from matplotlib.figure import Figure
 
     scale = axis(parameter.texts)
     place = dict(zip(parameter.texts, scale.places, strict=True))
-    figure = Figure(figsize=(4.6 * len(found), 4.4), layout="constrained")
-    figure.suptitle(note, fontsize=9, color="#b00020")
+    panels = len(found) + bool(shares)
+    figure = Figure(figsize=(4.6 * panels, 4.4), layout="constrained")
     labels = list(dict.fromkeys(line.label for own in found.values() for line in own))
     colours = {label: f"C{index}" for index, label in enumerate(labels)}
     handles: dict[str, Any] = {}
-    for index, (name, own) in enumerate(found.items(), 1):
-        axes: Any = figure.add_subplot(1, len(found), index)
+    for index, (name, own) in enumerate([*found.items(), *[("", [])] * bool(shares)], 1):
+        axes: Any = figure.add_subplot(1, panels, index)
         for line in own:
-            places = (place[text] for text in line.texts)
-            points = sorted(zip(places, line.middle, line.low, line.high, strict=True))
-            x, middle, low, high = zip(*points, strict=True)
+            points = sorted(
+                (place[text], (s.median, s.first, s.third, s.least, s.most))
+                for text, s in zip(line.texts, line.spreads, strict=True)
+            )
+            middle, first, third, least, most = np.array([spread for _, spread in points]).T
+            x = np.array([at for at, _ in points])
             colour = colours[line.label]
             handles[line.label], *_ = axes.plot(x, middle, "o-", color=colour)
-            axes.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
+            axes.fill_between(x, first, third, color=colour, alpha=0.2, lw=0)
+            axes.errorbar(
+                x, middle, (middle - least, most - middle), fmt="none", ecolor=colour, capsize=3
+            )
+        if not own:
+            for style, (label, percent) in zip(("s-", "^--"), shares.items(), strict=True):
+                x, y = np.array(sorted(zip(scale.places, percent, strict=True))).T
+                axes.plot(x, y, style, color="#b00020", label=label)
+            axes.legend(fontsize=8)
+            axes.set_ylim(top=105)
         if scale.words:
             axes.set_xticks(scale.places, parameter.texts)
             axes.set_xlim(-0.5, len(scale.places) - 0.5)
-        axes.set(xlabel=parameter.path + f" ({scale.unit})" * bool(scale.unit), title=PLOTTED[name])
+        axes.set(
+            xlabel=parameter.path + f" ({scale.unit})" * bool(scale.unit),
+            title=PLOTTED.get(name, _SHARES),
+        )
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
     if any(labels):

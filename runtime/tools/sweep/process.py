@@ -19,6 +19,7 @@ from typing import Any
 
 import msgspec
 
+from runtime.digest import combined
 from runtime.results import claim
 from runtime.tools.sweep.plan import Job
 from runtime.tools.sweep.rows import Row, failed
@@ -43,6 +44,7 @@ class Ended(msgspec.Struct, frozen=True):
     sim_seconds: float
     wall_seconds: float
     digest: str | None = None
+    digests: dict[str, str] = {}
     not_deterministic: list[str] = []
     verdict: RunVerdict | None = None
     workers: dict[str, dict[str, float | None]] = {}
@@ -152,8 +154,18 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
         if ended.reason in _STOPPED:
             row["error"] = f"interrupted by {ended.reason}"
     if verdict and not row["error"]:
+        assert ended is not None
         row["passed"], row["estimators"] = verdict.passed, verdict.estimators
+        row["digests"] = {
+            name: combined(own)
+            for name in verdict.estimators
+            if (own := _outputs_of(name.partition("/")[0], ended.digests))
+        }
     return row
+
+
+def _outputs_of(node: str, digests: dict[str, str]) -> dict[str, str]:
+    return {name: each for name, each in digests.items() if name.partition(".")[0] == node}
 
 
 def last_error(output: str) -> str:

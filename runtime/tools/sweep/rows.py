@@ -23,7 +23,9 @@ class Row(TypedDict):
             process.
         error: What went wrong, in one line; empty for a run that is finished.
         passed: The run's verdict; `None` if it has none.
+        repeat: Which of the runs with equal settings and seed it is.
         digest: Of all events; `None` if off, or if equal runs may differ in it.
+        digests: Name of an estimator to the digest of all that it has sent.
         sim_seconds: Seconds of the run's clock.
         run_seconds: Real seconds from the first update to the end.
         wall_seconds: Real seconds of the whole process.
@@ -42,6 +44,8 @@ class Row(TypedDict):
     run_seconds: float | None
     wall_seconds: float | None
     estimators: dict[str, dict[str, Any]]
+    repeat: NotRequired[int]
+    digests: NotRequired[dict[str, str]]
     workers: NotRequired[dict[str, dict[str, float | None]]]
 
 
@@ -51,6 +55,7 @@ def failed(job: Job, error: str) -> Row:
         id=job.id,
         parameters=dict(job.settings),
         seed=job.seed,
+        repeat=job.repeat,
         exit_code=None,
         error=error,
         passed=None,

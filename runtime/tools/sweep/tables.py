@@ -33,22 +33,44 @@ MAIN_FIGURES = (
 
 
 class Spread(msgspec.Struct, frozen=True):
-    """One figure over the seeds that have it."""
+    """One figure over the runs that have it: median, first and third quartile, least and most."""
 
     median: float
+    first: float
+    third: float
     least: float
     most: float
 
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """Sum up at least one value; quartiles are interpolated between values."""
+        first, median, third = (values[0],) * 3
+        if len(values) > 1:
+            first, median, third = statistics.quantiles(values, n=4, method="inclusive")
+        return cls(median, first, third, min(values), max(values))
+
+    def __str__(self) -> str:
+        """Return the median and, if they differ, the least and the most."""
+        ends = f" ({self.least:.4g} to {self.most:.4g})" * (self.least < self.most)
+        return f"{self.median:.4g}{ends}"
+
+
+SPREAD = {"median": "median", "q1": "first", "q3": "third", "min": "least", "max": "most"}
+"""What ``summary.csv`` has of each main figure, and which field of its `Spread` that is."""
+
 
 class Combination(msgspec.Struct, frozen=True, kw_only=True):
-    """One combination of settings and one estimator, over all seeds.
+    """One combination of settings and one estimator, over all seeds and repeats.
 
     Attributes:
         settings: Values of the parameters, in their order.
         estimator: Its name; empty if no run has a verdict.
-        runs: How many seeds were run.
+        runs: How many there were.
         failed: How many of these came to nothing; no figure knows of them.
         passed: How many met the estimator's thresholds; `None` if there are none.
+        missed: How many did not meet them.
+        repeatable: Whether runs with equal settings and seed gave the same, in words; empty if
+            there were no two of them.
         figures: Main figure to its spread.
     """
 
@@ -57,6 +79,8 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
     runs: int
     failed: int
     passed: int | None
+    missed: int = 0
+    repeatable: str = ""
     figures: dict[str, Spread]
 
 
@@ -65,29 +89,30 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     paths = [p.path for p in plan.parameters]
     own = in_order(plan, rows)
     _write(plan.out / "table.csv", *_table(paths, own))
-    header = ["run", *paths, "seed", "wall_seconds", "run_seconds", "sim_seconds"]
+    seed = _seed(own)
+    header = ["run", *paths, *seed, "wall_seconds", "run_seconds", "sim_seconds"]
     times = [
-        [*_head(job), row["wall_seconds"], row["run_seconds"], row["sim_seconds"]]
+        [*_head(job, seed), row["wall_seconds"], row["run_seconds"], row["sim_seconds"]]
         for job, row in own
     ]
     _write(plan.out / "timing.csv", header, times)
     workers = [
-        (_head(job), name, costs)
+        (_head(job, seed), name, costs)
         for job, row in own
         for name, costs in row.get("workers", {}).items()
     ]
     keys = list(dict.fromkeys(key for _, _, costs in workers for key in costs))
-    header = ["run", *paths, "seed", "worker", *keys]
+    header = ["run", *paths, *seed, "worker", *keys]
     costs_of_all = [[*h, name, *(costs.get(k) for k in keys)] for h, name, costs in workers]
     _write(plan.out / "costs.csv", header, costs_of_all)
-    header = [*paths, "estimator", "runs", "failed", "passed"]
-    header += [f"{name}_{what}" for name in MAIN_FIGURES for what in ("median", "min", "max")]
+    header = [*paths, "estimator", "runs", "failed", "missed", "passed", "repeatable"]
+    header += [f"{name}_{what}" for name in MAIN_FIGURES for what in SPREAD]
     lines = []
     for each in summarise(plan, rows):
-        line: list[Any] = [*each.settings, each.estimator, each.runs, each.failed, each.passed]
+        line: list[Any] = [*each.settings, each.estimator, each.runs, each.failed, each.missed]
+        line += [each.passed, each.repeatable]
         for name in MAIN_FIGURES:
-            spread = each.figures.get(name)
-            line += [spread.median, spread.least, spread.most] if spread else [None] * 3
+            line += [getattr(each.figures.get(name), field, None) for field in SPREAD.values()]
         lines.append(line)
     _write(plan.out / "summary.csv", header, lines)
 
@@ -123,26 +148,50 @@ def _combination(settings: tuple[str, ...], name: str, group: Sequence[Row]) -> 
     spreads = {}
     for main in MAIN_FIGURES:
         if found := numbers(f.get(main) for f in figures):
-            spreads[main] = Spread(statistics.median(found), min(found), max(found))
+            spreads[main] = Spread.of(found)
     return Combination(
         settings=settings,
         estimator=name,
         runs=len(group),
         failed=sum(bool(row["error"]) for row in group),
         passed=sum(passed) if passed else None,
+        missed=passed.count(False),
+        repeatable=_repeatable(name, group),
         figures=spreads,
     )
 
 
+def _repeatable(name: str, group: Sequence[Row]) -> str:
+    """Say whether an estimator gave the same whenever settings and seed were the same."""
+    seeds: dict[int, list[Row]] = {}
+    for row in group:
+        if name in row.get("digests", {}):
+            seeds.setdefault(row["seed"], []).append(row)
+    several = [rows for rows in seeds.values() if len(rows) > 1]
+    if not several:
+        return ""
+    differing = [rows for rows in several if len({row["digests"][name] for row in rows}) > 1]
+    if not differing:
+        runs = sum(map(len, several))
+        return f"{runs} of {runs} equal"
+    errors = [numbers(r["estimators"][name].get("ate_percent") for r in rows) for rows in differing]
+    least, most = max(
+        ((min(each), max(each)) for each in errors if each),
+        key=lambda ends: ends[1] - ends[0],
+        default=(0.0, 0.0),
+    )
+    return "differs" + f": {least:.3g} to {most:.3g} %" * (most > 0)
+
+
 def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], list[list[Any]]]:
     """Return header and lines: one a run and estimator, or one for a run that has none."""
-    header = ["run", *paths, "seed", "exit_code", "error", "passed", "sim_seconds", "digest"]
+    header = ["run", *paths, *_seed(rows), "exit_code", "error", "passed", "sim_seconds", "digest"]
     found = {key for _, row in rows for f in row["estimators"].values() for key in f}
     figures = [name for name in MAIN_FIGURES if name in found]
     figures += sorted(found - {*figures})
     lines = []
     for job, row in rows:
-        head = [*_head(job), row["exit_code"], row["error"], row["passed"]]
+        head = [*_head(job, _seed(rows)), row["exit_code"], row["error"], row["passed"]]
         head += [row["sim_seconds"], row["digest"]]
         for name, own in (row["estimators"] or {"": {}}).items():
             lines.append([*head, name, *(own.get(figure) for figure in figures)])
@@ -152,8 +201,14 @@ def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], li
     return header, lines
 
 
-def _head(job: Job) -> list[Any]:
-    return [job.id, *(text for _, text in job.settings), job.seed]
+def _seed(rows: Sequence[tuple[Job, Row]]) -> list[str]:
+    """Return the columns that tell runs with equal settings apart."""
+    return ["seed", "repeat"] if any(job.repeat > 1 for job, _ in rows) else ["seed"]
+
+
+def _head(job: Job, columns: Sequence[str]) -> list[Any]:
+    own = [job.seed, job.repeat][: len(columns)]
+    return [job.id, *(text for _, text in job.settings), *own]
 
 
 def _write(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:

@@ -55,6 +55,17 @@ def test_a_job_has_the_same_id_in_any_sweep_that_has_it(tmp_path: Path) -> None:
     assert len(many.jobs) == 12
 
 
+def test_a_repeat_is_a_run_of_its_own(tmp_path: Path) -> None:
+    once, plan = plan_in(tmp_path, seeds=2), plan_in(tmp_path, seeds=2, repeats=2)
+    assert [(job.seed, job.repeat) for job in plan.jobs] == [(3, 1), (3, 2), (4, 1), (4, 2)]
+    assert [job.id for job in plan.jobs[::2]] == [job.id for job in once.jobs]
+    assert len({job.id for job in plan.jobs}) == len({job.out for job in plan.jobs}) == 4
+    assert plan.jobs[0].text == plan.jobs[1].text
+    assert [str(job) for job in plan.jobs[:2]] == ["seed=3", "seed=3 repeat=2"]
+    with pytest.raises(ConfigError, match="--repeat: expected at least 1, found 0"):
+        plan_in(tmp_path, repeats=0)
+
+
 def test_without_parameters_there_are_just_seeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

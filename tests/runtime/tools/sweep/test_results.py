@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
+from msgspec.structs import astuple
 
 from runtime.tools.sweep import Row, draw_plots, summarise, write_page, write_tables
 from runtime.tools.sweep.plots import lines
@@ -53,15 +54,16 @@ def test_a_summary_has_the_spread_over_the_seeds_and_counts_what_failed(tmp_path
     first, second, last = summarise(plan, rows)
     assert (first.settings, first.estimator, second.estimator) == (("1",), "vo", "slam")
     assert (first.runs, first.failed, first.passed) == (4, 1, 3)
-    assert first.figures == {"ate_percent": Spread(1.05, 1.03, 1.06)}
-    assert second.figures == {"ate_percent": Spread(0.525, 0.515, 0.53)}
+    expected = Spread(1.05, 1.04, 1.055, 1.03, 1.06)
+    assert astuple(first.figures["ate_percent"]) == pytest.approx(astuple(expected))
+    expected = Spread(0.525, 0.52, 0.5275, 0.515, 0.53)
+    assert astuple(second.figures["ate_percent"]) == pytest.approx(astuple(expected))
     assert (last.settings, last.estimator, last.failed) == (("2",), "", 4)
     assert (last.passed, last.figures) == (None, {})
     write_tables(plan, rows)
     line = read(plan.out / "summary.csv")[0]
-    assert [line[f"ate_percent_{what}"] for what in ("median", "min", "max")] == [
-        "1.05", "1.03", "1.06",
-    ]  # fmt: skip
+    found = [float(line[f"ate_percent_{what}"]) for what in ("median", "q1", "q3", "min", "max")]
+    assert found == pytest.approx([1.05, 1.04, 1.055, 1.03, 1.06])
     assert line["ate_rmse_m_median"] == ""
 
 
@@ -75,7 +77,10 @@ def test_a_page_shows_figures_plots_and_runs_with_their_reports(tmp_path: Path) 
     draw_plots(plan, rows)
     page = write_page(plan, rows).read_text(encoding="utf-8")
     assert "<th>judge.rate</th>" in page
-    assert '<td class="n">1.035<br><span class="soft">1.03 to 1.04</span></td>' in page
+    assert (
+        '<td class="n">1.035<br><span class="soft">1.032 to 1.038<br>1.03 to 1.04</span></td>'
+        in page
+    )
     assert '<img src="plots/judge.rate.png"' in page
     assert page.count(">open</a>") == 1
     assert f'<a href="runs/{plan.jobs[0].id}/report.html">open</a>' in page
@@ -97,7 +102,7 @@ def test_a_line_for_each_combination_of_the_others(tmp_path: Path) -> None:
     flow, depth = lines(plan, rows, plan.parameters[0], "ate_percent")
     assert (flow.label, depth.label) == ("judge.method=flow", "judge.method=depth")
     assert (flow.texts, depth.texts) == (("20", "10"), ("10",))
-    assert (flow.middle, flow.low, flow.high) == ((36, 26), (29, 19), (45, 35))
+    assert flow.spreads == (Spread(36, 32.5, 40.5, 29, 45), Spread(26, 22.5, 30.5, 19, 35))
     assert lines(plan, rows, plan.parameters[0], "lost_seconds") == []
     labels = [line.label for line in lines(plan, rows, plan.parameters[1], "ate_percent")]
     assert labels == ["judge.rate=20", "judge.rate=10"]
@@ -109,8 +114,57 @@ def test_many_combinations_become_one_line_with_quartiles(tmp_path: Path) -> Non
     rows = [with_ate(pretend(j), vo=float(dict(j.settings)["judge.rate"]), b=1) for j in plan.jobs]
     vo, other = lines(plan, rows, plan.parameters[0], "ate_percent")
     assert (vo.label, other.label) == ("vo, all others", "b, all others")
-    assert (vo.texts, vo.low, vo.middle, vo.high) == (("flow", "depth"), (2, 2), (3, 3), (4, 4))
+    assert (vo.texts, vo.spreads) == (("flow", "depth"), (Spread(3, 2, 4, 1, 5),) * 2)
     assert len(lines(plan, rows, plan.parameters[1], "ate_percent")) == 4
+
+
+def test_missed_and_failed_runs_are_two_counts(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "judge.rate=60,5", seeds=4)
+    rows = [pretend(job) for job in plan.jobs]
+    rows[0] = failed(plan.jobs[0], "out of order")
+    vo, *_ = summarise(plan, rows)
+    assert (vo.runs, vo.failed, vo.missed, vo.passed) == (4, 1, 3, 0)
+    draw_plots(plan, rows)
+    page = write_page(plan, rows).read_text(encoding="utf-8")
+    assert '<td class="n">1 (25%)</td>' in page
+    assert '<td class="n">3 (75%)</td>' in page
+    write_tables(plan, rows)
+    assert read(plan.out / "summary.csv")[0]["missed"] == "3"
+
+
+@pytest.mark.parametrize(
+    ("digests", "found"),
+    [
+        (["a", "a", "a"], "3 of 3 equal"),
+        (["a", "b", "a"], "differs: 1 to 1.2 %"),
+        (["a", None, "a"], "2 of 2 equal"),
+        (["a", None, None], ""),
+    ],
+)
+def test_what_is_said_of_an_estimator_that_is_run_again(
+    tmp_path: Path, digests: list[str | None], found: str
+) -> None:
+    plan = plan_in(tmp_path, repeats=3)
+    rows = []
+    for job, digest, error in zip(plan.jobs, digests, (1.0, 1.2, 1.1), strict=True):
+        row = with_ate(pretend(job), vo=error)
+        row["digests"] = {"vo": digest} if digest else {}
+        rows.append(row if digest else failed(job, "out of order"))
+    (vo,) = summarise(plan, rows)
+    assert (vo.repeatable, vo.runs) == (found, 3)
+    write_tables(plan, rows)
+    assert [line["repeat"] for line in read(plan.out / "table.csv")] == ["1", "2", "3"]
+    assert read(plan.out / "summary.csv")[0]["repeatable"] == found
+    page = write_page(plan, rows).read_text(encoding="utf-8")
+    assert f"<td>{found}</td>" in page
+
+
+def test_other_seeds_are_not_expected_to_be_equal(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, seeds=2, repeats=2)
+    rows = [with_ate(pretend(job), vo=1.0) for job in plan.jobs]
+    for row in rows:
+        row["digests"] = {"vo": f"{row['seed']}"}
+    assert summarise(plan, rows)[0].repeatable == "4 of 4 equal"
 
 
 def test_a_plot_for_each_parameter(tmp_path: Path) -> None:
