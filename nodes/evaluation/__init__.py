@@ -1,7 +1,8 @@
 """How well estimators do: figures while they run, and a verdict at the end.
 
-`metrics` and `alignment` are the mathematics, `record` holds what an estimator sent, `judging`
-makes figures and a verdict of it, `results` writes the files, and `node` is the node.
+`metrics`, `alignment`, `whole_flight` and `consistency` are the mathematics, `record` holds what an
+estimator sent, `judging` makes figures of it, `verdict` says whether they will do, `results` writes
+the files, and `node` is the node.
 """
 
 from nodes.evaluation.node import Evaluation, EvaluationConfig

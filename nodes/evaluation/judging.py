@@ -1,18 +1,19 @@
-"""From the estimates and the truth to figures, and from figures to a verdict.
+"""From the estimates and the truth to figures.
 
 Pure functions; `nodes.evaluation.node` collects, and `nodes.evaluation.results` writes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.evaluation.alignment import How, align, transform
+from nodes.evaluation.alignment import Alignment, How, align, transform, umeyama
+from nodes.evaluation.consistency import consistency, turned, velocity_error
 from nodes.evaluation.coverage import Interval, Stamps, choose_frames, cover, seconds
 from nodes.evaluation.metrics import (
     absolute_errors,
@@ -21,85 +22,16 @@ from nodes.evaluation.metrics import (
     position_errors,
     rms,
     rotation_errors,
+    share_errors,
 )
 from nodes.evaluation.record import EstimatorRecord
+from nodes.evaluation.whole_flight import held_errors, interpolated_errors, relocalization_times
 from nodes.trajectory import Trajectory, associate
 from runtime.schedule import SECOND
-from runtime.summary import overall
 
 Floats = npt.NDArray[np.float64]
 
 MILLISECOND = 1_000_000
-
-
-class Thresholds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What an estimator's figures may be; what is not given, and has no default, is not asked for.
-
-    All are upper limits but those of coverage, which are lower ones.
-
-    Attributes:
-        ate_rmse_m: Absolute trajectory error, metres.
-        ate_percent: The same in percent of the true path.
-        ate_max_m: Greatest position error, metres.
-        rot_rmse_deg: Rotation error.
-        rpe_trans_percent: Relative pose error of the position.
-        rpe_rot_deg_per_m: Relative pose error of the orientation.
-        drift_percent: Error of the last pose seen from the first, in percent of the path.
-        lost_seconds: Time without a pose.
-        latency_p99_ms: From exposure to estimate.
-        available_rmse_m: Error of the newest pose there was at each control tick.
-        plan_rmse_m: How far the vehicle was from its `PlannedPose`.
-        coverage_percent: Share of the flight with poses, at least.
-        frame_coverage_percent: Share of the images with a pose, at least.
-        restarts: Times that it began anew in a frame of its own.
-        repeated_stamps: Poses whose stamp was not later than that of the one before.
-        future_stamps: Poses whose time had not come when they arrived.
-        collisions: Of the vehicle.
-    """
-
-    ate_rmse_m: float | None = None
-    ate_percent: float | None = None
-    ate_max_m: float | None = None
-    rot_rmse_deg: float | None = None
-    rpe_trans_percent: float | None = None
-    rpe_rot_deg_per_m: float | None = None
-    drift_percent: float | None = None
-    lost_seconds: float | None = None
-    latency_p99_ms: float | None = None
-    available_rmse_m: float | None = None
-    plan_rmse_m: float | None = None
-    coverage_percent: float = 90.0
-    frame_coverage_percent: float | None = None
-    restarts: int = 0
-    repeated_stamps: int = 0
-    future_stamps: int = 0
-    collisions: int = 0
-
-    @property
-    def given(self) -> bool:
-        """Whether anything is asked for beyond what is asked of everybody."""
-        return self != Thresholds()
-
-    def missed(self, figures: dict[str, Any]) -> list[str]:
-        """Return a sentence for each threshold that is not met."""
-        found = []
-        for name in self.__struct_fields__:
-            limit, value = getattr(self, name), figures.get(name)
-            if limit is None or (value is None and name in COUNTS):
-                continue
-            side = "least" if name in AT_LEAST else "most"
-            if value is None:
-                found.append(f"{name}: expected at {side} {limit:g}, found none")
-            elif not (value >= limit if name in AT_LEAST else value <= limit):
-                found.append(f"{name}: expected at {side} {limit:g}, found {value:.4g}")
-        return found
-
-
-AT_LEAST = {"coverage_percent", "frame_coverage_percent"}
-"""Thresholds that are lower limits."""
-
-COUNTS = {"restarts", "repeated_stamps", "future_stamps", "collisions"}
-"""Figures that are counted; where there was nothing to count, none was found."""
 
 
 class Errors(msgspec.Struct, frozen=True, eq=False):
@@ -137,6 +69,7 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
         of_images: Errors of each pose at the time of its image.
         of_ticks: Errors of the newest pose there was at each control tick.
         lost: When it had no pose.
+        final: Its trajectory after loop closures in the truth's frame, if it sent one.
     """
 
     figures: dict[str, Any]
@@ -145,6 +78,7 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
     of_images: Errors | None = None
     of_ticks: Errors | None = None
     lost: list[Interval] = []
+    final: Trajectory | None = None
 
 
 def judge(
@@ -188,6 +122,7 @@ def judge(
     coverage = cover(due, poses, round(gap * SECOND), record.reported_lost(end))
     inside = (truth.stamps >= coverage.flight.start) & (truth.stamps <= coverage.flight.end)
     flight = truth.take(inside) if inside.any() else truth
+    path = flight.length()
     figures: dict[str, Any] = {
         "method": record.method,
         "estimates": len(record),
@@ -198,32 +133,42 @@ def judge(
         "restarts": record.restarts,
         "repeated_stamps": record.repeated,
         "future_stamps": record.future,
-        "path_m": flight.length(),
+        "path_m": path,
+        # Who never has a pose is at it until the end.
+        "initialization_seconds": (
+            (coverage.flight.end if estimate is None else int(poses[0])) - coverage.flight.start
+        )
+        / SECOND,
+        **_held(held_errors(truth, due, poses[:0], np.empty(0), coverage.lost), path),
     }
+    how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
+    final = _judge_final(record, truth, due, path, alignment, figures)
+    judgement = Judgement(figures, estimate, lost=coverage.lost, final=final)
     if estimate is None:
-        return Judgement(figures=figures, estimate=None, lost=coverage.lost)
-    how = choose_alignment(record) if alignment == "auto" else alignment
+        return judgement
+    if took := relocalization_times(coverage.lost, poses):
+        figures["relocalization_p50_seconds"] = float(np.median(took))
+        figures["relocalization_max_seconds"] = max(took)
     figures["alignment"] = how
     figures["rate_hz"] = (len(estimate) - 1) / estimate.seconds if estimate.seconds else 0.0
     if len(arrivals):
         latencies = (arrivals - poses) / MILLISECOND
         figures["latency_p50_ms"] = float(np.percentile(latencies, 50))
         figures["latency_p99_ms"] = float(np.percentile(latencies, 99))
-    figures["first_s"] = (int(poses[0]) - coverage.flight.start) / SECOND
     try:
         there, kept = associate(truth, estimate)
         aligned = align(kept, there, how)
     except ValueError as error:  # too little to align, or no time in common
-        return Judgement(
-            figures={**figures, "why": str(error)}, estimate=estimate, lost=coverage.lost
-        )
+        figures["why"] = str(error)
+        return judgement
     moved = aligned.trajectory
     figures |= {"scale": aligned.scale, **absolute_errors(there, moved)}
-    path = flight.length()
     figures["ate_percent"] = 100.0 * figures["ate_rmse_m"] / path if path > 0 else None
     try:
         figures |= path_errors(there, moved, delta)
         figures["drift_percent"] = drift_percent(there, moved)
+        figures["drift_m_per_s"] = figures["drift_percent"] * there.length() / 100 / there.seconds
+        figures |= share_errors(there, moved, path)
     except ValueError as error:  # it did not get that far
         figures["why"] = str(error)
     inside = truth.covers(poses)
@@ -233,6 +178,10 @@ def judge(
         position=position_errors(there.positions, moved.positions),
         rotation=rotation_errors(there.orientations, moved.orientations),
     )
+    held = held_errors(truth, due, there.stamps, of_images.position, coverage.lost)
+    figures |= _held(held, path) | _said_with_poses(record, truth, there, aligned)
+    if not record.scale_free:
+        figures["scale_error_percent"] = _scale_error(there, moved)
     whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
     of_ticks = errors_at_ticks(truth, whole, arrivals, rate) if len(arrivals) else None
     if of_ticks is not None:
@@ -241,34 +190,69 @@ def judge(
             "available_rot_rmse_deg": float(np.degrees(rms(of_ticks.rotation))),
             "available_age_ms": float(np.mean(of_ticks.stamps - of_ticks.since)) / MILLISECOND,
         }
-    return Judgement(figures, estimate, moved, of_images, of_ticks, coverage.lost)
+    return Judgement(figures, estimate, moved, of_images, of_ticks, coverage.lost, final)
 
 
-def conclude(
-    found: Mapping[str, dict[str, Any]], thresholds: Thresholds, faults: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Return the verdict on figures by estimator, as ``evaluation/verdict.json`` has it.
-
-    Args:
-        found: See `judge`.
-        thresholds: What the figures may be.
-        faults: Further reasons why all have failed.
-    """
-    estimators = {}
-    for name, figures in found.items():
-        failed = []
-        if figures.get("ate_rmse_m") is None:
-            failed.append(figures.get("why", "expected estimates, found none"))
-        if "coverage_percent" in figures:
-            failed += thresholds.missed(figures)
-        failed += faults
-        passed = not failed if failed or thresholds.given else None
-        estimators[name] = {"passed": passed, **figures, "failed": failed}
+def _held(errors: Floats, path: float, prefix: str = "") -> dict[str, float | None]:
+    """Return the figures of errors over the whole flight."""
+    known = len(errors) > 0
     return {
-        "passed": overall(figures["passed"] for figures in estimators.values()),
-        "estimators": estimators,
-        "thresholds": msgspec.to_builtins(thresholds),
+        f"{prefix}held_ate_rmse_m": rms(errors) if known else None,
+        f"{prefix}held_ate_percent": 100.0 * rms(errors) / path if known and path > 0 else None,
     }
+
+
+def _judge_final(
+    record: EstimatorRecord,
+    truth: Trajectory,
+    frames: Stamps,
+    path: float,
+    alignment: How | Literal["auto"],
+    figures: dict[str, Any],
+) -> Trajectory | None:
+    """Judge the trajectory after loop closures: add its figures, and return it aligned."""
+    if record.final is None:
+        return None
+    figures["final_poses"] = len(record.final)
+    if alignment == "auto":
+        alignment = choose_alignment(record.scale_free, record.final_frame_id)
+    try:
+        there, kept = associate(truth, record.final)
+        moved = align(kept, there, alignment).trajectory
+    except ValueError as error:
+        figures["why_not_final"] = str(error)
+        return None
+    errors = absolute_errors(there, moved)
+    figures |= {f"final_{name}": errors[name] for name in ("ate_rmse_m", "rot_rmse_deg")}
+    figures["final_ate_percent"] = 100.0 * errors["ate_rmse_m"] / path if path > 0 else None
+    figures |= _held(interpolated_errors(truth, frames, moved), path, "final_")
+    return moved
+
+
+def _said_with_poses(
+    record: EstimatorRecord, truth: Trajectory, there: Trajectory, aligned: Alignment
+) -> dict[str, Any]:
+    """Return the figures of velocities and covariances, as far as they were given."""
+    figures: dict[str, Any] = {}
+    stamps, velocities = record.velocities()
+    if (known := truth.covers(stamps)).any():
+        said = aligned.scale * velocities[known] @ aligned.rotation.T
+        figures["velocity_rmse_m_per_s"] = velocity_error(truth, stamps[known], said)
+    stamps, covariances = record.covariances()
+    if (known := truth.covers(stamps)).any():
+        rows = np.isin(there.stamps, stamps[known])
+        said = turned(covariances[known], aligned.rotation, aligned.scale)
+        figures |= consistency(there.take(rows), aligned.trajectory.take(rows), said)
+    return figures
+
+
+def _scale_error(truth: Trajectory, estimate: Trajectory) -> float | None:
+    """Return by how many percent Sim(3) would have to change the scale; `None` on a line."""
+    try:
+        scale = umeyama(estimate.positions, truth.positions, with_scale=True)[2]
+    except ValueError:
+        return None
+    return 100.0 * abs(scale - 1.0)
 
 
 def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
@@ -290,15 +274,15 @@ def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:
     return {"plan_rmse_m": rms(distances), "plan_max_m": float(distances.max())}
 
 
-def choose_alignment(record: EstimatorRecord) -> How:
+def choose_alignment(scale_free: bool, frame_id: str) -> How:
     """Return what an estimate's frame allows.
 
     ``sim3`` if its unit is its own, ``none`` if it claims to be in ``map``, else ``origin``: its
     first pose is laid on the true one.
     """
-    if record.scale_free:
+    if scale_free:
         return "sim3"
-    return "none" if record.frame_id == "map" else "origin"
+    return "none" if frame_id == "map" else "origin"
 
 
 def errors_at_ticks(

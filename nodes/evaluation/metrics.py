@@ -18,6 +18,9 @@ from nodes.trajectory import Trajectory
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+SHARES = (1, 2, 5, 10, 20)
+"""Percent of a flight's path over which relative errors are taken; see `share_errors`."""
+
 
 def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
     """Return the absolute trajectory errors (ATE) of an aligned estimate: how far each pose is off.
@@ -25,7 +28,8 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
     Returns:
         By name, with the unit at its end: root mean square, mean, median, standard deviation,
         maximum and mean square of the distances; root mean squares along x (north), y (east) and
-        z (down) of the truth's frame; root mean square of the angles between the orientations.
+        z (down) of the truth's frame; root mean square of the angles between the orientations,
+        and of the differences of the headings (yaw).
 
     Raises:
         ValueError: The stamps of the two differ.
@@ -45,6 +49,7 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
         "ate_down_rmse_m": rms(z),
         "mse_m2": float(np.mean(errors**2)),
         "rot_rmse_deg": rms(np.degrees(angles)),
+        "heading_rmse_deg": rms(np.degrees(heading_errors(truth, estimate))),
     }
 
 
@@ -76,6 +81,49 @@ def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> 
         "rpe_trans_percent": 100.0 * rms(shifts) / delta,
         "rpe_rot_deg_per_m": rms(np.degrees(angles)) / delta,
     }
+
+
+def share_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict[str, float | None]:
+    """Return the relative errors over 1, 2, 5, 10 and 20 % of a flight's path, and their mean.
+
+    As the development kit of KITTI's odometry benchmark has it (A. Geiger, P. Lenz, R. Urtasun,
+    CVPR 2012; ``evaluate_odometry.cpp``): the mean, not the root mean square, of the errors of all
+    stretches of a length, divided by the length; and the mean over the stretches of all lengths.
+    Three things differ: the lengths are shares of the path instead of 100 to 800 m, every pose
+    begins a stretch and not every tenth, and it ends at the pose that is nearest to its length
+    (`path_pairs`), not at the first one beyond.
+
+    Args:
+        truth: The true poses.
+        estimate: The estimated ones, at the same stamps.
+        path: Metres of the whole flight, above 0.
+
+    Returns:
+        By name; `None` for a length that no stretch has.
+
+    Raises:
+        ValueError: The stamps of the two differ.
+    """
+    same_stamps(truth, estimate)
+    distances = truth.distances()
+    found: dict[str, float | None] = {}
+    everything: list[tuple[Floats, Floats]] = []
+    for share in SHARES:
+        length = share / 100.0 * path
+        shifts, angles = relative_errors(truth, estimate, *path_pairs(distances, length))
+        each = 100.0 * shifts / length, np.degrees(angles) / length
+        everything.append(each)
+        found |= dict(zip(_share_names(str(share)), map(_mean, each), strict=True))
+    all_of = (np.concatenate(values) for values in zip(*everything, strict=True))
+    return found | dict(zip(_share_names("mean"), map(_mean, all_of), strict=True))
+
+
+def _share_names(which: str) -> tuple[str, str]:
+    return f"rpe_{which}_trans_percent", f"rpe_{which}_rot_deg_per_m"
+
+
+def _mean(values: Floats) -> float | None:
+    return float(values.mean()) if len(values) else None
 
 
 def drift_percent(truth: Trajectory, estimate: Trajectory) -> float:
@@ -145,6 +193,17 @@ def rotation_errors(truth: Floats, estimate: Floats) -> Floats:
     a = Rotation.from_quat(truth, scalar_first=True)
     b = Rotation.from_quat(estimate, scalar_first=True)
     return np.asarray((a.inv() * b).magnitude())
+
+
+def heading_errors(truth: Trajectory, estimate: Trajectory) -> Floats:
+    """Return the differences of the headings, radians in [-π, π], shape (n,).
+
+    The heading is the angle from x (north) to the body's x axis, seen along z (down).
+    """
+    forward = [t.rotations().apply([1.0, 0.0, 0.0]) for t in (truth, estimate)]
+    true, said = (np.arctan2(each[:, 1], each[:, 0]) for each in forward)
+    difference = said - true
+    return np.asarray(np.arctan2(np.sin(difference), np.cos(difference)))
 
 
 def same_stamps(truth: Trajectory, estimate: Trajectory) -> None:

@@ -16,6 +16,7 @@ from events import (
     Collision,
     EstimatorAnnouncement,
     Image,
+    LidarScan,
     Odometry,
     PlannedPose,
     PoseEstimate,
@@ -23,13 +24,15 @@ from events import (
     Score,
     TrackedFeatures,
     TrackingEvent,
+    TrajectoryEstimate,
 )
 from nodes.evaluation.album import Album
 from nodes.evaluation.flight import Flight, collision_rows
-from nodes.evaluation.judging import Judgement, Thresholds, conclude, judge
+from nodes.evaluation.judging import Judgement, judge
 from nodes.evaluation.live import LiveErrors
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import FRAMES, file_name, write_results
+from nodes.evaluation.verdict import Thresholds, conclude
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.growing import GrowingFile
@@ -86,6 +89,7 @@ class Evaluation(Node[EvaluationConfig]):
         self._records: dict[str, EstimatorRecord] = {}
         self._live: dict[str, LiveErrors] = {}
         self._frames: dict[str, array[int]] = {}  # times of exposure by camera
+        self._scans: dict[str, array[int]] = {}  # by lidar
         self._late: dict[str, int] = {}  # offsets of the cameras' clocks
         self._album = Album(self.config.image_count)
         self._files: dict[str, GrowingFile] = {}
@@ -97,7 +101,9 @@ class Evaluation(Node[EvaluationConfig]):
         if isinstance(announcement, CameraAnnouncement):
             self._late[announcement.source] = round(announcement.time_offset * 1e9)
         if isinstance(announcement, EstimatorAnnouncement):
-            record = EstimatorRecord(announcement.scale_free, announcement.method)
+            record = EstimatorRecord(
+                announcement.scale_free, announcement.method, announcement.reads
+            )
             self._records[announcement.source] = record
 
     def check(self) -> Iterable[str]:
@@ -152,6 +158,19 @@ class Evaluation(Node[EvaluationConfig]):
         """Note that an estimator lost or regained its way."""
         self._records.setdefault(event.source, EstimatorRecord()).note(event)
 
+    @on(TrajectoryEstimate)
+    def trajectories(self, event: TrajectoryEstimate) -> None:
+        """Note an estimator's trajectory after loop closures; the last one counts."""
+        if not self._closed:
+            self._records.setdefault(event.source, EstimatorRecord()).add_final(event)
+
+    @on(LidarScan)
+    def scans(self, event: LidarScan) -> None:
+        """Note that there was a scan."""
+        stamps = self._scans.setdefault(event.source, array("q"))
+        if not stamps or event.stamp > stamps[-1]:
+            stamps.append(event.stamp)
+
     @on(Image)
     def images(self, event: Image) -> None:
         """Note that there was an image; hold it for a while: its features may follow."""
@@ -189,13 +208,13 @@ class Evaluation(Node[EvaluationConfig]):
 
     def _finish(self, end: int) -> tuple[dict[str, Judgement], dict[str, Any]]:
         config = self.config
-        cameras = {name: np.array(stamps, np.int64) for name, stamps in self._frames.items()}
         truths = {v: f.truth.trajectory() for v, f in self._flights.items() if len(f.truth)}
         flown = {vehicle: flight.figures() for vehicle, flight in self._flights.items()}
         judgements = {}
         for name, record in self._records.items():
             vehicle = self._vehicle_of(name)
-            judgement = self._judge(record, truths.get(vehicle), self._seen(vehicle, cameras), end)
+            sensors = self._scans if "lidar" in record.reads else self._frames
+            judgement = self._judge(record, truths.get(vehicle), self._seen(vehicle, sensors), end)
             judgement.figures.update(flown.get(vehicle, {}))
             if len(self._vehicles.names) > 1:
                 judgement.figures["vehicle"] = vehicle
@@ -253,12 +272,15 @@ class Evaluation(Node[EvaluationConfig]):
         return self._flights.get(self._vehicle_of(estimator)) or Flight()
 
     def _seen(
-        self, vehicle: str, cameras: dict[str, npt.NDArray[np.int64]]
+        self, vehicle: str, sensors: dict[str, array[int]]
     ) -> dict[str, npt.NDArray[np.int64]]:
-        """Return the stamps of those cameras that may be a vehicle's: of several, its own."""
-        if len(self._vehicles.names) < 2:
-            return cameras
-        return {c: s for c, s in cameras.items() if self._vehicles.carrier(c) in {"", vehicle}}
+        """Return the stamps of those sensors that may be a vehicle's: of several, its own."""
+        several = len(self._vehicles.names) > 1
+        return {
+            sensor: np.array(stamps, np.int64)
+            for sensor, stamps in sensors.items()
+            if not several or self._vehicles.carrier(sensor) in {"", vehicle}
+        }
 
     def _named(self, what: str, vehicle: str) -> str:
         """Return the name of a file: ``truth`` of the first vehicle, ``truth.<name>`` of others."""

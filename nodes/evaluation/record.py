@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from events import PoseEstimate, TrackingEvent, TrackingLost
+from events import PoseEstimate, TrackingEvent, TrackingLost, TrajectoryEstimate
 from nodes.evaluation.coverage import Interval
 from nodes.trajectory import PoseRows, Trajectory
 
@@ -24,6 +25,7 @@ class EstimatorRecord:
     Args:
         scale_free: Whether its unit of length is its own.
         method: What it is.
+        reads: Kinds of data that it computes with; see `events.EstimatorAnnouncement`.
 
     Attributes:
         rows: The poses of its trajectory.
@@ -31,21 +33,31 @@ class EstimatorRecord:
         future: Poses of a time that had not come when they arrived.
         elsewhere: Poses in another frame than the first one.
         restarts: How often it changed to another frame: each time it has lost where it is.
+        final: Its trajectory after loop closures, the last one that it sent; `None` if it sent
+            none, or an empty one.
+        final_frame_id: Frame of that.
     """
 
-    def __init__(self, scale_free: bool = False, method: str = "") -> None:
+    def __init__(
+        self, scale_free: bool = False, method: str = "", reads: tuple[str, ...] = ()
+    ) -> None:
         self.scale_free = scale_free
         self.method = method
+        self.reads = reads
         self.frame_id = ""
         self.rows = PoseRows()
         self.repeated = 0
         self.future = 0
         self.elsewhere = 0
         self.restarts = 0
+        self.final: Trajectory | None = None
+        self.final_frame_id = ""
         self._last_stamp: int | None = None
         self._last_frame = ""
         self._arrivals = array("q")
         self._tracking: list[TrackingEvent] = []
+        self._velocities = _Columns((3,))
+        self._covariances = _Columns((6, 6))
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> EstimatorRecord:
@@ -73,7 +85,20 @@ class EstimatorRecord:
         self.rows.add(event.stamp, event.position, event.orientation)
         if now is not None:
             self._arrivals.append(now)
+        if event.velocity is not None:
+            self._velocities.add(event.stamp, event.velocity)
+        if event.covariance:
+            self._covariances.add(event.stamp, event.covariance)
         return True
+
+    def add_final(self, event: TrajectoryEstimate) -> None:
+        """Note its trajectory as it sees it now."""
+        self.final_frame_id = event.frame_id
+        self.final = (
+            Trajectory(event.stamps, event.positions, event.orientations)
+            if len(event.stamps)
+            else None
+        )
 
     def note(self, event: TrackingEvent) -> None:
         """Note that tracking was lost or regained."""
@@ -85,6 +110,14 @@ class EstimatorRecord:
     def arrivals(self) -> npt.NDArray[np.int64]:
         """Return when each pose of the trajectory came (ns), shape (n,); (0,) if not known."""
         return np.array(self._arrivals, np.int64)
+
+    def velocities(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Return stamps (ns), shape (m,), and velocities, shape (m, 3), where they were given."""
+        return self._velocities.arrays()
+
+    def covariances(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Return stamps (ns), shape (m,), and covariances, shape (m, 6, 6), where given."""
+        return self._covariances.arrays()
 
     def reported_lost(self, end: int) -> list[Interval]:
         """Return when it was lost by its own tracking events.
@@ -103,3 +136,20 @@ class EstimatorRecord:
         if since is not None:
             found.append(Interval(since, end))
         return found
+
+
+class _Columns:
+    """Numbers that only some poses have, and the stamps of these."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._shape = shape
+        self._stamps = array("q")
+        self._values = array("d")
+
+    def add(self, stamp: int, values: Sequence[float]) -> None:
+        self._stamps.append(stamp)
+        self._values.extend(values)
+
+    def arrays(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        values = np.array(self._values, np.float64)
+        return np.array(self._stamps, np.int64), values.reshape(-1, *self._shape)

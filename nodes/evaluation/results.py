@@ -10,6 +10,7 @@ evaluation/<estimator>.lost.csv     when it had no pose
 evaluation/<estimator>.ticks.csv    errors of the newest pose there was at each control tick (of a
                                     long run every second one, fourth, …)
 evaluation/<estimator>.aligned.tum  the estimates in the truth's frame
+evaluation/<estimator>.final.tum    the same of its trajectory after loop closures, if it sent one
 evaluation/verdict.json             all figures
 """
 
@@ -49,6 +50,9 @@ def write_results(
         if judgement.aligned is not None:
             comment = FRAMES.format("map (NED), aligned")
             write_tum(evaluation / f"{name}.aligned.tum", judgement.aligned, comment)
+        if judgement.final is not None:
+            comment = FRAMES.format("map (NED), after loop closures, aligned")
+            write_tum(evaluation / f"{name}.final.tum", judgement.final, comment)
         rows = [f"{start},{end}\n" for start, end in judgement.lost]
         lost = "".join(["start_ns,end_ns\n", *rows])
         (evaluation / f"{name}.lost.csv").write_text(lost, encoding="ascii")

@@ -14,10 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.alignment import How
-from nodes.evaluation.judging import Judgement, conclude, judge
+from nodes.evaluation.judging import Judgement, judge
 from nodes.evaluation.node import EvaluationConfig
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import FRAMES, file_name, write_results
+from nodes.evaluation.verdict import conclude
 from nodes.judge.sources import Axes, Source
 from nodes.report.contents import Facts, Verdict
 from nodes.report.page import write_report

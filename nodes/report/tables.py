@@ -7,13 +7,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from nodes.evaluation.judging import AT_LEAST, COUNTS
+from nodes.evaluation.verdict import AT_LEAST, COUNTS
 from nodes.report.contents import Facts, Run
 from nodes.report.style import number
 
 MAIN = {
     "ate_rmse_m": ("absolute trajectory error (ATE), RMS", "m"),
     "ate_percent": ("ATE in percent of the path", "%"),
+    "held_ate_percent": ("ATE over the whole flight, lost time as 100 % drift", "%"),
+    "final_ate_rmse_m": ("ATE after loop closures", "m"),
+    "final_ate_percent": ("the same in percent of the path", "%"),
+    "final_held_ate_percent": ("the same over the whole flight", "%"),
     "coverage_percent": ("share of the flight with poses", "%"),
     "ate_mean_m": ("mean position error", "m"),
     "ate_median_m": ("median position error", "m"),
@@ -25,7 +29,14 @@ MAIN = {
     "rot_rmse_deg": ("rotation error, RMS", "°"),
     "rpe_trans_percent": ("relative pose error (RPE), position", "%"),
     "rpe_rot_deg_per_m": ("relative pose error (RPE), rotation", "°/m"),
+    "rpe_mean_trans_percent": ("RPE, mean over 1 to 20 % of the path, position", "%"),
+    "rpe_mean_rot_deg_per_m": ("the same, rotation", "°/m"),
     "drift_percent": ("drift at the end, in percent of the path", "%"),
+    "scale_error_percent": ("error of the scale", "%"),
+    "velocity_rmse_m_per_s": ("velocity error, RMS", "m/s"),
+    "heading_rmse_deg": ("heading error, RMS", "°"),
+    "nees_position": ("NEES of the position, 3 if consistent", ""),
+    "nees_pose": ("NEES of the pose, 6 if consistent", ""),
     "available_rmse_m": ("error of the newest pose at control ticks, RMS", "m"),
     "available_rot_rmse_deg": ("rotation error of the same, RMS", "°"),
     "plan_rmse_m": ("distance of the flight from its plan, RMS", "m"),
@@ -35,6 +46,8 @@ MAIN = {
     "frame_coverage_percent": ("share of the images with a pose", "%"),
     "lost_seconds": ("time without a pose", "s"),
     "lost_count": ("times lost", ""),
+    "initialization_seconds": ("time before the first pose", "s"),
+    "relocalization_max_seconds": ("longest time to have a pose again", "s"),
     "restarts": ("times that it began anew in a frame of its own", ""),
     "repeated_stamps": ("poses whose stamp was not later than the one before", ""),
     "future_stamps": ("poses of a time that had not come", ""),
@@ -46,6 +59,7 @@ MAIN = {
 _UNITS = {
     "_percent": "%",
     "_deg_per_m": "°/m",
+    "_m_per_s": "m/s",
     "_deg": "°",
     "_ms": "ms",
     "_hz": "Hz",

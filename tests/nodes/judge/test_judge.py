@@ -98,7 +98,12 @@ def test_a_runs_own_trajectories_get_its_figures(
     for name, figures in found.items():
         assert UNKNOWN.isdisjoint(figures)
         same = figures.keys() - {"method", "failed", "compared", "passed"}
-        assert {"ate_percent", "rpe_trans_percent", "lost_seconds", "first_s"} <= same
+        assert {
+            "ate_percent",
+            "rpe_trans_percent",
+            "lost_seconds",
+            "initialization_seconds",
+        } <= same
         for key in same:
             assert figures[key] == pytest.approx(expected[name][key], abs=1e-7), (name, key)
         assert [each for each in expected[name]["failed"] if "coverage" in each] == figures[

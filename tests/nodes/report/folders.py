@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from events import PoseEstimate
-from nodes.evaluation.judging import Judgement, Thresholds, judge
+from nodes.evaluation.judging import Judgement, judge
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import file_name, write_results
+from nodes.evaluation.verdict import Thresholds
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
 
@@ -43,6 +44,7 @@ def recorded(
     silent: tuple[float, float] = (0.0, 0.0),
     source: str = "vo",
     seed: int = 2,
+    **said: Any,
 ) -> EstimatorRecord:
     """What an estimator that drifts says of a flight; nothing in an interval (s)."""
     random = np.random.default_rng(seed)
@@ -67,6 +69,7 @@ def recorded(
             frame_id="odom",
             position=(x, y, z),
             orientation=(qw, qx, qy, qz),
+            **said,
         )
         if stamp + round(late * SECOND) <= truth.stamps[-1]:
             record.add(event, stamp + round(late * SECOND))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from events import TrackingLost, TrackingRegained
-from nodes.evaluation.judging import Thresholds
 from nodes.evaluation.record import EstimatorRecord
+from nodes.evaluation.verdict import Thresholds
 from nodes.report.folder import read_run
 from nodes.report.page import write_report
 from nodes.report.style import Floats

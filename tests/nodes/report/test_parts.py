@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nodes.evaluation.coverage import Interval
-from nodes.evaluation.judging import Thresholds
+from nodes.evaluation.verdict import Thresholds
 from nodes.mapping.ply import read_ply
 from nodes.report.curves import draw_latency
 from nodes.report.folder import read_run

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from nodes.evaluation.judging import Thresholds
+from nodes.evaluation.verdict import Thresholds
 from nodes.report.folder import read_run
 from nodes.report.page import write_report
 from nodes.trajectory import Trajectory

@@ -1,0 +1,107 @@
+"""Errors over a whole flight, in which time without a pose counts as the worst dead reckoning.
+
+The errors of the poses there are (`nodes.evaluation.metrics`) say nothing of those that are
+missing: an estimator that gives up when it gets difficult would look better than one that drifts.
+Here every image of the flight has an error. Where the estimator is lost, its last pose is held, and
+what it cannot know is added: the length of the true path since then. So being lost costs as much as
+a drift of 100 %, wherever the vehicle flies meanwhile: a tour that ends where it began makes nobody
+look good who stayed there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from nodes.evaluation.coverage import Interval, answered, seconds
+from nodes.trajectory import Trajectory
+
+Floats = npt.NDArray[np.float64]
+Stamps = npt.NDArray[np.int64]
+
+
+def held_errors(
+    truth: Trajectory, frames: Stamps, poses: Stamps, errors: Floats, lost: Sequence[Interval]
+) -> Floats:
+    """Return the position error at each image of a flight, as its estimator said at that time.
+
+    An image has the error of the pose that is nearest in time, or, if it has none within a lost
+    interval, that of the last pose before plus the true path length since. Before the first pose,
+    that is the path length since the first image.
+
+    Args:
+        truth: The true poses.
+        frames: Stamps of the flight's images (ns), strictly rising, shape (k,).
+        poses: Stamps of the poses, strictly rising, shape (n,), n ≥ 0.
+        errors: Distance of each to the truth after alignment, metres, shape (n,).
+        lost: Intervals without a pose; see `nodes.evaluation.coverage.cover`.
+
+    Returns:
+        Metres, one for each image within the truth's time.
+    """
+    frames = frames[truth.covers(frames)]
+    if not len(frames):
+        return np.empty(0)
+    path = _path_at(truth, frames)
+    if not len(poses):
+        return np.asarray(path - path[0])
+    missing = np.zeros(len(frames), np.bool_)
+    for start, end in lost:
+        missing |= (frames >= start) & (frames <= end)
+    missing &= ~answered(frames, poses)
+    after = np.clip(np.searchsorted(poses, frames), 1, max(len(poses) - 1, 1))
+    nearer = abs(poses[after - 1] - frames) <= abs(poses[after % len(poses)] - frames)
+    found = errors[np.where(nearer, after - 1, after % len(poses))]
+    before = np.searchsorted(poses, frames, side="right") - 1
+    none = before < 0
+    since = np.where(none, path[0], _path_at(truth, poses)[before])
+    held = np.where(none, 0.0, errors[before]) + path - since
+    return np.asarray(np.where(missing, held, found))
+
+
+def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory) -> Floats:
+    """Return the position error at each image of a flight, for poses that were corrected later.
+
+    Between two poses, key frames perhaps, the estimate is interpolated. Before the first and after
+    the last, the nearer one is held, and the true path length from there is added.
+
+    Args:
+        truth: The true poses.
+        frames: Stamps of the flight's images (ns), strictly rising, shape (k,).
+        estimate: The aligned poses.
+
+    Returns:
+        Metres, one for each image within the truth's time.
+    """
+    frames = frames[truth.covers(frames)]
+    if not len(frames):
+        return np.empty(0)
+    first, last = int(estimate.stamps[0]), int(estimate.stamps[-1])
+    inside = np.clip(frames, first, last)
+    away = abs(_path_at(truth, frames) - _path_at(truth, inside))
+    offsets = _positions_at(estimate, inside) - _positions_at(truth, inside)
+    return np.asarray(np.linalg.norm(offsets, axis=1) + away)
+
+
+def relocalization_times(lost: Sequence[Interval], poses: Stamps) -> list[float]:
+    """Return how long it took each time, from losing the pose to having one again, seconds.
+
+    An interval that lasts to the end of the flight counts as long as it is: it took no less.
+    Before the first pose nothing was lost.
+    """
+    return [seconds([each]) for each in lost if len(poses) and each.start >= poses[0]]
+
+
+def _path_at(truth: Trajectory, stamps: Stamps) -> Floats:
+    """Return the path length from the start of the truth to each time, metres."""
+    since = truth.stamps[0]  # so that a float holds every nanosecond
+    return np.asarray(np.interp(stamps - since, truth.stamps - since, truth.distances()))
+
+
+def _positions_at(trajectory: Trajectory, stamps: Stamps) -> Floats:
+    """Return positions at times that may repeat, linear in between, shape (k, 3)."""
+    since = trajectory.stamps[0]
+    times = stamps - since, trajectory.stamps - since
+    return np.stack([np.interp(*times, axis) for axis in trajectory.positions.T], axis=1)
