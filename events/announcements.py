@@ -370,6 +370,7 @@ class EstimatorAnnouncement(Announcement):
         reads: Kinds of data that it computes with: ``grey``, ``depth``, ``imu``, ``lidar``.
         eyes: Number of cameras whose images it takes together: 2 is a stereo rig.
         lenses: Distortion models that it can compute with, besides an ideal camera.
+        rectifies: Whether it turns images of other lenses into those of a pinhole camera first.
     """
 
     method: str
@@ -377,3 +378,4 @@ class EstimatorAnnouncement(Announcement):
     reads: tuple[str, ...] = ()
     eyes: int = 1
     lenses: tuple[str, ...] = ()
+    rectifies: bool = False

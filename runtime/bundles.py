@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import types
 from collections import deque
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import (
     Any,
     Generic,
@@ -131,6 +131,7 @@ class Matcher(Generic[B]):
     Attributes:
         missed: How often a set did not come about because an event of this field was missing, or
             (of the first field) not later than that of the set before.
+        prepare: Awaited with a set that is read; the reader gets its result. `None` for nothing.
     """
 
     def __init__(
@@ -145,6 +146,7 @@ class Matcher(Generic[B]):
         self.deliver: Callable[[B], Any] = stream.offer
         self.slots = {name: Slot(self, name, field.kind) for name, field in fields.items()}
         self.missed = dict.fromkeys(fields, 0)
+        self.prepare: Callable[[B], Awaitable[B]] | None = None
         self._set_type = set_type
         self._tolerance = tolerance
         self._newest: int | None = None
@@ -153,15 +155,20 @@ class Matcher(Generic[B]):
         if self._tuples:
             stream.merge = self._with_tuples_of
 
-    def __aiter__(self) -> Stream[B]:
-        return self.stream
+    def __aiter__(self) -> AsyncIterator[B]:
+        return self.stream if self.prepare is None else self
+
+    async def __anext__(self) -> B:
+        found = await self.stream.__anext__()
+        return found if self.prepare is None else await self.prepare(found)
 
     async def receive(self) -> B:
         """Wait for the next set and take it; see `Stream.receive`."""
-        return await self.stream.receive()
+        found = await self.stream.receive()
+        return found if self.prepare is None else await self.prepare(found)
 
     def receive_nowait(self) -> B:
-        """Take the next set if one waits; see `Stream.receive_nowait`."""
+        """Take the next set if one waits, as it came; see `Stream.receive_nowait`."""
         return self.stream.receive_nowait()
 
     def close(self) -> None:

@@ -7,9 +7,9 @@ Poses are computed in the subclasses (`nodes.visual_odometry` and others), and j
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,9 +36,11 @@ from events import (
 )
 from events.camera_info import COEFFICIENTS
 from nodes.estimation.mount import Mount
+from nodes.estimation.rectification import ALIGNED, Rectification, misalignment
 from nodes.estimation.result import TrackingResult
 from nodes.estimation.rig import SensorChoice
 from runtime import Node, NodeConfig, Output, on
+from runtime.node import matchers
 from runtime.units import Latency
 
 WORKER_ENVIRONMENT = {
@@ -89,13 +91,18 @@ class EstimatorConfig(NodeConfig):
         origin: ``announced``: the estimates are in ``map`` and start at the pose that the vehicle
             announced, if that is known to be true (else as ``start``; see `Estimator`). ``start``:
             they are in ``odom``, whose origin is the body at the first image with a pose.
+        rectify: Whether images that it cannot compute with, because of their lens or because the
+            rows of both eyes are not aligned, are turned into those of pinhole cameras first. If
+            not, they are refused. Cameras whose images need it come after others.
         latency: Time on the run's clock from the arrival of an image to its estimate.
     """
 
     origin: Literal["announced", "start"] = "announced"
+    rectify: bool = True
     latency: Latency = Latency(0.015)  # immutable
 
 
+F = TypeVar("F", bound=tuple[Any, ...])
 C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
 
 
@@ -123,6 +130,12 @@ class Estimator(Node[C], ABC):
     The tracker gives poses of the optical camera (x right, y down, z forward) in the optical camera
     at its first image. What is sent is the pose of the body (FRD) that carries the camera, as a
     `PoseEstimate`; its stamp is on the clock of the IMU (`exposed_at`).
+
+    **Lenses.** What `refusal` says no to, and stereo pairs that are not `aligned`, is rectified
+    beside the loop (`nodes.estimation.rectification`) before `frames` gives it, unless the setting
+    ``rectify`` is false. `the_camera` is the pinhole camera then, and features are sent where they
+    are in the announced camera's own image. Rows keep the read-out time of a rolling shutter only
+    nearly.
 
     **Frame and alignment.** The `frame_id` of the estimates, chosen once with the first pose, says
     what is known about their origin, and so how `nodes.evaluation` aligns them with the ground
@@ -158,6 +171,8 @@ class Estimator(Node[C], ABC):
     lenses: frozenset[str] = frozenset(COEFFICIENTS)
     """Distortion models that it can compute with, besides an ideal camera; see `refusal` for other
     conditions."""
+    aligned: bool = True
+    """Whether the images of a stereo rig must be those of equal pinhole cameras, row by row."""
     method: str = ""
     """Name of the method, for the report."""
     scale_free: bool = False
@@ -169,12 +184,15 @@ class Estimator(Node[C], ABC):
     trajectories = Output(TrajectoryEstimate)
 
     cameras: tuple[CameraAnnouncement, ...] = ()
-    """The cameras whose images are read, as many as `eyes`, the left one first."""
+    """The cameras whose images are read, as many as `eyes`, the left one first; if they are
+    rectified, the pinhole cameras in their place."""
     imu_announcement: ImuAnnouncement | None = None
     """The IMU whose samples are read, if it is `inertial`."""
     _vehicles: tuple[VehicleAnnouncement, ...] = ()
     _choice: SensorChoice | None = None
+    _rectification: Rectification | None = None
     _mount: Mount | None = None
+    _given: Mapping[str, str] = MappingProxyType({})
     _lost = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
 
@@ -193,6 +211,7 @@ class Estimator(Node[C], ABC):
             reads=(*sorted(self.needs), *(["imu"] if self.inertial else [])),
             eyes=self.eyes,
             lenses=tuple(sorted(self.lenses)),
+            rectifies=self.config.rectify,
         )
 
     def on_announcement(self, announcement: Announcement) -> None:
@@ -204,17 +223,55 @@ class Estimator(Node[C], ABC):
         if isinstance(announcement, VehicleAnnouncement):
             self._vehicles += (announcement,)
         if self._choice is None:
-            named = dict(self.sources)
-            self._choice = SensorChoice(self.needs, self.eyes, self.inertial, named, self.refusal)
+            self._given = dict(self.sources)
+            self._choice = self._new_choice(self._given)
+        before = self._choice.cameras
         self._choice.announced(announcement)
-        if not self.cameras and self._choice.cameras:
-            self.cameras = self._choice.cameras
-            ports = ("frames",) if self.eyes == 1 else ("frames.left", "frames.right")
-            for port, camera in zip(ports, self.cameras, strict=True):
-                self.narrow(port, camera.source)
+        if self._choice.cameras is not before:
+            self._take(self._choice.cameras)
+            self.imu_announcement = None
         if self.imu_announcement is None and self._choice.imu is not None:
             self.imu_announcement = self._choice.imu
-            self.narrow("frames.imu", self._choice.imu.source)
+            self._narrow_to("frames.imu", self._choice.imu.source)
+
+    def _take(self, cameras: tuple[CameraAnnouncement, ...]) -> None:
+        """Read the images of these cameras, rectified if they are of no use as they are."""
+        self.cameras, self._rectification = cameras, None
+        if self._choice is not None and self._choice.rectified:
+            self._rectification = Rectification(cameras)
+            self.cameras = self._rectification.cameras
+        for matcher in matchers(self).values():
+            matcher.prepare = self._rectify if self._rectification else None
+        ports = ("frames",) if self.eyes == 1 else ("frames.left", "frames.right")
+        for port, camera in zip(ports, cameras, strict=True):
+            self._narrow_to(port, camera.source)
+
+    def _narrow_to(self, port: str, source: str) -> None:
+        """Receive this source, and not the one before, unless the file names another."""
+        if port not in self._given:
+            self.sources[port] = source
+
+    async def _rectify(self, frame: F) -> F:
+        assert self._rectification is not None
+        return await self.offload(self._rectification.frame, frame)
+
+    def _new_choice(self, named: Mapping[str, str]) -> SensorChoice:
+        return SensorChoice(self.needs, self.eyes, self.inertial, named, self._refusals)
+
+    def _refusals(self, cameras: Sequence[CameraAnnouncement], rectified: bool) -> dict[str, str]:
+        """Return why images are of no use, as they are or rectified, by their cameras' sources."""
+        if rectified:
+            try:
+                cameras = Rectification(cameras).cameras if self.config.rectify else cameras
+            except ValueError as error:
+                return {cameras[0].source: str(error)}
+        found = {camera.source: why for camera in cameras if (why := self.refusal(camera))}
+        if len(cameras) < 2 or found or not self.aligned:
+            return found
+        if (off := misalignment(*cameras)) > ALIGNED:
+            left, right = (camera.source for camera in cameras)
+            found[right] = f"expected its rows aligned with those of {left}, found {off:.2g} px off"
+        return found
 
     def refusal(self, camera: CameraAnnouncement) -> str:
         """Return why a camera's images are of no use here, in a sentence; empty if they are."""
@@ -224,8 +281,8 @@ class Estimator(Node[C], ABC):
         coefficients = ", ".join(f"{value:g}" for value in camera.info.distortion)
         known = f" or with {', '.join(sorted(self.lenses))}" if self.lenses else ""
         return (
-            f"expected images without distortion{known} (a camera sends them as well with "
-            f"undistorted = true), found {model} with {coefficients}"
+            f"expected images without distortion{known} (rectify = true makes such of others), "
+            f"found {model} with {coefficients}"
         )
 
     @on(Armed, TakenOff)
@@ -234,9 +291,14 @@ class Estimator(Node[C], ABC):
         self._armed_at = {event.source: event.stamp, **self._armed_at}
 
     def check(self) -> Iterable[str]:
-        """Return the error if no camera gives what is needed, or there is no IMU for it."""
+        """Return the error if no camera gives what is needed, or there is no IMU for it.
+
+        Says in the log what is rectified.
+        """
         if missing := self._missing():
             yield missing
+        if self._rectification is not None:
+            self.log.info("%s is rectified: %s", self.the_camera().source, self._rectification)
 
     @abstractmethod
     async def run(self) -> None:
@@ -260,8 +322,7 @@ class Estimator(Node[C], ABC):
         return image.stamp - round(self.the_camera().time_offset * 1e9)
 
     def _missing(self) -> str:
-        choice = self._choice or SensorChoice(self.needs, self.eyes, self.inertial, {}, str)
-        return choice.missing()
+        return (self._choice or self._new_choice({})).missing()
 
     def publish(
         self, image: Image | DepthImage, result: TrackingResult, origin: int | None = None
@@ -279,12 +340,15 @@ class Estimator(Node[C], ABC):
             self._lost = True
             reason = f"restarted: poses are in {self._odom()} from here on"
             self.tracking_events.send(TrackingLost(stamp=stamp, source=self.name, reason=reason))
+        points = result.points
+        if self._rectification is not None:
+            points = self._rectification.eyes[0].original(points).astype(np.float32)
         self.features.send(
             TrackedFeatures(
                 stamp=image.stamp,
                 source=self.name,
                 frame_id=image.frame_id,
-                points=result.points,
+                points=points,
                 inliers=result.inliers,
             )
         )

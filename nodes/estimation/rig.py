@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from events import Announcement, CameraAnnouncement, ImuAnnouncement
 from runtime.errors import suggest
@@ -17,10 +17,14 @@ class SensorChoice:
         inertial: Whether an IMU is needed.
         named: Port to the source that the file names for it: ``frames`` or ``frames.left`` (the
             first camera), ``frames.right``, ``frames.imu``.
-        refusal: Returns why a camera's images are of no use, in a sentence; empty if they are.
+        refusals: Returns why images of one or both eyes are of no use, a sentence by each source;
+            empty if they are. Called with False, as they are, and with True, as they can be
+            rectified.
 
     Attributes:
-        cameras: The chosen ones, the left one first; empty while there are none.
+        cameras: The chosen ones, the left one first; empty while there are none. Those whose
+            images are of use as they are come before those that have to be rectified.
+        rectified: Whether their images have to be.
         imu: The chosen IMU, on the vehicle of the first camera; `None` while there is none.
     """
 
@@ -30,15 +34,16 @@ class SensorChoice:
         eyes: int,
         inertial: bool,
         named: Mapping[str, str],
-        refusal: Callable[[CameraAnnouncement], str],
+        refusals: Callable[[Sequence[CameraAnnouncement], bool], Mapping[str, str]],
     ) -> None:
         self.cameras: tuple[CameraAnnouncement, ...] = ()
+        self.rectified = False
         self.imu: ImuAnnouncement | None = None
         self._needs, self._eyes, self._inertial = frozenset(needs), eyes, inertial
         self._first = named.get("frames.left", named.get("frames"))
         self._second = named.get("frames.right")
         self._imu = named.get("frames.imu")
-        self._refusal = refusal
+        self._refused = refusals
         self._seen: list[CameraAnnouncement] = []
         self._imus: list[ImuAnnouncement] = []
         self._refusals: dict[str, str] = {}
@@ -47,7 +52,7 @@ class SensorChoice:
         """Take note of a camera or an IMU, and choose if that is possible now."""
         if isinstance(announcement, CameraAnnouncement):
             self._seen.append(announcement)
-            if not self.cameras:
+            if not self.cameras or self.rectified:
                 self._choose_cameras()
         elif isinstance(announcement, ImuAnnouncement):
             self._imus.append(announcement)
@@ -70,41 +75,49 @@ class SensorChoice:
         )
 
     def _choose_cameras(self) -> None:
+        """Choose the first whose images are of use, for the first time or in place of rectified."""
+        sets = list(self._candidates())
+        for rectified in (False, True)[: 1 if self.cameras else 2]:
+            for cameras in sets:
+                found = self._refused(cameras, rectified)
+                if not found:
+                    self.cameras, self.rectified, self.imu = cameras, rectified, None
+                    return
+                self._refusals |= found
+
+    def _candidates(self) -> Iterator[tuple[CameraAnnouncement, ...]]:
+        """Yield cameras (or pairs) that give all kinds of image."""
         for camera in self._seen:
-            if camera.stereo or not self._is_useful(camera, self._first):
+            right_eye = camera.stereo and camera.source != self._first
+            if right_eye or not self._gives_all(camera, self._first):
                 continue
             if self._eyes == 1:
-                self.cameras = (camera,)
-                return
+                yield (camera,)
+                continue
             right = next((c for c in self._seen if self._is_partner(c, camera)), None)
-            if right is not None and self._is_useful(right, right.source):
-                self.cameras = (camera, right)
-                return
+            if right is not None and self._gives_all(right, right.source):
+                yield camera, right
 
     def _is_partner(self, camera: CameraAnnouncement, left: CameraAnnouncement) -> bool:
         if self._second is not None:
             return camera.source == self._second
         return camera.stereo == left.source
 
-    def _is_useful(self, camera: CameraAnnouncement, named: str | None) -> bool:
-        """Tell whether a camera's images can be read, and note why not.
+    def _gives_all(self, camera: CameraAnnouncement, named: str | None) -> bool:
+        """Tell whether a camera may be chosen and gives all kinds of image.
 
         Raises:
             ValueError: It is the one that the file names, and lacks a kind of image.
         """
         if named is not None and camera.source != named:
             return False
-        if lacking := self._needs - given(camera):
-            if named is None:
-                return False
+        lacking = self._needs - given(camera)
+        if lacking and named is not None:
             raise ValueError(
                 f"expected a camera with {', '.join(sorted(self._needs))} images, "
                 f"found none with {', '.join(sorted(lacking))}"
             )
-        refusal = self._refusal(camera)
-        if refusal:
-            self._refusals[camera.source] = refusal
-        return not refusal
+        return not lacking
 
     def _no_camera(self) -> str:
         if self._refusals:

@@ -192,7 +192,8 @@ def lacks(case: Case) -> list[Lack]:
 def refusal_faults(case: Case, lack: Lack) -> Iterator[str]:
     """Return what is wrong with how an estimator refuses a rig."""
     try:
-        run_nodes([spec(case.node, "est", case.settings)], inputs=lack.events, duration=0.2)
+        settings = {**case.settings, "rectify": False}
+        run_nodes([spec(case.node, "est", settings)], inputs=lack.events, duration=0.2)
     except VisnavError as error:
         message = str(error)
         if "expected" not in message or "found" not in message:

@@ -326,7 +326,7 @@ def test_a_lens_that_it_cannot_compute_with_is_refused(
 ) -> None:
     """In a sentence, with what was found and how to help; the file may name the camera or not."""
     seen = camera("drone/front", "rgb", "depth", info=info)
-    refused = [spec(PinholeOnly, "est", inputs=inputs)]
+    refused = [spec(PinholeOnly, "est", {"rectify": False}, inputs=inputs)]
     with pytest.raises(NodeError, match=rf"drone/front: expected images without.*{found}"):
         run_nodes(refused, inputs=[seen], duration=1.0)
     assert track(vehicle(), seen, *rgbd(1)).of(PoseEstimate)  # others can

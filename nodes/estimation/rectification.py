@@ -1,0 +1,234 @@
+"""Images of lenses that distort, turned into those of pinhole cameras; eyes row by row.
+
+For a single camera the optical axis, the principal point and the size stay. Both eyes of a stereo
+rig get one new orientation: x along the line from the left to the right one, z between both optical
+axes (as in A. Fusiello et al., "A compact algorithm for rectification of stereo pairs", 2000), and
+one matrix, so that a point falls on the same row of both, and its disparity is f · baseline / z.
+
+**The focal length** is that of square pixels, and the shortest with which every pixel of the new
+image shows something, at most `WIDEST` across. So the middle keeps about the resolution that it
+had, nothing is black, and the rim of a wide lens is cut off: of a fisheye of 150 degrees its middle
+is left. A lens of which less than a quarter would be left is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, TypeVar
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraAnnouncement, CameraInfo, DepthImage, Image
+from events.poses import pose_matrix, pose_tuples
+
+Floats = npt.NDArray[np.float64]
+F = TypeVar("F", bound=tuple[Any, ...])
+
+WIDEST = math.radians(110.0)
+"""Greatest field of view of a new image, along its longer side."""
+
+ALIGNED = 0.1
+"""Pixels by which both images of a point in a rectified pair may miss the rule above."""
+
+_NO_MAP: Any = None  # both coordinates stand in one
+
+_NARROWEST = 2.0
+"""Times the old focal length that the new one may be."""
+
+
+class Eye(msgspec.Struct, frozen=True, dict=True, eq=False):
+    """One camera, and the pinhole camera in its place.
+
+    Attributes:
+        lens: Intrinsics of its images.
+        pinhole: Those of the rectified ones.
+        turn: Rotation from the rectified to the announced optical frame, shape (3, 3).
+    """
+
+    lens: CameraInfo
+    pinhole: CameraInfo
+    turn: Floats
+
+    def original(self, pixels: npt.ArrayLike) -> Floats:
+        """Return where rectified pixels, shape (n, 2), are in the camera's own images.
+
+        NaN where they are not.
+        """
+        uv = np.asarray(pixels, np.float64).reshape(-1, 2)
+        info = self.pinhole
+        x, y = (uv - (info.cx, info.cy)).T / [[info.fx], [info.fy]]
+        return self.lens.project(np.column_stack([x, y, np.ones(len(uv))]) @ self.turn.T)
+
+    @cached_property
+    def _map(self) -> npt.NDArray[np.float32]:
+        """Pixel of the lens's image for each pixel of the new one, shape (h, w, 2)."""
+        rows, columns = np.mgrid[0 : self.pinhole.height, 0 : self.pinhole.width]
+        places = self.original(np.column_stack([columns.ravel(), rows.ravel()]))
+        # Far outside where there is nothing.
+        return np.nan_to_num(places, nan=-100.0).astype(np.float32).reshape(*rows.shape, 2)
+
+    @cached_property
+    def _fixed(self) -> Any:
+        """The same in 32nds of pixels, as OpenCV is quickest with."""
+        return cv2.convertMaps(self._map, _NO_MAP, cv2.CV_16SC2)
+
+    def rectify(self, event: Image | DepthImage) -> Image | DepthImage:
+        """Return an image as the pinhole camera would have taken it.
+
+        Brightness is interpolated; of depth the nearest pixel is taken, for the mean of two
+        surfaces is none. Depth is measured along the optical axis, so this is for depth only if
+        the axis stays.
+
+        Raises:
+            ValueError: The image is not of the announced size.
+        """
+        height, width = event.data.shape[:2]
+        if (width, height) != (self.lens.width, self.lens.height):
+            raise ValueError(
+                f"{event.source}: expected {self.lens.width}×{self.lens.height} pixels, as the "
+                f"camera announced, found {width}×{height}"
+            )
+        if isinstance(event, DepthImage):
+            data: Any = cv2.remap(
+                event.data, self._map, _NO_MAP, cv2.INTER_NEAREST, borderValue=math.inf
+            )
+        else:
+            places, shares = self._fixed
+            data = cv2.remap(event.data, places, shares, cv2.INTER_LINEAR)
+        return msgspec.structs.replace(event, data=data)
+
+
+class Rectification:
+    """The pinhole cameras in the place of a camera, or of both eyes of a stereo rig.
+
+    Args:
+        cameras: One, or the left and the right one.
+
+    Attributes:
+        cameras: The same with the pinhole cameras' intrinsics and orientations.
+        eyes: What makes their images.
+
+    Raises:
+        ValueError: No pinhole image shows enough of what they see, or both eyes are not side by
+            side; says why.
+    """
+
+    def __init__(self, cameras: Sequence[CameraAnnouncement]) -> None:
+        first = cameras[0].info
+        own = [pose_matrix(each.position, each.orientation) for each in cameras]
+        common = own[0][:3, :3] if len(own) == 1 else _common_axes(cameras, own)
+        turns = [matrix[:3, :3].T @ common for matrix in own]
+        info = CameraInfo(
+            width=first.width,
+            height=first.height,
+            fx=1.0,
+            fy=1.0,
+            cx=float(np.mean([each.info.cx for each in cameras])),
+            cy=float(np.mean([each.info.cy for each in cameras])),
+        )
+        lenses = [each.info for each in cameras]
+        focal = _focal(cameras[0].source, info, list(zip(lenses, turns, strict=True)))
+        info = msgspec.structs.replace(info, fx=focal, fy=focal)
+        self.eyes = tuple(Eye(lens, info, t) for lens, t in zip(lenses, turns, strict=True))
+        frame = np.eye(4)
+        frame[:3, :3] = common
+        orientation = pose_tuples(frame)[1]
+        self.cameras = tuple(
+            msgspec.structs.replace(each, info=info, orientation=orientation) for each in cameras
+        )
+
+    def frame(self, frame: F) -> F:
+        """Return the fields of a frame with rectified images; those of a right eye are `right`."""
+        names: tuple[str, ...] = frame._fields  # type: ignore[attr-defined]
+        fields = [
+            self.eyes[name == "right"].rectify(each)
+            if isinstance(each, Image | DepthImage)
+            else each
+            for name, each in zip(names, frame, strict=True)
+        ]
+        made: F = type(frame)._make(fields)  # type: ignore[attr-defined]
+        return made
+
+    def __str__(self) -> str:
+        info = self.eyes[0].pinhole
+        across, down = (
+            math.degrees(2 * math.atan(n / 2 / info.fx)) for n in (info.width, info.height)
+        )
+        return (
+            f"{self.eyes[0].lens.distortion_model} to pinhole, focal length {info.fx:.1f} px, "
+            f"{across:.0f}° × {down:.0f}°"
+        )
+
+
+def misalignment(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
+    """Return by how much a pair of pinhole images misses being aligned row by row, pixels.
+
+    The most that a point's right pixel differs from that to the left of its left one by f ·
+    baseline / z; ``inf`` if it cannot be seen.
+    """
+    info = left.info
+    u, v, z = np.meshgrid([0, info.width - 1], [0, info.height - 1], [1.0, 1e9])
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    rays = info.unproject(pixels)
+    points = rays / rays[:, 2:] * z.reshape(-1, 1)
+    places = [pose_matrix(each.position, each.orientation) for each in (left, right)]
+    across = np.linalg.inv(places[1]) @ places[0]
+    found = right.info.project(points @ across[:3, :3].T + across[:3, 3])
+    shift = info.fx * math.dist(left.position, right.position) / z.ravel()
+    off = np.abs(found - np.column_stack([pixels[:, 0] - shift, pixels[:, 1]])).max()
+    return float(off) if np.isfinite(off) else math.inf
+
+
+def _common_axes(cameras: Sequence[CameraAnnouncement], own: Sequence[Floats]) -> Floats:
+    """Return the axes (right, down, ahead; columns) that both eyes get, shape (3, 3)."""
+    x = own[1][:3, 3] - own[0][:3, 3]
+    length = float(np.linalg.norm(x))
+    ahead = own[0][:3, 2] + own[1][:3, 2]
+    rights = min(float(x @ each[:3, 0]) for each in own)
+    if length == 0.0 or rights < 0.5 * length or own[0][:3, 2] @ own[1][:3, 2] < 0.5:
+        raise ValueError(
+            f"expected {cameras[1].source} to the right of {cameras[0].source}, and both to look "
+            "the same way, found other poses"
+        )
+    x = x / length
+    z = ahead - (ahead @ x) * x
+    z /= np.linalg.norm(z)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _focal(source: str, info: CameraInfo, eyes: list[tuple[CameraInfo, Floats]]) -> float:
+    """Return the shortest focal length with which no pixel of the eyes' new images is empty."""
+    across, down = np.arange(info.width), np.arange(info.height)
+    rim = np.concatenate(
+        [np.column_stack([across, np.full_like(across, v)]) for v in (0, info.height - 1)]
+        + [np.column_stack([np.full_like(down, u), down]) for u in (0, info.width - 1)]
+    )
+
+    def is_full(focal: float) -> bool:
+        pinhole = msgspec.structs.replace(info, fx=focal, fy=focal)
+        for lens, turn in eyes:
+            places = Eye(lens, pinhole, turn).original(rim)
+            size = lens.width - 1, lens.height - 1
+            if not ((places >= 0).all() and (places <= size).all()):
+                return False
+        return True
+
+    lens = eyes[0][0]
+    low = (max(info.width, info.height) - 1) / 2 / math.tan(WIDEST / 2)
+    high = _NARROWEST * max(lens.fx, lens.fy, low)
+    if is_full(low):
+        return low
+    if not is_full(high):
+        raise ValueError(
+            f"{source}: expected a lens of which a pinhole image can show a quarter or more, found "
+            f"{lens.distortion_model} with which less is left"
+        )
+    while high - low > 1e-3 * low:
+        middle = (low + high) / 2
+        low, high = (low, middle) if is_full(middle) else (middle, high)
+    return high
