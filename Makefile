@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-pythons test-all check fix docs wheel peers bench bench-quick orbslam3 images clean
+.PHONY: help setup demo test test-slow test-pythons test-all check fix docs wheel peers bench bench-quick orbslam3 svo images clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -68,6 +68,11 @@ orbslam3: $(READY)  ## Install ORB-SLAM3 (GPL) and train its vocabulary from ren
 	$(BIN)/python -m pip install --quiet -e '.[orbslam3]'
 	@sh tools/system_packages.sh orbslam3 $(BIN)/python
 	$(BIN)/python -m runtime vocabulary config.toml
+
+# Without its dependency opencv-python, whose files would replace opencv-python-headless's.
+svo: $(READY)  ## Install SVO (GPL).
+	$(BIN)/python -m pip install --quiet --no-deps 'svo-cpp>=1.5'
+	$(BIN)/python -c 'import svo_cpp, cv2'
 
 peers: $(READY)  ## Install what the benchmarks compare with (PyPI, and Debian's ROS 1 and C++).
 	$(BIN)/python -m pip install --quiet -e '.[peers]'

@@ -33,6 +33,7 @@ BRIDGES = {
     "mcap",
     "pyorbslam3",
     "rosbags",
+    "svo_cpp",
     "textual",
 }
 PURE = {"asyncio", "socket", "threading"}
