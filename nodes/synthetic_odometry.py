@@ -1,0 +1,102 @@
+"""An estimator made of the truth: as late and as wrong as its settings say.
+
+With it a study varies one error at a time, which no real estimator allows: what does a drift of
+1 %, or a delay of 100 ms, do to a vehicle that flies on its estimate?
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from events import Announcement, EstimatorAnnouncement, Odometry, PoseEstimate
+from runtime import Node, NodeConfig, Output, Tick, every, on
+from runtime.units import Latency
+
+Share = Annotated[float, msgspec.Meta(ge=0, le=100)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+
+
+class SyntheticOdometryConfig(NodeConfig):
+    """Settings of an estimator that is made of the truth.
+
+    Attributes:
+        rate: Estimates per second.
+        latency: Time on the run's clock from a pose to its estimate.
+        drift: Error of the position that grows with the distance flown, in percent of it, in a
+            horizontal direction that depends on the run's seed.
+        heading_drift: Error of the heading that grows with the distance flown, degrees per metre;
+            its sign depends on the run's seed. The path turns with it.
+        noise: Standard deviation of the position's noise along each axis, metres.
+    """
+
+    rate: Annotated[float, msgspec.Meta(gt=0)] = 30
+    latency: Latency = Latency(0.015)  # immutable
+    drift: Share = 0.0
+    heading_drift: Share = 0.0
+    noise: NotNegative = 0.0
+
+
+class SyntheticOdometry(Node[SyntheticOdometryConfig]):
+    """Sends the true pose of a vehicle with a chosen drift, noise and latency.
+
+    Where there are several vehicles, the file narrows ``odometry`` to one of them.
+    """
+
+    estimates = Output(PoseEstimate)
+
+    def __init__(self) -> None:
+        turn, self._sign = self.rng.uniform(0.0, math.tau), self.rng.choice([-1.0, 1.0])
+        self._direction = np.array([math.cos(turn), math.sin(turn), 0.0])
+        self._truth: Odometry | None = None
+        self._start = np.zeros(3)
+        self._distance = 0.0
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce the estimates."""
+        method = f"truth, {self.config.drift:g} % drift, {self.config.latency * 1e3:g} ms late"
+        yield EstimatorAnnouncement(stamp=0, source=self.name, method=method)
+
+    @on(Odometry)
+    def odometry(self, event: Odometry) -> None:
+        """Note the true pose, and the distance flown."""
+        if self._truth is None:
+            self._start = np.array(event.position)
+        else:
+            self._distance += math.dist(self._truth.position, event.position)
+        self._truth = event
+
+    @every(hz="rate")
+    def estimate(self, _: Tick) -> None:
+        """Make an estimate of the newest pose; it is sent when the latency has passed."""
+        if self._truth is not None:
+            self.start(self._send(self._worsened(self._truth)))
+
+    async def _send(self, estimate: PoseEstimate) -> None:
+        await self.clock.sleep(self.config.latency)
+        self.estimates.send(estimate)
+
+    def _worsened(self, truth: Odometry) -> PoseEstimate:
+        config = self.config
+        angle = self._sign * math.radians(config.heading_drift) * self._distance
+        turn = Rotation.from_euler("z", angle)
+        position = self._start + turn.apply(np.array(truth.position) - self._start)
+        position += config.drift / 100 * self._distance * self._direction
+        if config.noise:
+            position += self.rng.normal(0.0, config.noise, 3)
+        orientation = turn * Rotation.from_quat(truth.orientation, scalar_first=True)
+        x, y, z = position.tolist()
+        w, qx, qy, qz = orientation.as_quat(scalar_first=True).tolist()
+        return PoseEstimate(
+            stamp=truth.stamp,
+            source=self.name,
+            frame_id=truth.frame_id,
+            child_frame_id=truth.child_frame_id,
+            position=(x, y, z),
+            orientation=(w, qx, qy, qz),
+        )
