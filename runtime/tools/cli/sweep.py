@@ -14,7 +14,7 @@ import typer
 from runtime.tools.cli.common import ConfigFile, Overrides
 
 if TYPE_CHECKING:
-    from runtime.tools.sweep import Children
+    from runtime.tools.sweep import Children, Plan, Row
 
 _WIDTH = 160
 """Of the table where there is no terminal, in letters; 80 would break its words."""
@@ -56,32 +56,19 @@ def sweep(
     Called again, only what is missing or has failed is run. Ends with 0 if every run came to its
     end, whether or not it met its thresholds; with 2 if one failed; with 130 after Ctrl-C.
     """
-    from concurrent.futures import ThreadPoolExecutor
-
     from rich.console import Console
 
     from runtime.config.reading import load
     from runtime.tools import sweep as sweeping
     from runtime.tools.cli.run import look_at
-    from runtime.tools.sweep.console import Display, summary_table
+    from runtime.tools.sweep.console import summary_table
 
     plan = sweeping.make_plan(
         config, vary or [], overrides=overrides or [], seeds=seeds, repeats=repeat, out=out
     )
     changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
     look_at(load(config, [*(overrides or []), *changes]))
-    children = sweeping.Children()
-    display = Display(children, Console(stderr=True))
-    try:
-        with (
-            _signals_interrupt(children),
-            display,
-            ThreadPoolExecutor(jobs or max(_cores() // 2, 1), "run") as executor,
-        ):
-            rows = sweeping.sweep(plan, executor, run=children.run, watch=display, fresh=fresh)
-    except KeyboardInterrupt:
-        typer.echo(f"interrupted; the same command runs what is missing in {plan.out}", err=True)
-        raise typer.Exit(130) from None
+    rows = carry_out(plan, jobs=jobs, fresh=fresh)
     sweeping.write_tables(plan, rows)
     sweeping.draw_plots(plan, rows)
     page = sweeping.write_page(plan, rows)
@@ -92,9 +79,41 @@ def sweep(
     console.print(
         f"{len(rows)} runs   results in [bold]{plan.out}[/bold]: open {page.name}", highlight=False
     )
-    if display.failed:
-        typer.echo(f"error: {display.failed} of {len(rows)} runs failed", err=True)
+    if failed := sum(bool(row["error"]) for row in rows):
+        typer.echo(f"error: {failed} of {len(rows)} runs failed", err=True)
         raise typer.Exit(2)
+
+
+def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> list[Row]:
+    """Run what a plan lacks on this machine, and show how it gets on.
+
+    Args:
+        plan: What to run.
+        jobs: Runs at the same time; half the cores if not given.
+        fresh: Forget what is finished.
+
+    Raises:
+        typer.Exit: With 130, after Ctrl-C or another signal that ends it.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    from rich.console import Console
+
+    from runtime.tools import sweep as sweeping
+    from runtime.tools.sweep.console import Display
+
+    children = sweeping.Children()
+    display = Display(children, Console(stderr=True))
+    try:
+        with (
+            _signals_interrupt(children),
+            display,
+            ThreadPoolExecutor(jobs or max(_cores() // 2, 1), "run") as executor,
+        ):
+            return sweeping.sweep(plan, executor, run=children.run, watch=display, fresh=fresh)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted; the same command runs what is missing in {plan.out}", err=True)
+        raise typer.Exit(130) from None
 
 
 @contextlib.contextmanager
