@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import cv2
@@ -39,7 +40,7 @@ from nodes.odometry.relocalization import detect_and_describe, relocalize
 from nodes.visual_odometry.keyframes import ORB_POINTS, Described, Keyframe, find_corners, squares
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import Rows, find_patches, half_width
-from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
+from nodes.visual_odometry.surfaces import Surfaces, inverse_depth, surfaces_at
 
 _FLOW_WINDOW = 15
 _LARGE = 320
@@ -127,12 +128,19 @@ class FeatureTracker:
     Args:
         info: Intrinsics of the images, which must be free of distortion.
         settings: Settings of the method.
+        surfaces: Reads depth at pixels, as `surfaces_at` does.
     """
 
-    def __init__(self, info: CameraInfo, settings: FeatureSettings | None = None) -> None:
+    def __init__(
+        self,
+        info: CameraInfo,
+        settings: FeatureSettings | None = None,
+        surfaces: Callable[[Depth, Floats, float], Surfaces] = surfaces_at,
+    ) -> None:
         refuse_distortion(info)
         self._info = info
         self._settings = settings or FeatureSettings()
+        self._surfaces_at = surfaces
         self._matrix = info.matrix()
         large = self._settings.levels and min(info.width, info.height) >= _LARGE
         self._reduction = 2 if large else 1
@@ -163,7 +171,7 @@ class FeatureTracker:
             self._count, rows[agree], np.concatenate([match.missed, rows[~agree]])
         )
         noise = self._settings.depth_noise
-        read = surfaces_at(inverse_of, match.pixels[agree], noise)
+        read = self._surfaces_at(inverse_of, match.pixels[agree], noise)
         self._map.fuse(self._pose, rows[agree], read, _READING * noise)
         self._before = self._reduced(grey), rows[agree], match.pixels[agree]
         if self._is_far(rows[agree]):
@@ -265,7 +273,7 @@ class FeatureTracker:
         missed, rows, pixels = rows[~found], rows[found], pixels[found]
         if len(rows) < settings.min_inliers:
             return None
-        read = surfaces_at(inverse_of, pixels, settings.depth_noise)
+        read = self._surfaces_at(inverse_of, pixels, settings.depth_noise)
         places = landmarks.places[rows]
         first = self._solve(places, pixels, expected, read.inverse, read.continuous)
         agree = first.errors < _AGREES
@@ -312,7 +320,7 @@ class FeatureTracker:
         """Store this image, and new landmarks between those found."""
         settings = self._settings
         corners = find_corners(grey, settings.spacing, pixels)
-        seen = surfaces_at(inverse_of, corners, settings.depth_noise)
+        seen = self._surfaces_at(inverse_of, corners, settings.depth_noise)
         number = next(reversed(self._keyframes), -1) + 1
         new = self._map.add(
             number, self._pose, corners[seen.continuous], seen.take(seen.continuous)
@@ -345,7 +353,8 @@ class FeatureTracker:
     def _start_map(self, stamp: int, grey: Grey, inverse_of: Depth, reason: str) -> TrackingResult:
         """Make the first key frame of a new map, at the present pose, if it shows enough."""
         corners = find_corners(grey, self._settings.spacing, np.empty((0, 2)))
-        count = int(surfaces_at(inverse_of, corners, self._settings.depth_noise).continuous.sum())
+        seen = self._surfaces_at(inverse_of, corners, self._settings.depth_noise)
+        count = int(seen.continuous.sum())
         if count < self._settings.min_inliers:
             few = f"{count} corners with depth, of {self._settings.min_inliers} needed for a map"
             return self._lost(stamp, few)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from nodes.monocular_odometry import MonocularOdometry
+from nodes.stereo_odometry import StereoOdometry
 from nodes.visual_odometry import VisualOdometry
 from tests.nodes.estimation.conformance import (
     Case,
@@ -24,6 +25,7 @@ CASES = {
     "features": Case(VisualOdometry),
     "dense": Case(VisualOdometry, {"method": "dense"}, width=160),
     "monocular": Case(MonocularOdometry, begins=14),
+    "stereo": Case(StereoOdometry),
 }
 """By a name for the test; those that need more than the project itself are slow."""
 

@@ -1,0 +1,102 @@
+"""Stereo odometry: depth of a pair, the trajectory from it, and the rigs that it refuses."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from events import CameraAnnouncement
+from nodes.stereo_odometry import StereoMatcher, StereoSettings, why_not_rectified
+from nodes.stereo_odometry.node import StereoTracker
+from nodes.visual_odometry.features import FeatureSettings
+from nodes.visual_odometry.surfaces import inverse_depth
+from tests.nodes.visual_odometry.world import INFO, look, pose
+
+BASELINE = 0.1
+
+
+def pair(camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the images of both eyes, and the true depth of the left one."""
+    left, depth = look(camera)
+    right, _ = look(camera @ pose(x=BASELINE))
+    return left, right, depth
+
+
+def test_depth_at_corners_is_within_the_stated_noise() -> None:
+    matcher = StereoMatcher(INFO, BASELINE)
+    left, right, truth = pair(pose(yaw=8.0))
+    coarse = inverse_depth(matcher.depth(left, right))
+    columns, rows = np.meshgrid(np.arange(90, 300, 10), np.arange(20, 220, 10))
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+    found = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
+    assert found.continuous.mean() > 0.5
+    true = 1.0 / truth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+    errors = (found.inverse - true)[found.continuous]
+    assert np.median(np.abs(errors)) < matcher.depth_noise
+    assert np.abs(np.median(errors)) < 0.5 * matcher.depth_noise
+
+
+@pytest.mark.parametrize("other", ["black", "unrelated", "swapped"])
+def test_images_that_do_not_match_have_no_depth(other: str) -> None:
+    left, right, _ = pair(pose())
+    if other == "black":
+        right = np.zeros_like(right)
+    elif other == "unrelated":
+        right = np.random.default_rng(1).integers(0, 255, right.shape, np.uint8)
+    else:
+        left, right = right, left
+    matcher = StereoMatcher(INFO, BASELINE)
+    coarse = inverse_depth(matcher.depth(left, right))
+    columns, rows = np.meshgrid(np.arange(90, 300, 10), np.arange(20, 220, 10))
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+    assert matcher.surfaces_at(coarse, pixels, matcher.depth_noise).continuous.mean() < 0.03
+
+
+def test_the_trajectory_is_metric_and_the_same_twice() -> None:
+    def fly() -> list[np.ndarray]:
+        tracker = StereoTracker(INFO, BASELINE, StereoSettings(), FeatureSettings())
+        poses = []
+        for step in range(12):
+            left, right, _ = pair(pose(x=0.03 * step, z=0.02 * step, yaw=0.5 * step))
+            found = tracker.track(step * 50_000_000, left, right)
+            assert not found.lost
+            poses.append(found.pose)
+        return poses
+
+    poses = fly()
+    truth = pose(x=0.33, z=0.22, yaw=5.5)
+    assert np.linalg.norm(poses[-1][:3, 3] - truth[:3, 3]) < 0.01
+    assert np.abs(poses[-1][:3, :3] - truth[:3, :3]).max() < 0.005
+    assert np.array_equal(poses, fly())
+
+
+def camera(
+    name: str, position: tuple[float, float, float], width: int = INFO.width
+) -> CameraAnnouncement:
+    """Return a camera of this place, looking along z."""
+    return CameraAnnouncement(
+        stamp=0,
+        source=name,
+        images=("grey",),
+        info=msgspec.structs.replace(INFO, width=width),
+        rate=20.0,
+        latency=0.0,
+        frame_id=name,
+        parent_frame_id="base_link",
+        position=position,
+        orientation=(1.0, 0.0, 0.0, 0.0),
+    )
+
+
+def test_only_rectified_pairs_are_taken() -> None:
+    left = camera("left", (0.2, 0.0, 0.0))
+    assert why_not_rectified((left, camera("right", (0.3, 0.0, 0.0)))) == ""
+    assert why_not_rectified(()) == ""
+    assert "to the right" in why_not_rectified((left, camera("right", (0.1, 0.0, 0.0))))
+    assert "to the right" in why_not_rectified((left, camera("right", (0.3, 0.01, 0.0))))
+    turned = msgspec.structs.replace(
+        camera("right", (0.3, 0.0, 0.0)), orientation=(0.99998, 0.00632, 0.0, 0.0)
+    )
+    assert "turned by" in why_not_rectified((left, turned))
+    assert "intrinsics" in why_not_rectified((left, camera("right", (0.3, 0.0, 0.0), width=321)))
