@@ -55,6 +55,20 @@ def check_pose(event: Any, position: tuple[float, ...], orientation: tuple[float
         _check_all(event)
 
 
+def check_covariance(event: Any, field: str, size: int) -> None:
+    """Check that a covariance is empty, or has `size` rows of `size` finite numbers in one tuple.
+
+    Whether it is one, so symmetric and positive definite, is for those to judge who use it.
+
+    Raises:
+        TypeError: It is something else.
+        ValueError: A number is not finite.
+    """
+    numbers = getattr(event, field)
+    if numbers.__class__ is not tuple or numbers:
+        _check_numbers(f"{type(event).__name__}.{field}", numbers, size * size)
+
+
 def _norm(numbers: tuple[float, ...]) -> float:
     try:
         return hypot(*numbers)

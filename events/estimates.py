@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Category, Event, Quaternion, Vector3
-from events.checks import UNIT_TOLERANCE, check, check_pose
+from events.checks import UNIT_TOLERANCE, check, check_covariance, check_pose
 from events.sensors import publish
 
 
@@ -46,6 +46,7 @@ class PoseEstimate(Event):
         check_pose(self, self.position, self.orientation)
         if self.velocity is not None:
             check(self, self.velocity)
+        check_covariance(self, "covariance", 6)
 
 
 class TrajectoryEstimate(Event, eq=False):

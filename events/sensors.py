@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Category, Event, Vector3
-from events.checks import check
+from events.checks import check, check_covariance
 
 
 def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
@@ -168,6 +168,7 @@ class NavSatFix(Event):
 
     def __post_init__(self) -> None:
         check(self, (self.latitude, self.longitude, self.altitude), self.velocity)
+        check_covariance(self, "position_covariance", 3)
 
 
 class Range(Event):

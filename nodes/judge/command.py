@@ -14,6 +14,10 @@ def judge(
         list[str],
         typer.Option(metavar="[NAME=]FILE", help="Poses, or BAG:/TOPIC. May be repeated."),
     ],
+    final: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=FILE", help="The same after loop closures. May be repeated."),
+    ] = None,
     alignment: Annotated[str, typer.Option(help="auto, none, origin, se3 or sim3.")] = "auto",
     scale_free: Annotated[
         bool, typer.Option("--scale-free", help="The estimates' unit of length is their own.")
@@ -39,6 +43,9 @@ def judge(
     Odometry, PoseStamped and PoseWithCovarianceStamped of bags. Figures, report and thresholds are
     those of a run; what poses alone do not tell, such as latencies, is absent. --frames is a
     times.txt, rgb.txt, rgb.csv or cam0/data.csv; without it the flight is that of the truth.
+
+    --final NAME=FILE is the trajectory after loop closures of the estimate NAME: its figures stand
+    beside those of the poses that were said at the time.
 
     An estimate is laid on the truth by sim3 if it is --scale-free; if it names its frame, not at
     all in map and else at its origin; otherwise by se3. World and body are NED and FRD in TUM's
@@ -74,7 +81,9 @@ def judge(
         camera = sources.read_mounting(body_from_camera, truth) if body_from_camera else None
         found = [sources.read(each, config.axes, times, camera) for each in estimate]
         stamps = sources.read_stamps(Path(frames)) if frames else None
-        judgements, verdict, notes = judging.judge_all(true, found, stamps, config)
+        corrected = [sources.read(each, config.axes, times, camera) for each in final or ()]
+        finals = {each.name: each.poses for each in corrected}
+        judgements, verdict, notes = judging.judge_all(true, found, stamps, config, finals)
         page = judging.write(Path(out or f"judged/{name}"), true, judgements, verdict, notes)
     except ValueError as error:
         raise ConfigError(str(error)) from None

@@ -6,8 +6,9 @@ tell: when they came, and thus latencies, errors at control ticks and stamps of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -50,15 +51,29 @@ def judge_all(
     estimates: Sequence[Source],
     frames: npt.NDArray[np.int64] | None,
     config: JudgeConfig,
+    finals: Mapping[str, Trajectory] = MappingProxyType({}),
 ) -> tuple[dict[str, Judgement], Verdict, list[str]]:
     """Judge estimates by the truth; the flight is that of the images, if their stamps are known.
+
+    Args:
+        truth: The true poses.
+        estimates: What was said at the time.
+        frames: Stamps of the images (ns), if they are known.
+        config: How to judge.
+        finals: The trajectories after loop closures, by the name of the estimate.
 
     Returns:
         Judgements by name, the verdict, and sentences on what was not compared.
 
     Raises:
-        ValueError: Two have one name, or one is nowhere near to a true pose in time.
+        ValueError: Two have one name, one is nowhere near to a true pose in time, or a final
+            trajectory is of none of them.
     """
+    names = [source.name for source in estimates]
+    if strangers := finals.keys() - {*names}:
+        raise ValueError(
+            f"final: expected the name of an estimate ({', '.join(names)}), found {min(strangers)}"
+        )
     judgements: dict[str, Judgement] = {}
     notes = []
     for source in estimates:
@@ -67,8 +82,10 @@ def judge_all(
         by_frame: dict[str, How] = {"": "se3", "map": "none"}
         usual = "sim3" if config.scale_free else by_frame.get(source.frame_id, "origin")
         poses, note = _compared(truth.poses, source, config.max_difference)
+        record = EstimatorRecord.of(poses)
+        record.final = finals.get(source.name)
         judgement = judge(
-            EstimatorRecord.of(poses),
+            record,
             truth.poses,
             cameras=None if frames is None else {"": frames},
             alignment=usual if config.alignment == "auto" else config.alignment,

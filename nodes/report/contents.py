@@ -69,6 +69,7 @@ class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         of_images: Errors of each pose at the time of its image.
         of_ticks: Errors of the newest pose there was at each control tick.
         lost: When it had no pose.
+        final: Its trajectory after loop closures in the truth's frame.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Estimator(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     of_images: Errors | None = None
     of_ticks: Errors | None = None
     lost: list[Interval] = []
+    final: Trajectory | None = None
 
 
 class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):

@@ -131,7 +131,8 @@ class _Reader:
     ) -> Estimator:
         first = next(iter(truths.values()), None)
         truth = truths.get(str(figures.get("vehicle")), first)
-        found = Estimator(name=name, color=color, figures=figures)
+        final = self._try(f"evaluation/{file}.final.tum", read_poses)
+        found = Estimator(name=name, color=color, figures=figures, final=final)
         aligned = self._try(f"evaluation/{file}.aligned.tum", read_poses)
         errors = self._try(f"evaluation/{file}.csv", _errors)
         ticks = self._try(f"evaluation/{file}.ticks.csv", _errors)

@@ -126,6 +126,9 @@ def _lines(run: Run) -> list[_Line]:
         if each.aligned is not None:
             style = {"color": each.color, "lw": 1.3}
             found.append(_line(label(each.name), each.aligned, style, each.lost))
+        if each.final is not None:
+            style = {"color": each.color, "lw": 1.3, "ls": (0, (2, 1.5))}
+            found.append(_line(f"{label(each.name)} after loop closures", each.final, style))
     return found
 
 

@@ -144,3 +144,18 @@ def test_a_range_without_an_end_and_numbers_of_numpy_are_right() -> None:
     assert PoseStamped(stamp=0, source="a", position=position, orientation=turn).position[1] == 2.0
     huge = (1e308, 1e308, 1e308)  # whose norm is not finite, but they are
     PoseStamped(stamp=0, source="a", position=huge, orientation=(1.0, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("wrong", [(0.0,) * 35, (0.0,) * 37, [0.0] * 36, None, np.zeros(36), (1,)])
+def test_a_covariance_of_another_shape_is_refused(wrong: Any) -> None:
+    values = fields_of(PoseEstimate)
+    with pytest.raises(TypeError, match=r"PoseEstimate.covariance: expected a tuple of 36 numbers"):
+        PoseEstimate(**values | {"covariance": wrong})
+
+
+@pytest.mark.parametrize("number", [nan, inf, -inf])
+def test_a_covariance_that_is_not_finite_is_refused(number: float) -> None:
+    values = fields_of(PoseEstimate)
+    with pytest.raises(ValueError, match=r"covariance: expected finite numbers"):
+        PoseEstimate(**values | {"covariance": (0.0,) * 35 + (number,)})
+    assert PoseEstimate(**values | {"covariance": (0.0,) * 36}).covariance == (0.0,) * 36

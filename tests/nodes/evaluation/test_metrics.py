@@ -17,13 +17,17 @@ from scipy.spatial.transform import Rotation
 
 from events.rotations import angle_between
 from nodes.evaluation.alignment import align
+from nodes.evaluation.judging import judge
 from nodes.evaluation.metrics import (
+    SHARES,
     absolute_errors,
     drift_percent,
     path_errors,
     path_pairs,
     rotation_errors,
+    share_errors,
 )
+from nodes.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory, associate
 from nodes.trajectory.formats import read_tum
 from tests.nodes.trajectory.samples import as_evo, moved, noisy, walk
@@ -193,3 +197,94 @@ def test_other_stamps_are_an_error_that_names_the_row(function: Any) -> None:
         function(truth, late)
     with pytest.raises(ValueError, match=r"found 5 of the truth and 4 of the estimate"):
         function(truth, late.take(slice(0, 4)))
+
+
+@given(seed=SEEDS)
+@settings(max_examples=8, deadline=None)
+def test_errors_over_shares_of_the_path_are_the_means_of_evos(seed: int) -> None:
+    truth = walk(300, seed)
+    estimate = noisy(truth, metres=0.005, seed=seed + 1)
+    path = truth.length()
+    found = share_errors(truth, estimate, path)
+    sums, count = 0.0, 0
+    for share in SHARES:
+        length = share / 100 * path
+        options = (length, Unit.meters, 0.1, True, True)
+        shifts = rpe(truth, estimate, evo.PoseRelation.translation_part, *options)
+        turns = rpe(truth, estimate, evo.PoseRelation.rotation_angle_deg, *options)
+        mean = 100 * shifts.get_all_statistics()["mean"] / length
+        assert found[f"rpe_{share}_trans_percent"] == pytest.approx(mean)
+        mean = turns.get_all_statistics()["mean"] / length
+        assert found[f"rpe_{share}_rot_deg_per_m"] == pytest.approx(mean)
+        sums, count = sums + 100 * shifts.error.sum() / length, count + len(shifts.error)
+    assert found["rpe_mean_trans_percent"] == pytest.approx(sums / count)
+
+
+def as_kitti_has_it(truth: Trajectory, estimate: Trajectory, lengths: list[float]) -> float:
+    """Return the mean translation error in percent by the definition of KITTI's page.
+
+    Each pose begins a stretch, which ends at the first pose beyond the length.
+    """
+    distances = truth.distances()
+    true, said = truth.matrices(), estimate.matrices()
+    errors = []
+    for length in lengths:
+        for first in range(len(truth)):
+            beyond = np.flatnonzero(distances > distances[first] + length)
+            if len(beyond):
+                a, b = (np.linalg.inv(m[first]) @ m[beyond[0]] for m in (said, true))
+                errors.append(np.linalg.norm((np.linalg.inv(a) @ b)[:3, 3]) / length)
+    return 100.0 * float(np.mean(errors))
+
+
+def test_the_mean_over_shares_is_about_kittis() -> None:
+    """But for the end of a stretch, which is nearer to its length here."""
+    truth = walk(1200, step=0.01)
+    estimate = noisy(truth, metres=0.002)
+    lengths = [share / 100 * truth.length() for share in SHARES]
+    expected = as_kitti_has_it(truth, estimate, lengths)
+    found = share_errors(truth, estimate, truth.length())["rpe_mean_trans_percent"]
+    assert found == pytest.approx(expected, rel=0.02)
+
+
+def test_a_scale_that_is_wrong_is_as_wrong_over_every_share() -> None:
+    truth = walk(600)
+    large = Trajectory(truth.stamps, 1.1 * truth.positions, truth.orientations)
+    found = share_errors(truth, large, truth.length())
+    for share in SHARES:
+        value = found[f"rpe_{share}_trans_percent"]
+        assert value is not None
+        # Of the chord, which is shorter than the path.
+        assert (7.0 if share == 1 else 1.0) < value < 10.001
+        assert found[f"rpe_{share}_rot_deg_per_m"] == pytest.approx(0.0, abs=1e-9)
+    figures = judge(EstimatorRecord.of(large), truth, alignment="se3").figures
+    assert figures["scale_error_percent"] == pytest.approx(100 - 100 / 1.1, rel=1e-6)
+
+
+def test_a_stretch_that_nobody_covers_has_no_error() -> None:
+    truth = walk(600)
+    start = slice(0, 30)
+    found = share_errors(truth.take(start), truth.take(start), truth.length())
+    assert found["rpe_2_trans_percent"] == pytest.approx(0.0, abs=1e-9)
+    assert found["rpe_20_trans_percent"] is None
+
+
+@given(degrees=st.floats(-179.0, 179.0), seed=SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_a_heading_that_is_off_is_off_by_so_much(degrees: float, seed: int) -> None:
+    """Whatever the tilt; and a tilt alone is hardly one."""
+    truth = walk(30, seed)
+    flat = Trajectory(
+        truth.stamps,
+        truth.positions,
+        Rotation.from_euler("ZYX", np.random.default_rng(seed).uniform(-1, 1, (30, 3))).as_quat(
+            scalar_first=True
+        ),
+    )
+    turned = Rotation.from_euler("z", degrees, degrees=True) * flat.rotations()
+    estimate = Trajectory(truth.stamps, truth.positions, turned.as_quat(scalar_first=True))
+    found = absolute_errors(flat, estimate)["heading_rmse_deg"]
+    assert found == pytest.approx(abs(degrees), abs=1e-6)
+    rolled = flat.rotations() * Rotation.from_euler("x", degrees, degrees=True)
+    estimate = Trajectory(truth.stamps, truth.positions, rolled.as_quat(scalar_first=True))
+    assert absolute_errors(flat, estimate)["heading_rmse_deg"] < 1e-6

@@ -321,3 +321,17 @@ def test_a_runs_folder_is_not_written_over(
     done = said(tmp_path, *words)
     assert done.returncode == 2
     assert done.stderr == "error: tour: expected no run's folder: name another with --out\n"
+
+
+def test_a_final_trajectory_stands_beside_its_estimate(
+    pair: tuple[Trajectory, Trajectory], tmp_path: Path
+) -> None:
+    truth, _ = pair
+    write_tum(tmp_path / "closed.tum", truth)
+    words = ("--truth", "truth.tum", "--estimate", "vo.tum")
+    figures = only(judge(tmp_path, *words, "--final", "vo=closed.tum"))
+    assert figures["ate_rmse_m"] > 1e-3
+    assert figures["final_ate_rmse_m"] < 1e-6
+    done = said(tmp_path, *words, "--final", "closed.tum")
+    assert done.returncode == 2
+    assert "expected the name of an estimate (vo), found closed" in done.stderr
