@@ -39,7 +39,7 @@ from nodes.estimation.mount import Mount
 from nodes.estimation.rectification import ALIGNED, Rectification, misalignment
 from nodes.estimation.result import TrackingResult
 from nodes.estimation.rig import SensorChoice
-from runtime import Node, NodeConfig, Output, on
+from runtime import Bundle, Node, NodeConfig, Output, on
 from runtime.node import matchers
 from runtime.units import Latency
 
@@ -195,6 +195,15 @@ class Estimator(Node[C], ABC):
     _given: Mapping[str, str] = MappingProxyType({})
     _lost = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
+
+    def read(self, frame: type[tuple[Any, ...]]) -> None:
+        """Read sets of this type as ``frames``, for a class whose settings say what it reads.
+
+        Call it in ``__init__``. The class declares all fields of all such types.
+        """
+        bundle = Bundle(frame, keep="latest")
+        bundle.name = "frames"
+        vars(self)["frames"] = bundle.make(self.name)
 
     @property
     def camera(self) -> CameraAnnouncement | None:

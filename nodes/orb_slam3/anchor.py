@@ -72,6 +72,11 @@ class Anchor:
         """Return how far a pose would be from the last one."""
         return float(np.linalg.norm((from_world @ pose)[:3, 3] - self._last[:3, 3]))
 
+    def first(self, stamp: float) -> Floats | None:
+        """Return the first key frame of a map in our frame, by its stamp; `None` if unknown."""
+        known = (pose for at, pose in self._first.items() if abs(at - stamp) < 1e-4)
+        return next(known, None)
+
     def place(self, pose: Floats) -> Floats:
         """Return a pose in the frame of the very first key frame; remembered as the last one."""
         self._last = self._from_world @ pose

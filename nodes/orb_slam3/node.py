@@ -2,35 +2,60 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from events import (
-    Announcement,
-    CameraAnnouncement,
-    DepthImage,
-    Image,
-    Imu,
-    ImuAnnouncement,
+from events import DepthImage, Image, Imu
+from nodes.estimation import (
+    Estimator,
+    EstimatorConfig,
+    RgbdFrame,
+    RgbdInertialFrame,
+    StereoFrame,
+    StereoInertialFrame,
 )
-from nodes.estimation import Estimator, EstimatorConfig
 from nodes.orb_slam3.process import OrbSlam3Process
-from nodes.orb_slam3.settings import Mode, OrbSettings, make_settings, unknown_lens
+from nodes.orb_slam3.settings import LENSES, Mode, OrbSettings, Settings, make_settings
 from nodes.orb_slam3.vocabulary_file import find_vocabulary
-from runtime import Bundle, Duration, on
+from runtime import Bundle, Duration
 from runtime.paths import InputPath
 
 
+class MonocularFrame(NamedTuple):
+    """An image."""
+
+    image: Image
+
+
+class MonocularInertialFrame(NamedTuple):
+    """The same, and the samples of the IMU since the frame before."""
+
+    image: Image
+    imu: tuple[Imu, ...]
+
+
 class Frame(NamedTuple):
-    """An image, and its depth if the camera gives it."""
+    """All that any mode reads."""
 
     image: Image
     depth: DepthImage | None
+    left: Image | None
+    right: Image | None
+    imu: Imu | None
+
+
+_FRAMES: dict[Mode, type[tuple[Any, ...]]] = {
+    "rgbd": RgbdFrame,
+    "monocular": MonocularFrame,
+    "stereo": StereoFrame,
+    "rgbd_inertial": RgbdInertialFrame,
+    "monocular_inertial": MonocularInertialFrame,
+    "stereo_inertial": StereoInertialFrame,
+}
 
 
 class OrbSlam3Config(EstimatorConfig):
@@ -63,67 +88,66 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
     def __init__(self) -> None:
         mode = self.config.mode
         self.needs = frozenset({"grey", "depth"} if "rgbd" in mode else {"grey"})
+        self.eyes = 2 if "stereo" in mode else 1
+        self.inertial = "inertial" in mode
+        self.lenses = LENSES[mode.removesuffix("_inertial")]
         self.method = f"ORB-SLAM3 ({mode.replace('_', ', ')})"
         self.scale_free = mode == "monocular"
-        self._imu: ImuAnnouncement | None = None
-        self._samples: deque[Imu] = deque(maxlen=100_000)
-
-    def on_announcement(self, announcement: Announcement) -> None:
-        """Choose the camera, and the first IMU."""
-        super().on_announcement(announcement)
-        if isinstance(announcement, ImuAnnouncement) and self._imu is None:
-            self._imu = announcement
-            self.narrow("imu", announcement.source)
-
-    def refusal(self, camera: CameraAnnouncement) -> str:
-        """Return why ORB-SLAM3 has no model of a camera."""
-        return unknown_lens(self.config.mode, camera.info)
+        self.read(_FRAMES[mode])
 
     def check(self) -> Iterable[str]:
-        """Return the errors: no camera, or no vocabulary."""
-        yield from super().check()
+        """Return the errors: no camera, an IMU on another body, or no vocabulary."""
+        missing = [*super().check()]
+        yield from missing
         try:
+            if not missing:
+                self._settings()
             find_vocabulary(self.config.vocabulary)
         except ValueError as error:
             yield str(error)
 
-    @on(Imu)
-    def imu(self, event: Imu) -> None:
-        """Keep the samples of the IMU until the next image."""
-        if "inertial" in self.config.mode:
-            self._samples.append(event)
-
     async def on_ready(self) -> None:
         """Start ORB-SLAM3, in a process of its own."""
-        config = self.config
+        self.the_camera()
         self._slam = await self.worker(
             OrbSlam3Process,
-            make_settings(config.mode, self.the_camera(), self._imu, config.orb),
+            self._settings(),
             self._vocabulary(),
-            float(config.mapping_timeout),
-            latency=config.latency,
+            float(self.config.mapping_timeout),
+            latency=self.config.latency,
         )
 
     async def run(self) -> None:
         """Track each image; those that arrive meanwhile are skipped."""
         initialized = False
-        async for image, depth in self.frames:
-            if ("rgbd" in self.config.mode) != (depth is not None):
-                if depth is None:
-                    continue
-                depth = None
-            stamp = self.exposed_at(image)
+        async for frame in self.frames:
+            given = frame._asdict()
+            image = frame[0]
             result = await self._slam.call(
                 OrbSlam3Process.track,
-                stamp,
+                self.exposed_at(image),
                 image.data,
-                None if depth is None else depth.data,
-                self._take_samples(stamp),
+                given["depth"].data if "depth" in given else None,
+                given["right"].data if "right" in given else None,
+                _rows(given["imu"]) if "imu" in given else None,
             )
             initialized = initialized or not result.lost
             if initialized:
                 first = result.first_keyframe
                 self.publish(image, result, origin=first if first >= 0 else None)
+
+    async def on_end(self) -> None:
+        """Send the trajectory after loop closures and other corrections."""
+        self.publish_trajectory(*await self._slam.call_for(0.0, OrbSlam3Process.trajectory))
+
+    def _settings(self) -> Settings:
+        """Return ORB-SLAM3's settings for the sensors.
+
+        Raises:
+            ValueError: It cannot compute with them.
+        """
+        config = self.config
+        return make_settings(config.mode, self.cameras, self.imu_announcement, config.orb)
 
     def _vocabulary(self) -> Path:
         """Return the vocabulary's file.
@@ -136,12 +160,8 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         except ValueError as error:
             self.log.fatal("%s", error)
 
-    def _take_samples(self, until: int) -> npt.NDArray[np.float64] | None:
-        """Return the samples since the last image, shape (n, 7)."""
-        if "inertial" not in self.config.mode:
-            return None
-        rows = []
-        while self._samples and self._samples[0].stamp <= until:
-            sample = self._samples.popleft()
-            rows.append((sample.stamp, *sample.angular_velocity, *sample.linear_acceleration))
-        return np.array(rows, np.float64).reshape(-1, 7)
+
+def _rows(samples: tuple[Imu, ...]) -> npt.NDArray[np.float64]:
+    """Return samples of an IMU as an array, shape (n, 7)."""
+    rows = [(each.stamp, *each.angular_velocity, *each.linear_acceleration) for each in samples]
+    return np.array(rows, np.float64).reshape(-1, 7)

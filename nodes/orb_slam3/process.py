@@ -2,6 +2,7 @@
 
     slam = await self.worker(OrbSlam3Process, settings, vocabulary, latency=…)
     result = await slam.call(OrbSlam3Process.track, stamp, image, depth)
+    stamps, poses = await slam.call(OrbSlam3Process.trajectory)
 
 The library is imported when an object is made, so that others may import this module for its
 names. It prints much, to standard output, which a worker gathers.
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from nodes.estimation import TrackingResult
 from nodes.orb_slam3.anchor import Anchor, first_key_frame
@@ -100,22 +102,25 @@ class OrbSlam3Process:
         stamp: int,
         image: npt.NDArray[np.uint8],
         depth: npt.NDArray[np.float32] | None = None,
+        right: npt.NDArray[np.uint8] | None = None,
         imu: Floats | None = None,
     ) -> OrbSlam3Result:
         """Return the pose of the next image.
 
         Args:
             stamp: Stamp of the exposure (ns); later than the last one.
-            image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
+            image: Shape (h, w, 3) red, green, blue, or (h, w) grey; of a stereo rig the left one.
             depth: Metres along the optical axis, shape (h, w); ``inf`` where there is none. For
                 modes with depth only.
-            imu: For inertial modes: the measurements since the last image up to this one, in
-                order, shape (n, 7): stamp (ns), angular velocity (rad/s), specific force (m/s²).
+            right: The right image, for stereo modes only.
+            imu: For inertial modes: the measurements since the last call, in order, shape (n, 7):
+                stamp (ns), angular velocity (rad/s), specific force (m/s²). Later ones than the
+                image wait for the next.
 
         Raises:
             ValueError: An array is missing, superfluous, or of the wrong shape.
         """
-        check_arrays(self._settings, image, depth, imu)
+        check_arrays(self._settings, image, depth, right, imu)
         self._stamps.append(stamp)
         if self._new:
             # Compared with the first key frame by its words, which another thread must have
@@ -123,15 +128,46 @@ class OrbSlam3Process:
             time.sleep(max(self._left_alone + _FIRST - time.monotonic(), 0.0))
         _wait_for_other_threads(self._left_alone + self._mapping_timeout)
         chunk = None if imu is None else imu * (1e-9, 1, 1, 1, 1, 1, 1)
-        if depth is None:
-            result = self._slam.track_monocular(image, stamp * 1e-9, chunk)
-        else:
+        if depth is not None:
             # 0 is how ORB-SLAM3 knows that there is no depth.
             known = np.where(np.isfinite(depth), depth, np.float32(0))
             result = self._slam.track_rgbd(image, known, stamp * 1e-9, chunk)
+        elif right is not None:
+            result = self._slam.track_stereo(image, right, stamp * 1e-9, chunk)
+        else:
+            result = self._slam.track_monocular(image, stamp * 1e-9, chunk)
         found = self._result(result)
         self._left_alone = time.monotonic()
         return found
+
+    def trajectory(self) -> tuple[npt.NDArray[np.int64], Floats]:
+        """End ORB-SLAM3's threads, and return the poses as it sees them after all corrections.
+
+        They are those of the images that were tracked in its largest map.
+
+        Returns:
+            Stamps of images as given to `track`, strictly rising, shape (n,), and the optical
+            camera in the frame of `track`'s poses, shape (n, 4, 4).
+        """
+        _wait_for_other_threads(time.monotonic() + _LAST)
+        self._slam.shutdown()
+        folder = Path(self._folder.name)
+        files = str(folder / "frames.txt"), str(folder / "key_frames.txt")
+        self._slam.save_trajectory_euroc(files[0])
+        self._slam.save_keyframe_trajectory_euroc(files[1])
+        rows, key_frames = (np.loadtxt(file, ndmin=2) for file in files)
+        first = self._anchor.first(key_frames[0, 0] * 1e-9) if len(key_frames) else None
+        if first is None or not len(rows):
+            return np.empty(0, np.int64), np.empty((0, 4, 4))
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, :3, 3] = rows[:, 1:4]
+        poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+        on_imu = self._settings.camera_on_imu  # with an IMU, poses are those of its frame
+        poses = first @ np.linalg.inv(on_imu) @ poses @ on_imu
+        sent = np.array(self._stamps)
+        at = np.abs(sent - np.round(rows[:, :1])).argmin(1)
+        at, row = np.unique(at, return_index=True)
+        return sent[at], poses[row]
 
     def close(self) -> None:
         """End ORB-SLAM3's threads."""
@@ -198,6 +234,7 @@ def check_arrays(
     settings: Settings,
     image: npt.NDArray[np.uint8],
     depth: npt.NDArray[np.float32] | None,
+    right: npt.NDArray[np.uint8] | None,
     imu: Floats | None,
 ) -> None:
     """Refuse arrays for which ORB-SLAM3 would end the process, or which it would not notice.
@@ -206,22 +243,19 @@ def check_arrays(
         ValueError: An array is missing, superfluous, or of the wrong shape.
     """
     mode, size = settings.mode, (settings.height, settings.width)
-    for name, array, wanted in (
-        ("depth", depth, "rgbd" in mode),
-        ("imu", imu, "inertial" in mode),
+    for name, array, part, shapes in (
+        ("image", image, "", (size, (*size, 3))),
+        ("depth", depth, "rgbd", (size,)),
+        ("right", right, "stereo", (size, (*size, 3))),
+        ("imu", imu, "inertial", ((len(imu) if imu is not None else 0, 7),)),
     ):
-        if (array is not None) != wanted:
-            expected, found = ("an array", "none") if wanted else ("none", "an array")
+        if (array is not None) != (part in mode):
+            expected, found = ("an array", "none") if array is None else ("none", "an array")
             raise ValueError(f"{name}: mode {mode!r} expects {expected}, found {found}")
-    if image.shape[:2] != size or image.shape[2:] not in {(), (3,)}:
-        raise ValueError(
-            f"image: expected shape {size} or {(*size, 3)}, as the camera announced, "
-            f"found {image.shape}"
-        )
-    if depth is not None and depth.shape != size:
-        raise ValueError(f"depth: expected shape {size}, found {depth.shape}")
-    if imu is not None and (imu.ndim != 2 or imu.shape[1] != 7):
-        raise ValueError(f"imu: expected shape (n, 7), found {imu.shape}")
+        if array is not None and array.shape not in shapes:
+            raise ValueError(
+                f"{name}: expected shape {' or '.join(map(str, shapes))}, found {array.shape}"
+            )
 
 
 def _wait_for_other_threads(until: float) -> None:
@@ -242,11 +276,16 @@ _QUIET = 0.004
 _FIRST = 0.1
 """Seconds for the other threads after the first image of a map; also on a busy machine."""
 
+_LAST = 10.0
+"""Seconds for the other threads after the last image, at most."""
+
 _SENSORS = {
     "rgbd": "RGBD",
     "monocular": "MONOCULAR",
+    "stereo": "STEREO",
     "rgbd_inertial": "IMU_RGBD",
     "monocular_inertial": "IMU_MONOCULAR",
+    "stereo_inertial": "IMU_STEREO",
 }
 
 _REASONS = {

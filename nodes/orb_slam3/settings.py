@@ -8,16 +8,33 @@ the file is the template ``settings.yaml.jinja``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
 from events.poses import pose_matrix
 from nodes.dataset.recording import templates
 
-Mode = Literal["rgbd", "monocular", "rgbd_inertial", "monocular_inertial"]
+Mode = Literal[
+    "rgbd", "monocular", "stereo", "rgbd_inertial", "monocular_inertial", "stereo_inertial"
+]
+
+LENSES: dict[str, frozenset[str]] = {
+    "rgbd": frozenset({"plumb_bob"}),
+    "monocular": frozenset({"plumb_bob", "equidistant"}),
+    "stereo": frozenset(),
+}
+"""Distortion models that ORB-SLAM3 computes with, by the mode without its IMU.
+
+With depth it takes key points for those of a pinhole unless they have plumb_bob's distortion
+(``Frame::UndistortKeyPoints`` and ``Frame::UnprojectStereo``). Of a stereo pair it looks for a
+point's partner in the same row before it removes any distortion (``Frame::ComputeStereoMatches``).
+"""
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Threshold = Annotated[int, msgspec.Meta(ge=1, le=255)]
@@ -35,7 +52,7 @@ class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         min_fast_threshold: The same, for regions without corners by `fast_threshold`.
         baseline: Distance of two cameras, in metres, which ORB-SLAM3 assumes for an RGB-D camera.
             It gives the weight of depth: the variance of its error is ``(z² / (baseline fx))²``
-            square metres per square pixel.
+            square metres per square pixel. That of a stereo rig is known.
         close_depth: Depth in metres up to which a point is put into the map from its depth at once;
             a farther one when it has been seen from two sides. Any measured depth is used.
         loop_closing: Whether places seen before correct the map.
@@ -51,7 +68,7 @@ class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     loop_closing: bool = True
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True):
+class Settings(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """All that an ORB-SLAM3 process needs to start.
 
     Attributes:
@@ -60,6 +77,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
         width: Width of the images, pixels.
         height: Height of the images, pixels.
         intrinsics: fx, fy, cx, cy, in pixels.
+        camera_on_imu: The (left) camera in the IMU's frame, shape (4, 4); identity without an IMU.
     """
 
     mode: Mode
@@ -67,31 +85,32 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     width: int
     height: int
     intrinsics: tuple[float, float, float, float]
+    camera_on_imu: npt.NDArray[np.float64]
 
 
 def make_settings(
     mode: Mode,
-    camera: CameraAnnouncement,
+    cameras: Sequence[CameraAnnouncement],
     imu: ImuAnnouncement | None = None,
     orb: OrbSettings | None = None,
 ) -> Settings:
-    """Return the settings for an announced camera, and an IMU if the mode is inertial.
+    """Return the settings for announced cameras, and an IMU if the mode is inertial.
+
+    Args:
+        mode: The sensors that are used.
+        cameras: The camera, or the left and the right one of a rectified stereo rig.
+        imu: The IMU.
+        orb: ORB-SLAM3's own settings.
 
     Raises:
-        ValueError: The mode needs something that was not announced, or an IMU in a frame other
-            than the one that the camera is mounted on.
+        ValueError: The IMU is not on the body that carries the camera.
     """
     orb = orb or OrbSettings()
-    info = camera.info
-    if "rgbd" in mode and "depth" not in camera.images:
-        raise ValueError(
-            f"mode {mode!r}: expected {camera.source} to give depth, "
-            f"found {', '.join(camera.images)}"
-        )
-    if unknown := unknown_lens(mode, info):
-        raise ValueError(f"{camera.source}: {unknown}")
-    if "inertial" in mode:
-        _check_mounting(mode, camera, imu)
+    camera, info = cameras[0], cameras[0].info
+    baseline = orb.baseline
+    if len(cameras) == 2:  # row by row: see `Estimator.aligned`
+        baseline = float((np.linalg.inv(_pose(camera)) @ _pose(cameras[1]))[0, 3])
+    on_imu = _on_imu(camera, imu) if imu is not None and "inertial" in mode else np.eye(4)
     environment = templates(Path(__file__).parent)
     environment.filters["real"] = _real
     text = environment.get_template("settings.yaml.jinja").render(
@@ -99,8 +118,9 @@ def make_settings(
         camera=camera,
         lens=_distortion(info),
         imu=imu,
-        pose=pose_matrix(camera.position, camera.orientation).ravel().tolist(),
+        pose=on_imu.ravel().tolist(),
         orb=orb,
+        baseline=baseline,
     )
     return Settings(
         mode=mode,
@@ -108,20 +128,8 @@ def make_settings(
         width=info.width,
         height=info.height,
         intrinsics=(info.fx, info.fy, info.cx, info.cy),
+        camera_on_imu=on_imu,
     )
-
-
-def unknown_lens(mode: Mode, info: CameraInfo) -> str:
-    """Return why ORB-SLAM3 cannot compute with a lens, in a sentence; empty if it can.
-
-    With depth it takes key points for those of a pinhole unless they have plumb_bob's distortion
-    (``Frame::UndistortKeyPoints`` and ``Frame::UnprojectStereo``).
-    """
-    if info.distortion_model == "rational_polynomial" and any(info.distortion):
-        return "expected plumb_bob or equidistant images, found rational_polynomial ones"
-    if info.distortion_model == "equidistant" and "rgbd" in mode:
-        return f"mode {mode!r}: expected plumb_bob images beside the depth, found equidistant ones"
-    return ""
 
 
 def _distortion(info: CameraInfo) -> dict[str, float]:
@@ -134,14 +142,24 @@ def _distortion(info: CameraInfo) -> dict[str, float]:
     return {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
 
 
-def _check_mounting(mode: Mode, camera: CameraAnnouncement, imu: ImuAnnouncement | None) -> None:
-    if imu is None:
-        raise ValueError(f"mode {mode!r}: expected an IMU beside {camera.source}, found none")
-    if imu.frame_id != camera.parent_frame_id:
+def _pose(sensor: CameraAnnouncement | ImuAnnouncement) -> npt.NDArray[np.float64]:
+    """Return a sensor on the body that carries it, shape (4, 4)."""
+    return pose_matrix(sensor.position, sensor.orientation)
+
+
+def _on_imu(camera: CameraAnnouncement, imu: ImuAnnouncement) -> npt.NDArray[np.float64]:
+    """Return the camera in the IMU's frame, shape (4, 4).
+
+    Raises:
+        ValueError: They are not on the same body.
+    """
+    if imu.parent_frame_id != camera.parent_frame_id:
         raise ValueError(
-            f"mode {mode!r}: expected an IMU in {camera.parent_frame_id}, on which "
-            f"{camera.source} is mounted, found {imu.source} in {imu.frame_id}"
+            f"expected an IMU on {camera.parent_frame_id}, on which {camera.source} is mounted, "
+            f"found {imu.source} on {imu.parent_frame_id}"
         )
+    pose: npt.NDArray[np.float64] = np.linalg.inv(_pose(imu)) @ _pose(camera)
+    return pose
 
 
 def _real(value: float) -> str:

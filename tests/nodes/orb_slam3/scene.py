@@ -11,6 +11,7 @@ from functools import cache
 from typing import NamedTuple
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -32,6 +33,10 @@ CAMERA = CameraAnnouncement(
     position=(0.15, 0.0, -0.02),
     orientation=(0.5, 0.5, 0.5, 0.5),
 )
+RIGHT = msgspec.structs.replace(
+    CAMERA, source="drone/right", images=("rgb",), position=(0.15, 0.11, -0.02)
+)
+"""Partner of the camera in a stereo rig."""
 IMU = ImuAnnouncement(
     stamp=0,
     source="drone/imu",

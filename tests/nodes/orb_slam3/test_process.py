@@ -24,7 +24,7 @@ from runtime.errors import MissingDependencyError
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.testing import run_in_lockstep
 from runtime.workers.worker import Worker
-from tests.nodes.orb_slam3.scene import CAMERA, IMU, INFO, View, views
+from tests.nodes.orb_slam3.scene import CAMERA, IMU, INFO, RIGHT, View, views
 
 ROOT = Path(__file__).parents[3]
 Floats = npt.NDArray[np.float64]
@@ -55,7 +55,7 @@ class Flight:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, LockstepLoop)
         clock = LockstepClock(loop)
-        settings = make_settings(mode, CAMERA, IMU, ORB)
+        settings = make_settings(mode, [CAMERA], IMU, ORB)
         slam = Worker(
             "slam", clock, OrbSlam3Process, settings, vocabulary, printed=self.printed.append
         )
@@ -165,6 +165,7 @@ def test_without_depth_the_way_is_right_but_for_its_scale(vocabulary: Path) -> N
         ("rgbd", ("rgb", "small"), r"depth: expected shape \(240, 320\), found \(10, 10\)"),
         ("monocular", ("rgb", "depth"), "depth: mode 'monocular' expects none, found an array"),
         ("monocular", ("small",), r"image: expected shape .*\(240, 320, 3\).*found \(10, 10\)"),
+        ("stereo", ("rgb",), "right: mode 'stereo' expects an array, found none"),
         ("monocular_inertial", ("rgb",), "imu: mode 'monocular_inertial' expects an array"),
     ],
 )
@@ -178,8 +179,9 @@ def test_what_orb_slam3_would_not_notice_is_refused(
         "small": np.zeros((10, 10), np.float32),
     }
     image, depth = [*(known[name] for name in arrays), None][:2]
+    cameras = [CAMERA, RIGHT] if mode == "stereo" else [CAMERA]
     with pytest.raises(ValueError, match=message):
-        check_arrays(make_settings(mode, CAMERA, IMU), image, depth, None)
+        check_arrays(make_settings(mode, cameras, IMU), image, depth, None, None)
 
 
 def test_a_missing_library_is_an_error_that_says_what_to_install(
@@ -187,7 +189,7 @@ def test_a_missing_library_is_an_error_that_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyorbslam3", None)
     with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[orbslam3\]'.*libegl1"):
-        OrbSlam3Process(make_settings("rgbd", CAMERA), vocabulary)
+        OrbSlam3Process(make_settings("rgbd", [CAMERA]), vocabulary)
 
 
 def test_importing_the_module_does_not_import_the_library() -> None:
