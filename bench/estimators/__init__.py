@@ -1,0 +1,8 @@
+"""The suite: known estimators in scenarios from easy to brutal, each flown once, in one table.
+
+    suite.toml  →  `plan`: a job for each scenario, estimator and repeat  →  `runtime.tools.sweep`
+                →  `page`: SUITE.md and its pictures
+
+``rig.toml`` is the vehicle with its sensors; ``suite.toml`` says what changes in each scenario, and
+which estimators there are. The command is ``python -m runtime suite``.
+"""

@@ -1,0 +1,162 @@
+"""What the suite consists of, and the runs that this makes."""
+
+from __future__ import annotations
+
+import importlib.util
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from runtime.config.override import override
+from runtime.config.reading import parse
+from runtime.errors import CommandError, ConfigError, suggest
+from runtime.tools.sweep.plan import Plan, make_job
+from runtime.tools.sweep.values import Parameter
+
+FOLDER = Path(__file__).parent
+LEVELS = ("easy", "medium", "hard", "brutal")
+
+
+class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A flight.
+
+    Attributes:
+        name: In one word.
+        level: How hard it is.
+        shows: What is in it, for the page.
+        set: What differs from ``rig.toml``, as for ``--set``.
+    """
+
+    name: str
+    level: Literal["easy", "medium", "hard", "brutal"]
+    shows: str
+    set: tuple[str, ...] = ()
+
+
+class Entrant(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An estimator.
+
+    Attributes:
+        name: Of its node.
+        node: The table of the node without its name.
+        reads: What it computes from, for the page.
+        module: That must be there; empty if it is a part of the project.
+        install: The command that installs the module.
+    """
+
+    name: str
+    node: dict[str, Any]
+    reads: str
+    module: str = ""
+    install: str = ""
+
+    @property
+    def installed(self) -> bool:
+        """Whether it can run here."""
+        return not self.module or importlib.util.find_spec(self.module) is not None
+
+
+class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Scenarios and estimators.
+
+    Attributes:
+        rig: Path of the file of the vehicle with its sensors, in which the scenarios change
+            something; in the file relative to it.
+        thresholds: Of the evaluation: an estimator that misses one has failed.
+        scenarios: In the order of the page.
+        estimators: In the order of the page.
+    """
+
+    rig: str
+    thresholds: dict[str, float]
+    scenarios: tuple[Scenario, ...]
+    estimators: tuple[Entrant, ...]
+
+    def only(self, scenarios: Sequence[str], estimators: Sequence[str]) -> Suite:
+        """Return a part of it; an empty list of names stands for all.
+
+        Raises:
+            CommandError: There is none of such a name.
+        """
+        return msgspec.structs.replace(
+            self,
+            scenarios=_named("scenario", self.scenarios, scenarios),
+            estimators=_named("estimator", self.estimators, estimators),
+        )
+
+
+def read_suite(path: Path = FOLDER / "suite.toml") -> Suite:
+    """Read a suite.
+
+    Raises:
+        ConfigError: Something in it is wrong.
+    """
+    try:
+        suite = msgspec.toml.decode(path.read_bytes(), type=Suite)
+    except OSError as error:
+        raise ConfigError(f"{path}: expected a readable file, found: {error.strerror}") from None
+    except (msgspec.MsgspecError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return msgspec.structs.replace(suite, rig=str(path.resolve().parent / suite.rig))
+
+
+def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> Plan:
+    """Plan a run for each scenario, seed, estimator that is installed, and repeat.
+
+    Those of one scenario and seed follow each other: they share one flight.
+
+    Raises:
+        ConfigError: A scenario or an estimator has settings that do not exist.
+    """
+    entrants = [each for each in suite.estimators if each.installed]
+    folder = Path(suite.rig).parent
+    jobs = [
+        make_job(
+            parse(_table(suite, scenario, entrant), suite.rig, folder),
+            (("scenario", scenario.name), ("estimator", entrant.name)),
+            *(seed, folder, out, repeat),
+        )
+        for scenario in suite.scenarios
+        for seed in range(1, seeds + 1)
+        for entrant in entrants
+        for repeat in range(1, repeats + 1)
+    ]
+    parameters = (
+        Parameter("scenario", tuple(each.name for each in suite.scenarios)),
+        Parameter("estimator", tuple(each.name for each in entrants)),
+    )
+    return Plan(parameters=parameters, jobs=tuple(jobs), out=out)
+
+
+def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]:
+    """Return the settings of a run, as they would stand in a file."""
+    try:
+        table = tomllib.loads(Path(suite.rig).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{suite.rig}: expected a TOML file of a rig, found: {error}") from None
+    for change in (f"run.name={scenario.name}", *scenario.set):
+        override(table, change)
+    table["nodes"] += [
+        {"name": entrant.name, **entrant.node},
+        {
+            "name": "evaluation",
+            "type": "nodes.evaluation:Evaluation",
+            "thresholds": dict(suite.thresholds),
+            "image_count": 2,
+        },
+    ]
+    return table
+
+
+def _named(what: str, known: tuple[Any, ...], names: Sequence[str]) -> tuple[Any, ...]:
+    by_name = {each.name: each for each in known}
+    for name in names:
+        if name not in by_name:
+            raise CommandError(
+                f"--{what}: expected one of {', '.join(by_name)}, found {name}"
+                + suggest(name, by_name)
+            )
+    return tuple(by_name[name] for name in by_name if not names or name in names)

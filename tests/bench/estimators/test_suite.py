@@ -1,0 +1,188 @@
+"""The suite: which runs it makes, and what its page says of those that fail."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from bench.estimators.page import cells, write_page
+from bench.estimators.plan import FOLDER, LEVELS, Suite, make_plan, read_suite
+from runtime.errors import CommandError, ConfigError
+from runtime.tools.sweep.rows import Row, failed
+from tests.runtime.tools.samples_cli import command
+
+SMALL = """
+rig = "rig.toml"
+thresholds = { ate_percent = 1.0, coverage_percent = 90.0 }
+
+[[scenarios]]
+name = "slow"
+level = "easy"
+shows = "a short flight"
+
+[[scenarios]]
+name = "quick"
+level = "brutal"
+shows = "another one"
+set = ["pilot.speed=2"]
+
+[[estimators]]
+name = "good"
+reads = "truth"
+node = { type = "nodes.synthetic_odometry:SyntheticOdometry", drift = 0.5 }
+
+[[estimators]]
+name = "bad"
+reads = "truth"
+node = { type = "nodes.synthetic_odometry:SyntheticOdometry", drift = 9.0 }
+
+[[estimators]]
+name = "elsewhere"
+reads = "nothing"
+module = "a_module_that_is_not_there"
+install = "make elsewhere"
+node = { type = "nodes.synthetic_odometry:SyntheticOdometry" }
+"""
+
+RIG = """
+[run]
+name = "rig"
+duration = "20s"
+
+[[nodes]]
+name = "drone"
+type = "sims.multirotor:Multirotor"
+
+[[nodes]]
+name = "pilot"
+type = "nodes.pilots:WaypointFollower"
+start_delay = "0s"
+waypoints = [[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]
+"""
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    (tmp_path / "rig.toml").write_text(RIG, encoding="utf-8")
+    (tmp_path / "suite.toml").write_text(SMALL, encoding="utf-8")
+    return tmp_path / "suite.toml"
+
+
+def test_the_projects_own_suite_is_right() -> None:
+    """Every scenario's and estimator's settings exist; the scenarios rise from easy to brutal."""
+    suite = read_suite()
+    everybody = [msgspec.structs.replace(e, module="") for e in suite.estimators]
+    suite = msgspec.structs.replace(suite, estimators=tuple(everybody))
+    plan = make_plan(suite, out=Path("out"), repeats=2)
+    assert len(plan.jobs) == 2 * len(suite.scenarios) * len(suite.estimators)
+    levels = [LEVELS.index(each.level) for each in suite.scenarios]
+    assert levels == sorted(levels)
+    assert {*levels} == {*range(len(LEVELS))}
+    assert (FOLDER / "rig.toml").is_file()
+
+
+def test_runs_of_one_flight_follow_each_other(small: Path) -> None:
+    plan = make_plan(read_suite(small), out=Path("out"), seeds=2, repeats=2)
+    order = [(dict(j.settings)["scenario"], j.seed) for j in plan.jobs]
+    assert order == sorted(order, key=lambda each: (each[0] != "slow", each[1]))
+    assert len({job.id for job in plan.jobs}) == len(plan.jobs) == 16
+    assert {dict(j.settings)["estimator"] for j in plan.jobs} == {"good", "bad"}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        ("drift = 0.5", "drfit = 0.5", r"drfit"),
+        ('"pilot.speed=2"', '"pliot.speed=2"', r"pliot"),
+        ('level = "easy"', 'level = "nice"', r"suite\.toml: Invalid enum value 'nice'"),
+        ('rig = "rig.toml"', 'rig = "no.toml"', r"no\.toml: expected a TOML file of a rig"),
+        ('rig = "rig.toml"', "rig = ", r"suite\.toml: Invalid value"),
+    ],
+)
+def test_what_is_wrong_in_a_suite_is_named(
+    small: Path, before: str, after: str, expected: str
+) -> None:
+    small.write_text(SMALL.replace(before, after), encoding="utf-8")
+    with pytest.raises(ConfigError, match=expected):
+        make_plan(read_suite(small), out=Path("out"))
+
+
+def test_a_part_of_it_is_chosen_by_name(small: Path) -> None:
+    part = read_suite(small).only(["quick"], ["good", "elsewhere"])
+    assert [s.name for s in part.scenarios] == ["quick"]
+    assert [e.name for e in part.estimators] == ["good", "elsewhere"]
+    with pytest.raises(CommandError, match=r"--scenario: expected one of slow, quick, found quik"):
+        read_suite(small).only(["quik"], [])
+
+
+def page_of(suite: Suite, tmp_path: Path, change: Any) -> str:
+    """Return the page of rows of which one estimator's are changed."""
+    plan = make_plan(suite, out=tmp_path / "out")
+    rows: list[Row] = []
+    for job in plan.jobs:
+        name = dict(job.settings)["estimator"]
+        row = failed(job, "")
+        figures = {"held_ate_percent": 0.5 * job.repeat, "coverage_percent": 100.0}
+        row |= {"passed": True, "estimators": {name: {"passed": True, **figures}}}
+        rows.append(change(row) if name == "bad" else row)
+    write_page(suite, plan, rows, tmp_path / "SUITE.md", "runtime suite")
+    return (tmp_path / "SUITE.md").read_text(encoding="utf-8")
+
+
+def line_of(page: str, name: str) -> str:
+    """Return the line of an estimator in the table of all."""
+    return next(line for line in page.splitlines() if line.startswith(f"| {name} |"))
+
+
+def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
+    """A missed threshold, a crash and silence: in the table of all, and in that of the scenario."""
+
+    def missed(row: Row) -> Row:
+        row["estimators"]["bad"]["held_ate_percent"] = 40.0
+        return row | {"passed": False}
+
+    def crashed(row: Row) -> Row:
+        return row | {"passed": None, "estimators": {}, "error": "its worker died"}
+
+    def once(row: Row) -> Row:
+        return crashed(row) if row["repeat"] == 2 else row
+
+    suite = read_suite(small)
+    page = page_of(suite, tmp_path, missed)
+    assert line_of(page, "good") == "| good | truth | 0.75 (0.5 to 1) | 0.75 (0.5 to 1) |"
+    assert line_of(page, "bad") == "| bad | truth | 40 **failed** | 40 **failed** |"
+    page = page_of(suite, tmp_path, crashed)
+    assert line_of(page, "bad") == "| bad | truth | **failed** | **failed** |"
+    assert page.count("bad: its worker died") == 2
+    page = page_of(suite, tmp_path, once)
+    assert "**failed** 1 of 2" in line_of(page, "bad")
+
+
+def test_who_is_not_installed_is_named(small: Path, tmp_path: Path) -> None:
+    page = page_of(read_suite(small), tmp_path, lambda row: row)
+    assert "- elsewhere: `make elsewhere` installs it." in page
+
+
+def test_an_estimator_without_rows_has_no_cell(small: Path) -> None:
+    suite = read_suite(small)
+    assert cells(suite, make_plan(suite, out=Path("out")), []) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_command_runs_a_suite_and_runs_it_on(small: Path, tmp_path: Path) -> None:
+    words = ["suite", "--file", str(small), "--out", str(tmp_path / "out"), "--scenario", "slow"]
+    words += ["--repeat", "1"]
+    done = command(*words, folder=tmp_path, limit=300)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "out" / "SUITE.md").read_text(encoding="utf-8")
+    assert "2 runs: 1 seed, each 1 time" in page
+    assert re.search(r"\| good \| truth \| 0\.\d+ \|", page)
+    assert "**failed**" in line_of(page, "bad")
+    assert (tmp_path / "out" / "suite" / "suite.png").stat().st_size > 1000
+    again = command(*words, folder=tmp_path, limit=300)
+    assert "2 runs are finished already, 0 to do" in again.stderr
