@@ -7,6 +7,7 @@ A `Case` says how an estimator is run; `fly` lets it fly `tests.nodes.estimation
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
@@ -49,6 +50,7 @@ class Case(NamedTuple):
         script: What becomes of the images; see `tests.nodes.estimation.flight.SCRIPT`.
         worker: Whether its tracker needs a process of its own in every test; those that do not
             run in the tests' process, which saves the seconds in which Python starts.
+        built: Returns more settings, with what is built for the test.
         needs: Module without which it is not tested.
         slow: Whether its flight is for the slow suite.
     """
@@ -60,6 +62,7 @@ class Case(NamedTuple):
     width: int = 240
     script: str = SCRIPT
     worker: bool = False
+    built: Callable[[], Mapping[str, Any]] = dict
     needs: str = ""
     slow: bool = False
 
@@ -124,7 +127,14 @@ class InProcess:
 
 async def in_process(node: Node[Any], factory: Any, *args: Any, **options: Any) -> Any:
     """Take the place of `Node.worker`."""
-    return InProcess(node.clock, factory(*args), options.get("latency", 0.0))
+    made = factory(*args)
+    if hasattr(made, "close"):
+        MADE.callback(made.close)
+    return InProcess(node.clock, made, options.get("latency", 0.0))
+
+
+MADE = contextlib.ExitStack()
+"""Closes the objects of a run, as their processes would."""
 
 
 class Ears(Node):
@@ -143,10 +153,10 @@ def run(case: Case, flight: Flight | None = None) -> Record:
         pytest.importorskip(case.needs)
     flight = flight or case.flight()
     Ears.heard.clear()
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, MADE:
         if not case.worker:
             patch.setattr(Node, "worker", in_process)
-        node = spec(case.node, "est", case.settings)
+        node = spec(case.node, "est", {**case.settings, **case.built()})
         result = run_nodes(
             [node, spec(Ears, "ears")], inputs=flight.events, duration=flight.seconds
         )
@@ -192,7 +202,7 @@ def lacks(case: Case) -> list[Lack]:
 def refusal_faults(case: Case, lack: Lack) -> Iterator[str]:
     """Return what is wrong with how an estimator refuses a rig."""
     try:
-        settings = {**case.settings, "rectify": False}
+        settings = {**case.settings, **case.built(), "rectify": False}
         run_nodes([spec(case.node, "est", settings)], inputs=lack.events, duration=0.2)
     except VisnavError as error:
         message = str(error)

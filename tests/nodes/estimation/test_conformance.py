@@ -5,6 +5,7 @@ One entry in `CASES` for each; its rig is what it announces to read.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from nodes.monocular_odometry import MonocularOdometry
 from nodes.stereo_odometry import StereoOdometry
 from nodes.visual_odometry import VisualOdometry
+from nodes.vit import MonocularVit, Vit
 from tests.nodes.estimation.conformance import (
     Case,
     Lack,
@@ -20,12 +22,24 @@ from tests.nodes.estimation.conformance import (
     refusal_faults,
     run,
 )
+from tests.nodes.vit.library import stub_settings
+
+VIT = {"library": "stub.so", "hold": {"initialise": 1.0, "max_wait": 30.0}, "patience": 0.1}
+
+
+def stub_of_vit(node: type[Vit]) -> Case:
+    """Return the case of a library that counts on its IMU, from the sixth image on."""
+    more = functools.partial(stub_settings, "starts 5 delay 1")
+    return Case(node, VIT, begins=4, width=160, built=more)
+
 
 CASES = {
     "features": Case(VisualOdometry),
     "dense": Case(VisualOdometry, {"method": "dense"}, width=160),
     "monocular": Case(MonocularOdometry, begins=14),
     "stereo": Case(StereoOdometry),
+    "vit": stub_of_vit(Vit),
+    "monocular vit": stub_of_vit(MonocularVit),
 }
 """By a name for the test; those that need more than the project itself are slow."""
 

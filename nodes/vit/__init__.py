@@ -1,0 +1,10 @@
+"""Visual-inertial tracking libraries, as Basalt and OpenVINS are, by Monado's C interface.
+
+interface       the C interface, by ctypes
+tracker         a library in a worker's process: what goes in, and the poses that come out
+node            the estimators, for stereo rigs and for single cameras
+"""
+
+from nodes.vit.node import MonocularVit, Vit, VitConfig
+
+__all__ = ["MonocularVit", "Vit", "VitConfig"]

@@ -1,0 +1,187 @@
+"""A VIT library in a worker's process: images and samples go in, poses of the camera come out."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import tempfile
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from events.poses import inverse
+from nodes.calibration.formats import camera_in_imu
+from nodes.dataset.rig import Rig
+from nodes.estimation import TrackingResult
+from nodes.odometry.images import grey_image
+from nodes.vit import interface
+from nodes.vit.interface import (
+    CameraCalibration,
+    ImuCalibration,
+    InertialCalibration,
+    Library,
+    PoseData,
+)
+
+FOLDER = "$VISNAV_FOLDER"
+"""Stands in a configuration for the folder of the calibration's files."""
+
+_POLL = 0.0005
+"""Real seconds between two looks for a pose, for which the interface does not wait."""
+
+_TOLERANCE = 1000
+"""Nanoseconds by which a pose's stamp may differ from its image's: OpenVINS has seconds inside."""
+
+
+class VitSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """All that a library's process needs to start.
+
+    Attributes:
+        library: Path of the shared library.
+        config: Path of its settings; empty for the first of `files`, or its defaults.
+        files: Files of the calibration, by name, with their texts.
+        rig: The cameras, the left one first, and the IMU.
+        by_interface: Whether the calibration is passed by the interface.
+    """
+
+    library: str
+    config: str
+    files: dict[str, str]
+    rig: Rig
+    by_interface: bool
+
+
+class VitTracker:
+    """A library with its threads.
+
+    Args:
+        settings: The library, and what it is told.
+
+    Raises:
+        VitError: It cannot be used, or refuses what it is told.
+    """
+
+    def __init__(self, settings: VitSettings) -> None:
+        rig = self._rig = settings.rig
+        self._offset = round(rig.cameras[0].time_offset * 1e9) if settings.by_interface else 0
+        self._camera = camera_in_imu(rig, rig.cameras[0])
+        self._world = np.eye(4)  # the library's, in the optical camera at its first pose
+        self._pose = np.eye(4)
+        self._anew = True
+        with contextlib.ExitStack() as opened:
+            folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="vit_"))
+            file = _write(settings, Path(folder))
+            self._library = Library(settings.library, file, len(rig.cameras))
+            opened.callback(self._library.close)
+            self._library.start(calibrations(rig) if settings.by_interface else [])
+            self._opened = opened.pop_all()
+
+    def track(
+        self,
+        stamp: int,
+        images: list[npt.NDArray[np.uint8]],
+        samples: npt.NDArray[np.float64],
+        wait: float,
+    ) -> list[tuple[int, TrackingResult]]:
+        """Push samples and then images, and return the stamps and poses that have come.
+
+        Args:
+            stamp: Of the images (ns).
+            images: One of each camera, grey or red, green, blue.
+            samples: Of the IMU since the last images, up to these, shape (n, 7): stamp (ns),
+                angular velocity (rad/s), specific force (m/s²).
+            wait: Real seconds after which no pose of this stamp is waited for; it is the last one.
+
+        Raises:
+            VitError: The library refuses something.
+            ValueError: An image has another size than its camera's.
+        """
+        grey = [
+            np.ascontiguousarray(grey_image(camera.info, image))
+            for camera, image in zip(self._rig.cameras, images, strict=True)
+        ]
+        self._library.push(stamp - self._offset, grey, samples)
+        found: list[tuple[int, TrackingResult]] = []
+        until = time.monotonic() + wait
+        while not found or abs(found[-1][0] - stamp) > _TOLERANCE:
+            data = self._library.pop()
+            if data is not None:
+                found.append((data.stamp + self._offset, self._result(data)))
+            elif time.monotonic() >= until:
+                break
+            else:
+                time.sleep(_POLL)
+        return found
+
+    def close(self) -> None:
+        """End the library's threads."""
+        self._opened.close()
+
+    def _result(self, data: PoseData) -> TrackingResult:
+        """Return where the camera is; after a pose that is none the library begins anew there."""
+        numbers = np.array([*data.position, *data.orientation, *data.velocity], np.float64)
+        if not np.isfinite(numbers).all() or not numbers[3:7].any():
+            self._anew = self._library.reset() or self._anew
+            return TrackingResult(self._pose, True, "the library's pose is not finite")
+        in_world = np.eye(4)
+        in_world[:3, :3] = Rotation.from_quat(numbers[3:7]).as_matrix()
+        in_world[:3, 3] = numbers[:3]
+        in_world = in_world @ self._camera
+        if self._anew:
+            self._world, self._anew = self._pose @ inverse(in_world), False
+        self._pose = self._world @ in_world
+        return TrackingResult(self._pose, velocity=self._world[:3, :3] @ numbers[7:])
+
+
+def _write(settings: VitSettings, folder: Path) -> Path | None:
+    """Write the files, and return that of the library's settings."""
+    path = Path(settings.config)
+    text = path.read_text(encoding="utf-8") if settings.config else ""
+    files = {path.name: text.replace(FOLDER, str(folder))} if FOLDER in text else {}
+    files |= settings.files
+    for name, each in files.items():
+        (folder / name).write_text(each, encoding="utf-8")
+    if settings.config and FOLDER not in text:
+        return path  # beside the files that it may name
+    return folder / next(iter(files)) if files else None
+
+
+def calibrations(rig: Rig) -> list[CameraCalibration | ImuCalibration]:
+    """Return what the interface is told of a rig: its cameras, and its IMU.
+
+    A radial-tangential lens has eight coefficients, and as a ninth the radius (x/z) up to which
+    the model is monotonic: Basalt takes no other.
+
+    Raises:
+        ValueError: Cameras and IMU are not on one body.
+    """
+    made: list[CameraCalibration | ImuCalibration] = []
+    for number, camera in enumerate(rig.cameras):
+        info, lens, model = camera.info, camera.info.distortion, interface.KB4
+        if info.is_pinhole:
+            lens, model = (), interface.NONE
+        elif info.distortion_model != "equidistant":
+            radius = math.tan(min(info.widest_angle(), 1.55))
+            lens, model = (*(*lens, 0.0, 0.0, 0.0)[:8], radius), interface.RT8
+        pinhole = (info.fx, info.fy, info.cx, info.cy)
+        pose = tuple(camera_in_imu(rig, camera).ravel().tolist())
+        sizes = (number, info.width, info.height, camera.rate)
+        made.append(CameraCalibration(*sizes, pinhole, model, len(lens), lens, pose))
+    if (imu := rig.imu) is not None:
+        acceleration = imu.accelerometer_random_walk, imu.accelerometer_noise_density
+        rotation = imu.gyroscope_random_walk, imu.gyroscope_noise_density
+        noisy = (
+            _inertial(imu.accelerometer_matrix, *acceleration),
+            _inertial(imu.gyroscope_matrix, *rotation),
+        )
+        made.append(ImuCalibration(0, imu.rate, *noisy))
+    return made
+
+
+def _inertial(matrix: tuple[float, ...], walk: float, density: float) -> InertialCalibration:
+    corrects = np.linalg.inv(np.reshape(matrix, (3, 3))).ravel().tolist()
+    return InertialCalibration(tuple(corrects), (0.0,) * 3, (walk,) * 3, (density,) * 3)
