@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from nodes.evaluation.metrics import rms, same_stamps
+from nodes.evaluation.metrics import interpolated, position_errors, rms, same_stamps
 from nodes.trajectory import Trajectory
 
 Floats = npt.NDArray[np.float64]
@@ -26,9 +26,8 @@ def velocity_error(truth: Trajectory, stamps: npt.NDArray[np.int64], velocities:
         stamps: Of the velocities (ns), within the truth's time, shape (n,), n ≥ 1.
         velocities: In the truth's frame, shape (n, 3).
     """
-    times = stamps - truth.stamps[0], truth.stamps - truth.stamps[0]
-    true = np.stack([np.interp(*times, axis) for axis in truth.velocities().T], axis=1)
-    return rms(np.linalg.norm(velocities - true, axis=1))
+    true = interpolated(truth.stamps, truth.velocities(), stamps)
+    return rms(position_errors(true, velocities))
 
 
 def consistency(
@@ -87,16 +86,3 @@ def positive_definite(matrices: Floats) -> npt.NDArray[np.bool_]:
     scaled = scaled / (deviations[:, :, None] * deviations[:, None, :])
     skew = abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2))
     return np.asarray(possible & (skew < 1e-6) & (np.linalg.eigvalsh(scaled)[:, 0] > _SINGULAR))
-
-
-def turned(covariances: Floats, rotation: Floats, scale: float) -> Floats:
-    """Return covariances of poses, shape (n, 6, 6), in a frame that `rotation` leads to.
-
-    Args:
-        covariances: In the old frame.
-        rotation: Old frame to new, shape (3, 3).
-        scale: Of lengths.
-    """
-    both = np.zeros((6, 6))
-    both[:3, :3], both[3:, 3:] = scale * rotation, rotation
-    return np.asarray(both @ covariances @ both.T)

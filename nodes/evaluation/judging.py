@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.alignment import Alignment, How, align, transform, umeyama
-from nodes.evaluation.consistency import consistency, turned, velocity_error
+from nodes.evaluation.consistency import consistency, velocity_error
 from nodes.evaluation.coverage import Interval, Stamps, choose_frames, cover, seconds
 from nodes.evaluation.metrics import (
     absolute_errors,
@@ -25,7 +25,7 @@ from nodes.evaluation.metrics import (
     share_errors,
 )
 from nodes.evaluation.record import EstimatorRecord
-from nodes.evaluation.whole_flight import held_errors, interpolated_errors, relocalization_times
+from nodes.evaluation.whole_flight import held_errors, interpolated_errors
 from nodes.trajectory import Trajectory, associate
 from runtime.schedule import SECOND
 
@@ -146,7 +146,8 @@ def judge(
     judgement = Judgement(figures, estimate, lost=coverage.lost, final=final)
     if estimate is None:
         return judgement
-    if took := relocalization_times(coverage.lost, poses):
+    # An interval that lasts to the end of the flight counts as long as it is: it took no less.
+    if took := [seconds([each]) for each in coverage.lost if each.start >= poses[0]]:
         figures["relocalization_p50_seconds"] = float(np.median(took))
         figures["relocalization_max_seconds"] = max(took)
     figures["alignment"] = how
@@ -234,15 +235,18 @@ def _said_with_poses(
 ) -> dict[str, Any]:
     """Return the figures of velocities and covariances, as far as they were given."""
     figures: dict[str, Any] = {}
-    stamps, velocities = record.velocities()
-    if (known := truth.covers(stamps)).any():
-        said = aligned.scale * velocities[known] @ aligned.rotation.T
-        figures["velocity_rmse_m_per_s"] = velocity_error(truth, stamps[known], said)
-    stamps, covariances = record.covariances()
-    if (known := truth.covers(stamps)).any():
-        rows = np.isin(there.stamps, stamps[known])
-        said = turned(covariances[known], aligned.rotation, aligned.scale)
-        figures |= consistency(there.take(rows), aligned.trajectory.take(rows), said)
+    rotation, scale = aligned.rotation, aligned.scale
+    rows = np.isin(there.stamps, [*record.velocities])
+    if rows.any():
+        said = np.array([record.velocities[stamp] for stamp in there.stamps[rows].tolist()])
+        turned = scale * said @ rotation.T
+        figures["velocity_rmse_m_per_s"] = velocity_error(truth, there.stamps[rows], turned)
+    rows = np.isin(there.stamps, [*record.covariances])
+    if rows.any():
+        said = np.array([record.covariances[stamp] for stamp in there.stamps[rows].tolist()])
+        turn = np.kron(np.diag([scale, 1.0]), rotation)
+        turned = turn @ said.reshape(-1, 6, 6) @ turn.T
+        figures |= consistency(there.take(rows), aligned.trajectory.take(rows), turned)
     return figures
 
 

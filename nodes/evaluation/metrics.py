@@ -29,7 +29,7 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
         By name, with the unit at its end: root mean square, mean, median, standard deviation,
         maximum and mean square of the distances; root mean squares along x (north), y (east) and
         z (down) of the truth's frame; root mean square of the angles between the orientations,
-        and of the differences of the headings (yaw).
+        and of the differences of the headings: where the body's x axis points, seen along z.
 
     Raises:
         ValueError: The stamps of the two differ.
@@ -38,6 +38,7 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
     errors = position_errors(truth.positions, estimate.positions)
     angles = rotation_errors(truth.orientations, estimate.orientations)
     x, y, z = (estimate.positions - truth.positions).T
+    ahead, said = (t.rotations().apply([1.0, 0.0, 0.0]) @ [1, 1j, 0] for t in (truth, estimate))
     return {
         "ate_rmse_m": rms(errors),
         "ate_mean_m": float(errors.mean()),
@@ -49,7 +50,7 @@ def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]
         "ate_down_rmse_m": rms(z),
         "mse_m2": float(np.mean(errors**2)),
         "rot_rmse_deg": rms(np.degrees(angles)),
-        "heading_rmse_deg": rms(np.degrees(heading_errors(truth, estimate))),
+        "heading_rmse_deg": rms(np.angle(said * ahead.conj(), deg=True)),
     }
 
 
@@ -195,15 +196,10 @@ def rotation_errors(truth: Floats, estimate: Floats) -> Floats:
     return np.asarray((a.inv() * b).magnitude())
 
 
-def heading_errors(truth: Trajectory, estimate: Trajectory) -> Floats:
-    """Return the differences of the headings, radians in [-π, π], shape (n,).
-
-    The heading is the angle from x (north) to the body's x axis, seen along z (down).
-    """
-    forward = [t.rotations().apply([1.0, 0.0, 0.0]) for t in (truth, estimate)]
-    true, said = (np.arctan2(each[:, 1], each[:, 0]) for each in forward)
-    difference = said - true
-    return np.asarray(np.arctan2(np.sin(difference), np.cos(difference)))
+def interpolated(known: Indices, values: Floats, stamps: Indices) -> Floats:
+    """Return values at other times, which may repeat: shapes (n,), (n, d) and (k,) to (k, d)."""
+    times = stamps - known[0], known - known[0]  # so that a float holds every nanosecond
+    return np.stack([np.interp(*times, column) for column in values.T], axis=1)
 
 
 def same_stamps(truth: Trajectory, estimate: Trajectory) -> None:

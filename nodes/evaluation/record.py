@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +32,8 @@ class EstimatorRecord:
         future: Poses of a time that had not come when they arrived.
         elsewhere: Poses in another frame than the first one.
         restarts: How often it changed to another frame: each time it has lost where it is.
+        velocities: Those that poses came with, by stamp: 3 numbers.
+        covariances: Likewise: 36 numbers, row by row.
         final: Its trajectory after loop closures, the last one that it sent; `None` if it sent
             none, or an empty one.
         final_frame_id: Frame of that.
@@ -50,14 +51,14 @@ class EstimatorRecord:
         self.future = 0
         self.elsewhere = 0
         self.restarts = 0
+        self.velocities: dict[int, array[float]] = {}
+        self.covariances: dict[int, array[float]] = {}
         self.final: Trajectory | None = None
         self.final_frame_id = ""
         self._last_stamp: int | None = None
         self._last_frame = ""
         self._arrivals = array("q")
         self._tracking: list[TrackingEvent] = []
-        self._velocities = _Columns((3,))
-        self._covariances = _Columns((6, 6))
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> EstimatorRecord:
@@ -86,19 +87,16 @@ class EstimatorRecord:
         if now is not None:
             self._arrivals.append(now)
         if event.velocity is not None:
-            self._velocities.add(event.stamp, event.velocity)
+            self.velocities[event.stamp] = array("d", event.velocity)
         if event.covariance:
-            self._covariances.add(event.stamp, event.covariance)
+            self.covariances[event.stamp] = array("d", event.covariance)
         return True
 
     def add_final(self, event: TrajectoryEstimate) -> None:
         """Note its trajectory as it sees it now."""
+        poses = event.stamps, event.positions, event.orientations
+        self.final = Trajectory(*poses) if len(event.stamps) else None
         self.final_frame_id = event.frame_id
-        self.final = (
-            Trajectory(event.stamps, event.positions, event.orientations)
-            if len(event.stamps)
-            else None
-        )
 
     def note(self, event: TrackingEvent) -> None:
         """Note that tracking was lost or regained."""
@@ -110,14 +108,6 @@ class EstimatorRecord:
     def arrivals(self) -> npt.NDArray[np.int64]:
         """Return when each pose of the trajectory came (ns), shape (n,); (0,) if not known."""
         return np.array(self._arrivals, np.int64)
-
-    def velocities(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-        """Return stamps (ns), shape (m,), and velocities, shape (m, 3), where they were given."""
-        return self._velocities.arrays()
-
-    def covariances(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-        """Return stamps (ns), shape (m,), and covariances, shape (m, 6, 6), where given."""
-        return self._covariances.arrays()
 
     def reported_lost(self, end: int) -> list[Interval]:
         """Return when it was lost by its own tracking events.
@@ -136,20 +126,3 @@ class EstimatorRecord:
         if since is not None:
             found.append(Interval(since, end))
         return found
-
-
-class _Columns:
-    """Numbers that only some poses have, and the stamps of these."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self._shape = shape
-        self._stamps = array("q")
-        self._values = array("d")
-
-    def add(self, stamp: int, values: Sequence[float]) -> None:
-        self._stamps.append(stamp)
-        self._values.extend(values)
-
-    def arrays(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-        values = np.array(self._values, np.float64)
-        return np.array(self._stamps, np.int64), values.reshape(-1, *self._shape)

@@ -15,7 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from nodes.evaluation.coverage import Interval, answered, seconds
+from nodes.evaluation.coverage import Interval, answered
+from nodes.evaluation.metrics import interpolated, position_errors
 from nodes.trajectory import Trajectory
 
 Floats = npt.NDArray[np.float64]
@@ -81,27 +82,10 @@ def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory)
     first, last = int(estimate.stamps[0]), int(estimate.stamps[-1])
     inside = np.clip(frames, first, last)
     away = abs(_path_at(truth, frames) - _path_at(truth, inside))
-    offsets = _positions_at(estimate, inside) - _positions_at(truth, inside)
-    return np.asarray(np.linalg.norm(offsets, axis=1) + away)
-
-
-def relocalization_times(lost: Sequence[Interval], poses: Stamps) -> list[float]:
-    """Return how long it took each time, from losing the pose to having one again, seconds.
-
-    An interval that lasts to the end of the flight counts as long as it is: it took no less.
-    Before the first pose nothing was lost.
-    """
-    return [seconds([each]) for each in lost if len(poses) and each.start >= poses[0]]
+    true, said = (interpolated(t.stamps, t.positions, inside) for t in (truth, estimate))
+    return position_errors(true, said) + away
 
 
 def _path_at(truth: Trajectory, stamps: Stamps) -> Floats:
     """Return the path length from the start of the truth to each time, metres."""
-    since = truth.stamps[0]  # so that a float holds every nanosecond
-    return np.asarray(np.interp(stamps - since, truth.stamps - since, truth.distances()))
-
-
-def _positions_at(trajectory: Trajectory, stamps: Stamps) -> Floats:
-    """Return positions at times that may repeat, linear in between, shape (k, 3)."""
-    since = trajectory.stamps[0]
-    times = stamps - since, trajectory.stamps - since
-    return np.stack([np.interp(*times, axis) for axis in trajectory.positions.T], axis=1)
+    return interpolated(truth.stamps, truth.distances()[:, None], stamps)[:, 0]

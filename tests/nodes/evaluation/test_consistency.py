@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from events import PoseEstimate
-from nodes.evaluation.consistency import consistency, positive_definite, turned
+from nodes.evaluation.consistency import consistency, positive_definite
 from nodes.evaluation.judging import judge
 from nodes.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory
@@ -186,6 +186,22 @@ def test_a_covariance_given_now_and_then_is_that_of_its_pose() -> None:
     assert judge(record, truth).figures["nees_position"] == pytest.approx(1.0)
 
 
-def test_lengths_scale_and_angles_do_not() -> None:
-    p = turned(np.eye(6)[None], np.eye(3), 3.0)[0]
-    assert np.diag(p).tolist() == [9.0, 9.0, 9.0, 1.0, 1.0, 1.0]
+def test_of_a_covariance_lengths_are_scaled_and_angles_are_not() -> None:
+    """Of an estimator whose unit is a quarter of a metre, so that Sim(3) scales it by 0.25."""
+    truth = walk(300)
+    record = EstimatorRecord(scale_free=True)
+    noise = np.random.default_rng(1).normal(0.0, 0.02, (300, 3))
+    p = np.diag([0.02**2 * 16] * 3 + [1e-4] * 3)
+    for k, (x, y, z) in enumerate((4 * (truth.positions + noise)).tolist()):
+        qw, qx, qy, qz = truth.orientations[k].tolist()
+        event = PoseEstimate(
+            stamp=int(truth.stamps[k]),
+            source="e",
+            position=(x, y, z),
+            orientation=(qw, qx, qy, qz),
+            covariance=tuple(p.ravel().tolist()),
+        )
+        record.add(event, event.stamp)
+    figures = judge(record, truth).figures
+    assert figures["scale"] == pytest.approx(0.25, rel=0.02)
+    assert figures["nees_position"] == pytest.approx(3.0, abs=0.4)

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from nodes.evaluation.coverage import cover
 from nodes.evaluation.judging import judge
 from nodes.evaluation.record import EstimatorRecord
-from nodes.evaluation.whole_flight import held_errors, interpolated_errors, relocalization_times
+from nodes.evaluation.whole_flight import held_errors, interpolated_errors
 from nodes.trajectory import Trajectory
 from tests.nodes.evaluation.flights import MS, SECOND, estimate, heading, lost, place, regained
 
@@ -228,4 +228,3 @@ def test_errors_without_any_image_in_the_truths_time_are_none() -> None:
     elsewhere = FRAMES + 2 * END
     assert held_errors(TRUTH, elsewhere, FRAMES, np.zeros(len(FRAMES)), []).shape == (0,)
     assert interpolated_errors(TRUTH, elsewhere, TRUTH).shape == (0,)
-    assert relocalization_times([], FRAMES) == []
