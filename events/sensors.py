@@ -229,3 +229,8 @@ class LidarScan(Event, eq=False):
                 f"LidarScan: expected points, intensities and rings of {count} times, found "
                 f"shapes {self.points.shape}, {self.intensities.shape}, {self.rings.shape}"
             )
+
+    @property
+    def end(self) -> int:
+        """Stamp of the last ray that gave a point (ns)."""
+        return self.stamp + (round(float(self.times[-1]) * 1e9) if len(self.times) else 0)

@@ -30,6 +30,7 @@ BRIDGES = {
     "zenoh",
     "rerun",
     "foxglove",
+    "kiss_icp",
     "mcap",
     "pyorbslam3",
     "rosbags",

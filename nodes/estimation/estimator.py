@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +22,9 @@ from events import (
     DepthImage,
     EstimatorAnnouncement,
     Image,
-    Imu,
     ImuAnnouncement,
+    LidarAnnouncement,
+    LidarScan,
     PoseEstimate,
     TakenOff,
     TrackedFeatures,
@@ -54,36 +55,6 @@ The sums of linear algebra then always have the same order, and so the same resu
 """
 
 
-class RgbdFrame(NamedTuple):
-    """A colour (or grey) image and the depth of the same exposure."""
-
-    image: Image
-    depth: DepthImage
-
-
-class RgbdInertialFrame(NamedTuple):
-    """The same, and the samples of the IMU since the frame before."""
-
-    image: Image
-    depth: DepthImage
-    imu: tuple[Imu, ...]
-
-
-class StereoFrame(NamedTuple):
-    """The images of both cameras of a stereo rig, of one exposure."""
-
-    left: Image
-    right: Image
-
-
-class StereoInertialFrame(NamedTuple):
-    """The same, and the samples of the IMU since the frame before."""
-
-    left: Image
-    right: Image
-    imu: tuple[Imu, ...]
-
-
 class EstimatorConfig(NodeConfig):
     """Settings of every estimator.
 
@@ -101,6 +72,9 @@ class EstimatorConfig(NodeConfig):
     rectify: bool = True
     latency: Latency = Latency(0.015)  # immutable
 
+
+Frame = Image | DepthImage | LidarScan
+"""What a pose is estimated for."""
 
 F = TypeVar("F", bound=tuple[Any, ...])
 C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
@@ -323,19 +297,21 @@ class Estimator(Node[C], ABC):
             self.log.fatal("%s", self._missing())
         return self.camera
 
-    def exposed_at(self, image: Image | DepthImage) -> int:
+    def exposed_at(self, image: Frame) -> int:
         """Return when an image was exposed on the clock of IMU and ground truth (ns).
 
         That is its stamp without the offset of the camera's clock, which was announced.
         """
         return image.stamp - round(self.the_camera().time_offset * 1e9)
 
+    def _sensor(self) -> CameraAnnouncement | LidarAnnouncement:
+        """Return what the tracker gives the pose of."""
+        return self.the_camera()
+
     def _missing(self) -> str:
         return (self._choice or self._new_choice({})).missing()
 
-    def publish(
-        self, image: Image | DepthImage, result: TrackingResult, origin: int | None = None
-    ) -> None:
+    def publish(self, image: Frame, result: TrackingResult, origin: int | None = None) -> None:
         """Send what a tracker found in an image: features, pose, and whether tracking was lost.
 
         Args:
@@ -349,18 +325,7 @@ class Estimator(Node[C], ABC):
             self._lost = True
             reason = f"restarted: poses are in {self._odom()} from here on"
             self.tracking_events.send(TrackingLost(stamp=stamp, source=self.name, reason=reason))
-        points = result.points
-        if self._rectification is not None:
-            points = self._rectification.eyes[0].original(points).astype(np.float32)
-        self.features.send(
-            TrackedFeatures(
-                stamp=image.stamp,
-                source=self.name,
-                frame_id=image.frame_id,
-                points=points,
-                inliers=result.inliers,
-            )
-        )
+        self._send_features(image, result)
         if result.lost and not self._lost:
             self.log.warning("lost: %s", result.reason or "no reason given")
             self.tracking_events.send(
@@ -374,6 +339,20 @@ class Estimator(Node[C], ABC):
             if self._mount is None:
                 self._mount = self._mounting(stamp if origin is None else origin)
             self.estimates.send(self._mount.estimate(stamp, self.name, result))
+
+    def _send_features(self, image: Frame, result: TrackingResult) -> None:
+        points = result.points
+        if self._rectification is not None:
+            points = self._rectification.eyes[0].original(points).astype(np.float32)
+        self.features.send(
+            TrackedFeatures(
+                stamp=image.stamp,
+                source=self.name,
+                frame_id=image.frame_id,
+                points=points,
+                inliers=result.inliers,
+            )
+        )
 
     def publish_trajectory(
         self, stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float64]
@@ -391,7 +370,7 @@ class Estimator(Node[C], ABC):
 
     def _mounting(self, origin: int) -> Mount:
         """Return the mount for a tracker whose poses start at an image of this stamp."""
-        camera = self.the_camera()
+        camera = self._sensor()
         vehicles = (v for v in self._vehicles if camera.source.startswith(f"{v.source}/"))
         vehicle = next(vehicles, None) if self.config.origin == "announced" else None
         if (
@@ -411,7 +390,7 @@ class Estimator(Node[C], ABC):
 
     def _at_announced_pose(self, vehicle: VehicleAnnouncement, stamp: int) -> bool:
         """Return whether a vehicle is known to have been at its announced pose at a time (ns)."""
-        camera = self.the_camera()
+        camera = self._sensor()
         if self.restarts or self._armed_at.get(vehicle.source, stamp) < stamp:
             return False
         first = camera.latency + (1.0 / camera.rate if camera.rate > 0 else 0.0)

@@ -7,7 +7,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from events import CameraAnnouncement, PoseEstimate, TrajectoryEstimate, VehicleAnnouncement
+from events import (
+    CameraAnnouncement,
+    LidarAnnouncement,
+    PoseEstimate,
+    TrajectoryEstimate,
+    VehicleAnnouncement,
+)
 from events.poses import pose_matrix, pose_tuples
 from nodes.estimation.result import TrackingResult
 
@@ -31,12 +37,15 @@ class Mount(msgspec.Struct, frozen=True, eq=False):
 
     @classmethod
     def of(
-        cls, camera: CameraAnnouncement, vehicle: VehicleAnnouncement | None, frame_id: str = "odom"
+        cls,
+        camera: CameraAnnouncement | LidarAnnouncement,
+        vehicle: VehicleAnnouncement | None,
+        frame_id: str = "odom",
     ) -> Mount:
-        """Make the mount of an announced camera.
+        """Make the mount of an announced camera, or of a lidar in its place.
 
         Args:
-            camera: The announcement of the camera.
+            camera: The announcement of the sensor.
             vehicle: The announcement of the vehicle, if the body had the announced pose at the
                 first image; `None` if its pose there is unknown.
             frame_id: Parent frame of the estimates if the pose is unknown.

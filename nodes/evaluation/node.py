@@ -166,10 +166,10 @@ class Evaluation(Node[EvaluationConfig]):
 
     @on(LidarScan)
     def scans(self, event: LidarScan) -> None:
-        """Note that there was a scan."""
+        """Note that there was a scan, when it was complete: a pose may be for any of its rays."""
         stamps = self._scans.setdefault(event.source, array("q"))
-        if not stamps or event.stamp > stamps[-1]:
-            stamps.append(event.stamp)
+        if not stamps or event.end > stamps[-1]:
+            stamps.append(event.end)
 
     @on(Image)
     def images(self, event: Image) -> None:
