@@ -128,7 +128,8 @@ class Estimator(Node[C], ABC):
     - the vehicle had not been armed (and had not taken off) at that image's stamp;
     - the vehicle takes commands (its announced control rate is above 0), so that it stands still
       until it sends `Armed`; or, for a recorded vehicle, which may move from the start without any
-      event, the image is not later than a camera's period and latency after the announcement;
+      event, the image is not farther than a camera's period and latency from the announcement's
+      stamp;
     - the estimates are in metres: the estimator is not scale-free.
 
     Otherwise it is ``odom``, whose origin is the body at that image, and after a restart
@@ -394,7 +395,7 @@ class Estimator(Node[C], ABC):
         if self.restarts or self._armed_at.get(vehicle.source, stamp) < stamp:
             return False
         first = camera.latency + (1.0 / camera.rate if camera.rate > 0 else 0.0)
-        return vehicle.control_rate > 0 or stamp - vehicle.stamp <= first * 1e9
+        return vehicle.control_rate > 0 or abs(stamp - vehicle.stamp) <= first * 1e9
 
     def _odom(self) -> str:
         """Return the frame of estimates whose origin is unknown."""

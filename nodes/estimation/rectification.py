@@ -132,7 +132,7 @@ class Rectification:
             cy=float(np.mean([each.info.cy for each in cameras])),
         )
         lenses = [each.info for each in cameras]
-        focal = _focal(cameras[0].source, info, list(zip(lenses, turns, strict=True)))
+        focal = _focal(info, list(zip(lenses, turns, strict=True)))
         info = msgspec.structs.replace(info, fx=focal, fy=focal)
         self.eyes = tuple(Eye(lens, info, t) for lens, t in zip(lenses, turns, strict=True))
         frame = np.eye(4)
@@ -201,7 +201,7 @@ def _common_axes(cameras: Sequence[CameraAnnouncement], own: Sequence[Floats]) -
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def _focal(source: str, info: CameraInfo, eyes: list[tuple[CameraInfo, Floats]]) -> float:
+def _focal(info: CameraInfo, eyes: list[tuple[CameraInfo, Floats]]) -> float:
     """Return the shortest focal length with which no pixel of the eyes' new images is empty."""
     across, down = np.arange(info.width), np.arange(info.height)
     rim = np.concatenate(
@@ -225,8 +225,9 @@ def _focal(source: str, info: CameraInfo, eyes: list[tuple[CameraInfo, Floats]])
         return low
     if not is_full(high):
         raise ValueError(
-            f"{source}: expected a lens of which a pinhole image can show a quarter or more, found "
-            f"{lens.distortion_model} with which less is left"
+            "expected a lens of which a pinhole image can show a quarter or more, found "
+            f"{lens.distortion_model} with {', '.join(f'{k:g}' for k in lens.distortion)}, focal "
+            f"length {lens.fx:g} px and {lens.width}×{lens.height} pixels"
         )
     while high - low > 1e-3 * low:
         middle = (low + high) / 2

@@ -1,8 +1,8 @@
 """Recordings and data sets in the place of a simulator.
 
 `node` finds the right reader and sends the events again; `choice` selects them, `ahead` reads in a
-thread. `reader` is what the readers have in common: `recorded` (ours), `rosbag`, `euroc` and
-`tum_rgbd`.
+thread. `reader` is what the readers have in common: `recorded` (ours), `rosbag`, `euroc`,
+`tum_rgbd` and `kitti`.
 """
 
 from nodes.replay.node import Replay

@@ -3,7 +3,8 @@
 M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. The world's z points up; it
 is turned to NED by half a turn about x. Times count from the first stamp, or from the epoch that
 ``body.yaml`` notes (``epoch_ns``). The body keeps the axes that the data set gives it: with
-EuRoC's own those of its IMU, which is no FRD, but cameras and truth agree on it.
+EuRoC's own those of its IMU, which is no FRD, but cameras and truth agree on it. Of two cameras
+side by side the second is announced as the right one of a stereo rig.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from events.rotations import rotate_inverse
 from nodes.replay.folders import (
     FolderReader,
     Rows,
+    as_pair,
     read_image,
     vehicle_at,
     while_seen,
@@ -111,8 +113,10 @@ class Euroc(FolderReader):
         self._depths: dict[str, tuple[list[tuple[int, Path]], float]] = {}
         self._imu_frame = _BODY
         try:
-            for camera in sorted(folder.glob("cam[0-9]*")):
-                self._announcements.append(self._camera(camera))
+            cameras = [self._camera(camera) for camera in sorted(folder.glob("cam[0-9]*"))]
+            if len(cameras) == 2:
+                cameras[1] = as_pair(*cameras)
+            self._announcements += cameras
             self._imu = self._measurements(folder / "imu0" / "data.csv")
             if self._imu:
                 self._announcements.append(self._imu_announcement())

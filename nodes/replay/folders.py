@@ -10,10 +10,20 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Announcement, DepthImage, Event, Image, Odometry, VehicleAnnouncement
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    Event,
+    Image,
+    Odometry,
+    VehicleAnnouncement,
+)
+from events.poses import pose_matrix
 from nodes.replay.reader import Reader, ReplayError, Timed, Wants
 
 R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
@@ -35,9 +45,9 @@ def while_seen(truth: list[R], first: int, last: int) -> list[R]:
 
 
 def vehicle_at(pose: Odometry) -> VehicleAnnouncement:
-    """Return the announcement of a vehicle of which only the first pose is known."""
+    """Return the announcement of a vehicle of which only the first pose is known, and when."""
     return VehicleAnnouncement(
-        stamp=0,
+        stamp=pose.stamp,
         source=pose.source,
         mass=0.0,
         max_thrust=0.0,
@@ -45,6 +55,22 @@ def vehicle_at(pose: Odometry) -> VehicleAnnouncement:
         position=pose.position,
         orientation=pose.orientation,
     )
+
+
+def as_pair(left: CameraAnnouncement, right: CameraAnnouncement) -> CameraAnnouncement:
+    """Return the right camera as that of a stereo rig, or as it is if both are none.
+
+    Both are if they have one size and one rate, and stand side by side: less than 60 degrees apart
+    in direction, and the right one at least half of their distance to the left one's right.
+    """
+    one, other = (pose_matrix(each.position, each.orientation) for each in (left, right))
+    apart = other[:3, 3] - one[:3, 3]
+    distance = float(np.linalg.norm(apart))
+    beside = apart @ one[:3, 0] > 0.5 * distance > 0.0 and one[:3, 2] @ other[:3, 2] > 0.5
+    alike = [(each.info.width, each.info.height, each.rate) for each in (left, right)]
+    if not beside or alike[0] != alike[1]:
+        return right
+    return msgspec.structs.replace(right, stereo=left.source, baseline=distance)
 
 
 class Rows(NamedTuple):

@@ -41,12 +41,19 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
             from nodes.replay.tum_rgbd import TumRgbd
 
             return TumRgbd(path, vehicle, config.camera, config.depth_factor)
+        if (path / "times.txt").is_file() and (path / "calib.txt").is_file():
+            from nodes.replay.kitti import Kitti
+
+            return Kitti(path, vehicle)
         raise ReplayError(
-            f"{path}: expected a ROS 2 bag (metadata.yaml), or a data set of EuRoC's (mav0) or "
-            "TUM's (rgb.txt), found a folder with none of these"
+            f"{path}: expected a ROS 2 bag (metadata.yaml), or a data set of EuRoC's (mav0), TUM's "
+            "(rgb.txt) or KITTI's (times.txt and calib.txt), found a folder with none of these"
         )
     if not path.is_file():
-        raise ReplayError(f"{path}: expected a recording, found no such file")
+        raise ReplayError(
+            f"{path}: expected a recording or the folder of a data set, found nothing there; "
+            "docs/how-to/datasets.md says where to download those of EuRoC, TUM and KITTI"
+        )
     if path.suffix not in {".db3", ".bag"} and is_ours(path):
         return Recorded(path)
     from nodes.replay.rosbag import RosBag
@@ -234,6 +241,7 @@ class Replay(Node[ReplayConfig]):
             return announcement
         return msgspec.structs.replace(
             announcement,
+            stamp=event.stamp - round(self.config.start * SECOND),
             control_rate=0.0,  # in mid-recording, it may be moving
             position=event.position,
             orientation=event.orientation,

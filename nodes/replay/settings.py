@@ -68,7 +68,8 @@ class ReplayConfig(NodeConfig):
 
     Attributes:
         file: A recording of `nodes.mcap_recorder` (torn ones too), a ROS 2 bag (a folder, or an
-            MCAP or SQLite file), or the folder of a data set in the layout of EuRoC or TUM RGB-D.
+            MCAP or SQLite file), or the folder of a data set in the layout of EuRoC, of TUM RGB-D,
+            or of KITTI's odometry (``sequences/00``).
         start: Where to begin. The run's clock is 0 there, and stamps count from there.
         end: Where to end, on the recording's own time; 0 for its end.
         linger: How long the run goes on after the last event, so that others can react to it.

@@ -12,6 +12,7 @@ import pytest
 
 from runtime.config.reading import load
 from sims.worlds import load_world
+from tests.nodes.replay import downloads
 from tests.runtime.peers.samples import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -268,3 +269,26 @@ def test_a_flight_in_wind_or_among_things_that_move(example: str, tmp_path: Path
     assert sent["world.wind" if example == "windy" else "world.body_poses"] > 200
     assert sent["drone.vehicle_events"] == 4
     assert summary["verdict"]["estimators"]["odometry"]["ate_percent"] < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_data_sets_in_the_layouts_that_people_download(tmp_path: Path) -> None:
+    """`euroc`, `tum` and `kitti` on small folders: lenses are rectified, eyes become a pair."""
+    lens = downloads.KINECT
+    camera = {name: getattr(lens, name) for name in ("fx", "fy", "cx", "cy")}
+    camera["distortion"] = list(lens.distortion)
+    table = ", ".join(f"{name} = {value}" for name, value in camera.items())
+    changes = {
+        "euroc": (downloads.euroc(tmp_path / "MH_01"), ()),
+        "tum": (downloads.tum(tmp_path / "fr1"), (f"replay.camera={{ {table} }}",)),
+        "kitti": (downloads.kitti(tmp_path / "kitti"), ()),
+    }
+    for name, (folder, more) in changes.items():
+        file = f"replay.file={folder}"
+        summary = run(name, tmp_path / name, file, *more, "report.figures=[]")
+        figures = summary["verdict"]["estimators"]
+        judged = figures["odometry" if name == "tum" else "stereo"]
+        assert judged["estimates"] == downloads.IMAGES
+        assert judged["ate_rmse_m"] < 0.005
+        assert judged["lost_seconds"] == 0.0

@@ -171,7 +171,7 @@ def fly(reads: tuple[str, ...], eyes: int, width: int = 240, script: str = SCRIP
 @cache
 def _view(stamp: int, takes_off: int, eye: int, width: int) -> tuple[Grey, npt.NDArray[np.float32]]:
     """Return image and depth of a camera."""
-    camera = _camera(stamp, takes_off)
+    camera = camera_in_first(stamp, takes_off)
     camera[:3, 3] += camera[:3, :3] @ (BASELINE * eye, 0.0, 0.0)
     image, depth = look_with_depth(camera, camera_info(width), SCENE)
     image.flags.writeable = depth.flags.writeable = False
@@ -218,7 +218,7 @@ def _spoil(
     return image, depth
 
 
-def _camera(stamp: int, takes_off: int) -> Floats:
+def camera_in_first(stamp: int, takes_off: int) -> Floats:
     """Return the left camera in itself at the start: x right, y down, z ahead."""
     t = max(stamp - takes_off, 0) / 1e9
     camera = np.eye(4)
@@ -233,7 +233,7 @@ def _camera(stamp: int, takes_off: int) -> Floats:
 def _body(stamp: int, takes_off: int) -> Floats:
     mount = pose_matrix(MOUNT, LOOKING_AHEAD)
     start = pose_matrix(START, (1.0, 0.0, 0.0, 0.0))
-    body: Floats = start @ mount @ _camera(stamp, takes_off) @ np.linalg.inv(mount)
+    body: Floats = start @ mount @ camera_in_first(stamp, takes_off) @ np.linalg.inv(mount)
     return body
 
 

@@ -198,7 +198,7 @@ def test_what_cannot_be_a_pair_or_a_pinhole_is_refused() -> None:
         width=WIDTH, height=HEIGHT, fx=20.0, fy=20.0, cx=31.5, cy=23.5,
         distortion=(-0.9, 0.0, 0.0, 0.0, 0.0),
     )  # fmt: skip
-    with pytest.raises(ValueError, match=r"drone/cam: expected a lens .* found plumb_bob"):
+    with pytest.raises(ValueError, match=r"expected a lens .* found plumb_bob"):
         Rectification([seen(turning_back)])
 
 
