@@ -6,10 +6,13 @@ from nodes.estimation.estimator import (
     EstimatorConfig,
 )
 from nodes.estimation.frames import (
+    MonocularFrame,
+    MonocularInertialFrame,
     RgbdFrame,
     RgbdInertialFrame,
     StereoFrame,
     StereoInertialFrame,
+    sample_rows,
 )
 from nodes.estimation.lidar import LidarEstimator
 from nodes.estimation.mount import Mount
@@ -20,10 +23,13 @@ __all__ = [
     "Estimator",
     "EstimatorConfig",
     "LidarEstimator",
+    "MonocularFrame",
+    "MonocularInertialFrame",
     "Mount",
     "RgbdFrame",
     "RgbdInertialFrame",
     "StereoFrame",
     "StereoInertialFrame",
     "TrackingResult",
+    "sample_rows",
 ]

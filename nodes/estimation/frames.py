@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
 from events import DepthImage, Image, Imu
+
+
+class MonocularFrame(NamedTuple):
+    """An image."""
+
+    image: Image
+
+
+class MonocularInertialFrame(NamedTuple):
+    """The same, and the samples of the IMU since the frame before."""
+
+    image: Image
+    imu: tuple[Imu, ...]
 
 
 class RgbdFrame(NamedTuple):
@@ -35,3 +52,9 @@ class StereoInertialFrame(NamedTuple):
     left: Image
     right: Image
     imu: tuple[Imu, ...]
+
+
+def sample_rows(samples: Iterable[Imu]) -> npt.NDArray[np.float64]:
+    """Return samples of an IMU: stamp (ns), rad/s and m/s² in a row, shape (n, 7)."""
+    rows = [(each.stamp, *each.angular_velocity, *each.linear_acceleration) for each in samples]
+    return np.array(rows, np.float64).reshape(-1, 7)

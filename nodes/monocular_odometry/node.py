@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import cv2
 
-from events import CameraInfo, Image
-from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig
+from events import CameraInfo
+from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig, MonocularFrame
 from nodes.monocular_odometry.settings import MonocularSettings
 from nodes.monocular_odometry.tracker import MonocularTracker
 from runtime import Bundle
-
-
-class Frame(NamedTuple):
-    """One image."""
-
-    image: Image
 
 
 class MonocularOdometryConfig(EstimatorConfig):
@@ -37,7 +29,7 @@ class MonocularOdometry(Estimator[MonocularOdometryConfig]):
     method = "monocular odometry"
     scale_free = True
 
-    frames = Bundle(Frame, keep="latest")
+    frames = Bundle(MonocularFrame, keep="latest")
 
     async def on_ready(self) -> None:
         """Start the tracker, in a process of its own."""

@@ -6,36 +6,23 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from events import DepthImage, Image, Imu
 from nodes.estimation import (
     Estimator,
     EstimatorConfig,
+    MonocularFrame,
+    MonocularInertialFrame,
     RgbdFrame,
     RgbdInertialFrame,
     StereoFrame,
     StereoInertialFrame,
+    sample_rows,
 )
 from nodes.orb_slam3.process import OrbSlam3Process
 from nodes.orb_slam3.settings import LENSES, Mode, OrbSettings, Settings, make_settings
 from nodes.orb_slam3.vocabulary_file import find_vocabulary
 from runtime import Bundle, Duration
 from runtime.paths import InputPath
-
-
-class MonocularFrame(NamedTuple):
-    """An image."""
-
-    image: Image
-
-
-class MonocularInertialFrame(NamedTuple):
-    """The same, and the samples of the IMU since the frame before."""
-
-    image: Image
-    imu: tuple[Imu, ...]
 
 
 class Frame(NamedTuple):
@@ -129,7 +116,7 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
                 image.data,
                 given["depth"].data if "depth" in given else None,
                 given["right"].data if "right" in given else None,
-                _rows(given["imu"]) if "imu" in given else None,
+                sample_rows(given["imu"]) if "imu" in given else None,
             )
             initialized = initialized or not result.lost
             if initialized:
@@ -159,9 +146,3 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
             return find_vocabulary(self.config.vocabulary)
         except ValueError as error:
             self.log.fatal("%s", error)
-
-
-def _rows(samples: tuple[Imu, ...]) -> npt.NDArray[np.float64]:
-    """Return samples of an IMU as an array, shape (n, 7)."""
-    rows = [(each.stamp, *each.angular_velocity, *each.linear_acceleration) for each in samples]
-    return np.array(rows, np.float64).reshape(-1, 7)

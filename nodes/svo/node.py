@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-from events import Image
-from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig
+from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig, MonocularFrame
 from nodes.svo.process import SvoProcess
 from nodes.svo.settings import SvoSettings
 from runtime import Bundle
-
-
-class Frame(NamedTuple):
-    """One image."""
-
-    image: Image
 
 
 class SvoConfig(EstimatorConfig):
@@ -39,7 +30,7 @@ class Svo(Estimator[SvoConfig]):
     method = "SVO"
     scale_free = True
 
-    frames = Bundle(Frame, keep="latest")
+    frames = Bundle(MonocularFrame, keep="latest")
 
     async def on_ready(self) -> None:
         """Start SVO, in a process of its own."""

@@ -2,9 +2,9 @@
 
 interface       the C interface, by ctypes
 tracker         a library in a worker's process: what goes in, and the poses that come out
-node            the estimators, for stereo rigs and for single cameras
+node            the estimator
 """
 
-from nodes.vit.node import MonocularVit, Vit, VitConfig
+from nodes.vit.node import Vit, VitConfig
 
-__all__ = ["MonocularVit", "Vit", "VitConfig"]
+__all__ = ["Vit", "VitConfig"]

@@ -4,25 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from events import Image, Imu
 from nodes.calibration.formats import write_files
 from nodes.dataset.rig import Rig
-from nodes.estimation import Estimator, EstimatorConfig, StereoInertialFrame, TrackingResult
-from nodes.vit.tracker import VitSettings, VitTracker
+from nodes.estimation import (
+    Estimator,
+    EstimatorConfig,
+    MonocularInertialFrame,
+    StereoInertialFrame,
+    TrackingResult,
+    sample_rows,
+)
+from nodes.vit.tracker import VitTracker
 from runtime import Bundle, Duration
 from runtime.hold import Hold, HoldConfig
 from runtime.owed import Owed
 from runtime.paths import InputPath
 
 
-class InertialFrame(NamedTuple):
-    """An image, and the samples of the IMU since the one before."""
+class Frame(NamedTuple):
+    """All that either mode reads."""
 
     image: Image
+    left: Image | None
+    right: Image | None
     imu: tuple[Imu, ...]
 
 
@@ -33,6 +42,7 @@ class VitConfig(EstimatorConfig):
         library: Path of the shared library.
         config: Path of its own settings; ``$VISNAV_FOLDER`` in it stands for the folder with the
             calibration's files. If empty, the first of these, or the library's defaults.
+        mode: The sensors that are used.
         calibration: How it gets the calibration: by the ``interface``; from its own ``config``; or
             from files in the format of ``basalt``, ``openvins`` or ``kalibr`` (see ``export``).
         patience: Real seconds that an image gets before the first pose, when the library may give
@@ -43,27 +53,30 @@ class VitConfig(EstimatorConfig):
 
     library: InputPath
     config: InputPath = ""
+    mode: Literal["stereo_inertial", "monocular_inertial"] = "stereo_inertial"
     calibration: Literal["interface", "config", "basalt", "openvins", "kalibr"] = "interface"
     patience: Duration = Duration(0.1)  # immutable
     hold: HoldConfig = HoldConfig(initialise=Duration(10.0))
 
 
 class Vit(Estimator[VitConfig]):
-    """Estimates the pose of a stereo rig with an IMU by a library with Monado's VIT interface.
+    """Estimates the pose of a camera or a stereo rig with an IMU by such a library.
 
-    Each image goes to the library after all samples of the IMU up to it, and simulated time waits
-    at its latency until its pose has come. The library's threads may make it vary from run to run.
+    Each image goes to it after all samples of the IMU up to that image, and simulated time waits
+    at the latency until the pose has come. The library's threads may make it vary.
     """
 
     deterministic: ClassVar[bool] = False
     needs = frozenset({"grey"})
-    eyes = 2
     inertial = True
     aligned = False
 
-    frames = Bundle(StereoInertialFrame, keep="latest")
+    frames = Bundle(Frame, keep="latest")
 
     def __init__(self) -> None:
+        stereo = self.config.mode == "stereo_inertial"
+        self.read(StereoInertialFrame if stereo else MonocularInertialFrame)
+        self.eyes = 2 if stereo else 1
         self.method = Path(self.config.library).stem.removeprefix("lib") or "VIT"
         self._hold: Hold[TrackingResult]
         self._first: int | None = None
@@ -82,33 +95,24 @@ class Vit(Estimator[VitConfig]):
         """Start the library, in a process of its own."""
         config = self.config
         rig = Rig(self.the_camera().source.rpartition("/")[0], self.cameras, self.imu_announcement)
-        settings = VitSettings(
-            library=config.library,
-            config=config.config,
-            files=self._files(rig),
-            rig=rig,
-            by_interface=config.calibration == "interface",
-        )
-        limit = config.hold.max_wait + 60.0
+        files: dict[str, str] | None = None if config.calibration == "interface" else {}
+        if config.calibration not in {"interface", "config"}:
+            try:
+                files = write_files(rig, config.calibration)
+            except ValueError as error:
+                self.log.fatal("calibration: %s", error)
         self._hold = self.hold(self.name, config.hold, config.latency)
-        start = self.worker(VitTracker, settings, latency=config.latency, timeout=limit)
+        told = config.library, config.config, files, rig
+        limit = config.hold.max_wait + 60.0
+        start = self.worker(VitTracker, *told, latency=config.latency, timeout=limit)
         self._tracker = await start
-
-    def _files(self, rig: Rig) -> dict[str, str]:
-        """Return the files of the calibration, if it is passed by files."""
-        if self.config.calibration in {"interface", "config"}:
-            return {}
-        try:
-            return write_files(rig, self.config.calibration)
-        except ValueError as error:
-            self.log.fatal("calibration: %s", error)
 
     async def run(self) -> None:
         """Track each exposure; those that come meanwhile are skipped."""
-        async for left, right, samples in self.frames:
-            await self._track((left, right), samples)
+        async for *images, samples in self.frames:
+            await self._track(images, samples)
 
-    async def _track(self, images: tuple[Image, ...], samples: tuple[Imu, ...]) -> None:
+    async def _track(self, images: list[Any], samples: tuple[Imu, ...]) -> None:
         """Have the library track an exposure, and hand its poses to whoever waits for them."""
         stamp, hold = images[0].stamp, self._hold
         self._first = stamp if self._first is None else self._first
@@ -116,12 +120,11 @@ class Vit(Estimator[VitConfig]):
         self.start(self._deliver(images[0], owed))
         early = not self._said and stamp - self._first < self.config.hold.initialise * 1e9
         wait = float(self.config.patience if early else self.config.hold.max_wait)
-        rows = [(s.stamp, *s.angular_velocity, *s.linear_acceleration) for s in samples]
         found = await self._tracker.call(
             VitTracker.track,
             stamp,
             [image.data for image in images],
-            np.array(rows, np.float64).reshape(-1, 7),
+            sample_rows(samples),
             wait if hold.expects else 0.0,
         )
         for of, result in found:
@@ -140,16 +143,3 @@ class Vit(Estimator[VitConfig]):
             self.publish(image, result)
         elif self._said:
             self.publish(image, TrackingResult(self._pose, True, "the library gave no pose"))
-
-
-class MonocularVit(Vit):
-    """Estimates the pose of a single camera with an IMU by such a library; see `Vit`."""
-
-    eyes = 1
-
-    frames = Bundle(InertialFrame, keep="latest")  # type: ignore[assignment]
-
-    async def run(self) -> None:
-        """Track each image; those that come meanwhile are skipped."""
-        async for image, samples in self.frames:
-            await self._track((image,), samples)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes as c
 import math
 import tempfile
 import time
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -24,7 +24,6 @@ from nodes.vit.interface import (
     ImuCalibration,
     InertialCalibration,
     Library,
-    PoseData,
 )
 
 FOLDER = "$VISNAV_FOLDER"
@@ -37,47 +36,33 @@ _TOLERANCE = 1000
 """Nanoseconds by which a pose's stamp may differ from its image's: OpenVINS has seconds inside."""
 
 
-class VitSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """All that a library's process needs to start.
-
-    Attributes:
-        library: Path of the shared library.
-        config: Path of its settings; empty for the first of `files`, or its defaults.
-        files: Files of the calibration, by name, with their texts.
-        rig: The cameras, the left one first, and the IMU.
-        by_interface: Whether the calibration is passed by the interface.
-    """
-
-    library: str
-    config: str
-    files: dict[str, str]
-    rig: Rig
-    by_interface: bool
-
-
 class VitTracker:
     """A library with its threads.
 
     Args:
-        settings: The library, and what it is told.
+        library: Path of the shared library.
+        config: Path of its settings; empty for the first of `files`, or its defaults.
+        files: Files of the calibration, by name, with their texts; `None`: it is passed by the
+            interface.
+        rig: The cameras, the left one first, and the IMU.
 
     Raises:
         VitError: It cannot be used, or refuses what it is told.
     """
 
-    def __init__(self, settings: VitSettings) -> None:
-        rig = self._rig = settings.rig
-        self._offset = round(rig.cameras[0].time_offset * 1e9) if settings.by_interface else 0
+    def __init__(self, library: str, config: str, files: dict[str, str] | None, rig: Rig) -> None:
+        self._rig = rig
+        self._offset = round(rig.cameras[0].time_offset * 1e9) if files is None else 0
         self._camera = camera_in_imu(rig, rig.cameras[0])
         self._world = np.eye(4)  # the library's, in the optical camera at its first pose
         self._pose = np.eye(4)
         self._anew = True
         with contextlib.ExitStack() as opened:
             folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="vit_"))
-            file = _write(settings, Path(folder))
-            self._library = Library(settings.library, file, len(rig.cameras))
+            file = _write(config, files or {}, Path(folder))
+            self._library = Library(library, file, len(rig.cameras))
             opened.callback(self._library.close)
-            self._library.start(calibrations(rig) if settings.by_interface else [])
+            self._library.start(calibrations(rig) if files is None else [])
             self._opened = opened.pop_all()
 
     def track(
@@ -121,7 +106,7 @@ class VitTracker:
         """End the library's threads."""
         self._opened.close()
 
-    def _result(self, data: PoseData) -> TrackingResult:
+    def _result(self, data: c.Structure) -> TrackingResult:
         """Return where the camera is; after a pose that is none the library begins anew there."""
         numbers = np.array([*data.position, *data.orientation, *data.velocity], np.float64)
         if not np.isfinite(numbers).all() or not numbers[3:7].any():
@@ -137,20 +122,19 @@ class VitTracker:
         return TrackingResult(self._pose, velocity=self._world[:3, :3] @ numbers[7:])
 
 
-def _write(settings: VitSettings, folder: Path) -> Path | None:
+def _write(config: str, files: dict[str, str], folder: Path) -> Path | None:
     """Write the files, and return that of the library's settings."""
-    path = Path(settings.config)
-    text = path.read_text(encoding="utf-8") if settings.config else ""
-    files = {path.name: text.replace(FOLDER, str(folder))} if FOLDER in text else {}
-    files |= settings.files
+    text = Path(config).read_text(encoding="utf-8") if config else ""
+    if FOLDER in text:
+        files = {Path(config).name: text.replace(FOLDER, str(folder)), **files}
     for name, each in files.items():
         (folder / name).write_text(each, encoding="utf-8")
-    if settings.config and FOLDER not in text:
-        return path  # beside the files that it may name
+    if config and FOLDER not in text:
+        return Path(config)  # beside the files that it may name
     return folder / next(iter(files)) if files else None
 
 
-def calibrations(rig: Rig) -> list[CameraCalibration | ImuCalibration]:
+def calibrations(rig: Rig) -> list[c.Structure]:
     """Return what the interface is told of a rig: its cameras, and its IMU.
 
     A radial-tangential lens has eight coefficients, and as a ninth the radius (x/z) up to which
@@ -159,7 +143,7 @@ def calibrations(rig: Rig) -> list[CameraCalibration | ImuCalibration]:
     Raises:
         ValueError: Cameras and IMU are not on one body.
     """
-    made: list[CameraCalibration | ImuCalibration] = []
+    made = []
     for number, camera in enumerate(rig.cameras):
         info, lens, model = camera.info, camera.info.distortion, interface.KB4
         if info.is_pinhole:
@@ -172,16 +156,11 @@ def calibrations(rig: Rig) -> list[CameraCalibration | ImuCalibration]:
         sizes = (number, info.width, info.height, camera.rate)
         made.append(CameraCalibration(*sizes, pinhole, model, len(lens), lens, pose))
     if (imu := rig.imu) is not None:
-        acceleration = imu.accelerometer_random_walk, imu.accelerometer_noise_density
-        rotation = imu.gyroscope_random_walk, imu.gyroscope_noise_density
-        noisy = (
-            _inertial(imu.accelerometer_matrix, *acceleration),
-            _inertial(imu.gyroscope_matrix, *rotation),
-        )
+        noisy = []
+        for kind in ("accelerometer", "gyroscope"):
+            names = ("matrix", "random_walk", "noise_density")
+            matrix, walk, density = (getattr(imu, f"{kind}_{name}") for name in names)
+            corrects = tuple(np.linalg.inv(np.reshape(matrix, (3, 3))).ravel().tolist())
+            noisy.append(InertialCalibration(corrects, (0.0,) * 3, (walk,) * 3, (density,) * 3))
         made.append(ImuCalibration(0, imu.rate, *noisy))
     return made
-
-
-def _inertial(matrix: tuple[float, ...], walk: float, density: float) -> InertialCalibration:
-    corrects = np.linalg.inv(np.reshape(matrix, (3, 3))).ravel().tolist()
-    return InertialCalibration(tuple(corrects), (0.0,) * 3, (walk,) * 3, (density,) * 3)

@@ -13,7 +13,7 @@ import pytest
 from nodes.monocular_odometry import MonocularOdometry
 from nodes.stereo_odometry import StereoOdometry
 from nodes.visual_odometry import VisualOdometry
-from nodes.vit import MonocularVit, Vit
+from nodes.vit import Vit
 from tests.nodes.estimation.conformance import (
     Case,
     Lack,
@@ -24,13 +24,12 @@ from tests.nodes.estimation.conformance import (
 )
 from tests.nodes.vit.library import stub_settings
 
-VIT = {"library": "stub.so", "hold": {"initialise": 1.0, "max_wait": 30.0}, "patience": 0.1}
 
-
-def stub_of_vit(node: type[Vit]) -> Case:
+def stub_of_vit(mode: str) -> Case:
     """Return the case of a library that counts on its IMU, from the sixth image on."""
+    settings = {"library": "stub.so", "mode": mode, "hold": {"initialise": 1.0}}
     more = functools.partial(stub_settings, "starts 5 delay 1")
-    return Case(node, VIT, begins=4, width=160, built=more)
+    return Case(Vit, settings, begins=4, width=160, built=more)
 
 
 CASES = {
@@ -38,8 +37,8 @@ CASES = {
     "dense": Case(VisualOdometry, {"method": "dense"}, width=160),
     "monocular": Case(MonocularOdometry, begins=14),
     "stereo": Case(StereoOdometry),
-    "vit": stub_of_vit(Vit),
-    "monocular vit": stub_of_vit(MonocularVit),
+    "vit": stub_of_vit("stereo_inertial"),
+    "monocular vit": stub_of_vit("monocular_inertial"),
 }
 """By a name for the test; those that need more than the project itself are slow."""
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from events import CameraAnnouncement, Event, PoseEstimate, TrackingLost, TrackingRegained
-from nodes.vit import MonocularVit, Vit
+from nodes.vit import Vit
 from runtime.errors import NodeError, VisnavError
 from runtime.testing import run_nodes, spec
 from tests.nodes.estimation.conformance import Case, Record, run
@@ -24,8 +24,8 @@ def case(words: str = "", eyes: int = 2, **more: Any) -> Case:
     """Return a short flight of the stub, which does what the words say."""
     hold = {"initialise": 1.0, "max_wait": 5.0, "on_missing": "lost", "lost_allowed": 1000}
     settings = {**stub_settings(words), "hold": hold, "patience": 0.05}
-    node = Vit if eyes == 2 else MonocularVit
-    return Case(node, settings | more, script=FLIGHT, width=64)
+    mode = "stereo_inertial" if eyes == 2 else "monocular_inertial"
+    return Case(Vit, settings | {"mode": mode} | more, script=FLIGHT, width=64)
 
 
 def fly_stub(given: Case) -> Record:
