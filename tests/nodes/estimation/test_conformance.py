@@ -38,14 +38,9 @@ CASES = {
     "dense": Case(VisualOdometry, {"method": "dense"}, width=160),
     "monocular": Case(MonocularOdometry, begins=14),
     "stereo": Case(StereoOdometry),
-<<<<<<< HEAD
+    "svo": Case(Svo, begins=30, width=480, worker=True, needs="svo_cpp", slow=True),
     "vit": stub_of_vit("stereo_inertial"),
     "monocular vit": stub_of_vit("monocular_inertial"),
-=======
-    "svo": Case(Svo, begins=30, width=480, worker=True, needs="svo_cpp", slow=True),
-    "vit": stub_of_vit(Vit),
-    "monocular vit": stub_of_vit(MonocularVit),
->>>>>>> fa2b40a (Say what SVO reaches, and put it under the suite of all estimators)
 }
 """By a name for the test; those that need more than the project itself are slow."""
 
