@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy.typing as npt
-
+from events import Imu
+from nodes.odometry.images import Grey
 from runtime.errors import VisnavError
 
 VERSIONS = (1, 2)
@@ -29,8 +29,6 @@ NONE, RT4, RT5, RT8, KB4 = range(5)
 
 _L8 = 1
 """Format of an image: 8 bits of grey."""
-
-Array = npt.NDArray[Any]
 
 
 class VitError(VisnavError):
@@ -128,20 +126,27 @@ class Library:
             self._do(f"add_{kind}_calibration", c.byref(each))
         self._do("start")
 
-    def push(self, stamp: int, images: Sequence[Array], samples: Array) -> None:
-        """Push samples, shape (n, 7): ns, rad/s, m/s²; and then the images of a stamp, (h, w)."""
+    def push(self, stamp: int, images: Sequence[Grey], samples: Sequence[Imu]) -> None:
+        """Push samples of the IMU, and then the images of a stamp (ns), each of shape (h, w).
+
+        If there is none of after the images, one more, equal to the last, is a nanosecond later:
+        Basalt integrates up to an image when it has such a sample.
+        """
         running = c.c_bool()
         self._do("is_running", c.byref(running))
         if not running.value:
             raise VitError(f"{self._path}: expected a tracker that runs, found one that does not")
-        for of, *w, ax, ay, az in samples.tolist():
-            sample = ImuSample(int(of), (ax, ay, az), tuple(w))
+        stamped = [(each.stamp, each) for each in samples]
+        if stamped and stamped[-1][0] <= stamp:
+            stamped.append((stamp + 1, stamped[-1][1]))
+        for at, each in stamped:
+            sample = ImuSample(at, each.linear_acceleration, each.angular_velocity)
             self._do("push_imu_sample", c.byref(sample))
         for number, image in enumerate(images):
             (height, width), stride = image.shape, image.strides[0]
             shape = (width, height, stride, image.nbytes)
-            pushed = ImageSample(number, stamp, image.ctypes.data, *shape, _L8, 0, None)
-            self._do("push_img_sample", c.byref(pushed))
+            sample = ImageSample(number, stamp, image.ctypes.data, *shape, _L8, 0, None)
+            self._do("push_img_sample", c.byref(sample))
 
     def pop(self) -> c.Structure | None:
         """Return the next pose, if there is one already."""

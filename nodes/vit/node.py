@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
-from events import Image, Imu
+from events import CameraAnnouncement, Image, Imu
 from nodes.calibration.formats import write_files
 from nodes.dataset.rig import Rig
 from nodes.estimation import (
@@ -17,7 +18,6 @@ from nodes.estimation import (
     MonocularInertialFrame,
     StereoInertialFrame,
     TrackingResult,
-    sample_rows,
 )
 from nodes.vit.tracker import VitTracker
 from runtime import Bundle, Duration
@@ -83,6 +83,12 @@ class Vit(Estimator[VitConfig]):
         self._said = False
         self._pose = np.eye(4)
 
+    def refusal(self, camera: CameraAnnouncement) -> str:
+        """Return why images would come before samples of the IMU that belong to them."""
+        if camera.time_offset >= 0:
+            return super().refusal(camera)
+        return f"expected a time_offset of at least 0 s, found {camera.time_offset:g} s"
+
     def check(self) -> Iterable[str]:
         """Return what is missing: sensors, library, settings."""
         yield from super().check()
@@ -94,7 +100,9 @@ class Vit(Estimator[VitConfig]):
     async def on_ready(self) -> None:
         """Start the library, in a process of its own."""
         config = self.config
-        rig = Rig(self.the_camera().source.rpartition("/")[0], self.cameras, self.imu_announcement)
+        body = self.the_camera().source.rpartition("/")[0]
+        cameras = (replace(camera, time_offset=0.0) for camera in self.cameras)
+        rig = Rig(body, tuple(cameras), self.imu_announcement)
         files: dict[str, str] | None = None if config.calibration == "interface" else {}
         if config.calibration not in {"interface", "config"}:
             try:
@@ -114,7 +122,7 @@ class Vit(Estimator[VitConfig]):
 
     async def _track(self, images: list[Any], samples: tuple[Imu, ...]) -> None:
         """Have the library track an exposure, and hand its poses to whoever waits for them."""
-        stamp, hold = images[0].stamp, self._hold
+        stamp, hold = self.exposed_at(images[0]), self._hold
         self._first = stamp if self._first is None else self._first
         owed = hold.owe(stamp)
         self.start(self._deliver(images[0], owed))
@@ -124,7 +132,7 @@ class Vit(Estimator[VitConfig]):
             VitTracker.track,
             stamp,
             [image.data for image in images],
-            sample_rows(samples),
+            samples,
             wait if hold.expects else 0.0,
         )
         for of, result in found:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from events import Imu
 from events.poses import inverse
 from nodes.calibration.formats import camera_in_imu
 from nodes.dataset.rig import Rig
@@ -52,7 +53,6 @@ class VitTracker:
 
     def __init__(self, library: str, config: str, files: dict[str, str] | None, rig: Rig) -> None:
         self._rig = rig
-        self._offset = round(rig.cameras[0].time_offset * 1e9) if files is None else 0
         self._camera = camera_in_imu(rig, rig.cameras[0])
         self._world = np.eye(4)  # the library's, in the optical camera at its first pose
         self._pose = np.eye(4)
@@ -69,16 +69,15 @@ class VitTracker:
         self,
         stamp: int,
         images: list[npt.NDArray[np.uint8]],
-        samples: npt.NDArray[np.float64],
+        samples: tuple[Imu, ...],
         wait: float,
     ) -> list[tuple[int, TrackingResult]]:
         """Push samples and then images, and return the stamps and poses that have come.
 
         Args:
-            stamp: Of the images (ns).
+            stamp: Of the images (ns), on the clock of the IMU.
             images: One of each camera, grey or red, green, blue.
-            samples: Of the IMU since the last images, up to these, shape (n, 7): stamp (ns),
-                angular velocity (rad/s), specific force (m/s²).
+            samples: Of the IMU since the last images, up to these.
             wait: Real seconds after which no pose of this stamp is waited for; it is the last one.
 
         Raises:
@@ -89,13 +88,13 @@ class VitTracker:
             np.ascontiguousarray(grey_image(camera.info, image))
             for camera, image in zip(self._rig.cameras, images, strict=True)
         ]
-        self._library.push(stamp - self._offset, grey, samples)
+        self._library.push(stamp, grey, samples)
         found: list[tuple[int, TrackingResult]] = []
         until = time.monotonic() + wait
         while not found or abs(found[-1][0] - stamp) > _TOLERANCE:
             data = self._library.pop()
             if data is not None:
-                found.append((data.stamp + self._offset, self._result(data)))
+                found.append((data.stamp, self._result(data)))
             elif time.monotonic() >= until:
                 break
             else:

@@ -136,7 +136,7 @@ int vit_tracker_push_img_sample(tracker *t, const image_sample *s) {
     if (!t->running || s->format != 1 || s->camera != t->next || s->size != s->stride * s->height)
         return -2;
     if (s->camera ? s->stamp != t->image : s->stamp <= t->image) return -2;
-    if (t->imu < s->stamp) return -2; /* a sample that is still to come */
+    if (t->imu <= s->stamp) return -2; /* Basalt would wait for a sample of after it */
     t->image = s->stamp;
     if (++t->next < t->cameras) return 0;
     t->next = 0;

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
-from events import CameraAnnouncement, Event, PoseEstimate, TrackingLost, TrackingRegained
+from events import CameraAnnouncement, Event, Image, PoseEstimate, TrackingLost, TrackingRegained
 from nodes.vit import Vit
 from runtime.errors import NodeError, VisnavError
 from runtime.testing import run_nodes, spec
@@ -166,6 +167,38 @@ def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_missing_library_is_an_error(settings: dict[str, Any], error: str) -> None:
     with pytest.raises(VisnavError, match=error):
         fly_stub(case(**settings))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.012])
+def test_images_are_on_the_clock_of_the_imu_for_the_library(offset: float) -> None:
+    """What is stamped late is paired with the samples of when it was exposed, and answered."""
+    given = case()
+    sent: list[Event] = []
+    for event in fly(READS, 2, given.width, given.script).events:
+        if isinstance(event, CameraAnnouncement):
+            sent.append(replace(event, time_offset=offset))
+        elif isinstance(event, Image):
+            sent.append(replace(event, stamp=event.stamp + round(offset * 1e9)))
+        else:
+            sent.append(event)
+    sent.sort(key=lambda event: (event.stamp, isinstance(event, Image)))
+    record = run(given, fly(READS, 2, given.width, given.script)._replace(events=tuple(sent)))
+    stamps = [each.stamp for each in poses(record)]
+    assert stamps == [*record.flight.kinds][: len(stamps)]
+    assert len(stamps) >= 14  # for the last one the IMU has ended too early
+    for pose in poses(record):
+        assert math.dist(pose.position, record.flight.truth[pose.stamp][:3, 3]) < 0.02
+
+
+def test_images_that_are_stamped_early_are_refused() -> None:
+    said = announcements(READS, 2)
+    early = [
+        replace(e, time_offset=-0.01) if isinstance(e, CameraAnnouncement) else e for e in said
+    ]
+    with pytest.raises(
+        NodeError, match="drone/left: expected a time_offset of at least 0 s, found"
+    ):
+        run_nodes([spec(Vit, "est", case().settings)], inputs=early)
 
 
 def test_a_calibration_that_a_format_has_no_word_for_is_refused(tmp_path: Path) -> None:
