@@ -21,6 +21,7 @@ from typing_extensions import Buffer
 from runtime.digest import combined
 from runtime.errors import ConfigError
 from runtime.schedule import SECOND
+from runtime.workers.costs import Costs
 
 Outcome = Literal["answered", "empty", "initialising", "skipped", "lost"]
 """What became of a frame: answered; answered without content; not answered because the system was
@@ -44,6 +45,7 @@ class Answers:
         latency: Seconds declared from a frame to its answer; `None` if they vary.
         lost_allowed: How many frames may be lost.
         why_not: Why an equal run might differ; empty if it would not.
+        costs: What its answers cost, if its processes are known.
     """
 
     def __init__(self, latency: float | None = 0.0, lost_allowed: int = 0) -> None:
@@ -53,6 +55,7 @@ class Answers:
         self.sent = 0
         self.received: int | None = None
         self.why_not: dict[str, None] = {}
+        self.costs = Costs()
         self._lock = threading.Lock()
         self._stamps = array("q")
         self._latencies = array("d")

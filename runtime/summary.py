@@ -24,6 +24,7 @@ from runtime.part_summaries import (
 from runtime.run_state import RunState
 from runtime.schedule import SECOND
 from runtime.watchdogs.loop import Stall
+from runtime.workers.costs import Costs
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -87,7 +88,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         announcements: What nodes announced.
         environment: Machine and versions; the command line, and the commit of the current folder.
         processes: Where which nodes ran, if not all in one process.
-        workers: What workers cost, by ``node.Factory``.
+        workers: What workers cost, by ``node.Factory``, and programs, by their nodes.
         outside: How systems outside the process answered, by name.
     """
 
@@ -201,7 +202,10 @@ def summarise(
             "command": command_line(),
             "commit": commit(),
         },
-        workers={name: WorkerSummary.of(each) for name, each in state.costs.items()},
+        workers={
+            name: WorkerSummary.of(each)
+            for name, each in (state.costs | _programs(state.outside)).items()
+        },
         outside={name: OutsideSummary.of(each) for name, each in state.outside.items()},
     )
 
@@ -210,6 +214,13 @@ def _not_deterministic(state: RunState) -> list[str]:
     nodes = {node.name for node in state.all_nodes if not node.deterministic}
     held = state.outside.items() if state.clock.kind == "lockstep" else ()
     return sorted(nodes | {name for name, answers in held if answers.why_not})
+
+
+def _programs(outside: dict[str, Answers]) -> dict[str, Costs]:
+    """Return what systems outside cost whose processes are known."""
+    for each in outside.values():
+        each.costs.latency = each.latency
+    return {name: each.costs for name, each in outside.items() if each.costs.calls}
 
 
 def _losses(outside: dict[str, Answers]) -> dict[str, dict[str, Any]]:

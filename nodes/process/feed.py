@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ class Feed:
         description: What the program is told; see `nodes.link.describe`.
         hold: What the answers are for.
         story: Called in a thread with why it is gone; returns what else is known.
+        processes: Returns the numbers of the program's processes, whose costs are measured.
         skips: Whether an answer says that none will come for the frames before it.
         options: Of the `Endpoint`: `slots`, `slot_bytes`, `logged`.
     """
@@ -46,14 +48,15 @@ class Feed:
         description: Mapping[str, Any],
         hold: Hold[LinkAnswer],
         story: Callable[[str], str],
+        processes: Callable[[], Sequence[int]],
         *,
         skips: bool,
         **options: Any,
     ) -> None:
-        self.unanswered: dict[int, None] = {}
-        """Stamps of the frames that are sent, or about to be."""
+        self.unanswered: dict[int, int] = {}
+        """Stamps of the frames that are sent, or about to be, and real times of that (ns)."""
         self.why_gone = ""
-        self._hold, self._story, self._skips = hold, story, skips
+        self._hold, self._story, self._skips, self._processes = hold, story, skips, processes
         self._initialised = self._closed = False
         self._outbox: queue.SimpleQueue[tuple[Exposure, npt.NDArray[Any]] | None] = (
             queue.SimpleQueue()
@@ -68,7 +71,7 @@ class Feed:
 
     def send(self, exposure: Exposure, samples: npt.NDArray[Any]) -> None:
         """Have samples of the IMU sent, and then a frame; returns at once."""
-        self.unanswered[exposure[0][2].stamp] = None
+        self.unanswered[exposure[0][2].stamp] = time.monotonic_ns()
         self._outbox.put((exposure, samples))
 
     def close(self) -> None:
@@ -94,6 +97,9 @@ class Feed:
                 self._hold.fail(LinkError(str(error)))
 
     def _take(self, answer: LinkAnswer) -> None:
+        if sent := self.unanswered.get(answer.stamp):
+            costs = self._hold.answers.costs
+            costs.measure(time.monotonic_ns() - sent, self._processes())
         earlier = [stamp for stamp in list(self.unanswered) if stamp < answer.stamp]
         for stamp in (*(earlier if self._skips else ()), answer.stamp):
             self.unanswered.pop(stamp, None)

@@ -180,6 +180,7 @@ class Process(Estimator[ProcessConfig]):
                 self._story("it has not connected" if over else str(error))
             ) from None
         self._connected = True
+        self._hold.answers.costs.measure(0, self._processes())  # its start is for no frame
         self.log.info("%s is connected", name)
 
     def _make_feed(self) -> Feed:
@@ -207,6 +208,7 @@ class Process(Estimator[ProcessConfig]):
             describe([(c, kinds) for c in rig.cameras], rig.imu, {"kind": self.clock.kind}),
             self._hold,
             self._story,
+            self._processes,
             skips=config.hold.skips == "allowed" or real,
             slots=slots,
             slot_bytes=pixels * sum(KINDS[kind][1] for kind in config.images),
@@ -279,6 +281,9 @@ class Process(Estimator[ProcessConfig]):
         self._launch.close()
 
     # What is known of the program, in any thread.
+
+    def _processes(self) -> list[int]:
+        return [] if self._program is None else self._program.processes()
 
     def _show(self, line: str) -> None:
         self.log.info("%s", line)

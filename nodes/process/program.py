@@ -87,6 +87,15 @@ class Program:
         """Wait until it has ended, and tell whether it has."""
         return self._over.wait(seconds)
 
+    def processes(self) -> list[int]:
+        """Return the numbers of its process, and of all that it has started and that still run."""
+        found = [self._guard.pid]
+        for pid in found:
+            for thread in Path(f"/proc/{pid}/task").glob("*/children"):
+                with contextlib.suppress(OSError):
+                    found += map(int, thread.read_text("ascii").split())
+        return found[1:]
+
     def story(self) -> str:
         """Return how it ended, if it did, and what it last printed."""
         return self._output.story(self._how or "still runs")

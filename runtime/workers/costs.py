@@ -7,9 +7,15 @@ from __future__ import annotations
 
 import re
 import threading
+import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from runtime.histogram import DurationHistogram
+
+_CPUCLOCK_SCHED = 2
+"""Kind of clock in the numbers of processes' clocks; see ``clock_getcpuclockid(3)`` and Linux's
+``posix-timers.h``."""
 
 
 class Costs:
@@ -33,6 +39,7 @@ class Costs:
         self.peak = 0
         self.processes = 0
         self.latency: float | None = None
+        self._used: dict[int, int] = {}
 
     def add(self, wall: int, cpu: int) -> None:
         """Count one call."""
@@ -41,11 +48,31 @@ class Costs:
             self.wall.add(wall)
             self.cpu.add(cpu)
 
+    def measure(self, wall: int, pids: Iterable[int]) -> None:
+        """Count one call of processes that do not measure themselves, but for the first time.
+
+        Their processor time is that since the time before; the first one is where it counts from.
+        """
+        before, self._used = self._used, {pid: cpu_time(pid) for pid in pids}
+        for pid in self._used:
+            self.look_at(pid)
+        self.processes = max(self.processes, len(self._used))
+        if before and self._used:
+            self.add(wall, sum(max(t - before.get(pid, 0), 0) for pid, t in self._used.items()))
+
     def look_at(self, pid: int) -> None:
         """Note how much memory a process has had until now."""
         peak = peak_memory(pid)
         with self._lock:
             self.peak = max(self.peak, peak)
+
+
+def cpu_time(pid: int) -> int:
+    """Return the processor time (ns) of all threads of a process; 0 if it has gone."""
+    try:
+        return time.clock_gettime_ns(~pid << 3 | _CPUCLOCK_SCHED)
+    except OSError:
+        return 0
 
 
 def peak_memory(pid: int) -> int:

@@ -52,6 +52,10 @@ def main() -> None:
                 link.log(f"imu {len(frame.imu)} {frame.imu['stamp'].tolist()}")
             if "flood" in modes:
                 print("x" * 200 + "\n" * 500, flush=True)
+            if "burns" in modes:
+                until = time.process_time() + float(modes["burns"])
+                while time.process_time() < until:
+                    pass
             if "slow" in modes:
                 time.sleep(float(modes["slow"]))
             if "dies" in modes and number == int(modes["dies"]) and first_time():

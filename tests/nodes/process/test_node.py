@@ -86,6 +86,21 @@ def test_as_a_worker_it_gives_the_same_estimates_at_the_same_times(
         assert worker.digests[output] == plain.digests[output]
 
 
+def test_what_a_program_costs_is_measured_from_outside(plain: Summary, tmp_path: Path) -> None:
+    """By a shell that starts it, too: what counts is all that was started."""
+    shell = f"{sys.executable} {STUB} burns=0.02; true"
+    summary = fly(program(command=["sh", "-c", shell]), tmp_path)
+    costs = summary.workers["slam"]
+    assert costs.calls == FRAMES
+    assert costs.cpu_p50_ms >= 19.0
+    assert costs.cpu_p50_ms > 2.0 * plain.workers["slam"].cpu_p50_ms
+    assert costs.wall_p50_ms >= 19.0
+    assert costs.processes >= 2
+    assert costs.peak_rss_mb is not None
+    assert costs.peak_rss_mb > 5.0
+    assert costs.latency_ms == pytest.approx(15.0)
+
+
 @pytest.mark.slow
 def test_with_both_cores_busy_it_is_the_same(plain: Summary, tmp_path: Path) -> None:
     over = threading.Event()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 from pathlib import Path
 
 import msgspec
@@ -134,3 +136,25 @@ def test_in_a_sweep_costs_stand_beside_the_table_and_not_in_it(tmp_path: Path) -
         assert {line["worker"] for line in lines} == {"vo.make_tracker"}
         assert {(line["cpu_p50_ms"], line["peak_rss_mb"]) for line in lines} == {(f"{cost}", "")}
     assert tables[0] == tables[1]
+
+
+def test_processes_that_do_not_measure_themselves_are_measured_from_outside() -> None:
+    code = "import time\nwhile time.process_time() < 0.1: pass\nprint(flush=True)\ninput()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as child:
+        costs = Costs()
+        costs.measure(7 * MS, [child.pid])
+        assert costs.calls == 0  # it counts from there
+        assert child.stdout is not None
+        child.stdout.read(1)
+        costs.measure(7 * MS, [child.pid])
+        costs.measure(7 * MS, [child.pid])
+        assert costs.calls == 2
+        assert 0.05e9 < costs.cpu.maximum < 0.5e9
+        assert costs.cpu.quantile(0.25) < 0.02e9
+        assert costs.peak > 1e6
+        child.communicate(b"\n")
+    costs.measure(7 * MS, [child.pid])  # it has gone
+    costs.measure(7 * MS, [])
+    assert costs.calls == 3
