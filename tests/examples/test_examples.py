@@ -286,7 +286,7 @@ def test_data_sets_in_the_layouts_that_people_download(tmp_path: Path) -> None:
     }
     for name, (folder, more) in changes.items():
         file = f"replay.file={folder}"
-        summary = run(name, tmp_path / name, file, *more, "report.figures=[]")
+        summary = run(name, tmp_path / f"{name}_out", file, *more, "report.figures=[]")
         figures = summary["verdict"]["estimators"]
         judged = figures["odometry" if name == "tum" else "stereo"]
         assert judged["estimates"] == downloads.IMAGES
