@@ -10,8 +10,9 @@ import gc
 import logging
 import signal
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -49,6 +50,7 @@ def execute(
     log_events: bool = False,
     watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None = None,
     only: Collection[str] = (),
+    stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
 ) -> Summary:
     """Run a configuration to its end.
 
@@ -60,6 +62,7 @@ def execute(
         watch: Given the supervisor, returns a context that lasts as long as the run: a progress
             bar, a monitor.
         only: Nodes to run here; the others run in other processes. All, if empty.
+        stand_ins: Classes that run in the place of some nodes' own, by the node's name.
 
     Raises:
         VisnavError: Something went wrong; what was recorded until then is complete, and what is to
@@ -69,7 +72,7 @@ def execute(
     if out is not None:
         results.prepare(out, config)
         handlers.append(file_handler(out / "log.txt"))
-    run = _Run(config, out, log_events, watch, only)
+    run = _Run(config, out, log_events, watch, only, stand_ins)
     with logging_to(handlers, config.run.log, run.now):
         summary = event_loop.run_to_end(run.loop, run.main(), run.escaped)
         if out is not None:
@@ -118,6 +121,7 @@ class _Run:
         log_events: bool,
         watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
         only: Collection[str],
+        stand_ins: Mapping[str, type[Node[Any]]],
     ) -> None:
         self.loop = make_loop(config.run)
         self._clock: Clock | None = None
@@ -125,6 +129,7 @@ class _Run:
         self._out = out
         self._watch = watch or contextlib.nullcontext
         self._only = only
+        self._stand_ins = stand_ins
         wanted = config.run.clock == "lockstep" if config.run.digest is None else config.run.digest
         self._digest = Digest() if wanted else None
         self._taps: list[Tap] = [self._digest] if self._digest else []
@@ -141,7 +146,7 @@ class _Run:
         task_factory.install(loop)
         clock = self._clock = make_clock(run, loop)
         self.supervisor = supervisor = Supervisor(
-            self._config, clock, self._taps, self._out, self._only
+            self._config, clock, self._taps, self._out, self._only, self._stand_ins
         )
         # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
         level = logging.DEBUG if run.clock == "lockstep" else logging.WARNING

@@ -97,6 +97,9 @@ class Node(Generic[C]):
 
     deterministic: ClassVar[bool] = True
     """Whether equal inputs give equal outputs; if not, no run with it promises its digest."""
+    flies: ClassVar[bool] = False
+    """Whether it is a part of the flight itself (a simulator, a pilot), which a sweep records once
+    for all runs with equal ones if nothing else has an influence on it."""
     files: ClassVar[tuple[str, ...]] = ()
     """What it writes into the run's folder, besides what settings of type `OutputPath` name."""
     declared: ClassVar[Declared]

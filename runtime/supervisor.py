@@ -16,10 +16,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Collection, Coroutine, Sequence
+from collections.abc import Collection, Coroutine, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
+
+import msgspec
 
 from events import Announcement, Event, Shutdown, WindowClosed
 from runtime import code_location, graph
@@ -27,6 +30,7 @@ from runtime.clock import Clock
 from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
 from runtime.instruments import Instruments
+from runtime.node import Node
 from runtime.node_host import NodeHost
 from runtime.node_runner import NodeRunner, log_error, wrap
 from runtime.parameter_server import ParameterServer
@@ -59,6 +63,7 @@ class Supervisor:
         taps: See every event before its listeners do.
         out: Folder for what nodes write, or `None`.
         only: Nodes that run here, if others run in other processes.
+        stand_ins: Classes in the place of some nodes' own, by the node's name.
 
     Attributes:
         state: What is known of the run.
@@ -75,9 +80,13 @@ class Supervisor:
         taps: Sequence[Tap] = (),
         out: Path | None = None,
         only: Collection[str] = (),
+        stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
     ) -> None:
         here = [spec for spec in config.nodes if not only or spec.name in only]
-        runners = {spec.name: NodeRunner(spec, self._own) for spec in here}
+        runners = {}
+        for spec in here:
+            node = stand_ins.get(spec.name, spec.node)
+            runners[spec.name] = NodeRunner(msgspec.structs.replace(spec, node=node), self._own)
         several = len(runners) < len(config.nodes)
         self.state = RunState(config, clock, runners, several_processes=several)
         self.instruments = Instruments(runners, self._reconnect)

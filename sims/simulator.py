@@ -66,6 +66,8 @@ class Simulator(Inhabitant, Node[C], ABC):
     rig; the rest of the cameras' work is done here.
     """
 
+    flies = True
+
     images = Output(Image)
     depth_images = Output(DepthImage)
     segmentation_images = Output(SegmentationImage)

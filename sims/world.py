@@ -50,6 +50,8 @@ class World(Inhabitant, Node[WorldConfig]):
     A run without wind, and without anything that moves or changes by itself, needs none.
     """
 
+    flies = True
+
     body_poses = Output(PoseStamped)
     wind = Output(Wind)
 

@@ -101,6 +101,7 @@ class Pilot(Node[C], ABC):
     A subclass calls `update_pose` with the vehicle's pose as it knows it, and implements `follow`.
     """
 
+    flies = True
     commands = Output(Command)
     shutdowns = Output(Shutdown)
 

@@ -77,6 +77,9 @@ def run(
             min=0, max=65535, metavar="PORT", help="Show the monitor as a page, on this port."
         ),
     ] = None,
+    flight: Annotated[
+        str, typer.Option(hidden=True, help='For sweeps: "use" a recorded flight, or "record" it.')
+    ] = "",
 ) -> None:
     """Run the nodes of a file until they, its duration or Ctrl-C end the run.
 
@@ -102,6 +105,11 @@ def run(
     folder = out or Path("runs") / name
     if out is None and (kept := keep_earlier(folder)) and not quiet:
         print(f"the earlier run in {folder} is now {kept}", file=sys.stderr)
+    stand_ins = {}
+    if flight:
+        from runtime.tools.flights.cache import recorded
+
+        stand_ins = recorded(settings, record=flight == "record")
     observers = Observers(settings, name, quiet=quiet, trace=trace, top=top, web=web)
     summary = execute(
         settings,
@@ -110,6 +118,7 @@ def run(
         log_events=log is Log.events,
         watch=observers.watch,
         only=nodes_here,
+        stand_ins=stand_ins,
     )
     if not quiet:
         report(summary, folder)

@@ -42,7 +42,22 @@ def sweep(
     ] = None,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, help="Runs at the same time; half the cores if not given."),
+        typer.Option(
+            min=1,
+            help="Runs at the same time; if not given, as many as there are cores if they share "
+            "their flights, else half of that.",
+        ),
+    ] = None,
+    fly: Annotated[
+        bool, typer.Option("--fly", help="Fly each run anew, also what was recorded.")
+    ] = False,
+    timeout: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DURATION",
+            help='Real time after which a run is ended as failed, such as "20min"; if not given, '
+            "10 min and 30 times the run's duration.",
+        ),
     ] = None,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Run everything, also what is finished already.")
@@ -50,7 +65,9 @@ def sweep(
 ) -> None:
     """Run a file with every combination of some settings, and compare the results.
 
-    Each run is a process of its own; one that fails is a row of the table. Results go to
+    Each run is a process of its own; one that fails is a row of the table. Runs that differ only in
+    what comes after the sensors fly once: that flight is recorded, and kept for later sweeps (see
+    the command flights). Results go to
     sweeps/<name>: index.html shows all of them; table.csv, summary.csv, plots/, each run's folder
     in runs/, and, since they depend on the machine, timing.csv and what workers cost in costs.csv.
     Called again, only what is missing or has failed is run. Ends with 0 if every run came to its
@@ -64,7 +81,14 @@ def sweep(
     from runtime.tools.sweep.console import summary_table
 
     plan = sweeping.make_plan(
-        config, vary or [], overrides=overrides or [], seeds=seeds, repeats=repeat, out=out
+        config,
+        vary or [],
+        overrides=overrides or [],
+        seeds=seeds,
+        repeats=repeat,
+        out=out,
+        fly=fly,
+        limit=_seconds(timeout),
     )
     changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
     look_at(load(config, [*(overrides or []), *changes]))
@@ -89,7 +113,8 @@ def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> li
 
     Args:
         plan: What to run.
-        jobs: Runs at the same time; half the cores if not given.
+        jobs: Runs at the same time; if not given, as many as there are cores if they share their
+            flights, else half of that.
         fresh: Forget what is finished.
 
     Raises:
@@ -108,7 +133,7 @@ def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> li
         with (
             _signals_interrupt(children),
             display,
-            ThreadPoolExecutor(jobs or max(_cores() // 2, 1), "run") as executor,
+            ThreadPoolExecutor(jobs or _at_once(plan), "run") as executor,
         ):
             return sweeping.sweep(plan, executor, run=children.run, watch=display, fresh=fresh)
     except KeyboardInterrupt:
@@ -138,5 +163,17 @@ def _signals_interrupt(children: Children) -> Iterator[None]:
             signal.signal(number, before[number])
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
+def _at_once(plan: Plan) -> int:
+    """Return how many runs fit on the cores: rendering takes one of its own."""
+    cores = len(os.sched_getaffinity(0))
+    return cores if all(job.record for job in plan.jobs) else max(cores // 2, 1)
+
+
+def _seconds(duration: str | None) -> float | None:
+    from runtime.errors import ConfigError
+    from runtime.units import Duration
+
+    try:
+        return None if duration is None else float(Duration.parse(duration))
+    except ValueError as error:
+        raise ConfigError(f"--timeout {duration}: {error}") from None

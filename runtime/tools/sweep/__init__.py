@@ -16,15 +16,16 @@ which the project is installed. With Dask (``pip install distributed``)::
     draw_plots(plan, rows)
     write_page(plan, rows)
 
-``pure=False`` lets a failed run be tried again. A job carries its settings as text; what it reads
-besides (modules beside the file, trajectories, worlds) must be found at the same paths on every
-machine, and a run's folder of results stays on the machine that ran it unless the sweep's folder
-is shared. The rows come back in any case.
+Runs that differ only in what comes after the sensors use one flight, which each machine records
+once (`runtime.tools.flights`). ``pure=False`` lets a failed run be tried again. A job carries its
+settings as text; what it reads besides (modules beside the file, trajectories, worlds) must be
+found at the same paths on every machine, and a run's folder of results stays on the machine that
+ran it unless the sweep's folder is shared. The rows come back in any case.
 """
 
 from runtime.tools.sweep.console import Watch, sweep
 from runtime.tools.sweep.page import write_page
-from runtime.tools.sweep.plan import Job, Plan, make_job, make_plan
+from runtime.tools.sweep.plan import Job, Plan, make_job, make_plan, sharing
 from runtime.tools.sweep.plots import draw_plots
 from runtime.tools.sweep.process import Children, run_job
 from runtime.tools.sweep.rows import Row
@@ -40,6 +41,7 @@ __all__ = [
     "make_job",
     "make_plan",
     "run_job",
+    "sharing",
     "summarise",
     "sweep",
     "write_page",

@@ -113,6 +113,7 @@ class Display(Watch):
         self._children = children
         self._console = console
         self._missing = 0
+        self._usage, self._looked = (0, 0.0), 0.0
         self._begin = self._last = time.monotonic()
         self._bar = Progress(
             TextColumn("sweep"),
@@ -169,7 +170,11 @@ class Display(Watch):
             each = (self._last - self._begin) / self.finished
             until = self._last + each * (self._missing - self.finished)
             left = _clock(max(until - time.monotonic(), 0))
-        return f"{self.failed} failed, {len(self._children)} running, {left} left"
+        if time.monotonic() - self._looked > 1.0:
+            self._usage, self._looked = self._children.usage(), time.monotonic()
+        processes, memory = self._usage
+        using = f" ({processes} processes, {memory:.1f} GB)" * bool(processes)
+        return f"{self.failed} failed, {len(self._children)} running{using}, {left} left"
 
     def _count(self) -> str:
         return f"{self.finished}/{self._missing}"

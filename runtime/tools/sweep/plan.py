@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -13,7 +14,12 @@ import tomli_w
 from runtime.config.model import Config, to_builtins
 from runtime.config.reading import load
 from runtime.errors import ConfigError
+from runtime.tools.flights.part import flight_of, settings_key
 from runtime.tools.sweep.values import Parameter, parameter
+
+LEAST_LIMIT, SLOWEST, USUAL = 600.0, 30.0, 120.0
+"""Real seconds that each run may take, and those for each second of its duration, and how long it
+is taken to be if it has none: what takes longer hangs."""
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
@@ -25,6 +31,10 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
         folder: Of the file that they come from; modules of its nodes are looked for there.
         settings: What is varied, as path and value, in the order of the parameters.
         seed: Of the run's random numbers.
+        flight: Equal for runs with equal flights, if these can be recorded; else empty, and it is
+            flown by the run itself.
+        record: Whether its flight is worth recording; else it is used if there is one.
+        limit: Real seconds that it may take.
         repeat: The how manieth run with these settings and this seed; they differ if something
             in it does not depend on these alone.
         out: Absolute path of the folder for the run's results.
@@ -36,6 +46,9 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[tuple[str, str], ...]
     seed: int
     out: str
+    flight: str = ""
+    record: bool = False
+    limit: float = LEAST_LIMIT
     repeat: int = 1
 
     def __str__(self) -> str:
@@ -66,6 +79,8 @@ def make_plan(
     seeds: int = 1,
     repeats: int = 1,
     out: Path | None = None,
+    fly: bool = False,
+    limit: float | None = None,
 ) -> Plan:
     """Plan a sweep.
 
@@ -76,6 +91,8 @@ def make_plan(
         seeds: How many seeds each combination is run with, from the file's on.
         repeats: How often it is run with each seed.
         out: Folder for everything; ``sweeps/<name of the run>`` if not given.
+        fly: Whether each run flies itself, even if another has an equal flight.
+        limit: Real seconds that a run may take; plenty for its duration, if not given.
 
     Raises:
         ConfigError: Something is wrong with the file, a path or a value, or two combinations
@@ -102,8 +119,20 @@ def make_plan(
                     f"--vary: expected combinations that differ, found the same settings for "
                     f"{jobs[job.id]} and {job}"
                 )
-            jobs[job.id] = job
-    return Plan(parameters=parameters, jobs=tuple(jobs.values()), out=out)
+            jobs[job.id] = msgspec.structs.replace(
+                job, limit=limit or job.limit, flight="" if fly else job.flight
+            )
+    return Plan(parameters=parameters, jobs=sharing(jobs.values()), out=out)
+
+
+def sharing(jobs: Iterable[Job]) -> tuple[Job, ...]:
+    """Return jobs of which those record their flight that share it with another."""
+    found = tuple(jobs)
+    counts = Counter(job.flight for job in found)
+    return tuple(
+        msgspec.structs.replace(job, record=job.flight != "" and counts[job.flight] > 1)
+        for job in found
+    )
 
 
 def _refuse_repeated(varied: list[str], fixed: list[str]) -> None:
@@ -146,6 +175,7 @@ def make_job(
     """
     config = msgspec.structs.replace(config, run=msgspec.structs.replace(config.run, seed=seed))
     text = tomli_w.dumps(to_builtins(config))
+    part = flight_of(config)
     key = hashlib.sha256(text.encode()).hexdigest()[:16] + f"-{repeat}" * (repeat > 1)
     return Job(
         id=key,
@@ -154,5 +184,7 @@ def make_job(
         settings=settings,
         seed=seed,
         out=str(out / "runs" / key),
+        flight=settings_key(part) if part is not None else "",
+        limit=LEAST_LIMIT + SLOWEST * (config.run.duration or USUAL),
         repeat=repeat,
     )

@@ -79,6 +79,8 @@ class Children:
         settings = out / "config.toml"
         settings.write_text(job.text, encoding="utf-8")
         command = [sys.executable, "-m", "runtime", "run", str(settings)]
+        if job.flight:
+            command += ["--flight", "record" if job.record else "use"]
         paths = [os.environ.get("PYTHONPATH", ""), job.folder]
         begin = time.monotonic()
         with (out / "output.txt").open("wb") as output:
@@ -96,7 +98,13 @@ class Children:
                 )
                 self._running.add(child)
             try:
-                code = child.wait()
+                code = child.wait(job.limit)
+            except subprocess.TimeoutExpired:
+                _kill(child)
+                row = failed(job, f"timed out after {job.limit:g} s")
+                row["exit_code"] = child.wait()
+                row["wall_seconds"] = round(time.monotonic() - begin, 6)
+                return row
             except BaseException:
                 child.send_signal(signal.SIGINT)
                 child.wait()
@@ -113,11 +121,26 @@ class Children:
                 if not self.ending:
                     child.send_signal(signal.SIGINT)
                 elif child.poll() is None:
-                    # Not by a second SIGINT, which may fall together with the first; and its
-                    # workers are in its group.
-                    with contextlib.suppress(ProcessLookupError):
-                        os.killpg(child.pid, signal.SIGKILL)
+                    _kill(child)  # a second SIGINT may fall together with the first
             self.ending = True
+
+    def usage(self) -> tuple[int, float]:
+        """Return how many processes the runs have, and their own memory (GB)."""
+        sessions = {str(child.pid) for child in [*self._running]}
+        count, pages = 0, 0
+        for folder in Path("/proc").glob("[0-9]*") if sessions else ():
+            with contextlib.suppress(OSError, IndexError):  # it may just have ended
+                fields = (folder / "stat").read_text().rpartition(")")[2].split()
+                if fields[3] in sessions:
+                    _, resident, shared, *_ = (folder / "statm").read_text().split()
+                    count, pages = count + 1, pages + int(resident) - int(shared)
+        return count, pages * os.sysconf("SC_PAGE_SIZE") / 1e9
+
+
+def _kill(child: subprocess.Popen[bytes]) -> None:
+    """End a run and its workers, which are in its group, at once."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGKILL)
 
 
 def read_results(job: Job, code: int, wall_seconds: float) -> Row:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from runtime.config.reading import load
 from runtime.errors import ConfigError
 from runtime.tools.sweep import make_plan
+from tests.runtime.tools.flights.samples import flight_file
 from tests.runtime.tools.sweep.samples import judge_file, plan_in
 
 
@@ -64,6 +65,22 @@ def test_a_repeat_is_a_run_of_its_own(tmp_path: Path) -> None:
     assert [str(job) for job in plan.jobs[:2]] == ["seed=3", "seed=3 repeat=2"]
     with pytest.raises(ConfigError, match="--repeat: expected at least 1, found 0"):
         plan_in(tmp_path, repeats=0)
+
+
+def test_runs_with_equal_flights_record_them(tmp_path: Path) -> None:
+    config = flight_file(tmp_path)
+    jobs = make_plan(config, ["craft.rate=10,20", "guesser.latency=1ms,2ms"], out=tmp_path).jobs
+    flights = [job.flight for job in jobs]
+    assert all(job.record for job in jobs)
+    assert flights[0] == flights[1] != flights[2] == flights[3]
+    alone = make_plan(config, ["craft.rate=10,20"], out=tmp_path).jobs
+    assert [(job.flight, job.record) for job in alone] == [(f, False) for f in flights[::2]]
+    assert [job.id for job in make_plan(config, ["craft.rate=10,20"], fly=True).jobs] == [
+        job.id for job in alone
+    ]
+    (job,) = make_plan(config, fly=True, limit=7.0).jobs
+    assert (job.flight, job.record, job.limit) == ("", False, 7.0)
+    assert alone[0].limit == 600 + 3 * 30
 
 
 def test_without_parameters_there_are_just_seeds(

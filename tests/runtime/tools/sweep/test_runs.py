@@ -13,8 +13,10 @@ from typing import Any
 
 import pytest
 
-from runtime.tools.sweep import make_plan, sweep, write_tables
+from runtime.tools.flights.cache import kept
+from runtime.tools.sweep import Children, make_plan, sweep, write_tables
 from runtime.tools.sweep.process import last_error, read_results
+from tests.runtime.tools.flights.samples import flight_file
 from tests.runtime.tools.samples_cli import summary
 from tests.runtime.tools.sweep.samples import Judge, judge_file, plan_in, started
 
@@ -60,6 +62,42 @@ def test_a_run_that_fails_is_a_row_and_the_sweep_goes_on(tmp_path: Path) -> None
     assert re.search(f"true,3,2,{error},,0.5,", table[1])
     assert "false,3,0,,true,0.5," in table[2]
     assert (tmp_path / "out" / "plots" / "judge.fail.png").stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_runs_with_one_flight_fly_once_and_have_the_same_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    config, tables = flight_file(tmp_path), []
+    for fly in (True, False):
+        vary = ["guesser.latency=0ms,30ms", "craft.rate=20,50"]
+        plan = make_plan(config, vary, out=tmp_path / f"{fly}", fly=fly)
+        with ThreadPoolExecutor(2) as pool:
+            rows = sweep(plan, pool)
+        write_tables(plan, rows)
+        assert [row["error"] for row in rows] == [""] * 4
+        tables.append([(plan.out / f"{t}.csv").read_bytes() for t in ("table", "summary")])
+        assert len(kept()) == (0 if fly else 2)
+    assert tables[0] == tables[1]
+
+
+@pytest.mark.slow
+def test_a_run_that_hangs_is_ended_with_its_workers_and_is_a_row(tmp_path: Path) -> None:
+    sign = tmp_path / "sign"
+    config = judge_file(tmp_path, run="clock = 'real'")
+    plan = make_plan(config, [f"judge.sign={sign}"], out=tmp_path / "out", limit=8.0)
+    children = Children()
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(children.run, plan.jobs[0])
+        while not sign.exists() and not future.done():
+            time.sleep(0.05)  # it is another process that writes it
+        processes, memory = children.usage()
+        assert processes >= 1
+        assert 0.01 < memory < 2
+        row = future.result()
+    assert (row["error"], row["exit_code"]) == ("timed out after 8 s", -signal.SIGKILL)
+    assert children.usage() == (0, 0.0)
 
 
 @pytest.mark.slow

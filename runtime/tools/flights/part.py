@@ -1,0 +1,135 @@
+"""Which nodes of a file fly, and by what a flight is known: settings, sources, files, machine."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import xxhash
+
+from runtime.config.model import Config, NodeSpec, to_builtins
+from runtime.environment import environment
+from runtime.graph import edges
+from runtime.paths import written
+
+_DRIVERS = (
+    *("/usr/lib/*/libEGL*", "/usr/lib/*/libgallium*", "/usr/lib/*/libLLVM*", "/usr/lib/*/dri/*"),
+    "/proc/driver/nvidia/version",
+)
+_VARIABLES = re.compile("MUJOCO_|E?GL|_?_?E?GL[VX]?_|LIBGL_|GALLIUM_|MESA_|LP_")
+_IMPORTED = re.compile(r"^\s*(?:from|import)\s+([\w.]+)(?:\s+import\s+(\w+))?", re.MULTILINE)
+_NAMED = re.compile(r'\bfile\w*\s*=\s*"([^"]+)"')
+_FOLDERS = re.compile(r'(?:mesh|texture|asset)dir\s*=\s*"([^"]+)"')
+
+
+def flight_of(config: Config) -> Config | None:
+    """Return the part of a file that flies; `None` if something else has an influence on it.
+
+    So does a node whose output a port of the flight takes, unless the port is narrowed to a source
+    of the flight. Nodes that write files, or give no equal results, have to run themselves.
+    """
+    flying = {spec.name: spec for spec in config.nodes if spec.node.flies}
+    if config.run.clock != "lockstep" or not flying:
+        return None
+    if any(
+        not s.node.deterministic or s.node.files or [*written(s.config)] for s in flying.values()
+    ):
+        return None
+    for sender, _, _, receiver, port in edges([(spec.name, spec.node) for spec in config.nodes]):
+        if receiver in flying and sender not in flying:
+            source = _narrowed(flying[receiver], port)
+            if source is None or source.partition("/")[0] not in flying:
+                return None
+    return msgspec.structs.replace(config, nodes=tuple(flying.values()))
+
+
+def _narrowed(spec: NodeSpec, port: str) -> str | None:
+    bundle = port.partition(".")[0]
+    declared = spec.node.declared
+    ports: dict[str, Any] = {**declared.inputs, **declared.bundles, **declared.handlers}
+    source: str | None = spec.inputs.get(port, spec.inputs.get(bundle, ports[bundle].source))
+    return source
+
+
+def settings_key(flight: Config) -> str:
+    """Return what is equal for flights with equal settings."""
+    run = flight.run
+    nodes = to_builtins(flight)["nodes"]
+    return _hashed([json.dumps([run.seed, run.duration, nodes], default=str, sort_keys=True)])
+
+
+def content_key(flight: Config) -> str:
+    """Return a key of what a flight depends on: settings, sources, files, libraries, drivers."""
+    texts = [settings_key(flight), json.dumps(environment())]
+    texts += [f"{k}={v}" for k, v in sorted(os.environ.items()) if _VARIABLES.match(k)]
+    for pattern in _DRIVERS:
+        for path in sorted(Path("/").glob(pattern[1:])):
+            found = path.stat()
+            texts.append(f"{path} {found.st_size} {found.st_mtime_ns}")
+    files = {*_sources(spec.node.__module__ for spec in flight.nodes)}
+    for path in _paths(to_builtins(flight)["nodes"]):
+        files |= {*_read_by(path, (path.parent,))}
+    texts += [f"{path} {_hashed([path.read_bytes()])}" for path in sorted(files)]
+    return _hashed(texts)
+
+
+def _hashed(parts: Iterable[str | bytes]) -> str:
+    digest = xxhash.xxh3_128()
+    for part in parts:
+        digest.update(part.encode() if isinstance(part, str) else part)
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def _sources(modules: Iterable[str]) -> Iterator[Path]:
+    """Yield the files of some modules, and of what they import of their own or of our packages."""
+    todo = [*modules]
+    roots = {*(name.partition(".")[0] for name in todo), "runtime", "events"}
+    seen: set[str] = set()
+    while todo:
+        name = todo.pop()
+        if name in seen or name.partition(".")[0] not in roots:
+            continue
+        seen.add(name)
+        try:
+            spec = importlib.util.find_spec(name)
+        except (ImportError, ValueError):
+            spec = None
+        if spec is None or not spec.has_location or spec.origin is None:
+            continue
+        path = Path(spec.origin)
+        package = path.name == "__init__.py"
+        yield from (p for p in path.parent.iterdir() if p.is_file()) if package else [path]
+        for one, other in _IMPORTED.findall(path.read_text(encoding="utf-8", errors="replace")):
+            todo += [one, f"{one}.{other}" if other else one]
+        todo.append(name.rpartition(".")[0] or name)
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """Yield the files that settings name; reading the file has made their paths absolute."""
+    if isinstance(value, str) and value.startswith("/") and Path(value).exists():
+        yield Path(value)
+    elif isinstance(value, dict | list):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _paths(each)
+
+
+def _read_by(path: Path, folders: tuple[Path, ...]) -> Iterator[Path]:
+    """Yield a file, what a folder holds, and what a model of MuJoCo's includes."""
+    if path.is_dir():
+        yield from (each for each in path.rglob("*") if each.is_file())
+        return
+    yield path
+    if path.suffix == ".xml":
+        text = path.read_text(encoding="utf-8", errors="replace")
+        folders += tuple(folders[0] / name for name in _FOLDERS.findall(text))
+        for name in _NAMED.findall(text):
+            for each in {folder / name for folder in folders}:
+                if each.is_file() and each != path:
+                    yield from _read_by(each, folders)

@@ -1,0 +1,252 @@
+"""Notes a flight while it is flown, by looking on: an instrument, and hooks on the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import msgspec
+import xxhash
+
+from events import Event
+from runtime import wire
+from runtime.config.model import Config, NodeSpec
+from runtime.execute import execute
+from runtime.instruments import Call, Instrument
+from runtime.lockstep import LockstepLoop
+from runtime.node import Node, NodeConfig
+from runtime.schedule import Tick, Ticker
+from runtime.sender import Sender
+from runtime.supervisor import Supervisor
+from runtime.tools.flights.layout import EVENTS, INDEX, Action, Flight, Kind, pruned
+
+_ALIGNED = 64
+_REST = 10.0
+"""Seconds of the clock for which a flight goes on without ticks: what is on its way at the end, as
+an image may be, arrives in a run whose estimator takes long to end."""
+
+
+def record(config: Config, folder: Path) -> Flight:
+    """Fly, and write what there is to say of it into a folder.
+
+    Args:
+        config: The nodes that fly, on simulated time.
+        folder: Exists; what is in it is complete when this returns.
+
+    Raises:
+        VisnavError: Something went wrong in the flight.
+        OSError: It cannot be written.
+    """
+    rest = NodeSpec(
+        name="(rest)", type_name="", on_error="stop", inputs={}, links={}, node=_Rest,
+        config=NodeConfig(),
+    )  # fmt: skip
+    run = msgspec.structs.replace(config.run, digest=False, speed=None)
+    config = msgspec.structs.replace(config, run=run, nodes=(*config.nodes, rest))
+    with (folder / EVENTS).open("wb", buffering=1 << 20) as file:
+        recorder = _Recorder(file)
+        execute(config, watch=recorder.watch)
+    flight = recorder.flight()
+    (folder / INDEX).write_bytes(msgspec.msgpack.encode(flight))
+    return flight
+
+
+class _Rest(Node):
+    async def on_shutdown(self) -> None:
+        """Let time go on, the last node in the file being the first to end."""
+        await self.clock.sleep(_REST)
+
+
+class _Recorder(Instrument):
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._size = 0
+        self._hash = xxhash.xxh3_128()
+        self._occasions: list[list[Action]] = []
+        self._events: dict[int, Event] = {}  # of this occasion, by action
+        self._now = -1
+        self._turn = self._begun = 0
+        self._inside = False
+        self._doing: list[tuple[str, int]] = []  # node, and the event that it has got
+        self._ticks: dict[str, dict[int, int]] = {}
+        self._starts: dict[str, int] = {}
+        self._unfit = ""
+        self._supervisor: Supervisor
+        self.event_sent = self._sent
+
+    @contextlib.contextmanager
+    def watch(self, supervisor: Supervisor) -> Iterator[None]:
+        """Look at a run, from within its loop."""
+        self._supervisor = supervisor
+        supervisor.instruments.attach(self)
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, LockstepLoop)
+        self._hook(loop)
+        host = supervisor._host
+        stop = host.stop
+
+        def stopped(reason: str) -> None:
+            if self._now >= 0:
+                self._act("stop", text=reason)
+            stop(reason)
+
+        host.stop = stopped
+        yield
+
+    def flight(self) -> Flight:
+        """Return what there is to say; called when it is over."""
+        state = self._supervisor.state
+        runners = [runner for name, runner in state.runners.items() if name != "(rest)"]
+        announced: dict[str, list[bytes]] = {runner.spec.name: [] for runner in runners}
+        for each in state.announcements:
+            name = each.source.partition("/")[0]
+            if name in announced:
+                announced[name].append(wire.pack(each).frame())
+            else:
+                self._unfit = self._unfit or f"{each.source} is announced in another's name"
+        if state.error is not None or state.stop_requested:
+            self._unfit = f"the flight ended by {state.stop_requested or state.error}"
+        elif state.conclusions or state.outside or state.after_run:
+            self._unfit = "a node of the flight concludes, writes or asks something"
+        elif len(state.all_nodes) > len(state.runners):
+            self._unfit = "a node of the flight was restarted"
+        if self._unfit:
+            return Flight(unfit=self._unfit)
+        tickers: dict[str, list[tuple[str, float]]] = {name: [] for name in announced}
+        for name, ticker in state.tickers.items():
+            node, _, what = name.partition(".")
+            tickers[node].append((what, ticker.hz))
+        return Flight(
+            announcements=announced,
+            tickers=tickers,
+            ticks=self._ticks,
+            starts=self._starts,
+            occasions=pruned(self._occasions),
+            environment=dict(state.environment),
+            size=self._size,
+            checksum=self._hash.hexdigest(),
+        )
+
+    # What nodes do.
+
+    def wrap_call(self, node: str, what: str, call: Call) -> Call:
+        """Note what a node does in a call."""
+
+        def wrapped(given: Any) -> Any:
+            within = -1
+            ticks = isinstance(given, Tick)
+            if ticks:
+                self._ticks.setdefault(f"{node}.{what}", {})[given.index] = self._begin(self._new())
+            elif isinstance(given, Event):
+                found = (n for n, event in reversed(self._events.items()) if event is given)
+                within = next(found, -1)
+            elif what == "run" and node not in self._starts:
+                self._starts[node] = self._begin(self._new())
+            self._inside = self._inside or ticks
+            self._doing.append((node, within))
+            try:
+                result = call(given)
+                if result is True and isinstance(given, Event):
+                    self._act("handled")
+                return result
+            finally:
+                self._doing.pop()
+                self._inside = self._inside and not ticks
+
+        return wrapped
+
+    def _sent(self, sender: Sender[Any] | None, event: Event) -> None:
+        if sender is None:
+            return
+        node = sender.name.partition(".")[0]
+        runner = self._supervisor.state.runners[node]
+        if runner.shutting_down or runner.phase == "on_end":  # when that is depends on all nodes
+            self._unfit = f"{node} sends something at its end"
+        frame = wire.pack(event).frame()
+        action = self._act("send", sender.name, self._size, len(frame), node)
+        self._events[action] = event
+        for part in (frame, bytes(-len(frame) % _ALIGNED)):
+            self._file.write(part)
+            self._hash.update(part)
+            self._size += len(part)
+
+    def _act(
+        self, kind: Kind, text: str = "", due: float = 0, number: int = -1, node: str = ""
+    ) -> int:
+        own, within = self._doing[-1] if self._doing else (node, -1)
+        actions = self._occasions[self._now]
+        turn = -1 if self._inside else self._turn - self._begun
+        actions.append(Action(kind, node or own, within, turn, text, due, number))
+        return len(actions) - 1
+
+    # Occasions.
+
+    def _new(self) -> int:
+        self._occasions.append([])
+        return len(self._occasions) - 1
+
+    def _begin(self, occasion: int) -> int:
+        self._now, self._begun = occasion, self._turn
+        self._events.clear()
+        return occasion
+
+    def _hook(self, loop: LockstepLoop) -> None:
+        schedule: Any = loop.schedule
+        add, hold, call_at, run_once = schedule.add, loop.hold, loop.call_at, loop._run_once  # type: ignore[attr-defined]
+
+        def turned() -> None:
+            self._turn += 1
+            run_once()
+
+        def added(due: int, entry: Any) -> None:
+            if self._now >= 0 and isinstance(entry, Ticker):
+                self._unfit = "a node of the flight begins to tick in the middle"
+            elif self._now >= 0:
+                self._act("once", due=due, number=(later := self._new()))
+                entry = _Entry(entry, self._from_within(later))
+            add(due, entry)
+
+        def held(work: Any, due: int) -> asyncio.Future[Any]:
+            future = hold(work, due)
+            if self._now >= 0:
+                self._act("held", due=due, number=(later := self._new()))
+                future.add_done_callback(lambda f: None if f.cancelled() else self._begin(later))
+            return future
+
+        def called(when: float, call: Callable[..., Any], *args: Any, context: Any = None) -> Any:
+            if self._now >= 0:
+                self._act("timer", due=when, number=(later := self._new()))
+                args, call = (call, *args), self._from_within(later)
+            return call_at(when, call, *args, context=context)
+
+        patched: Any = loop
+        schedule.add, patched.hold, patched.call_at = added, held, called
+        patched._run_once = turned
+
+    def _from_within(self, occasion: int) -> Callable[..., Any]:
+        """Return what calls a function on an occasion."""
+
+        def call(function: Callable[..., Any], *args: Any) -> Any:
+            self._begin(occasion)
+            self._inside = True
+            try:
+                return function(*args)
+            finally:
+                self._inside = False
+
+        return call
+
+
+class _Entry:
+    """An entry of the schedule, and what notes that it is due."""
+
+    def __init__(self, entry: Any, call: Callable[..., Any]) -> None:
+        self._entry = entry
+        self._call = call
+
+    def fire(self, due: int, now: int) -> int | None:
+        again: int | None = self._call(self._entry.fire, due, now)
+        return again

@@ -1,0 +1,209 @@
+"""A flight that is played again is, to all who watch it, the flight itself."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from runtime.config.reading import load
+from runtime.errors import NodeError
+from runtime.tools.flights.cache import home, kept, recorded, remove_beyond
+from runtime.tools.flights.layout import EVENTS, INDEX
+from runtime.tools.flights.part import content_key, flight_of, settings_key
+from runtime.tools.flights.recorder import record
+from tests.runtime.tools.flights.samples import events_of, flown
+from tests.runtime.tools.samples_cli import ROOT
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def assert_equal_when_played(
+    folder: Path, *overrides: str, flight: tuple[str, ...] = (), run: str = "duration = '3s'"
+) -> None:
+    """Fly, and play a flight recorded with other settings of what does not fly."""
+    config = flown(folder, *overrides, *flight, run=run)
+    summary, lines = events_of(config)
+    assert recorded(flown(folder, *flight, run=run), record=True)
+    stand_ins = recorded(config, record=False)
+    assert set(stand_ins) == {"craft", "captain"}
+    again, same_lines = events_of(config, stand_ins=stand_ins)
+    assert same_lines == lines
+    assert len(lines) > 100
+    for field in (
+        "digest",
+        "digests",
+        "verdict",
+        "reason",
+        "sim_seconds",
+        "announcements",
+        "outputs",
+    ):
+        assert getattr(again, field) == getattr(summary, field), field
+    assert again.environment["craft"] == "a model"
+    ticks = {name: each.calls for name, each in summary.ticks.items()}
+    assert {name: each.calls for name, each in again.ticks.items()} == ticks
+
+
+@settings(
+    max_examples=5,
+    deadline=None,
+    phases=[Phase.explicit, Phase.generate],
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    st.sampled_from([20, 33.3, 50, 100]),
+    st.sampled_from(["0ms", "5ms", "20ms", "40ms", "70ms"]),
+    st.sampled_from(["0ms", "10ms", "20ms", "40ms"]),
+    st.sampled_from(["0ms", "20ms", "30ms"]),
+)
+def test_a_played_flight_is_equal_to_the_event_and_in_their_order(
+    tmp_path: Path, rate: float, latency: str, guess: str, before: str
+) -> None:
+    flight = (f"craft.rate={rate}", f"craft.latency={latency}")
+    others = (f"guesser.latency={guess}", f"before.latency={before}")
+    assert_equal_when_played(tmp_path, *others, flight=flight)
+
+
+@pytest.mark.parametrize("run", ["duration = '0.5s'", "duration = '3s'", "seed = 4"])
+def test_it_ends_as_it_did(tmp_path: Path, run: str) -> None:
+    run = run if "duration" in run else "duration = '2s'"
+    assert_equal_when_played(tmp_path, run=run)
+
+
+def test_it_ends_earlier_if_another_node_ends_the_run(tmp_path: Path) -> None:
+    assert_equal_when_played(tmp_path, "guesser.end=0.4")
+
+
+def test_links_before_nodes_of_the_flight_and_others_are_the_same(tmp_path: Path) -> None:
+    links = ("captain.links.felt.delay=7ms", "captain.links.seen.delay=13ms")
+    assert_equal_when_played(tmp_path, "guesser.links.pairs.loss=0.2", flight=links)
+
+
+def test_what_else_has_an_influence_is_not_recorded(tmp_path: Path) -> None:
+    meddler = "[[nodes]]\nname = 'meddler'\ntype = 'tests.runtime.tools.flights.samples:Meddler'\n"
+    meddled = flown(tmp_path, text=meddler)
+    assert flight_of(meddled) is None
+    assert recorded(meddled, record=True) == {}
+    narrowed = flown(tmp_path, "craft.inputs.orders=captain", text=meddler)
+    part = flight_of(narrowed)
+    assert part is not None
+    assert [spec.name for spec in part.nodes] == ["craft", "captain"]
+    assert flight_of(flown(tmp_path, "run.clock=real")) is None
+    assert flight_of(load(ROOT / "examples" / "closed_loop.toml")) is None
+    tour = flight_of(load(ROOT / "config.toml"))
+    assert tour is not None
+    assert [spec.name for spec in tour.nodes] == ["drone", "pilot"]
+
+
+def test_flights_are_told_apart_by_what_they_depend_on(tmp_path: Path) -> None:
+    def keys(*overrides: str) -> tuple[str, str]:
+        part = flight_of(flown(tmp_path, *overrides))
+        assert part is not None
+        return settings_key(part), content_key(part)
+
+    assert keys() == keys("guesser.latency=1ms", "run.log=error", "run.name=other")
+    different = [keys(each) for each in ("craft.rate=20", "run.seed=9", "run.duration=2s")]
+    assert len({*different, keys()}) == 4
+
+
+def test_the_key_knows_what_a_world_includes(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    mesh, part = tmp_path / "meshes" / "rock.obj", tmp_path / "part.xml"
+    mesh.write_text("v 0 0 0")
+    part.write_text('<mujoco><asset><mesh file="rock.obj"/></asset></mujoco>')
+    world = tmp_path / "world.xml"
+    world.write_text('<mujoco><compiler meshdir="meshes"/><include file="part.xml"/></mujoco>')
+    config = load(ROOT / "config.toml", [f"drone.world={world}"])
+    found = flight_of(config)
+    assert found is not None
+    keys = {content_key(found)}
+    for file in (mesh, part, world):
+        file.write_text(file.read_text() + "\n")
+        keys.add(content_key(found))
+    assert len(keys) == 4
+
+
+@pytest.mark.parametrize("name", [EVENTS, INDEX])
+@pytest.mark.parametrize("what", ["cut", "changed", "gone"])
+def test_what_is_damaged_is_flown_again(tmp_path: Path, name: str, what: str) -> None:
+    config = flown(tmp_path, "captain.end=0.2")
+    recorded(config, record=True)
+    (flight,) = kept()
+    file, content = flight.folder / name, (flight.folder / name).read_bytes()
+    if what == "gone":
+        file.unlink()
+    else:
+        file.write_bytes(content[:-7] if what == "cut" else b"\xc1" + content[1:])
+    assert recorded(config, record=False) == {}
+    assert recorded(config, record=True)
+    assert file.read_bytes() == content
+
+
+def test_what_cannot_be_played_again_is_remembered_as_such(tmp_path: Path) -> None:
+    config = flown(tmp_path, "craft.last_words=true")
+    for _ in range(2):
+        assert recorded(config, record=True) == {}
+        assert len(kept()) == 1
+
+
+def test_a_flight_that_fails_is_not_kept(tmp_path: Path) -> None:
+    config = flown(tmp_path, "craft.fail=true")
+    assert recorded(config, record=True) == {}
+    assert kept() == []
+    with pytest.raises(NodeError, match="out of order"):
+        events_of(config)
+
+
+def test_one_flies_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = flown(tmp_path, "captain.end=0.2")
+    flights = []
+
+    def counted(*arguments: object) -> object:
+        flights.append(arguments)
+        return record(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("runtime.tools.flights.cache.fly", counted)
+    found: list[set[str]] = []
+    threads = [
+        threading.Thread(target=lambda: found.append({*recorded(config, record=True)}))
+        for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [{"craft", "captain"}] * 3
+    assert len(flights) == 1
+
+
+def test_those_not_used_for_longest_go_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    configs = [flown(tmp_path, "captain.end=0.2", f"run.seed={seed}") for seed in range(3)]
+    for config in configs:
+        recorded(config, record=True)
+    for age, each in enumerate(kept()):
+        os.utime(each.folder, (1000 - age, 1000 - age))
+    newest, _, oldest = kept()
+    used = next(c for c in configs if content_key(flight_of(c) or c) == oldest.folder.name)
+    stand_ins = recorded(used, record=False)
+    (removed,) = remove_beyond((oldest.size + newest.size + 9) / 1e9)
+    assert removed.folder not in {oldest.folder, newest.folder}
+    assert [each.folder for each in kept()] == [oldest.folder, newest.folder]
+    remove_beyond(0)
+    assert kept() == []
+    summary, lines = events_of(used, stand_ins=stand_ins)  # what is open stays
+    assert (summary.error, len(lines) > 50) == (None, True)
+    monkeypatch.setenv("VISNAV_FLIGHTS_GB", "0.000001")
+    for config in configs:
+        assert recorded(config, record=True)
+    assert len(kept()) == 1
+    assert {path.name[0] for path in home().iterdir()} == {".", kept()[0].folder.name[0]}
