@@ -13,7 +13,7 @@ import msgspec
 from runtime.config.override import override
 from runtime.config.reading import parse
 from runtime.errors import CommandError, ConfigError, suggest
-from runtime.tools.sweep.plan import Plan, make_job
+from runtime.tools.sweep.plan import Plan, make_job, sharing
 from runtime.tools.sweep.values import Parameter
 
 FOLDER = Path(__file__).parent
@@ -128,7 +128,7 @@ def make_plan(suite: Suite, *, out: Path, seeds: int = 1, repeats: int = 2) -> P
         Parameter("scenario", tuple(each.name for each in suite.scenarios)),
         Parameter("estimator", tuple(each.name for each in entrants)),
     )
-    return Plan(parameters=parameters, jobs=tuple(jobs), out=out)
+    return Plan(parameters=parameters, jobs=sharing(jobs), out=out)
 
 
 def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]:
