@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from nodes.inertial_odometry import RgbdInertialOdometry, StereoInertialOdometry
 from nodes.monocular_odometry import MonocularOdometry
 from nodes.stereo_odometry import StereoOdometry
 from nodes.svo import Svo
@@ -41,6 +42,8 @@ CASES = {
     "svo": Case(Svo, begins=30, width=480, worker=True, needs="svo_cpp", slow=True),
     "vit": stub_of_vit("stereo_inertial"),
     "monocular vit": stub_of_vit("monocular_inertial"),
+    "RGB-D-inertial": Case(RgbdInertialOdometry),
+    "stereo-inertial": Case(StereoInertialOdometry),
 }
 """By a name for the test; those that need more than the project itself are slow."""
 

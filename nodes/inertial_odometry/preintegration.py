@@ -1,0 +1,156 @@
+"""Preintegration of an IMU: what its samples say of a motion, whatever pose and speed it began at.
+
+C. Forster, L. Carlone, F. Dellaert and D. Scaramuzza, "On-manifold preintegration for real-time
+visual-inertial odometry", IEEE T-RO 2017, equations 33 to 48; rotation, velocity and position here
+stand in this order. Rates are those in the middle of two samples, so errors fall with the square of
+the interval.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from events import ImuAnnouncement
+from events.poses import pose_matrix
+
+Floats = npt.NDArray[np.float64]
+
+_GAP = 3.0
+"""Sampling intervals beyond which nothing is known about what happened between two samples."""
+_UNKNOWN = np.array([1.0, 5.0])
+"""Standard deviations then: of the angular velocity, rad/s, and of the acceleration, m/s²."""
+
+
+class Preintegrated(msgspec.Struct, frozen=True, eq=False):
+    """A motion as an IMU felt it, without gravity and without the velocity at its start.
+
+    Attributes:
+        seconds: How long it took.
+        rotation: The frame at the end in that at the start, shape (3, 3).
+        velocity: Change of velocity in the frame at the start, m/s, shape (3,).
+        position: Change of position in the frame at the start, metres, shape (3,).
+        by_bias: Derivatives of the three (of the rotation: of a small one at its end) by the biases
+            of gyroscope and accelerometer, shape (9, 6).
+        covariance: Of the three, shape (9, 9).
+    """
+
+    seconds: float
+    rotation: Floats
+    velocity: Floats
+    position: Floats
+    by_bias: Floats
+    covariance: Floats
+
+
+class ImuModel:
+    """What an announcement says of an IMU, as the filter needs it.
+
+    Args:
+        imu: The announcement.
+
+    Attributes:
+        pose: The IMU in the frame of its parent, shape (4, 4).
+        interval: Seconds between two samples.
+        noise: Densities of the noise of gyroscope and accelerometer, shape (2,).
+        walk: Densities of the random walks of their biases, shape (2,).
+        turn_on: Standard deviations of their biases at the start, shape (2,).
+    """
+
+    def __init__(self, imu: ImuAnnouncement) -> None:
+        self.pose = pose_matrix(imu.position, imu.orientation)
+        self.interval = 1.0 / imu.rate
+        accelerometer = np.hypot(
+            imu.accelerometer_noise_density, imu.vibration * np.sqrt(self.interval)
+        )
+        # Samples of a moving body are also samples of what happens between them.
+        self.noise = 2.0 * np.array([imu.gyroscope_noise_density, accelerometer]) + (1e-5, 1e-4)
+        self.walk = np.array([imu.gyroscope_random_walk, imu.accelerometer_random_walk]) + 1e-6
+        self.turn_on = np.array([imu.gyroscope_turn_on_bias, imu.accelerometer_turn_on_bias])
+        self._averaged = imu.averaged
+        self._undo = [
+            np.linalg.inv(np.reshape(matrix, (3, 3)))
+            for matrix in (imu.gyroscope_matrix, imu.accelerometer_matrix)
+        ]
+
+    def corrected(self, samples: Floats) -> Floats:
+        """Return samples, shape (n, 7), without the announced scale and misalignment.
+
+        Args:
+            samples: Seconds, angular velocity (rad/s), specific force (m/s²), by rows.
+        """
+        turn, force = (
+            s @ u.T for s, u in zip((samples[:, 1:4], samples[:, 4:]), self._undo, strict=True)
+        )
+        return np.hstack([samples[:, :1], turn, force])
+
+    def at(self, samples: Floats, times: Floats) -> Floats:
+        """Return samples, shape (m, 7), at times (m,): interpolated, or held outside.
+
+        Args:
+            samples: As `corrected` gives them, strictly rising in time, shape (n, 7), n > 0.
+            times: Seconds.
+        """
+        if self._averaged:
+            rows = np.searchsorted(samples[:, 0], times).clip(max=len(samples) - 1)
+            return np.column_stack([times, samples[rows, 1:]])
+        columns = (np.interp(times, samples[:, 0], column) for column in samples[:, 1:].T)
+        return np.column_stack([times, *columns])
+
+    def preintegrate(self, samples: Floats, bias: Floats) -> Preintegrated:
+        """Return the motion from the first sample to the last.
+
+        Args:
+            samples: As `corrected` gives them, strictly rising in time, shape (n, 7), n > 1.
+            bias: Of gyroscope and accelerometer, shape (6,).
+        """
+        steps = np.diff(samples[:, 0])
+        means = samples[1:] if self._averaged else (samples[1:] + samples[:-1]) / 2
+        rates = means[:, 1:] - bias
+        turns = Rotation.from_rotvec(rates[:, :3] * steps[:, None]).as_matrix()
+        halves = Rotation.from_rotvec(rates[:, :3] * (steps[:, None] / 2)).as_matrix()
+        rotation, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
+        by_bias, covariance = np.zeros((9, 6)), np.zeros((9, 9))
+        for dt, turn, half, force in zip(steps, turns, halves, rates[:, 3:], strict=True):
+            middle = rotation @ half
+            felt = middle @ force
+            # How an error at the start of the step, and one of the rates in it, goes on.
+            change = np.eye(9)
+            change[:3, :3] = turn.T
+            change[3:6, :3] = -rotation @ cross(half @ force) * dt
+            change[6:, :3] = change[3:6, :3] * (dt / 2)
+            change[6:, 3:6] = dt * np.eye(3)
+            by_rates = np.zeros((9, 6))
+            by_rates[:3, :3] = half.T * dt
+            by_rates[3:6, :3] = -middle @ cross(force) * (dt * dt / 2)
+            by_rates[3:6, 3:] = middle * dt
+            by_rates[6:] = by_rates[3:6] * (dt / 2)
+            by_bias = change @ by_bias - by_rates
+            variance = self.noise**2 / dt
+            if dt > _GAP * self.interval:
+                variance = variance + _UNKNOWN**2
+            covariance = (
+                change @ covariance @ change.T + (by_rates * np.repeat(variance, 3)) @ by_rates.T
+            )
+            position = position + velocity * dt + felt * (dt * dt / 2)
+            velocity = velocity + felt * dt
+            rotation = rotation @ turn
+        seconds = float(samples[-1, 0] - samples[0, 0])
+        return Preintegrated(seconds, rotation, velocity, position, by_bias, covariance)
+
+
+def cross(vector: Floats) -> Floats:
+    """Return the matrix of a cross product with a vector from the left, shape (3, 3)."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def crosses(vectors: Floats) -> Floats:
+    """Return the matrices of cross products with vectors, shape (n, 3), from the left."""
+    found = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
+    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
+    return found

@@ -1,0 +1,248 @@
+"""Visual-inertial odometry: the map of the RGB-D tracker, and a filter that the IMU drives.
+
+The IMU says where the map should be in the next image, all landmarks found there correct the
+filter (tightly coupled: none is too few), and the filter's pose is what the map grows from. Where
+nothing is seen, the IMU alone carries the pose on.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraAnnouncement, ImuAnnouncement
+from events.poses import inverse, pose_matrix
+from nodes.estimation import TrackingResult
+from nodes.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
+from nodes.inertial_odometry.preintegration import Floats, ImuModel, cross
+from nodes.inertial_odometry.rolling_shutter import Rows as ImageRows
+from nodes.odometry.images import Depth, Grey
+from nodes.odometry.pose import rays
+from nodes.stereo_odometry import StereoMatcher, StereoSettings
+from nodes.visual_odometry.features import FeatureSettings, FeatureTracker, MapMatch
+from nodes.visual_odometry.patches import Rows
+from nodes.visual_odometry.surfaces import surfaces_at
+
+_KNOWN = 0.3
+"""Standard deviations of velocity (m/s) and gravity (m/s²) from which on the IMU is of use."""
+_READING = 0.5
+"""Noise of a reading of depth, as a share of that of one pixel."""
+_REJECTED = 10
+"""Images in a row that contradict the IMU, after which the filter begins again from the map."""
+
+
+class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the fusion with an IMU.
+
+    Attributes:
+        carry: Seconds without any landmark for which the IMU alone gives the pose; then the camera
+            is lost.
+        pixel_noise: Standard deviation of a landmark's pixel, errors of its place included.
+    """
+
+    carry: Annotated[float, msgspec.Meta(ge=0)] = 3.0
+    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.3
+
+
+class InertialTracker(FeatureTracker):
+    """Tracks a camera with depth, or a stereo rig, and an IMU on one body.
+
+    Equal images and samples give equal poses, to the bit.
+
+    Args:
+        camera: The camera, or the left one of a rectified rig.
+        imu: The IMU.
+        baseline: Metres to the right camera; 0 if there is none.
+        features: Settings of the map.
+        inertial: Settings of the fusion.
+        stereo: Settings of the stereo matching.
+    """
+
+    def __init__(
+        self,
+        camera: CameraAnnouncement,
+        imu: ImuAnnouncement,
+        baseline: float,
+        features: FeatureSettings,
+        inertial: InertialSettings,
+        stereo: StereoSettings,
+    ) -> None:
+        cv2.setNumThreads(1)
+        self._matcher = StereoMatcher(camera.info, baseline, stereo) if baseline else None
+        surfaces = surfaces_at
+        if self._matcher is not None:
+            features = msgspec.structs.replace(features, depth_noise=self._matcher.depth_noise)
+            surfaces = self._matcher.surfaces_at
+        super().__init__(camera.info, features, surfaces)
+        self._imu, self._inertial, self._readout = ImuModel(imu), inertial, camera.readout
+        mounted = inverse(self._imu.pose) @ pose_matrix(camera.position, camera.orientation)
+        self._filter = InertialFilter(self._imu, mounted, features.keyframes + 1)
+        self._samples = np.empty((0, 7))
+        self._time: float | None = None  # of the filter, seconds
+        self._epoch: int | None = None
+        self._seen_at = 0.0
+        self._rejected = 0
+
+    def fuse(
+        self,
+        stamp: int,
+        image: npt.NDArray[np.uint8],
+        other: npt.NDArray[np.uint8] | Depth,
+        samples: Floats,
+    ) -> TrackingResult:
+        """Return the pose of the next image.
+
+        Args:
+            stamp: When the image was exposed on the clock of the IMU (ns).
+            image: Grey or colour, of the (left) camera.
+            other: Its depth in metres, or the image of the right camera.
+            samples: Of the IMU since the image before: stamp (ns), angular velocity, specific
+                force; shape (n, 7).
+
+        Raises:
+            ValueError: The size is not that of the camera.
+        """
+        self._epoch = stamp if self._epoch is None else self._epoch
+        now = (stamp - self._epoch) / 1e9
+        samples = self._imu.corrected(
+            np.column_stack([(samples[:, 0] - self._epoch) / 1e9, samples[:, 1:]])
+        )
+        self._samples = np.vstack([self._samples, samples])
+        self._rates = rates = self._advance(now)
+        if self._readout > 0:
+            image, other = self._straightened(image, other)
+        if self._matcher is None:
+            depth = np.asarray(other, np.float32)
+        else:
+            depth = self._matcher.depth(image, np.asarray(other, np.uint8))
+        self._now = now
+        result = self.track(stamp, image, depth)
+        if self._time is None and not result.lost:
+            self._time = self._seen_at = now
+            self._filter.start(rates[3:])
+            self._filter.remember(0)
+        if not self._is_known:
+            return result
+        if result.lost and now - self._seen_at <= self._inertial.carry:
+            result = msgspec.structs.replace(result, lost=False, reason="")
+        return msgspec.structs.replace(
+            result,
+            velocity=self._filter.state.rotation
+            @ self._filter.camera[:3, :3]
+            @ self._camera_velocity(),
+            covariance=self._camera_covariance(),
+        )
+
+    @property
+    def _is_known(self) -> bool:
+        """Whether velocity and gravity are known well enough to go on without images."""
+        variances = np.diag(self._filter.covariance)
+        return self._time is not None and bool(
+            max(variances[V].max(), variances[G].max()) < _KNOWN**2
+        )
+
+    def _advance(self, now: float) -> Floats:
+        """Bring the filter to a time; return angular velocity and specific force then, shape (6,).
+
+        Samples that are missing at the end are replaced by the last one.
+        """
+        samples = self._samples
+        if len(samples):
+            newest = np.maximum.accumulate(samples[:, 0])
+            samples = samples[np.concatenate([[True], np.diff(newest) > 0])]
+        else:
+            rest = -self._filter.state.gravity @ self._filter.state.rotation
+            samples = np.array([[now, 0.0, 0.0, 0.0, *rest]])
+        begin = now if self._time is None else self._time
+        inner = samples[(samples[:, 0] > begin) & (samples[:, 0] < now), 0]
+        times = np.concatenate([[begin], inner, [now]])
+        rows = self._imu.at(samples, times)
+        if now > begin:
+            self._filter.propagate(self._imu.preintegrate(rows, self._filter.state.bias))
+            self._time = now
+        used = int(np.searchsorted(samples[:, 0], now)) - 1
+        self._samples = samples[max(used, 0) :] if len(self._samples) else self._samples
+        rates: Floats = rows[-1, 1:] - self._filter.state.bias
+        return rates
+
+    def _camera_velocity(self) -> Floats:
+        """Return the camera's velocity in its own axes, m/s, shape (3,)."""
+        camera, state = self._filter.camera, self._filter.state
+        turning = np.cross(self._rates[:3], camera[:3, 3])
+        velocity: Floats = camera[:3, :3].T @ (state.rotation.T @ state.velocity + turning)
+        return velocity
+
+    def _camera_covariance(self) -> Floats:
+        """Return the covariance of the camera's pose, as `TrackingResult` has it."""
+        state, camera = self._filter.state, self._filter.camera
+        moved = np.zeros((6, 6))
+        moved[:3, :3] = -state.rotation @ cross(camera[:3, 3])
+        moved[:3, 3:], moved[3:, :3] = np.eye(3), state.rotation
+        found: Floats = moved @ self._filter.covariance[POSE, POSE] @ moved.T
+        return (found + found.T) / 2
+
+    def _straightened(
+        self, image: npt.NDArray[np.uint8], other: npt.NDArray[np.uint8] | Depth
+    ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | Depth]:
+        """Return both images as if all rows had been exposed with the middle one."""
+        turn = self._filter.camera[:3, :3].T @ self._rates[:3]
+        velocity = self._camera_velocity() if self._is_known else np.zeros(3)
+        rows = ImageRows(self._info, self._readout, turn, velocity)
+        if self._matcher is None:
+            return rows.image_and_depth(image, np.asarray(other, np.float32))
+        return rows.image(image), rows.image(np.asarray(other, np.uint8))
+
+    # What the map's tracker asks for.
+
+    def _expect(self, grey: Grey) -> Floats | None:
+        """Return the pose that the IMU predicts, once the filter knows enough; world to camera."""
+        return inverse(self._camera_pose()) if self._is_known else super()._expect(grey)
+
+    def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
+        """Find the map in an image, and let the landmarks found correct the filter."""
+        match = super()._match(grey, inverse_of)
+        if self._time is None:
+            return match
+        if match is not None and not self._filter.update(self._sighting(match, inverse_of)):
+            self._rejected += 1
+            if self._rejected < _REJECTED:
+                match = None
+            else:
+                self._filter.restart(inverse(match.pose))
+        self._pose = inverse(self._camera_pose())
+        if match is None:
+            return None
+        self._seen_at, self._rejected = self._now, 0
+        return msgspec.structs.replace(match, pose=self._pose)
+
+    def _add_keyframe(self, grey: Grey, inverse_of: Depth, rows: Rows, pixels: Floats) -> None:
+        super()._add_keyframe(grey, inverse_of, rows, pixels)
+        number = next(reversed(self._keyframes))
+        if number == 0:
+            self._filter.forget()
+        if self._time is not None:
+            self._filter.remember(number)
+
+    def _camera_pose(self) -> Floats:
+        """Return the camera in the world, shape (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self._filter.state.rotation, self._filter.state.position
+        found: Floats = pose @ self._filter.camera
+        return found
+
+    def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:
+        """Return the landmarks of a match that agree with it."""
+        rows, pixels = match.rows[match.agree], match.pixels[match.agree]
+        noise = self._settings.depth_noise
+        read = self._surfaces_at(inverse_of, pixels, noise)
+        measured = rays(pixels, self._matrix)
+        measured[:, 2] = read.inverse
+        scale = np.empty_like(measured)
+        scale[:, :2] = (self._info.fx, self._info.fy)
+        scale[:, :2] /= self._inertial.pixel_noise
+        scale[:, 2] = np.where(read.continuous, 1.0 / (_READING * noise), 0.0)
+        return Sighting(self._map.places[rows], self._map.keyframes[rows], measured, scale)
