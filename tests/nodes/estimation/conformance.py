@@ -339,17 +339,18 @@ def marks_loss(record: Record, case: Case) -> Iterator[str]:
 def never_lies(record: Record, case: Case) -> Iterator[str]:
     """Until the image is frozen, which nobody can know: each pose is near the truth."""
     frozen = min(stamp for stamp, kind in record.flight.kinds.items() if kind == "z")
-    poses = [pose for pose in record.of(PoseEstimate) if pose.stamp < frozen]
+    known = record.flight.truth
+    poses = [e for e in record.of(PoseEstimate) if e.stamp < frozen and e.stamp in known]
     if not poses:
         return
-    truth = np.array([record.flight.truth[pose.stamp][:3, 3] for pose in poses])
+    truth = np.array([known[pose.stamp][:3, 3] for pose in poses])
     estimated = np.array([pose.position for pose in poses])
     if record.said.scale_free:
         rotation, translation, scale = umeyama(estimated, truth, with_scale=True)
         estimated = scale * estimated @ rotation.T + translation
     elif poses[0].frame_id != "map":
         first = pose_matrix(poses[0].position, poses[0].orientation)
-        moved = record.flight.truth[poses[0].stamp] @ np.linalg.inv(first)
+        moved = known[poses[0].stamp] @ np.linalg.inv(first)
         estimated = estimated @ moved[:3, :3].T + moved[:3, 3]
     errors = np.linalg.norm(estimated - truth, axis=1)
     for pose, error in zip(poses, errors, strict=True):
