@@ -53,7 +53,8 @@ class OrbSlam3Config(EstimatorConfig):
         vocabulary: File in DBoW2's text format; if empty, the one that
             ``python -m runtime vocabulary CONFIG`` has made.
         orb: ORB-SLAM3's own settings.
-        mapping_timeout: Real time that its mapping gets for each image, at most, before the next.
+        mapping_timeout: Time that its other threads may compute after each image, at most, before
+            the next; not counted while other programs have the processors.
     """
 
     mode: Mode = "rgbd"

@@ -10,7 +10,9 @@ names. It prints much, to standard output, which a worker gathers.
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -66,16 +68,17 @@ class OrbSlam3Process:
     Args:
         settings: Mode, settings file, size of images.
         vocabulary: In DBoW2's text format, its name ending with ``.txt``.
-        mapping_timeout: Real seconds for which `track` waits at most until the other threads have
-            finished with the previous image. Without any, images that come faster than a camera
-            takes them make the map poorer, and without depth it is lost sooner.
+        mapping_time: Seconds of computing that `track` leaves to the other threads, at most, after
+            each image; less if they have nothing to do. Without any, images that come faster than
+            a camera takes them make the map poorer, and without depth it is lost sooner. Real time
+            is not counted, lest a busy machine make the map poorer.
 
     Raises:
         MissingDependencyError: `pyorbslam3` cannot be imported.
         ValueError: The vocabulary is none.
     """
 
-    def __init__(self, settings: Settings, vocabulary: Path, mapping_timeout: float = 0.02) -> None:
+    def __init__(self, settings: Settings, vocabulary: Path, mapping_time: float = 0.02) -> None:
         try:
             import pyorbslam3
         except ImportError as error:  # also where one of the system's libraries is missing
@@ -84,8 +87,8 @@ class OrbSlam3Process:
             ) from error
         check_vocabulary(vocabulary)
         self._settings = settings
-        self._mapping_timeout = mapping_timeout
-        self._left_alone = time.monotonic()
+        self._mapping_time = mapping_time
+        self._left_alone = time.process_time()
         self._anchor = Anchor()
         self._was_ok = self._new = False
         self._stamps: list[int] = []
@@ -122,11 +125,10 @@ class OrbSlam3Process:
         """
         check_arrays(self._settings, image, depth, right, imu)
         self._stamps.append(stamp)
-        if self._new:
-            # Compared with the first key frame by its words, which another thread must have
-            # found by now: if not, it is lost at once.
-            time.sleep(max(self._left_alone + _FIRST - time.monotonic(), 0.0))
-        _wait_for_other_threads(self._left_alone + self._mapping_timeout)
+        # The second image of a map is compared with the first key frame by its words, which another
+        # thread must have found by now: if not, it is lost at once.
+        share = _FIRST if self._new else self._mapping_time
+        _wait_for_other_threads(self._left_alone + share)
         chunk = None if imu is None else imu * (1e-9, 1, 1, 1, 1, 1, 1)
         if depth is not None:
             # 0 is how ORB-SLAM3 knows that there is no depth.
@@ -137,7 +139,7 @@ class OrbSlam3Process:
         else:
             result = self._slam.track_monocular(image, stamp * 1e-9, chunk)
         found = self._result(result)
-        self._left_alone = time.monotonic()
+        self._left_alone = time.process_time()
         return found
 
     def trajectory(self) -> tuple[npt.NDArray[np.int64], Floats]:
@@ -149,7 +151,7 @@ class OrbSlam3Process:
             Stamps of images as given to `track`, strictly rising, shape (n,), and the optical
             camera in the frame of `track`'s poses, shape (n, 4, 4).
         """
-        _wait_for_other_threads(time.monotonic() + _LAST)
+        _wait_for_other_threads(self._left_alone + _LAST)
         self._slam.shutdown()
         folder = Path(self._folder.name)
         files = str(folder / "frames.txt"), str(folder / "key_frames.txt")
@@ -184,6 +186,9 @@ class OrbSlam3Process:
         corners = self._slam.tracked_keypoints()
         inliers = np.zeros(len(corners), np.bool_)
         reason = _REASONS.get(state, state)
+        tracked, mode = valid, self._settings.mode
+        if mode == "monocular_inertial" and tracked and not self._slam.imu_initialized():
+            valid, reason = False, "the IMU has not given the scale yet"
         if valid:
             pose = np.asarray(result.pose_wc, np.float64)
             before = self._anchor.maps
@@ -196,7 +201,7 @@ class OrbSlam3Process:
             points = self._slam.tracked_map_points()
             if len(points) and len(corners):
                 inliers[self._corners_of(points, pose, corners)] = True
-        self._new, self._was_ok = valid and not self._was_ok, valid
+        self._new, self._was_ok = tracked and not self._was_ok, tracked
         return OrbSlam3Result(
             pose=self._anchor.last,
             lost=not valid,
@@ -259,25 +264,40 @@ def check_arrays(
 
 
 def _wait_for_other_threads(until: float) -> None:
-    """Return when this process computes next to nothing, or at a time (`time.monotonic`).
+    """Return when the other threads have nothing to do, or at an amount of `time.process_time`.
 
-    ORB-SLAM3's threads look for work every 3 and 5 ms, and do not say when they have none.
+    They look for work every 3 and 5 ms, and do not say when they have none.
     """
-    while time.monotonic() + _QUIET < until:
-        before = time.process_time()
+    quiet, naps = 0, _naps()
+    while quiet < 3 and time.process_time() < until:
         time.sleep(_QUIET)
-        if time.process_time() - before < _QUIET / 8:
-            return
+        before, naps = naps, _naps()
+        # Who runs (or waits for a processor) and has not napped meanwhile has something to do.
+        busy = any(runs and before.get(task) == (runs, n) for task, (runs, n) in naps.items())
+        quiet = 0 if busy else quiet + 1
 
 
-_QUIET = 0.004
-"""Seconds."""
+def _naps() -> dict[str, tuple[bool, str]]:
+    """Return whether each other thread of this process runs, and how often it has waited so far."""
+    found = {}
+    for task in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(OSError):  # it has ended
+            status = (task / "status").read_text(encoding="utf-8", errors="replace")
+            fields = dict(line.split(":\t", 1) for line in status.splitlines() if ":\t" in line)
+            if task.name != str(threading.get_native_id()):
+                runs = fields["State"][0] in "RD"
+                found[task.name] = runs, fields["voluntary_ctxt_switches"]
+    return found
 
-_FIRST = 0.1
-"""Seconds for the other threads after the first image of a map; also on a busy machine."""
+
+_QUIET = 0.0025
+"""Seconds between two looks; three are longer than the threads' naps."""
+
+_FIRST = 1.0
+"""Seconds of computing for the other threads after the first image of a map."""
 
 _LAST = 10.0
-"""Seconds for the other threads after the last image, at most."""
+"""Seconds of computing for the other threads after the last image."""
 
 _SENSORS = {
     "rgbd": "RGBD",
