@@ -57,11 +57,12 @@ _MARGIN = 300
 
 
 class View(NamedTuple):
-    """One exposure; `pose` is the camera in the first one's frame, shape (4, 4)."""
+    """One exposure of both eyes; `pose` is the left one in the first one's frame, shape (4, 4)."""
 
     stamp: int
     rgb: npt.NDArray[np.uint8]
     depth: npt.NDArray[np.float32]
+    right: npt.NDArray[np.uint8]
     pose: Floats
 
 
@@ -89,6 +90,19 @@ def _view(wall: npt.NDArray[np.uint8], k: int, *, blank: bool) -> View:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("yx", (-0.006 * k, 0.002 * k)).as_matrix()
     pose[:3, 3] = (0.012 * k, -0.003 * k, 0.008 * k)
+    rgb, depth = _shot(wall, pose)
+    beside = pose.copy()
+    beside[:3, 3] += 0.11 * pose[:3, 0]
+    right, _ = _shot(wall, beside)
+    if blank:
+        rgb, right = np.full_like(rgb, 128), np.full_like(rgb, 128)
+    return View(round(k * 1e9 / 30), rgb, depth, right, pose)
+
+
+def _shot(
+    wall: npt.NDArray[np.uint8], pose: Floats
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
+    """Return what a camera sees from a pose, and its depth."""
     # A ray R K⁻¹ u from c meets n·X = d where X ~ (c nᵀ + (d - n·c) I) R K⁻¹ u.
     rays = pose[:3, :3] @ np.linalg.inv(INFO.matrix())
     centre = pose[:3, 3]
@@ -100,6 +114,4 @@ def _view(wall: npt.NDArray[np.uint8], k: int, *, blank: bool) -> View:
     u, v = np.meshgrid(np.arange(INFO.width), np.arange(INFO.height))
     along = np.stack([u, v, np.ones_like(u)], -1) @ rays.T @ _NORMAL
     depth = (left / along).astype(np.float32)
-    if blank:
-        rgb = np.full_like(rgb, 128)
-    return View(round(k * 1e9 / 30), np.asarray(rgb), depth, pose)
+    return np.asarray(rgb), depth

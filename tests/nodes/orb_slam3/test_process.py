@@ -46,6 +46,7 @@ class Flight:
         self.tracked: list[OrbSlam3Result] = []
         self.printed: list[str] = []
         self.seen = seen
+        self.stamps, self.final = np.empty(0, np.int64), np.empty((0, 4, 4))
         try:
             run_in_lockstep(self._fly(mode, vocabulary))
         except MissingDependencyError as error:
@@ -55,7 +56,7 @@ class Flight:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, LockstepLoop)
         clock = LockstepClock(loop)
-        settings = make_settings(mode, [CAMERA], IMU, ORB)
+        settings = make_settings(mode, [CAMERA, RIGHT][: 1 + (mode == "stereo")], IMU, ORB)
         slam = Worker(
             "slam", clock, OrbSlam3Process, settings, vocabulary, printed=self.printed.append
         )
@@ -63,11 +64,21 @@ class Flight:
             await slam.ready()
             for view in self.seen:
                 depth = view.depth if "rgbd" in mode else None
-                said = await slam.call(OrbSlam3Process.track, view.stamp, view.rgb, depth)
+                right = view.right if mode == "stereo" else None
+                said = await slam.call(OrbSlam3Process.track, view.stamp, view.rgb, depth, right)
                 self.tracked.append(said)
+            self.stamps, self.final = await slam.call(OrbSlam3Process.trajectory)
         finally:
             await asyncio.to_thread(slam.close)
             clock.close()
+
+    def final_errors(self) -> Floats:
+        """Return metres between the trajectory after all corrections and what is so."""
+        at = [[v.stamp for v in self.seen].index(stamp) for stamp in self.stamps.tolist()]
+        true = np.array([self.seen[k].pose for k in at])
+        assert (np.diff(self.stamps) > 0).all()
+        assert not any(self.tracked[k].lost for k in at)
+        return np.asarray(np.linalg.norm(self.final[:, :3, 3] - true[:, :3, 3], axis=1))
 
     def errors(self) -> tuple[Floats, Floats]:
         """Return metres and degrees between what was said and what is so, where it was known."""
@@ -137,6 +148,27 @@ def test_colours_are_taken_in_the_order_that_images_have(vocabulary: Path) -> No
     corners = [Flight("rgbd", vocabulary, [v]).tracked[0].points for v in (seen, grey, swapped)]
     np.testing.assert_array_equal(corners[0], corners[1])
     assert corners[0].tobytes() != corners[2].tobytes()
+
+
+def test_the_final_trajectory_is_in_the_frame_of_the_poses_that_were_said(flight: Flight) -> None:
+    """Also if ORB-SLAM3 has thrown its first map away, and begun another one."""
+    said = {v.stamp: t.pose for v, t in zip(flight.seen, flight.tracked, strict=True) if not t.lost}
+    assert len(flight.stamps) > 5
+    assert set(flight.stamps.tolist()) <= set(said)
+    before = np.array([said[stamp] for stamp in flight.stamps.tolist()])
+    apart = np.linalg.norm(flight.final[:, :3, 3] - before[:, :3, 3], axis=1)
+    assert apart.max() < 0.02
+
+
+@pytest.mark.slow
+def test_two_eyes_give_poses_in_metres(vocabulary: Path) -> None:
+    flight = Flight("stereo", vocabulary, views(45))
+    assert not any(t.lost for t in flight.tracked)
+    metres, degrees = flight.errors()
+    assert metres.max() < 0.03
+    assert degrees.max() < 0.8
+    assert len(flight.stamps) == 45
+    assert flight.final_errors().max() < 0.03
 
 
 @pytest.mark.slow
