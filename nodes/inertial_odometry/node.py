@@ -17,7 +17,7 @@ from nodes.estimation import (
 )
 from nodes.inertial_odometry.tracker import InertialSettings, InertialTracker
 from nodes.stereo_odometry import StereoSettings, baseline, why_not_rectified
-from nodes.visual_odometry.features import FeatureSettings
+from nodes.visual_odometry.settings import FeatureSettings
 from runtime import Bundle
 
 

@@ -23,8 +23,10 @@ from nodes.inertial_odometry.rolling_shutter import Rows as ImageRows
 from nodes.odometry.images import Depth, Grey
 from nodes.odometry.pose import rays
 from nodes.stereo_odometry import StereoMatcher, StereoSettings
-from nodes.visual_odometry.features import FeatureSettings, FeatureTracker, MapMatch
+from nodes.visual_odometry.features import FeatureTracker
+from nodes.visual_odometry.landmarks import MapMatch
 from nodes.visual_odometry.patches import Rows
+from nodes.visual_odometry.settings import FeatureSettings
 from nodes.visual_odometry.surfaces import surfaces_at
 
 _KNOWN = 0.3
@@ -61,6 +63,8 @@ class InertialTracker(FeatureTracker):
         inertial: Settings of the fusion.
         stereo: Settings of the stereo matching.
     """
+
+    _aligns = False  # as the filter takes landmarks only, and carries the pose without them
 
     def __init__(
         self,

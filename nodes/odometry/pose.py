@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from events.poses import inverse
 from nodes.odometry.images import Floats
 
 _HUBER = 2.0
@@ -62,15 +63,18 @@ def solve_pose(
     matrix: Floats,
     pixel_noise: float,
     depth_noise: float,
+    information: Floats | None = None,
 ) -> Solution:
     """Return the pose that minimises the sum of robust squared residuals.
 
     Args:
-        seen: At least four landmarks.
+        seen: At least four landmarks, or fewer if something is known of the initial pose.
         start: Initial pose, world to camera, shape (4, 4).
         matrix: K, shape (3, 3).
         pixel_noise: Standard deviation of a coordinate, pixels.
         depth_noise: Standard deviation of inverse depth, 1/m.
+        information: Inverse covariance of the initial pose, if that is more than a guess: of a
+            small motion of the camera's frame, translation, then rotation, shape (6, 6).
     """
     fx, fy, cx, cy = intrinsics(matrix)
     pose, count = start.copy(), len(seen.pixels)
@@ -103,14 +107,30 @@ def solve_pose(
         weights = _huber(errors) * ahead
         weighted = (by * weights[[0, 0, 1]]).reshape(6, -1)
         normal = weighted @ by.reshape(6, -1).T + 1e-9 * np.eye(6)
-        step = -np.linalg.solve(normal, weighted @ residuals.reshape(-1))
-        turn = cv2.Rodrigues(step[3:])[0]
-        pose[:3, :3] = turn @ pose[:3, :3]
-        pose[:3, 3] = turn @ pose[:3, 3] + step[:3]
+        gradient = weighted @ residuals.reshape(-1)
+        if information is not None:
+            normal += information
+            gradient += information @ motion_between(start, pose)
+        step = -np.linalg.solve(normal, gradient)
+        pose = moved(pose, step)
         if np.abs(step).max() < _SMALL:
             break
     errors[0, ~ahead] = np.inf
     return Solution(pose, errors[0])
+
+
+def moved(pose: Floats, step: Floats) -> Floats:
+    """Return a pose, world to camera, after a small motion of the camera's frame, shape (6,)."""
+    turn, there = cv2.Rodrigues(step[3:])[0], np.eye(4)
+    there[:3, :3] = turn @ pose[:3, :3]
+    there[:3, 3] = turn @ pose[:3, 3] + step[:3]
+    return there
+
+
+def motion_between(before: Floats, after: Floats) -> Floats:
+    """Return the small motion that `moved` takes from one pose to another, shape (6,)."""
+    between = after @ inverse(before)
+    return np.concatenate([between[:3, 3], cv2.Rodrigues(between[:3, :3])[0].ravel()])
 
 
 def _huber(errors: Floats) -> Floats:

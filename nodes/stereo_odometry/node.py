@@ -19,7 +19,8 @@ from nodes.estimation import (
     TrackingResult,
 )
 from nodes.stereo_odometry.matcher import StereoMatcher, StereoSettings
-from nodes.visual_odometry.features import FeatureSettings, FeatureTracker
+from nodes.visual_odometry.features import FeatureTracker
+from nodes.visual_odometry.settings import FeatureSettings
 from runtime import Bundle
 
 _TOLERANCE = 1e-3

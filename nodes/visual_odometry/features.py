@@ -3,8 +3,11 @@
 A few corners, followed from the previous image, give an approximate pose. Then landmarks of all
 stored key frames are looked for as they should look from there, each by its patch in the key frame
 in which it was first seen: so the error grows with new landmarks and not with images, and not at
-all where the camera returns soon enough. A landmark's depth is the mean of all readings. The parts
-are in `keyframes`, `landmarks`, `patches`, `surfaces`, and in `nodes.odometry`.
+all where the camera returns soon enough. A landmark's depth is the mean of all readings.
+
+Where that finds few landmarks, edges and surfaces are aligned with those of an earlier image, and
+the landmarks refine the pose. The parts are in `keyframes`, `landmarks`, `patches`, `surfaces`,
+`alignment`, `references`, `motion`, and in `nodes.odometry`.
 """
 
 from __future__ import annotations
@@ -12,10 +15,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Any, ClassVar
 
 import cv2
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -37,9 +39,13 @@ from nodes.odometry.pose import (
     solve_pose,
 )
 from nodes.odometry.relocalization import detect_and_describe, relocalize
+from nodes.visual_odometry.alignment import View
 from nodes.visual_odometry.keyframes import ORB_POINTS, Described, Keyframe, find_corners, squares
-from nodes.visual_odometry.landmarks import Landmarks
+from nodes.visual_odometry.landmarks import Landmarks, MapMatch
+from nodes.visual_odometry.motion import Motion
 from nodes.visual_odometry.patches import Rows, find_patches, half_width
+from nodes.visual_odometry.references import References
+from nodes.visual_odometry.settings import FeatureSettings
 from nodes.visual_odometry.surfaces import Surfaces, inverse_depth, surfaces_at
 
 _FLOW_WINDOW = 15
@@ -49,6 +55,10 @@ _AGREES = 4.0
 """Standard deviations up to which a landmark agrees with a pose."""
 _FEW = 120
 """Corners that suffice for an approximate pose, at most."""
+_ENOUGH = 60
+"""Agreeing landmarks that give a pose alone; with fewer, edges and surfaces are aligned, too."""
+_FEWEST = 4
+"""Agreeing landmarks that are of use beside that."""
 _SEARCHED = 20
 """Newest key frames by which a lost camera is relocalized."""
 _SEARCHED_PER_IMAGE = 2
@@ -66,62 +76,6 @@ A reading is the mean of many pixels, but not of an exact plane.
 """
 
 
-class FeatureSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the method on features.
-
-    Attributes:
-        spacing: Side of the squares of the image of which each holds one landmark, pixels. Time
-            grows with their number.
-        window: Side of the patches that are compared, pixels; odd.
-        levels: Times that flow halves the image for large motions between two images.
-        pixel_noise: Standard deviation of a patch's position, pixels.
-        depth_noise: Standard deviation of inverse depth, 1/m: k of a sensor with sigma = k z².
-        keyframes: Key frames that are stored. One takes the memory of a grey image.
-        keyframe_overlap: A key frame is made when less than this share of the last one's landmarks
-            is in view,
-        keyframe_rotation: or at this rotation since the last one, degrees,
-        keyframe_shift: or at this motion since the last one, pixels at the median depth.
-        min_inliers: Agreeing landmarks below which the camera is lost.
-        reset_timeout: Seconds for which a lost camera is only relocalized; then a new map starts at
-            its last pose.
-    """
-
-    spacing: Annotated[int, msgspec.Meta(ge=12, le=128)] = 28
-    window: Annotated[int, msgspec.Meta(ge=7, le=31)] = 11
-    levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 4
-    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.3
-    depth_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.002
-    keyframes: Annotated[int, msgspec.Meta(ge=2, le=10_000)] = 200
-    keyframe_overlap: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.6
-    keyframe_rotation: Annotated[float, msgspec.Meta(gt=0)] = 12.0
-    keyframe_shift: Annotated[float, msgspec.Meta(gt=0)] = 40.0
-    min_inliers: Annotated[int, msgspec.Meta(ge=6)] = 15
-    reset_timeout: Annotated[float, msgspec.Meta(ge=0)] = 1.0
-
-
-class MapMatch(msgspec.Struct, frozen=True, eq=False):
-    """The landmarks of the map that were found in an image, and the pose from them.
-
-    Attributes:
-        pose: World to camera, shape (4, 4).
-        rows: Landmarks found, shape (n,).
-        pixels: Their pixels, shape (n, 2).
-        agree: Which of them agree with the pose, shape (n,).
-        missed: Landmarks looked for and not found.
-    """
-
-    pose: Floats
-    rows: Rows
-    pixels: Floats
-    agree: npt.NDArray[np.bool_]
-    missed: Rows
-
-    @property
-    def share(self) -> float:
-        """Share of the landmarks looked for that agree with the pose."""
-        return float(self.agree.sum()) / (len(self.rows) + len(self.missed))
-
-
 class FeatureTracker:
     """Tracks an RGB-D camera. Equal images give equal poses, to the bit.
 
@@ -130,6 +84,9 @@ class FeatureTracker:
         settings: Settings of the method.
         surfaces: Reads depth at pixels, as `surfaces_at` does.
     """
+
+    _aligns: ClassVar[bool] = True
+    """Whether edges and surfaces are aligned where landmarks are few."""
 
     def __init__(
         self,
@@ -150,6 +107,8 @@ class FeatureTracker:
         self._searched = 0  # key frames, since tracking was lost
         self._near_until = 0
         self._near: Rows | None = None  # landmarks that are or may soon be in view
+        self._motion = Motion()
+        self._references = References(self._matrix, self._settings.depth_noise)
         self._clear_map()
 
     def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> TrackingResult:
@@ -157,13 +116,21 @@ class FeatureTracker:
         grey, depth = grey_and_depth(self._info, image, depth)
         inverse_of = inverse_depth(depth)
         self._count += 1
-        if not len(self._map):
+        if not self._keyframes:
             first = "" if self._lost_since is None else "by a first map"
             return self._start_map(stamp, grey, inverse_of, first)
+        lost, alignment = self._lost_since is not None, None
         match = self._match(grey, inverse_of)
+        if self._aligns and (match is None or match.agree.sum() < _ENOUGH):
+            view = View.of(grey, inverse_of)
+            expected = match.pose if match and lost else self._motion.expected(stamp)
+            alignment = self._references.align(view, expected, lost)
+            if alignment is not None:
+                match = self._find(grey, inverse_of, alignment.pose, alignment.information)
+                match = match or MapMatch.without_landmarks(alignment.pose)
         if match is None:
             return self._lose(stamp, grey, inverse_of)
-        reason = "" if self._lost_since is None else "against a key frame"
+        (self._motion.placed if lost else self._motion.measured)(stamp, match.pose)
         self._lost_since = None
         self._pose = match.pose
         agree, rows = match.agree, match.rows
@@ -174,13 +141,24 @@ class FeatureTracker:
         read = self._surfaces_at(inverse_of, match.pixels[agree], noise)
         self._map.fuse(self._pose, rows[agree], read, _READING * noise)
         self._before = self._reduced(grey), rows[agree], match.pixels[agree]
-        if self._is_far(rows[agree]):
+        self._references.note(grey, inverse_of, self._pose, alignment is not None)
+        points, inliers = match.pixels, agree
+        if alignment is None:
+            far = self._is_far(rows[agree])
+        else:
+            far = alignment.share < self._settings.keyframe_overlap
+            far |= self._is_far_from(alignment.reference, np.inf)
+            points = np.concatenate([points, alignment.pixels])
+            inliers = np.concatenate([inliers, alignment.agree])
+            if far:
+                self._references.renew(view, self._pose)
+        if far:
             self._add_keyframe(grey, inverse_of, rows[agree], match.pixels[agree])
         return TrackingResult(
             pose=inverse(self._pose),
-            reason=reason,
-            points=match.pixels.astype(np.float32),
-            inliers=agree,
+            reason="against a key frame" if lost else "",
+            points=points.astype(np.float32),
+            inliers=inliers,
         )
 
     def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
@@ -215,6 +193,8 @@ class FeatureTracker:
         brick would find the next brick.
         """
         image, rows, pixels = self._before
+        if len(rows) < self._settings.min_inliers:
+            return None
         few = slice(None, None, max(-(-len(rows) // _FEW), 1))
         rows, pixels = rows[few], pixels[few]
         no_guess: Any = None
@@ -252,9 +232,19 @@ class FeatureTracker:
         """Return the image in which corners are followed: half as large, if it is large."""
         return np.asarray(cv2.pyrDown(grey), np.uint8) if self._reduction > 1 else grey
 
-    def _find(self, grey: Grey, inverse_of: Depth, expected: Floats) -> MapMatch | None:
-        """Find the map in an image that was taken near an expected pose."""
+    def _find(
+        self,
+        grey: Grey,
+        inverse_of: Depth,
+        expected: Floats,
+        information: Floats | None = None,
+    ) -> MapMatch | None:
+        """Find the map in an image that was taken near an expected pose.
+
+        If that pose comes with its information, as an alignment gives it, few landmarks suffice.
+        """
         settings, landmarks = self._settings, self._map
+        least = settings.min_inliers if information is None else _FEWEST
         size = self._info.width, self._info.height
         near = self._near
         if near is None or self._count >= self._near_until:
@@ -267,20 +257,25 @@ class FeatureTracker:
         # The oldest of each square, as they have the least error.
         _, oldest = np.unique(squares(patches.expected, settings.spacing), return_index=True)
         rows, patches = rows[oldest], patches.take(oldest)
-        if len(rows) < settings.min_inliers:
+        if len(rows) < least:
             return None
         pixels, found = find_patches(patches, self._images(), grey, settings.window)
         missed, rows, pixels = rows[~found], rows[found], pixels[found]
-        if len(rows) < settings.min_inliers:
+        if len(rows) < least:
             return None
         read = self._surfaces_at(inverse_of, pixels, settings.depth_noise)
         places = landmarks.places[rows]
-        first = self._solve(places, pixels, expected, read.inverse, read.continuous)
+        first = self._solve(places, pixels, expected, read.inverse, read.continuous, information)
         agree = first.errors < _AGREES
-        if agree.sum() < max(settings.min_inliers, 0.4 * len(agree)):
+        if agree.sum() < max(least, 0.4 * len(agree)):
             return None
         last = self._solve(
-            places[agree], pixels[agree], first.pose, read.inverse[agree], read.continuous[agree]
+            places[agree],
+            pixels[agree],
+            first.pose if information is None else expected,
+            read.inverse[agree],
+            read.continuous[agree],
+            information,
         )
         return MapMatch(last.pose, rows, pixels, agree, missed)
 
@@ -291,6 +286,7 @@ class FeatureTracker:
         start: Floats,
         read: Floats | None = None,
         continuous: npt.NDArray[np.bool_] | None = None,
+        information: Floats | None = None,
     ) -> Solution:
         if read is None or continuous is None:
             observations = Observations.without_depth(places, pixels)
@@ -303,17 +299,22 @@ class FeatureTracker:
             self._matrix,
             settings.pixel_noise,
             _READING * settings.depth_noise,
+            information,
         )
 
     def _is_far(self, rows: Rows) -> bool:
         """Return whether the last key frame is nearly out of sight."""
-        settings, last = self._settings, next(reversed(self._keyframes.values()))
-        if len(rows) < settings.keyframe_overlap * self._at_keyframe:
+        if len(rows) < self._settings.keyframe_overlap * self._at_keyframe:
             return True
-        between = self._pose @ inverse(last.pose)
-        angle = math.acos(min(max((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0), 1.0))
         _, z = self._map.project(self._pose, rows)
-        shift = self._info.fx * float(np.linalg.norm(between[:3, 3]) / np.median(z))
+        last = next(reversed(self._keyframes.values()))
+        return self._is_far_from(last.pose, float(np.median(z)))
+
+    def _is_far_from(self, other: Floats, depth: float) -> bool:
+        """Return whether the camera has turned much, or moved much for things at a depth."""
+        settings, between = self._settings, self._pose @ inverse(other)
+        angle = math.acos(min(max((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0), 1.0))
+        shift = self._info.fx * float(np.linalg.norm(between[:3, 3]) / depth)
         return math.degrees(angle) > settings.keyframe_rotation or shift > settings.keyframe_shift
 
     def _add_keyframe(self, grey: Grey, inverse_of: Depth, rows: Rows, pixels: Floats) -> None:
@@ -356,10 +357,15 @@ class FeatureTracker:
         seen = self._surfaces_at(inverse_of, corners, self._settings.depth_noise)
         count = int(seen.continuous.sum())
         if count < self._settings.min_inliers:
-            few = f"{count} corners with depth, of {self._settings.min_inliers} needed for a map"
-            return self._lost(stamp, few)
+            view = View.of(grey, inverse_of)
+            if not (self._aligns and self._references.suffices(view)):
+                least = self._settings.min_inliers
+                few = f"{count} corners with depth, of {least} needed for a map, and too few edges"
+                return self._lost(stamp, few)
         self._clear_map()
         self._lost_since = None
+        self._motion.placed(stamp, self._pose)
+        self._references.note(grey, inverse_of, self._pose, False)
         self._add_keyframe(grey, inverse_of, np.empty(0, np.int64), np.empty((0, 2)))
         _, _, pixels = self._before
         return TrackingResult(
@@ -370,12 +376,21 @@ class FeatureTracker:
         )
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
-        """Return that tracking is lost; after a while, start a new map."""
+        """Return that tracking is lost; after a while, start a new map.
+
+        Where that starts is known from the images meanwhile, or guessed from the last motion.
+        """
         result = self._lost(stamp, "too few landmarks of the map were found")
         assert self._lost_since is not None
+        carried = self._pose
+        if self._aligns:
+            view = View.of(grey, inverse_of)
+            carried = self._references.carry(view, self._motion.carried(stamp))
+            self._motion.placed(stamp, carried)
         if stamp - self._lost_since < self._settings.reset_timeout * 1e9:
             return result
-        return self._start_map(stamp, grey, inverse_of, "by a new map, started at the last pose")
+        self._pose = carried
+        return self._start_map(stamp, grey, inverse_of, "by a new map, at the estimated pose")
 
     def _lost(self, stamp: int, reason: str) -> TrackingResult:
         if self._lost_since is None:

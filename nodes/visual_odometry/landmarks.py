@@ -5,7 +5,9 @@ Rows are in the order of age, so that forgetting the oldest key frame is cutting
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from events.poses import inverse
 from nodes.odometry.images import Depth, Floats
@@ -201,3 +203,32 @@ class Landmarks:
         self.places[rows] = (
             self._origins[rows] + self._directions[rows, :, 2] / self._inverse[rows][:, None]
         )
+
+
+class MapMatch(msgspec.Struct, frozen=True, eq=False):
+    """The landmarks of the map that were found in an image, and the pose from them.
+
+    Attributes:
+        pose: World to camera, shape (4, 4).
+        rows: Landmarks found, shape (n,).
+        pixels: Their pixels, shape (n, 2).
+        agree: Which of them agree with the pose, shape (n,).
+        missed: Landmarks looked for and not found.
+    """
+
+    pose: Floats
+    rows: Rows
+    pixels: Floats
+    agree: npt.NDArray[np.bool_]
+    missed: Rows
+
+    @classmethod
+    def without_landmarks(cls, pose: Floats) -> MapMatch:
+        """Return that none were looked for, as the pose is known without."""
+        none = np.empty(0, np.int64)
+        return cls(pose, none, np.empty((0, 2)), np.empty(0, np.bool_), none)
+
+    @property
+    def share(self) -> float:
+        """Share of the landmarks looked for that agree with the pose."""
+        return float(self.agree.sum()) / (len(self.rows) + len(self.missed))

@@ -18,7 +18,8 @@ from nodes.estimation import (
 )
 from nodes.odometry.images import Depth
 from nodes.visual_odometry.dense import DenseSettings, DenseTracker
-from nodes.visual_odometry.features import FeatureSettings, FeatureTracker
+from nodes.visual_odometry.features import FeatureTracker
+from nodes.visual_odometry.settings import FeatureSettings
 from runtime import Bundle
 
 

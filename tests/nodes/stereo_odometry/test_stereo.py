@@ -9,7 +9,7 @@ import pytest
 from events import CameraAnnouncement
 from nodes.stereo_odometry import StereoMatcher, StereoSettings, why_not_rectified
 from nodes.stereo_odometry.node import StereoTracker
-from nodes.visual_odometry.features import FeatureSettings
+from nodes.visual_odometry.settings import FeatureSettings
 from nodes.visual_odometry.surfaces import inverse_depth
 from tests.nodes.visual_odometry.world import INFO, look, pose
 

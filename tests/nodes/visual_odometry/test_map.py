@@ -8,10 +8,11 @@ import pytest
 from events.poses import inverse
 from nodes.odometry.images import Floats
 from nodes.odometry.pose import rays
-from nodes.visual_odometry.features import FeatureSettings, FeatureTracker
+from nodes.visual_odometry.features import FeatureTracker
 from nodes.visual_odometry.keyframes import find_corners, squares
 from nodes.visual_odometry.landmarks import Landmarks
 from nodes.visual_odometry.patches import find_patches
+from nodes.visual_odometry.settings import FeatureSettings
 from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
 from tests.nodes.visual_odometry.world import INFO, look, pose
 
