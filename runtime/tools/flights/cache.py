@@ -108,10 +108,6 @@ def _written(part: Config, folder: Path) -> Flight | None:
     new.mkdir()
     try:
         flight = fly(part, new)
-        if flight.unfit.startswith("the flight ended by"):
-            if "Ctrl-C" in flight.unfit:
-                raise KeyboardInterrupt
-            return None
         if flight.unfit:
             (new / EVENTS).write_bytes(b"")
         else:

@@ -38,6 +38,7 @@ def record(config: Config, folder: Path) -> Flight:
 
     Raises:
         VisnavError: Something went wrong in the flight.
+        KeyboardInterrupt: A signal ended it.
         OSError: It cannot be written.
     """
     rest = NodeSpec(
@@ -107,9 +108,9 @@ class _Recorder(Instrument):
                 announced[name].append(wire.pack(each).frame())
             else:
                 self._unfit = self._unfit or f"{each.source} is announced in another's name"
-        if state.error is not None or state.stop_requested:
-            self._unfit = f"the flight ended by {state.stop_requested or state.error}"
-        elif state.conclusions or state.outside or state.after_run:
+        if state.stop_requested:  # whatever was to follow is not wanted either
+            raise KeyboardInterrupt
+        if state.conclusions or state.outside or state.after_run:
             self._unfit = "a node of the flight concludes, writes or asks something"
         elif len(state.all_nodes) > len(state.runners):
             self._unfit = "a node of the flight was restarted"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
+import signal
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,6 +59,7 @@ class CraftConfig(NodeConfig):
     latency: Duration = Duration(0.04)
     fail: bool = False
     last_words: bool = False
+    signal: bool = False
 
 
 class Craft(Node[CraftConfig]):
@@ -85,6 +88,8 @@ class Craft(Node[CraftConfig]):
         """Measure at once."""
         if self.config.fail and tick.index == 20:
             raise RuntimeError("out of order")
+        if self.config.signal and tick.index == 20:
+            os.kill(os.getpid(), signal.SIGTERM)
         number = self.rng.random() + self.heard
         self.felt.send(Felt(stamp=tick.stamp, source=self.name, number=number))
 

@@ -162,6 +162,13 @@ def test_a_flight_that_fails_is_not_kept(tmp_path: Path) -> None:
         events_of(config)
 
 
+def test_a_signal_during_the_flight_ends_what_was_to_follow(tmp_path: Path) -> None:
+    config = flown(tmp_path, "craft.signal=true")
+    with pytest.raises(KeyboardInterrupt):
+        recorded(config, record=True)
+    assert kept() == []
+
+
 def test_one_flies_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = flown(tmp_path, "captain.end=0.2")
     flights = []
@@ -207,3 +214,25 @@ def test_those_not_used_for_longest_go_first(
         assert recorded(config, record=True)
     assert len(kept()) == 1
     assert {path.name[0] for path in home().iterdir()} == {".", kept()[0].folder.name[0]}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("name", "seconds"),
+    [
+        ("config.toml", 3),
+        ("examples/two_drones.toml", 2),
+        ("examples/lidar.toml", 2),
+        ("examples/moving.toml", 2),
+        ("examples/stereo_inertial.toml", 2),
+    ],
+)
+def test_real_flights_are_played_to_the_byte(name: str, seconds: int) -> None:
+    config = load(ROOT / name, [f"run.duration={seconds}s"])
+    summary, lines = events_of(config)
+    stand_ins = recorded(config, record=True)
+    assert stand_ins
+    again, same_lines = events_of(config, stand_ins=stand_ins)
+    assert same_lines == lines
+    assert (again.digests, again.verdict) == (summary.digests, summary.verdict)
