@@ -14,6 +14,7 @@ from events import (
     EstimatorAnnouncement,
     Imu,
     ImuAnnouncement,
+    LidarAnnouncement,
 )
 from runtime.config.model import Config, NodeSpec
 from runtime.tools.lint import Finding
@@ -162,14 +163,17 @@ def stamps(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: 
 
 
 def needs(config: Config, announced: Announced) -> Iterator[Finding]:
-    """Kinds of image that an estimator takes, and its IMU, have to be given by a sensor."""
+    """Kinds of data that an estimator takes, and its IMU, have to be given by a sensor."""
     given = {kind for camera in cameras(announced) for kind in camera.images}
     given |= {"grey"} if "rgb" in given else set()
+    given |= {"lidar"} if any(isinstance(each, LidarAnnouncement) for each in announced) else set()
     for spec in config.nodes:
         wants: Any = getattr(spec.node, "needs", frozenset())
         if lacking := sorted(wants - given if isinstance(wants, frozenset) else ()):
-            found = f"it needs {', '.join(lacking)}, which no camera gives"
-            yield Finding(spec.name, found, "add it to the camera's images")
+            what = "sensor" if "lidar" in lacking else "camera"
+            found = f"it needs {', '.join(lacking)}, which no {what} gives"
+            cure = "add one" if "lidar" in lacking else "add it to the camera's images"
+            yield Finding(spec.name, found, cure)
         inertial = "inertial" in str(getattr(spec.config, "mode", ""))
         if inertial and not any(isinstance(each, ImuAnnouncement) for each in announced):
             yield Finding(spec.name, "it needs an IMU, which nobody announces", "add one")

@@ -117,6 +117,27 @@ def test_a_single_camera_keeps_within_two_percent(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(500)
+def test_svo_is_judged_beside_our_odometry(tmp_path: Path) -> None:
+    """`svo` at the beginning of its tour: both have begun, and know where they are."""
+    pytest.importorskip("svo_cpp")
+    changes = "run.duration=10s", "report.figures=[]", "evaluation.thresholds.coverage_percent=60"
+    figures = run("svo", tmp_path, *changes)["verdict"]["estimators"]
+    assert all(figures[name]["ate_percent"] < 0.5 for name in ("svo", "odometry"))
+    assert figures["svo"]["lost_count"] == 1  # before it began
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(500)
+def test_a_lidar_that_sees_the_floor_knows_the_height(tmp_path: Path) -> None:
+    """`kiss_icp` answers every scan, and the wide lidar is the better one."""
+    pytest.importorskip("kiss_icp")
+    figures = run("kiss_icp", tmp_path, "report.figures=[]")["verdict"]["estimators"]
+    assert {each["coverage_percent"] for each in figures.values()} == {100.0}
+    assert figures["on_wide"]["ate_percent"] < figures["on_narrow"]["ate_percent"] < 3.0
+
+
+@pytest.mark.slow
 def test_poor_images_over_a_poor_link_are_late_and_some_are_missing(tmp_path: Path) -> None:
     """`imperfect` loses one image in twenty; the estimates are as late as it asks for."""
     summary = run("imperfect", tmp_path, "run.duration=8s", "report.figures=[]")

@@ -16,6 +16,7 @@ from runtime.config.reading import parse
 from runtime.tools.lint import Finding, lint
 from runtime.tools.lint import rules as all_rules
 from tests.nodes.calibration.samples import IMU, camera, stereo
+from tests.nodes.kiss_icp.test_node import lidar
 from tests.runtime.tools.samples_cli import command
 
 SLAM: dict[str, Any] = {"name": "slam", "type": "nodes.orb_slam3:OrbSlam3"}
@@ -28,6 +29,9 @@ def file(mode: str = "rgbd_inertial", latency: str = "15ms", accept: Sequence[st
     nodes = [SLAM | {"mode": mode, "latency": latency}]
     nodes.append({"name": "evaluation", "type": "nodes.evaluation:Evaluation"})
     return parse({"run": {"accept": list(accept)}, "nodes": nodes}, "test")
+
+
+ON_A_LIDAR = parse({"nodes": [{"name": "kiss", "type": "nodes.kiss_icp:KissIcp"}]}, "test")
 
 
 def square(**more: Any) -> CameraAnnouncement:
@@ -93,6 +97,7 @@ ODD: list[tuple[str, Config, list[Announcement], str]] = [
     ),
     ("stamps", file(), [LEFT, msgspec.structs.replace(RIGHT, time_jitter=1e-3)], "have a jitter"),
     ("needs", file(), [square()], "it needs an IMU, which nobody announces"),
+    ("needs", ON_A_LIDAR, [square(), IMU], "it needs lidar, which no sensor gives"),
 ]
 
 
@@ -120,6 +125,7 @@ def test_nothing_is_said_of_a_sound_rig() -> None:
     pair = [msgspec.structs.replace(each, info=square().info) for each in (LEFT, RIGHT)]
     near = msgspec.structs.replace(pair[1], position=(0.15, 0.12, -0.03), rate=30.0)
     assert [each.rule for each in lint(file("rgbd"), [pair[0], near])] == []
+    assert lint(ON_A_LIDAR, [lidar()]) == []
 
 
 def test_what_a_file_accepts_is_left_out_and_a_wrong_name_is_said() -> None:
