@@ -58,8 +58,6 @@ def check_pose(event: Any, position: tuple[float, ...], orientation: tuple[float
 def check_covariance(event: Any, field: str, size: int) -> None:
     """Check that a covariance is empty, or has `size` rows of `size` finite numbers in one tuple.
 
-    Whether it is one, so symmetric and positive definite, is for those to judge who use it.
-
     Raises:
         TypeError: It is something else.
         ValueError: A number is not finite.

@@ -120,6 +120,7 @@ class Hold(Generic[T]):
         if config.latencies:
             self._latency_at = read_latencies(Path(config.latencies), config.latency_factor)
             self.answers.latency = None
+        self.answers.costs.latency = self.answers.latency
         self._clock = clock
         self._log = log
         self._wall = wall

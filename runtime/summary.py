@@ -24,7 +24,6 @@ from runtime.part_summaries import (
 from runtime.run_state import RunState
 from runtime.schedule import SECOND
 from runtime.watchdogs.loop import Stall
-from runtime.workers.costs import Costs
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -204,7 +203,9 @@ def summarise(
         },
         workers={
             name: WorkerSummary.of(each)
-            for name, each in (state.costs | _programs(state.outside)).items()
+            for name, each in (
+                state.costs | {k: a.costs for k, a in state.outside.items() if a.costs.calls}
+            ).items()
         },
         outside={name: OutsideSummary.of(each) for name, each in state.outside.items()},
     )
@@ -214,13 +215,6 @@ def _not_deterministic(state: RunState) -> list[str]:
     nodes = {node.name for node in state.all_nodes if not node.deterministic}
     held = state.outside.items() if state.clock.kind == "lockstep" else ()
     return sorted(nodes | {name for name, answers in held if answers.why_not})
-
-
-def _programs(outside: dict[str, Answers]) -> dict[str, Costs]:
-    """Return what systems outside cost whose processes are known."""
-    for each in outside.values():
-        each.costs.latency = each.latency
-    return {name: each.costs for name, each in outside.items() if each.costs.calls}
 
 
 def _losses(outside: dict[str, Answers]) -> dict[str, dict[str, Any]]:

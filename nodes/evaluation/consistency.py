@@ -1,4 +1,4 @@
-"""Velocities and covariances that an estimator gives with its poses, held against the truth."""
+"""Covariances that an estimator gives with its poses, held against its errors."""
 
 from __future__ import annotations
 
@@ -7,27 +7,11 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from nodes.evaluation.metrics import interpolated, position_errors, rms, same_stamps
+from nodes.evaluation.metrics import Floats, same_stamps
 from nodes.trajectory import Trajectory
-
-Floats = npt.NDArray[np.float64]
 
 _SINGULAR = 1e-9
 """Smallest eigenvalue of a correlation matrix that can be inverted."""
-
-
-def velocity_error(truth: Trajectory, stamps: npt.NDArray[np.int64], velocities: Floats) -> float:
-    """Return the root mean square of the errors of velocities, m/s.
-
-    The true velocity is the difference of the true positions.
-
-    Args:
-        truth: The true poses, as densely as there are.
-        stamps: Of the velocities (ns), within the truth's time, shape (n,), n ≥ 1.
-        velocities: In the truth's frame, shape (n, 3).
-    """
-    true = interpolated(truth.stamps, truth.velocities(), stamps)
-    return rms(position_errors(true, velocities))
 
 
 def consistency(

@@ -5,6 +5,7 @@ Pure functions; `nodes.evaluation.node` collects, and `nodes.evaluation.results`
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -13,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.evaluation.alignment import Alignment, How, align, transform, umeyama
-from nodes.evaluation.consistency import consistency, velocity_error
+from nodes.evaluation.consistency import consistency
 from nodes.evaluation.coverage import Interval, Stamps, choose_frames, cover, seconds
 from nodes.evaluation.metrics import (
     absolute_errors,
     drift_percent,
+    interpolated,
     path_errors,
     position_errors,
     rms,
@@ -120,6 +122,7 @@ def judge(
     due = truth.stamps if frames is None else frames
     due = due[: max(int(np.searchsorted(due, end - waits, side="right")), 1)]
     coverage = cover(due, poses, round(gap * SECOND), record.reported_lost(end))
+    due = due[truth.covers(due)]
     inside = (truth.stamps >= coverage.flight.start) & (truth.stamps <= coverage.flight.end)
     flight = truth.take(inside) if inside.any() else truth
     path = flight.length()
@@ -139,12 +142,13 @@ def judge(
             (coverage.flight.end if estimate is None else int(poses[0])) - coverage.flight.start
         )
         / SECOND,
-        **_held(held_errors(truth, due, poses[:0], np.empty(0), coverage.lost), path),
     }
+    without = _held(held_errors(truth, due, poses[:0], np.empty(0), coverage.lost), path)
     how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
     final = _judge_final(record, truth, due, path, alignment, figures)
     judgement = Judgement(figures, estimate, lost=coverage.lost, final=final)
     if estimate is None:
+        figures |= without
         return judgement
     # An interval that lasts to the end of the flight counts as long as it is: it took no less.
     if took := [seconds([each]) for each in coverage.lost if each.start >= poses[0]]:
@@ -160,16 +164,16 @@ def judge(
         there, kept = associate(truth, estimate)
         aligned = align(kept, there, how)
     except ValueError as error:  # too little to align, or no time in common
-        figures["why"] = str(error)
+        figures |= {**without, "why": str(error)}
         return judgement
     moved = aligned.trajectory
     figures |= {"scale": aligned.scale, **absolute_errors(there, moved)}
     figures["ate_percent"] = 100.0 * figures["ate_rmse_m"] / path if path > 0 else None
     try:
-        figures |= path_errors(there, moved, delta)
         figures["drift_percent"] = drift_percent(there, moved)
         figures["drift_m_per_s"] = figures["drift_percent"] * there.length() / 100 / there.seconds
         figures |= share_errors(there, moved, path)
+        figures |= path_errors(there, moved, delta)
     except ValueError as error:  # it did not get that far
         figures["why"] = str(error)
     inside = truth.covers(poses)
@@ -182,7 +186,9 @@ def judge(
     held = held_errors(truth, due, there.stamps, of_images.position, coverage.lost)
     figures |= _held(held, path) | _said_with_poses(record, truth, there, aligned)
     if not record.scale_free:
-        figures["scale_error_percent"] = _scale_error(there, moved)
+        with contextlib.suppress(ValueError):  # on one line
+            scale = umeyama(moved.positions, there.positions, with_scale=True)[2]
+            figures["scale_error_percent"] = 100.0 * abs(scale - 1.0)
     whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
     of_ticks = errors_at_ticks(truth, whole, arrivals, rate) if len(arrivals) else None
     if of_ticks is not None:
@@ -239,8 +245,10 @@ def _said_with_poses(
     rows = np.isin(there.stamps, [*record.velocities])
     if rows.any():
         said = np.array([record.velocities[stamp] for stamp in there.stamps[rows].tolist()])
-        turned = scale * said @ rotation.T
-        figures["velocity_rmse_m_per_s"] = velocity_error(truth, there.stamps[rows], turned)
+        # The true velocity is the difference of the true positions, as densely as there are.
+        true = interpolated(truth.stamps, truth.velocities(), there.stamps[rows])
+        wrong = position_errors(true, scale * said @ rotation.T)
+        figures["velocity_rmse_m_per_s"] = rms(wrong)
     rows = np.isin(there.stamps, [*record.covariances])
     if rows.any():
         said = np.array([record.covariances[stamp] for stamp in there.stamps[rows].tolist()])
@@ -248,15 +256,6 @@ def _said_with_poses(
         turned = turn @ said.reshape(-1, 6, 6) @ turn.T
         figures |= consistency(there.take(rows), aligned.trajectory.take(rows), turned)
     return figures
-
-
-def _scale_error(truth: Trajectory, estimate: Trajectory) -> float | None:
-    """Return by how many percent Sim(3) would have to change the scale; `None` on a line."""
-    try:
-        scale = umeyama(estimate.positions, truth.positions, with_scale=True)[2]
-    except ValueError:
-        return None
-    return 100.0 * abs(scale - 1.0)
 
 
 def beside_the_plan(truth: Trajectory, plan: Trajectory) -> dict[str, float]:

@@ -13,14 +13,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from nodes.evaluation.coverage import Interval, answered
-from nodes.evaluation.metrics import interpolated, position_errors
+from nodes.evaluation.coverage import Interval, Stamps, answered
+from nodes.evaluation.metrics import Floats, interpolated, position_errors
 from nodes.trajectory import Trajectory
-
-Floats = npt.NDArray[np.float64]
-Stamps = npt.NDArray[np.int64]
 
 
 def held_errors(
@@ -34,20 +30,17 @@ def held_errors(
 
     Args:
         truth: The true poses.
-        frames: Stamps of the flight's images (ns), strictly rising, shape (k,).
+        frames: Stamps of the flight's images (ns), strictly rising, within the truth's time.
         poses: Stamps of the poses, strictly rising, shape (n,), n ≥ 0.
         errors: Distance of each to the truth after alignment, metres, shape (n,).
         lost: Intervals without a pose; see `nodes.evaluation.coverage.cover`.
 
     Returns:
-        Metres, one for each image within the truth's time.
+        Metres, one for each image.
     """
-    frames = frames[truth.covers(frames)]
-    if not len(frames):
-        return np.empty(0)
     path = _path_at(truth, frames)
     if not len(poses):
-        return np.asarray(path - path[0])
+        return np.asarray(path - path[:1])
     missing = np.zeros(len(frames), np.bool_)
     for start, end in lost:
         missing |= (frames >= start) & (frames <= end)
@@ -57,7 +50,7 @@ def held_errors(
     found = errors[np.where(nearer, after - 1, after % len(poses))]
     before = np.searchsorted(poses, frames, side="right") - 1
     none = before < 0
-    since = np.where(none, path[0], _path_at(truth, poses)[before])
+    since = np.where(none, path[:1], _path_at(truth, poses)[before])
     held = np.where(none, 0.0, errors[before]) + path - since
     return np.asarray(np.where(missing, held, found))
 
@@ -70,15 +63,12 @@ def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory)
 
     Args:
         truth: The true poses.
-        frames: Stamps of the flight's images (ns), strictly rising, shape (k,).
+        frames: Stamps of the flight's images (ns), strictly rising, within the truth's time.
         estimate: The aligned poses.
 
     Returns:
-        Metres, one for each image within the truth's time.
+        Metres, one for each image.
     """
-    frames = frames[truth.covers(frames)]
-    if not len(frames):
-        return np.empty(0)
     first, last = int(estimate.stamps[0]), int(estimate.stamps[-1])
     inside = np.clip(frames, first, last)
     away = abs(_path_at(truth, frames) - _path_at(truth, inside))

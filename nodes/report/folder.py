@@ -59,8 +59,10 @@ class _Reader:
         self.missing: list[str] = []
 
     def run(self) -> Run:
-        facts = self._try("summary.json", _facts, "the run did not end in an orderly way")
-        verdict = self._try("evaluation/verdict.json", _verdict, "nothing was evaluated to the end")
+        facts = self._try("summary.json", _decoder(Facts), "the run did not end in an orderly way")
+        verdict = self._try(
+            "evaluation/verdict.json", _decoder(Verdict), "nothing was evaluated to the end"
+        )
         if facts is not None:
             if verdict is not None and verdict.estimators and facts.verdict is None:
                 self.missing.append(
@@ -192,12 +194,8 @@ def _places(path: Path) -> npt.NDArray[np.float64]:
     return np.array(rows, np.float64).reshape(-1, 3)
 
 
-def _facts(path: Path) -> Facts:
-    return msgspec.json.decode(path.read_bytes(), type=Facts)
-
-
-def _verdict(path: Path) -> Verdict:
-    return msgspec.json.decode(path.read_bytes(), type=Verdict)
+def _decoder(type_: type[T]) -> Callable[[Path], T]:
+    return lambda path: msgspec.json.decode(path.read_bytes(), type=type_)
 
 
 def _text(path: Path) -> str:

@@ -19,13 +19,7 @@ MAIN = {
     "final_ate_percent": ("the same in percent of the path", "%"),
     "final_held_ate_percent": ("the same over the whole flight", "%"),
     "coverage_percent": ("share of the flight with poses", "%"),
-    "ate_mean_m": ("mean position error", "m"),
-    "ate_median_m": ("median position error", "m"),
-    "ate_std_m": ("standard deviation of the position error", "m"),
     "ate_max_m": ("greatest position error", "m"),
-    "ate_north_rmse_m": ("position error along north, RMS", "m"),
-    "ate_east_rmse_m": ("position error along east, RMS", "m"),
-    "ate_down_rmse_m": ("position error along down, RMS", "m"),
     "rot_rmse_deg": ("rotation error, RMS", "°"),
     "rpe_trans_percent": ("relative pose error (RPE), position", "%"),
     "rpe_rot_deg_per_m": ("relative pose error (RPE), rotation", "°/m"),
@@ -106,7 +100,9 @@ def figures(run: Run, *, main: bool) -> list[Row]:
         if (limit is None or name in COUNTS) and all(value is None for value in values):
             continue
         meaning, unit = MAIN.get(name) or (name.replace("_", " "), _unit(name))
-        cells = [(show(value), _missed(name, value, limit)) for value in values]
+        why = [e.figures.get("failed") or () for e in run.estimators]
+        missed = [any(str(reason).startswith(f"{name}: ") for reason in each) for each in why]
+        cells = list(zip(map(show, values), missed, strict=True))
         rows.append(
             Row(name, meaning, unit, "" if limit is None else f"{_side(name)} {limit:g}", cells)
         )
@@ -135,25 +131,19 @@ def facts(run: Run) -> list[tuple[str, str]]:
         speed = np.linalg.norm(truth.velocities(), axis=1).max()
         text = f"{number(truth.length())} m, at most {number(float(speed))} m/s"
         rows.append((name, text))
-    if f.clock is not None:
-        rows.append(("clock", f.clock))
-    if f.seed is not None:
-        rows.append(("seed", str(f.seed)))
-    if f.sim_seconds is not None:
-        rows.append(("time on the run's clock", f"{f.sim_seconds:.2f} s"))
-    if f.wall_seconds is not None:
-        speed = (f.sim_seconds or 0.0) / max(f.wall_seconds, 1e-9)
-        rows.append(("real time", f"{f.wall_seconds:.2f} s ({number(speed)} × real time)"))
-    if command := f.environment.get("command"):
-        rows.append(("command", command))
-    if commit := f.environment.get("commit"):
-        rows.append(("commit", commit))
-    if f.reason is not None:
-        rows.append(("ended by", f.reason))
-    if f.error is not None:
-        rows.append(("error", f.error))
-    if f.clock is not None:
-        rows.append(("digest", _digest(f)))
+    speed = (f.sim_seconds or 0.0) / max(f.wall_seconds or 0.0, 1e-9)
+    known = {
+        "clock": f.clock,
+        "seed": f.seed,
+        "time on the run's clock": f.sim_seconds and f"{f.sim_seconds:.2f} s",
+        "real time": f.wall_seconds and f"{f.wall_seconds:.2f} s ({number(speed)} × real time)",
+        "command": f.environment.get("command") or None,
+        "commit": f.environment.get("commit") or None,
+        "ended by": f.reason,
+        "error": f.error,
+        "digest": f.clock and _digest(f),
+    }
+    rows += [(name, str(value)) for name, value in known.items() if value is not None]
     rows += [(f"digest of what {k} was sent", o.inputs) for k, o in f.outside.items() if o.inputs]
     rows += [(f"dropped at {port}", str(s.dropped)) for port, s in f.streams.items() if s.dropped]
     rows += [
@@ -213,16 +203,9 @@ def _said(value: Any) -> str:
 
 def ticks(run: Run) -> list[list[str]]:
     """Return how punctual each ticker was."""
+    late = {k: (t.late_p50_us, t.late_p99_us, t.late_max_us) for k, t in run.facts.ticks.items()}
     return [
-        [
-            name,
-            f"{t.hz:g}",
-            str(t.calls),
-            f"{t.late_p50_us:.0f}",
-            f"{t.late_p99_us:.0f}",
-            f"{t.late_max_us:.0f}",
-            str(t.missed),
-        ]
+        [name, f"{t.hz:g}", str(t.calls), *(f"{each:.0f}" for each in late[name]), str(t.missed)]
         for name, t in sorted(run.facts.ticks.items())
     ]
 
@@ -245,14 +228,6 @@ def outputs(run: Run) -> list[list[str]]:
 
 def _unit(name: str) -> str:
     return next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
-
-
-def _missed(name: str, value: Any, limit: float | None) -> bool:
-    if limit is None or (value is None and name in COUNTS):
-        return False
-    if not isinstance(value, int | float):
-        return True
-    return not (value >= limit if name in AT_LEAST else value <= limit)
 
 
 def _side(name: str) -> str:

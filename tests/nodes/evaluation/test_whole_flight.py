@@ -224,7 +224,17 @@ def test_to_say_less_never_looks_better(said: list[int], percent: float) -> None
     assert (np.diff(every) <= 0.05 * PATH / 100).all()  # of an image within the gap at the end
 
 
-def test_errors_without_any_image_in_the_truths_time_are_none() -> None:
-    elsewhere = FRAMES + 2 * END
-    assert held_errors(TRUTH, elsewhere, FRAMES, np.zeros(len(FRAMES)), []).shape == (0,)
-    assert interpolated_errors(TRUTH, elsewhere, TRUTH).shape == (0,)
+def test_errors_of_no_image_are_none() -> None:
+    none = FRAMES[:0]
+    assert held_errors(TRUTH, none, FRAMES, np.zeros(len(FRAMES)), []).shape == (0,)
+    assert held_errors(TRUTH, none, none, np.zeros(0), []).shape == (0,)
+    assert interpolated_errors(TRUTH, none, TRUTH).shape == (0,)
+
+
+def test_images_after_the_truths_time_have_no_error() -> None:
+    record = EstimatorRecord()
+    for stamp in FRAMES.tolist():
+        drifts(2)(record, stamp, stamp / END)
+    figures = judge(record, TRUTH, cameras={"c": FRAMES + 2 * END}).figures
+    assert figures["held_ate_rmse_m"] is None
+    assert figures["ate_rmse_m"] > 0.0
