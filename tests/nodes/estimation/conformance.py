@@ -162,7 +162,8 @@ def run(case: Case, flight: Flight | None = None) -> Record:
         )
     assert isinstance(node.config, EstimatorConfig)
     latency = round(node.config.latency * 1e9)
-    return Record(flight, case.announced(), result.sent, [*Ears.heard], latency, result.reason)
+    (said,) = result.of(EstimatorAnnouncement)
+    return Record(flight, said, result.sent, [*Ears.heard], latency, result.reason)
 
 
 # Refusals.

@@ -6,12 +6,20 @@ One entry in `CASES` for each; its rig is what it announces to read.
 from __future__ import annotations
 
 import functools
+import json
+import sys
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from nodes.inertial_odometry import RgbdInertialOdometry, StereoInertialOdometry
+from nodes.link import client as client_module
 from nodes.monocular_odometry import MonocularOdometry
+from nodes.orb_slam3 import OrbSlam3
+from nodes.orb_slam3.vocabulary_file import find_vocabulary
+from nodes.process import Process
 from nodes.stereo_odometry import StereoOdometry
 from nodes.svo import Svo
 from nodes.visual_odometry import VisualOdometry
@@ -24,6 +32,7 @@ from tests.nodes.estimation.conformance import (
     refusal_faults,
     run,
 )
+from tests.nodes.estimation.flight import fly
 from tests.nodes.vit.library import stub_settings
 
 
@@ -34,12 +43,45 @@ def stub_of_vit(mode: str) -> Case:
     return Case(Vit, settings, begins=4, width=160, built=more)
 
 
+def program() -> dict[str, Any]:
+    """Return settings of a program that knows the truth, and sees when it is dark."""
+    flight = fly(("depth", "rgb"), 1, 160)
+    truth = {
+        stamp: None if flight.kinds[stamp] in "bwrhz" else pose.tolist()
+        for stamp, pose in flight.truth.items()
+    }
+    file = Path(tempfile.mkdtemp(prefix="conformance_")) / "truth.json"
+    file.write_text(json.dumps(truth))
+    client = str(Path(client_module.__file__).parent)
+    command = [sys.executable, str(Path(__file__).with_name("outside.py")), str(file)]
+    return {"command": command, "environment": {"PYTHONPATH": client}}
+
+
+def orb_slam3(mode: str) -> Case:
+    """Return the case of a mode of ORB-SLAM3, with the vocabulary that somebody has trained.
+
+    After the darkness it begins another map where it was last: 0.2 s of flight are missing.
+    """
+
+    def built() -> dict[str, Any]:
+        try:
+            return {"vocabulary": str(find_vocabulary(""))}
+        except ValueError as error:
+            pytest.skip(str(error))
+
+    plain = Case(OrbSlam3, {"mode": mode}, width=480, worker=True, slow=True, needs="pyorbslam3")
+    return plain._replace(begins=6, tolerance=0.25, built=built)
+
+
 CASES = {
     "features": Case(VisualOdometry),
     "dense": Case(VisualOdometry, {"method": "dense"}, width=160),
     "monocular": Case(MonocularOdometry, begins=14),
     "stereo": Case(StereoOdometry),
     "svo": Case(Svo, begins=30, width=480, worker=True, needs="svo_cpp", slow=True),
+    "program": Case(Process, width=160, built=program),
+    "ORB-SLAM3, RGB-D": orb_slam3("rgbd"),
+    "ORB-SLAM3, stereo": orb_slam3("stereo"),
     "vit": stub_of_vit("stereo_inertial"),
     "monocular vit": stub_of_vit("monocular_inertial"),
     "RGB-D-inertial": Case(RgbdInertialOdometry),
