@@ -60,7 +60,7 @@ def program() -> dict[str, Any]:
 def orb_slam3(mode: str) -> Case:
     """Return the case of a mode of ORB-SLAM3, with the vocabulary that somebody has trained.
 
-    After the darkness it begins another map where it was last: 0.2 s of flight are missing.
+    After each loss it begins another map where it was last: the flight meanwhile is missing.
     """
 
     def built() -> dict[str, Any]:
@@ -70,7 +70,7 @@ def orb_slam3(mode: str) -> Case:
             pytest.skip(str(error))
 
     plain = Case(OrbSlam3, {"mode": mode}, width=480, worker=True, slow=True, needs="pyorbslam3")
-    return plain._replace(begins=6, tolerance=0.25, built=built)
+    return plain._replace(begins=6, tolerance=0.5, built=built)
 
 
 CASES = {
