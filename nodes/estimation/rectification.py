@@ -169,9 +169,11 @@ def misalignment(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
     """Return by how much a pair of pinhole images misses being aligned row by row, pixels.
 
     The most that a point's right pixel differs from that to the left of its left one by f ·
-    baseline / z; ``inf`` if it cannot be seen.
+    baseline / z; ``inf`` if it cannot be seen, or their sizes differ.
     """
     info = left.info
+    if (info.width, info.height) != (right.info.width, right.info.height):
+        return math.inf
     u, v, z = np.meshgrid([0, info.width - 1], [0, info.height - 1], [1.0, 1e9])
     pixels = np.column_stack([u.ravel(), v.ravel()])
     rays = info.unproject(pixels)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 import numpy.typing as npt
 
@@ -16,7 +14,7 @@ from nodes.estimation import (
     StereoInertialFrame,
 )
 from nodes.inertial_odometry.tracker import InertialSettings, InertialTracker
-from nodes.stereo_odometry import StereoSettings, baseline, why_not_rectified
+from nodes.stereo_odometry import StereoSettings, baseline
 from nodes.visual_odometry.settings import FeatureSettings
 from runtime import Bundle
 
@@ -40,12 +38,6 @@ class _InertialOdometry(Estimator[InertialOdometryConfig]):
 
     inertial = True
     lenses = frozenset()
-
-    def check(self) -> Iterable[str]:
-        """Return the errors: sensors that are missing, or a rig that is not rectified."""
-        yield from super().check()
-        if why_not := why_not_rectified(self.cameras):
-            yield why_not
 
     async def on_ready(self) -> None:
         """Start the tracker, in a process of its own."""

@@ -5,7 +5,6 @@ from nodes.stereo_odometry.node import (
     StereoOdometry,
     StereoOdometryConfig,
     baseline,
-    why_not_rectified,
 )
 
 __all__ = [
@@ -14,5 +13,4 @@ __all__ = [
     "StereoOdometryConfig",
     "StereoSettings",
     "baseline",
-    "why_not_rectified",
 ]

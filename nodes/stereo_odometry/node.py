@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
 
 import cv2
 import msgspec
@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, CameraInfo
-from events.poses import inverse, pose_matrix
 from nodes.estimation import (
     WORKER_ENVIRONMENT,
     Estimator,
@@ -22,9 +21,6 @@ from nodes.stereo_odometry.matcher import StereoMatcher, StereoSettings
 from nodes.visual_odometry.features import FeatureTracker
 from nodes.visual_odometry.settings import FeatureSettings
 from runtime import Bundle
-
-_TOLERANCE = 1e-3
-"""Metres along y and z, and radians, by which a pair may differ from a rectified one."""
 
 
 class StereoOdometryConfig(EstimatorConfig):
@@ -48,12 +44,6 @@ class StereoOdometry(Estimator[StereoOdometryConfig]):
     method = "stereo odometry (features)"
 
     frames = Bundle(StereoFrame, keep="latest")
-
-    def check(self) -> Iterable[str]:
-        """Return the errors: no stereo rig, or one that is not rectified."""
-        yield from super().check()
-        if why_not := why_not_rectified(self.cameras):
-            yield why_not
 
     async def on_ready(self) -> None:
         """Start the tracker, in a process of its own."""
@@ -103,35 +93,5 @@ class StereoTracker:
 
 
 def baseline(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
-    """Return the metres from the left camera to the right one along its x axis."""
-    return float(_between(left, right)[0, 3])
-
-
-def why_not_rectified(cameras: tuple[CameraAnnouncement, ...]) -> str:
-    """Return why the rows of two cameras do not match, in a sentence; empty if they do."""
-    if len(cameras) != 2:
-        return ""
-    left, right = cameras
-    a, b = left.info, right.info
-    if (a.width, a.height, *a.matrix().ravel()) != (b.width, b.height, *b.matrix().ravel()):
-        return (
-            f"expected the same intrinsics of {left.source} and {right.source}, found {a} and {b}"
-        )
-    pose = _between(left, right)
-    turned, off = np.abs(pose[:3, :3] - np.eye(3)).max(), np.abs(pose[1:3, 3]).max()
-    if pose[0, 3] <= 0 or max(turned, off) > _TOLERANCE:
-        x, y, z = pose[:3, 3]
-        return (
-            f"expected {right.source} to look the same way as {left.source}, to the right of it "
-            f"(rectified images), found it at ({x:.4f}, {y:.4f}, {z:.4f}) m, turned by "
-            f"{np.degrees(turned):.2f}°"
-        )
-    return ""
-
-
-def _between(left: CameraAnnouncement, right: CameraAnnouncement) -> npt.NDArray[np.float64]:
-    """Return the right camera's pose in the left one, shape (4, 4)."""
-    return np.asarray(
-        inverse(pose_matrix(left.position, left.orientation))
-        @ pose_matrix(right.position, right.orientation)
-    )
+    """Return the metres from the left camera to the right one, both aligned."""
+    return math.dist(left.position, right.position)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from events import CameraAnnouncement
-from nodes.stereo_odometry import StereoMatcher, StereoSettings, why_not_rectified
+from nodes.estimation.rectification import ALIGNED, misalignment
+from nodes.stereo_odometry import StereoMatcher, StereoSettings
 from nodes.stereo_odometry.node import StereoTracker
 from nodes.visual_odometry.settings import FeatureSettings
 from nodes.visual_odometry.surfaces import inverse_depth
@@ -89,14 +90,16 @@ def camera(
     )
 
 
-def test_only_rectified_pairs_are_taken() -> None:
+def test_only_rectified_pairs_are_aligned() -> None:
     left = camera("left", (0.2, 0.0, 0.0))
-    assert why_not_rectified((left, camera("right", (0.3, 0.0, 0.0)))) == ""
-    assert why_not_rectified(()) == ""
-    assert "to the right" in why_not_rectified((left, camera("right", (0.1, 0.0, 0.0))))
-    assert "to the right" in why_not_rectified((left, camera("right", (0.3, 0.01, 0.0))))
+    assert misalignment(left, camera("right", (0.3, 0.0, 0.0))) < 1e-6
     turned = msgspec.structs.replace(
         camera("right", (0.3, 0.0, 0.0)), orientation=(0.99998, 0.00632, 0.0, 0.0)
     )
-    assert "turned by" in why_not_rectified((left, turned))
-    assert "intrinsics" in why_not_rectified((left, camera("right", (0.3, 0.0, 0.0), width=321)))
+    for right in (
+        camera("right", (0.1, 0.0, 0.0)),
+        camera("right", (0.3, 0.01, 0.0)),
+        camera("right", (0.3, 0.0, 0.0), width=321),
+        turned,
+    ):
+        assert misalignment(left, right) > ALIGNED
