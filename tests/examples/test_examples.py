@@ -129,12 +129,15 @@ def test_svo_is_judged_beside_our_odometry(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(500)
-def test_a_lidar_that_sees_the_floor_knows_the_height(tmp_path: Path) -> None:
-    """`kiss_icp` answers every scan, and the wide lidar is the better one."""
+def test_kiss_icp_answers_every_scan(tmp_path: Path) -> None:
+    """`kiss_icp` is good to centimetres but for the height, which it loses as it takes off."""
     pytest.importorskip("kiss_icp")
     figures = run("kiss_icp", tmp_path, "report.figures=[]")["verdict"]["estimators"]
-    assert {each["coverage_percent"] for each in figures.values()} == {100.0}
-    assert figures["on_wide"]["ate_percent"] < figures["on_narrow"]["ate_percent"] < 3.0
+    assert figures.keys() == {"on_narrow", "on_wide"}
+    for each in figures.values():
+        assert each["coverage_percent"] == 100.0
+        assert max(each["ate_north_rmse_m"], each["ate_east_rmse_m"]) < 0.05
+        assert each["ate_percent"] < 3.0
 
 
 @pytest.mark.slow
