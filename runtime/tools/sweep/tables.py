@@ -21,6 +21,7 @@ from runtime.tools.sweep.rows import Row
 MAIN_FIGURES = (
     "ate_rmse_m",
     "ate_percent",
+    "held_ate_percent",
     "rpe_trans_percent",
     "rpe_rot_deg_per_m",
     "coverage_percent",
