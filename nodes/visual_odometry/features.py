@@ -123,8 +123,10 @@ class FeatureTracker:
         match = self._match(grey, inverse_of)
         if self._aligns and (match is None or match.agree.sum() < _ENOUGH):
             view = View.of(grey, inverse_of)
-            expected = match.pose if match and lost else self._motion.expected(stamp)
-            alignment = self._references.align(view, expected, lost)
+            starts = [match.pose] if match and lost else [self._motion.expected(stamp)]
+            if match is None and lost:
+                starts += [self._motion.steady(stamp), self._pose]
+            alignment = self._references.align(view, starts, lost)
             if alignment is not None:
                 match = self._find(grey, inverse_of, alignment.pose, alignment.information)
                 match = match or MapMatch.without_landmarks(alignment.pose)

@@ -19,6 +19,7 @@ class Motion:
     def __init__(self) -> None:
         self._velocity = np.zeros(6)  # metres and radians per second
         self._last: tuple[int, Floats] | None = None
+        self._steady: tuple[int, Floats, Floats] | None = None
 
     def expected(self, stamp: int) -> Floats:
         """Return the pose at a time (ns), world to camera, shape (4, 4)."""
@@ -33,6 +34,14 @@ class Motion:
             before, last = self._last
             self._velocity = motion_between(last, pose) / ((stamp - before) * 1e-9)
         self._last = stamp, pose
+        self._steady = stamp, pose, self._velocity
+
+    def steady(self, stamp: int) -> Floats:
+        """Return the pose at a time if the last measured velocity has not changed since."""
+        if self._steady is None:
+            return self.expected(stamp)
+        before, pose, velocity = self._steady
+        return moved(pose, velocity * (stamp - before) * 1e-9)
 
     def carried(self, stamp: int) -> Floats:
         """Return the pose at a time without a measurement, from which on the motion fades."""

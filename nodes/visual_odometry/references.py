@@ -11,6 +11,8 @@ _UNSURE = 0.1
 """Metres of a position's standard deviation from which on an image says too little."""
 _AGREE = 0.6
 """Least share of the points in view that must agree,"""
+_AGREE_AGAIN = 0.8
+"""the same of edges after a loss, when the alignment may have found the wrong ones,"""
 _POINTS = 60
 """and their least number."""
 _PRIOR = 0.02, 0.02
@@ -53,25 +55,30 @@ class References:
         """Make a view the reference; its pose is world to camera, shape (4, 4)."""
         self._reference = self._made(view, pose)
 
-    def align(self, view: View, expected: Floats, lost: bool) -> Alignment | None:
+    def align(self, view: View, starts: list[Floats], lost: bool) -> Alignment | None:
         """Return the alignment of a view with the reference, or with the last known image.
 
         Args:
             view: The view.
-            expected: Its expected pose, world to camera, shape (4, 4).
-            lost: Whether that is a guess only; the last known pose is then another.
+            starts: Expected poses to begin with, world to camera, shape (4, 4) each.
+            lost: Whether these are guesses only.
         """
         found = None
         if self._reference is not None:
-            found = self._align(self._reference, view, expected, lost)
+            found = self._best(self._reference, view, starts, lost)
         if found is None and self._known is not None:
             grey, inverse_of, pose = self._known
             if self._reference is None or (self._reference.pose != pose).any():
                 self._reference = self._made(View.of(grey, inverse_of), pose)
-                found = self._align(self._reference, view, expected, lost)
-            if found is None and lost:
-                found = self._align(self._reference, view, pose, lost)
+                found = self._best(self._reference, view, starts, lost)
         return found
+
+    def _best(
+        self, reference: Reference, view: View, starts: list[Floats], lost: bool
+    ) -> Alignment | None:
+        """Return the alignment from one of some poses in which most edges agree."""
+        tried = (self._align(reference, view, start, lost) for start in starts)
+        return max((found for found in tried if found), key=lambda f: f.sharp, default=None)
 
     def carry(self, view: View, expected: Floats) -> Floats:
         """Return the pose of a view while tracking is lost.
@@ -98,5 +105,5 @@ class References:
         prior = _PRIOR_LOST if lost else _PRIOR
         found = align(reference, view, expected, self._matrix, _READING * self._noise, prior)
         enough = bool(found.agree.sum() >= _POINTS and found.agree.mean() > _AGREE)
-        enough &= found.sharp > _AGREE
+        enough &= found.sharp > (_AGREE_AGAIN if lost else _AGREE)
         return found if enough and found.deviation() < _UNSURE else None
