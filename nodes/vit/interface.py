@@ -18,9 +18,6 @@ from events import Imu
 from nodes.odometry.images import Grey
 from runtime.errors import VisnavError
 
-VERSIONS = (1, 2)
-"""Major versions that are known."""
-
 RESULTS = ("INVALID_VERSION", "INVALID_VALUE", "ALLOCATION_FAILURE", "NOT_SUPPORTED", "NOT_ENABLED")
 """Names of the results -1, -2, … after ``VIT_ERROR_``."""
 
@@ -47,49 +44,34 @@ _TYPES: dict[str, Any] = {
 }
 
 
-def _struct(name: str, declarations: str) -> type[c.Structure]:
-    """Return a structure with fields as C declares them."""
+# ns; m/s²; rad/s; pixels; hertz; matrices row by row. A pose is that of the IMU in the library's
+# world, whose z is up, with a quaternion x y z w. Noise is in continuous densities.
+_STRUCTURES = """
+Config: text file, u32 cameras, u32 imus, bool show_ui
+ImuSample: i64 stamp, float acceleration[3], float angular_velocity[3]
+ImageSample: u32 camera, i64 stamp, address data, u32 width, u32 height, u32 stride, u32 size, \
+    int format, u32 mask_count, address masks
+PoseData: i64 stamp, float position[3], float orientation[4], float velocity[3]
+CameraCalibration: u32 camera, int width, int height, double rate, double pinhole[4], int model, \
+    u32 count, double distortion[32], double transform[16]
+InertialCalibration: double transform[9], double offset[3], double bias[3], double noise[3]
+ImuCalibration: u32 imu, double rate, InertialCalibration accel, InertialCalibration gyro
+"""
+
+
+def _structure(line: str) -> type[c.Structure]:
+    """Return the structure of a line: its name, and its fields as C declares them."""
+    name, _, declarations = line.partition(": ")
     found = re.findall(r"(\w+) (\w+)(?:\[(\d+)\])?", declarations)
     fields = [(field, _TYPES[kind] * int(n) if n else _TYPES[kind]) for kind, field, n in found]
     made = _TYPES[name] = type(name, (c.Structure,), {"_fields_": fields})
     return made
 
 
-Config = _struct("Config", "text file, u32 cameras, u32 imus, bool show_ui")
-"""What a tracker is made with."""
-
-ImuSample = _struct("ImuSample", "i64 stamp, float acceleration[3], float angular_velocity[3]")
-"""Nanoseconds; specific force, m/s²; rad/s."""
-
-ImageSample = _struct(
-    "ImageSample",
-    "u32 camera, i64 stamp, address data, u32 width, u32 height, u32 stride, u32 size, int format, "
-    "u32 mask_count, address masks",
+Config, ImuSample, ImageSample, PoseData, *_calibrations = map(
+    _structure, _STRUCTURES.strip().splitlines()
 )
-"""An image; those of one stamp (ns) come in the order of the cameras."""
-
-PoseData = _struct(
-    "PoseData", "i64 stamp, float position[3], float orientation[4], float velocity[3]"
-)
-"""The IMU in the library's world, whose z is up: metres, x y z w, metres per second."""
-
-CameraCalibration = _struct(
-    "CameraCalibration",
-    "u32 camera, int width, int height, double rate, double pinhole[4], int model, u32 count, "
-    "double distortion[32], double transform[16]",
-)
-"""A camera: pixels, hertz, fx fy cx cy, lens, and its pose in the IMU's frame, row by row."""
-
-InertialCalibration = _struct(
-    "InertialCalibration", "double transform[9], double offset[3], double bias[3], double noise[3]"
-)
-"""What makes true values of measured ones, row by row, and their noise, continuous densities."""
-
-ImuCalibration = _struct(
-    "ImuCalibration",
-    "u32 imu, double rate, InertialCalibration accelerometer, InertialCalibration gyroscope",
-)
-"""An IMU."""
+CameraCalibration, InertialCalibration, ImuCalibration = _calibrations
 
 
 class Library:
@@ -112,10 +94,9 @@ class Library:
             self._call("api_get_version", *map(c.byref, version))
         except (OSError, AttributeError) as error:
             raise VitError(f"expected a library with the VIT interface, found {error}") from None
-        if version[0].value not in VERSIONS:
+        if version[0].value not in {1, 2}:
             found = ".".join(str(part.value) for part in version)
-            known = " or ".join(map(str, VERSIONS))
-            raise VitError(f"{path}: expected version {known} of the VIT interface, found {found}")
+            raise VitError(f"{path}: expected version 1 or 2 of the VIT interface, found {found}")
         given = Config(None if config is None else str(config).encode(), cameras, 1, False)
         self._call("tracker_create", c.byref(given), c.byref(self._tracker))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -30,8 +30,8 @@ class Frame(NamedTuple):
     """All that either mode reads."""
 
     image: Image
-    left: Image | None
-    right: Image | None
+    left: Image
+    right: Image
     imu: tuple[Imu, ...]
 
 
@@ -116,32 +116,24 @@ class Vit(Estimator[VitConfig]):
         self._tracker = await start
 
     async def run(self) -> None:
-        """Track each exposure; those that come meanwhile are skipped."""
+        """Have the library track each exposure, and hand its poses to whoever waits for them."""
+        hold, config = self._hold, self.config
         async for *images, samples in self.frames:
-            await self._track(images, samples)
-
-    async def _track(self, images: list[Any], samples: tuple[Imu, ...]) -> None:
-        """Have the library track an exposure, and hand its poses to whoever waits for them."""
-        stamp, hold = self.exposed_at(images[0]), self._hold
-        self._first = stamp if self._first is None else self._first
-        owed = hold.owe(stamp)
-        self.start(self._deliver(images[0], owed))
-        early = not self._said and stamp - self._first < self.config.hold.initialise * 1e9
-        wait = float(self.config.patience if early else self.config.hold.max_wait)
-        found = await self._tracker.call(
-            VitTracker.track,
-            stamp,
-            [image.data for image in images],
-            samples,
-            wait if hold.expects else 0.0,
-        )
-        for of, result in found:
-            if not self._said and stamp - of > self.config.hold.tolerance_ns:
-                hold.answers.why_not["its first pose came after its patience"] = None
-            self._said = True
-            hold.answer(of, result)
-        if early and not owed.work.done():
-            hold.answer(stamp, None)
+            stamp = self.exposed_at(images[0])
+            self._first = stamp if self._first is None else self._first
+            owed = hold.owe(stamp)
+            self.start(self._deliver(images[0], owed))
+            early = not self._said and stamp - self._first < config.hold.initialise * 1e9
+            wait = float(config.patience if early else config.hold.max_wait)
+            pixels = [image.data for image in images]
+            told = stamp, pixels, samples, wait if hold.expects else 0.0
+            for of, result in await self._tracker.call(VitTracker.track, *told):
+                if not self._said and stamp - of > config.hold.tolerance_ns:
+                    hold.answers.why_not["its first pose came after its patience"] = None
+                self._said = True
+                hold.answer(of, result)
+            if early and not owed.work.done():
+                hold.answer(stamp, None)
 
     async def _deliver(self, image: Image, owed: Owed[TrackingResult]) -> None:
         """Publish the pose of an image; of one without, that it is lost."""
