@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -18,7 +19,7 @@ from runtime.execute import execute
 from runtime.instruments import Call, Instrument
 from runtime.lockstep import LockstepLoop
 from runtime.node import Node, NodeConfig
-from runtime.schedule import Tick, Ticker
+from runtime.schedule import Once, Tick, Ticker
 from runtime.sender import Sender
 from runtime.supervisor import Supervisor
 from runtime.tools.flights.layout import EVENTS, INDEX, Action, Flight, Kind, pruned
@@ -207,7 +208,7 @@ class _Recorder(Instrument):
                 self._unfit = "a node of the flight begins to tick in the middle"
             elif self._now >= 0:
                 self._act("once", due=due, number=(later := self._new()))
-                entry = _Entry(entry, self._from_within(later))
+                entry = Once(functools.partial(self._from_within(later), entry.fire, due, due))
             add(due, entry)
 
         def held(work: Any, due: int) -> asyncio.Future[Any]:
@@ -239,15 +240,3 @@ class _Recorder(Instrument):
                 self._inside = False
 
         return call
-
-
-class _Entry:
-    """An entry of the schedule, and what notes that it is due."""
-
-    def __init__(self, entry: Any, call: Callable[..., Any]) -> None:
-        self._entry = entry
-        self._call = call
-
-    def fire(self, due: int, now: int) -> int | None:
-        again: int | None = self._call(self._entry.fire, due, now)
-        return again
