@@ -173,7 +173,7 @@ class Display(Watch):
         if time.monotonic() - self._looked > 1.0:
             self._usage, self._looked = self._children.usage(), time.monotonic()
         processes, memory = self._usage
-        using = f" ({processes} processes, {memory:.1f} GB)" * bool(processes)
+        using = f" ({processes} process{'es' * (processes > 1)}, {memory:.1f} GB)" * bool(processes)
         return f"{self.failed} failed, {len(self._children)} running{using}, {left} left"
 
     def _count(self) -> str:
