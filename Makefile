@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-pythons test-all check fix docs wheel peers bench bench-quick orbslam3 svo images clean
+.PHONY: help setup demo test test-slow test-pythons test-all check fix docs wheel peers bench bench-quick orbslam3 svo suite images clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -73,6 +73,9 @@ orbslam3: $(READY)  ## Install ORB-SLAM3 (GPL) and train its vocabulary from ren
 svo: $(READY)  ## Install SVO (GPL).
 	$(BIN)/python -m pip install --quiet --no-deps 'svo-cpp>=1.5'
 	$(BIN)/python -c 'import svo_cpp, cv2'
+
+suite: $(READY)  ## Judge all estimators that are installed in all scenarios; writes bench/SUITE.md.
+	$(BIN)/python -m runtime suite --page bench/SUITE.md
 
 peers: $(READY)  ## Install what the benchmarks compare with (PyPI, and Debian's ROS 1 and C++).
 	$(BIN)/python -m pip install --quiet -e '.[peers]'

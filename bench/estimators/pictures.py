@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 
+from bench.estimators.cells import RANKED, Cell
 from bench.estimators.plan import Suite
 from runtime.tools.sweep.plan import Plan
-
-if TYPE_CHECKING:
-    from bench.estimators.page import Cell
 
 HEIGHT = 240
 """Of the cameras' pictures, pixels."""
@@ -22,8 +20,6 @@ HEIGHT = 240
 def draw(suite: Suite, cells: Mapping[str, Mapping[str, Cell]], path: Path) -> None:
     """Draw the error of each estimator in each scenario, with its range; crosses have failed."""
     from matplotlib.figure import Figure
-
-    from bench.estimators.page import RANKED
 
     there = [e.name for e in suite.estimators if any(e.name in each for each in cells.values())]
     figure = Figure(figsize=(2.1 * len(suite.scenarios) + 2.4, 4.6), layout="constrained")

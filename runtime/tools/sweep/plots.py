@@ -19,6 +19,7 @@ PLOTTED = {
     "ate_percent": "trajectory error (% of the path)",
     "available_rmse_m": "error of the newest pose (m)",
     "lost_seconds": "lost (s)",
+    "plan_rmse_m": "distance of the flight from its plan (m)",
 }
 """Figure to what it is called on its axis."""
 
