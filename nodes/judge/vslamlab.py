@@ -121,13 +121,15 @@ def vslamlab(
             given = arguments(sequence, run, mode, settings, dashes=dashes)
             try:
                 path = run_once([*command, *given], run, limit)
-                found.append(sources.read(f"{run.name}={path}", None, "", camera))
+                source = sources.read(f"{run.name}={path}", None, "", camera)
+                judging.judge_all(truth, [source], images, config)  # raises, of another flight
+                found.append(source)
             except ValueError as error:
                 failed[run.name] = {"passed": False, "failure": str(error)}
         judgements, verdict, notes = judging.judge_all(truth, found, images, config)
-        errors = [each.figures["ate_rmse_m"] for each in judgements.values()]
-        if errors:
-            least, middle, most = np.percentile(errors, [0, 50, 100])
+        errors = [each.figures.get("ate_rmse_m", np.nan) for each in judgements.values()]
+        if np.isfinite(errors).any():  # of two key frames there is none
+            least, middle, most = np.nanpercentile(errors, [0, 50, 100])
             spread = f"ate_rmse_m: median {middle:.4g}, {least:.4g} to {most:.4g}"
             notes.append(f"{len(errors)} of {repeat} runs left a trajectory; {spread}")
         notes += [f"run {name} failed: {each['failure']}" for name, each in failed.items()]

@@ -48,6 +48,10 @@ for row in (sequence / "groundtruth.csv").read_text().splitlines()[1:]:
     if stamp in stamps and int(stamp) // 100_000_000 % 5 == 0:  # key frames
         place = [float(v) * 2.0 + random.gauss(0, 0.02) for v in numbers[:3]]
         rows.append(",".join([stamp, *map(str, place), *numbers[3:]]))
+if behaviour == "few":
+    rows = rows[:1]
+if behaviour == "another flight":
+    rows = ["2" + row[1:] for row in rows]
 text = "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\\n" + "\\n".join(rows) + "\\n"
 out.write_text("garbage" if behaviour == "garbage" else text)
 """
@@ -128,6 +132,14 @@ def test_a_run_that_fails_is_a_row_and_fails_the_whole(
     assert "failure" in rows["00001"]
     works = behaviour.endswith("once")
     assert ("ate_rmse_m" in rows["00000"]) == works
+
+
+@pytest.mark.parametrize("behaviour", ["few", "another flight"])
+def test_what_cannot_be_compared_passes_nothing(sequence: Path, behaviour: str) -> None:
+    result, verdict = judged(sequence, behaviour)
+    assert result.exit_code == 1
+    assert not verdict["estimators"]["00000"]["passed"]
+    assert "Traceback" not in result.output
 
 
 def test_a_run_that_hangs_is_ended_with_all_that_it_started(sequence: Path) -> None:
