@@ -31,8 +31,8 @@ from nodes.visual_odometry.surfaces import surfaces_at
 
 _KNOWN = 0.3
 """Standard deviations of velocity (m/s) and gravity (m/s²) from which on the IMU is of use."""
-_READING = 0.5
-"""Noise of a reading of depth, as a share of that of one pixel."""
+_READING = 0.8
+"""Noise of a reading of depth, as a share of that of one pixel: errors of place included."""
 _REJECTED = 10
 """Images in a row that contradict the IMU, after which the filter begins again from the map."""
 
@@ -47,7 +47,7 @@ class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """
 
     carry: Annotated[float, msgspec.Meta(ge=0)] = 3.0
-    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.3
+    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.5
 
 
 class InertialTracker(FeatureTracker):
