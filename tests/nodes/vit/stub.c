@@ -52,6 +52,7 @@ int vit_tracker_create(const config *c, tracker **out) {
     char word[4096];
     tracker *t = calloc(1, sizeof *t);
     t->cameras = c->cameras;
+    t->imu = t->image = -1;
     t->crash = t->nan = t->skips = t->stops = -1;
     FILE *f = c->file ? fopen(c->file, "r") : NULL;
     if (c->file && !f) return -2;
@@ -106,7 +107,7 @@ int vit_tracker_add_imu_calibration(tracker *t, const imu_calibration *c) {
 }
 int vit_tracker_push_imu_sample(tracker *t, const imu_sample *s) {
     if (s->stamp <= t->imu) return -2;
-    double dt = (s->stamp - t->imu) * 1e-9, w[3] = {s->wx, s->wy, s->wz};
+    double dt = t->imu < 0 ? 0 : (s->stamp - t->imu) * 1e-9, w[3] = {s->wx, s->wy, s->wz};
     double a[3] = {s->ax, s->ay, s->az}, *r = t->r, old[9];
     t->imu = s->stamp;
     double angle = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]) * dt;
