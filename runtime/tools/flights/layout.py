@@ -47,7 +47,7 @@ class Flight(msgspec.Struct, frozen=True):
 
     Attributes:
         unfit: Why it cannot be used; empty if it can.
-        announcements: Of each node, as frames.
+        announcements: Of each node, pickled: a whole number in them stays one, and no float.
         tickers: Of each node, name and rate, in the order of their making.
         ticks: Name of a ticker to its ticks on which something was done, with their occasions.
         starts: Name of a node to the occasion on which its `run` begins.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -106,7 +107,7 @@ class _Recorder(Instrument):
         for each in state.announcements:
             name = each.source.partition("/")[0]
             if name in announced:
-                announced[name].append(wire.pack(each).frame())
+                announced[name].append(pickle.dumps(each))
             else:
                 self._unfit = self._unfit or f"{each.source} is announced in another's name"
         if state.stop_requested:  # whatever was to follow is not wanted either
