@@ -72,7 +72,8 @@ def content_key(flight: Config) -> str:
         for path in sorted(Path("/").glob(pattern[1:])):
             found = path.stat()
             texts.append(f"{path} {found.st_size} {found.st_mtime_ns}")
-    files = {*_sources(spec.node.__module__ for spec in flight.nodes)}
+    here = (f"runtime.tools.flights.{name}" for name in ("layout", "recorder", "player"))
+    files = {*_sources([*(spec.node.__module__ for spec in flight.nodes), *here])}
     for path in _paths(to_builtins(flight)["nodes"]):
         files |= {*_read_by(path, (path.parent,))}
     texts += [f"{path} {_hashed([path.read_bytes()])}" for path in sorted(files)]
