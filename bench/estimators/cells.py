@@ -35,7 +35,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
         entrant: The estimator.
         runs: How many runs there are.
         passed: How many of them met the thresholds.
-        errors: What ended those that came to nothing, each once.
+        reasons: Why runs failed, each once, with the figures of the first of them.
         figures: Figure to its spread over the runs that have it.
         repeatable: Whether all repeats of a seed gave the same, in words.
     """
@@ -43,7 +43,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     entrant: Entrant
     runs: int
     passed: int
-    errors: tuple[str, ...]
+    reasons: tuple[str, ...]
     figures: Mapping[str, Spread]
     repeatable: str
 
@@ -79,11 +79,21 @@ def cells(suite: Suite, plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, 
                     entrant=entrant,
                     runs=len(group),
                     passed=sum(row["passed"] is True for row in group),
-                    errors=tuple(dict.fromkeys(row["error"] for row in group if row["error"])),
+                    reasons=_reasons(entrant.name, group),
                     figures=_figures(entrant.name, group),
                     repeatable=repeatable[key],
                 )
     return found
+
+
+def _reasons(name: str, group: Sequence[Row]) -> tuple[str, ...]:
+    """Return why runs came to nothing or missed a threshold; each threshold once."""
+    found: dict[str, str] = {}
+    for row in group:
+        missed = row["estimators"].get(name, {}).get("failed") or []
+        for reason in [row["error"]] * bool(row["error"]) + missed:
+            found.setdefault(reason.partition(":")[0], reason)
+    return tuple(found.values())
 
 
 def _figures(name: str, group: Sequence[Row]) -> dict[str, Spread]:

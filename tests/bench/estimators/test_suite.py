@@ -143,7 +143,7 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
     """A missed threshold, a crash and silence: in the table of all, and in that of the scenario."""
 
     def missed(row: Row) -> Row:
-        row["estimators"]["bad"]["held_ate_percent"] = 40.0
+        row["estimators"]["bad"] |= {"held_ate_percent": 40.0, "failed": ["lost: for 9 s"]}
         return row | {"passed": False}
 
     def crashed(row: Row) -> Row:
@@ -156,9 +156,10 @@ def test_who_fails_is_shown_as_such(small: Path, tmp_path: Path) -> None:
     page = page_of(suite, tmp_path, missed)
     assert line_of(page, "good") == "| good | truth | 0.75 (0.5 to 1) | 0.75 (0.5 to 1) |"
     assert line_of(page, "bad") == "| bad | truth | 40 **failed** | 40 **failed** |"
+    assert page.count("- bad: lost: for 9 s\n") == 2
     page = page_of(suite, tmp_path, crashed)
     assert line_of(page, "bad") == "| bad | truth | **failed** | **failed** |"
-    assert page.count("bad: its worker died") == 2
+    assert page.count("- bad: its worker died") == 2
     page = page_of(suite, tmp_path, once)
     assert "**failed** 1 of 2" in line_of(page, "bad")
 
