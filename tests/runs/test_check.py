@@ -143,7 +143,9 @@ def test_a_recording_is_looked_for_beside_the_file(tmp_path: Path) -> None:
     file = tmp_path / "flight.mcap"
     assert code == 2
     assert lines == [
-        f"error: again.toml: r: {file}: expected a recording, found no such file",
+        f"error: again.toml: r: {file}: expected a recording or the folder of a data set, found "
+        "nothing there; docs/how-to/datasets.md says where to download those of EuRoC, TUM and "
+        "KITTI",
     ]
 
 
