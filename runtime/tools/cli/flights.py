@@ -30,5 +30,5 @@ def flights(
     found = kept()
     for each in found:
         used = datetime.fromtimestamp(each.used).strftime("%Y-%m-%d %H:%M")
-        print(f"{each.folder.name}  {each.size / 1e9:7.2f} GB  used {used}")
+        print(f"{each.path.stem}  {each.size / 1e9:7.2f} GB  used {used}")
     print(f"{len(found)} flights, {sum(each.size for each in found) / 1e9:.2f} GB in {home()}")

@@ -1,22 +1,36 @@
-"""What is kept of a flight: ``events.bin``, the events as bytes, and ``index.msgpack``, the rest.
+"""What is kept of a flight: one file with its events, what nodes did with them, and a checksum.
 
 The loop gets into nodes by what is due: ticks, timers, work done elsewhere, and the first step of
 each `run`. Each of these is an *occasion*, and what nodes do on it are its *actions*: they send
 events, and set what brings about later occasions.
+
+    frames       of each event, its pickle and its arrays, each at a multiple of 64 bytes
+    flight       the rest, pickled
+    u64 LE       where that begins
+    16 bytes     XXH3 hash of all before
+
+Pickles keep the very types: a whole number in an event stays one, and has another digest than the
+equal float.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+import mmap
+import pickle
+import struct
+from pathlib import Path
+from typing import IO, Any, Literal, NamedTuple
 
-import msgspec
+import xxhash
 
-EVENTS, INDEX = "events.bin", "index.msgpack"
+from events import Announcement, Event
 
-Kind = Literal["send", "handled", "stop", "once", "held", "timer"]
+_ALIGNED = 64
+_BEGIN = struct.Struct("<Q")
+_CHECKSUM = 16
 
 
-class Action(msgspec.Struct, frozen=True, array_like=True):
+class Action(NamedTuple):
     """One thing that a node of the flight did.
 
     Attributes:
@@ -28,44 +42,117 @@ class Action(msgspec.Struct, frozen=True, array_like=True):
             if there is none.
         turn: Turns of the loop since the occasion; -1 before the loop went on.
         text: The output (``node.port``), or why the run is to stop.
-        due: Place of the event's frame in the file; or when the later occasion is due, ns (of a
-            timer: s).
-        number: Size of the frame; or the later occasion.
+        due: Place of the event in the file; or when the later occasion is due, ns (of a timer: s).
+        later: The later occasion.
+        sizes: Of the event's frames, bytes.
     """
 
-    kind: Kind
+    kind: Literal["send", "handled", "stop", "once", "held", "timer"]
     node: str
     within: int
     turn: int
     text: str = ""
-    due: int | float = 0
-    number: int = -1
+    due: float = 0
+    later: int = -1
+    sizes: tuple[int, ...] = ()
 
 
-class Flight(msgspec.Struct, frozen=True):
+class Flown(NamedTuple):
+    """One node of a flight.
+
+    Attributes:
+        announcements: What it announced.
+        tickers: By name, in the order of their making, rate and the ticks on which something was
+            done, with their occasions.
+        start: The occasion on which its `run` begins, if it does.
+    """
+
+    announcements: list[Announcement]
+    tickers: dict[str, tuple[float, dict[int, int]]]
+    start: int | None
+
+
+class Flight(NamedTuple):
     """A whole flight.
 
     Attributes:
         unfit: Why it cannot be used; empty if it can.
-        announcements: Of each node, pickled: a whole number in them stays one, and no float.
-        tickers: Of each node, name and rate, in the order of their making.
-        ticks: Name of a ticker to its ticks on which something was done, with their occasions.
-        starts: Name of a node to the occasion on which its `run` begins.
+        nodes: By name.
         occasions: Their actions, in order.
         environment: What the nodes found of the machine.
-        size: Bytes of the events.
-        checksum: Of the events.
     """
 
-    unfit: str = ""
-    announcements: dict[str, list[bytes]] = {}
-    tickers: dict[str, list[tuple[str, float]]] = {}
-    ticks: dict[str, dict[int, int]] = {}
-    starts: dict[str, int] = {}
-    occasions: list[list[Action]] = []
-    environment: dict[str, str] = {}
-    size: int = 0
-    checksum: str = ""
+    unfit: str
+    nodes: dict[str, Flown]
+    occasions: list[list[Action]]
+    environment: dict[str, str]
+
+
+class Writer:
+    """Writes a flight into a file, which is complete when `end` returns."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._hash = xxhash.xxh3_128()
+        self._size = 0
+
+    def event(self, event: Event) -> tuple[int, tuple[int, ...]]:
+        """Write an event; return its place and the sizes of its frames.
+
+        Raises:
+            Exception: Whatever pickling raises for something that is no data.
+        """
+        arrays: list[pickle.PickleBuffer] = []
+        head = pickle.dumps(event, pickle.HIGHEST_PROTOCOL, buffer_callback=arrays.append)
+        frames = [memoryview(head), *(array.raw() for array in arrays)]
+        place = self._size
+        for frame in frames:
+            self._write(frame)
+            self._write(bytes(-len(frame) % _ALIGNED))
+        return place, tuple(map(len, frames))
+
+    def end(self, flight: Flight) -> None:
+        """Write the rest; of a flight that cannot be used, nothing else is kept."""
+        if flight.unfit:
+            self._file.seek(0)
+            self._file.truncate()
+            self.__init__(self._file)  # type: ignore[misc]
+        begin = self._size
+        self._write(pickle.dumps(flight))
+        self._write(_BEGIN.pack(begin))
+        self._file.write(self._hash.digest())
+
+    def _write(self, data: bytes | memoryview) -> None:
+        self._file.write(data)
+        self._hash.update(data)
+        self._size += len(data)
+
+
+def opened(path: Path) -> tuple[Flight, memoryview] | None:
+    """Return a flight and its file's content; `None` if it cannot be read as it is."""
+    try:
+        with path.open("rb") as file:
+            content = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+        if xxhash.xxh3_128_digest(content[:-_CHECKSUM]) != content[-_CHECKSUM:]:
+            return None
+        end = len(content) - _CHECKSUM - _BEGIN.size
+        (begin,) = _BEGIN.unpack_from(content, end)
+        flight: Flight = pickle.loads(content[begin:end])  # noqa: S301  # of this user's own cache
+        sent = {each.text: each for actions in flight.occasions for each in actions if each.sizes}
+        for one in sent.values():  # of each output
+            event_at(content, one)
+    except Exception:  # what was written by other code may raise anything
+        return None
+    return flight, content
+
+
+def event_at(content: memoryview, sent: Action) -> Any:
+    """Return the event of an action, its arrays read-only in the file's content."""
+    place, frames = int(sent.due), []
+    for size in sent.sizes:
+        frames.append(content[place : place + size])
+        place += size + -size % _ALIGNED
+    return pickle.loads(frames[0], buffers=frames[1:])  # noqa: S301  # as above
 
 
 def pruned(occasions: list[list[Action]]) -> list[list[Action]]:
@@ -74,9 +161,7 @@ def pruned(occasions: list[list[Action]]) -> list[list[Action]]:
     for index in reversed(range(len(occasions))):  # what is due later has a higher number
         numbers: dict[int, int] = {}
         for number, action in enumerate(occasions[index]):
-            if action.kind in {"once", "held", "timer"} and not kept[action.number]:
-                continue
-            numbers[number] = len(kept[index])
-            within = numbers.get(action.within, -1)
-            kept[index].append(msgspec.structs.replace(action, within=within))
+            if action.later < 0 or kept[action.later]:
+                numbers[number] = len(kept[index])
+                kept[index].append(action._replace(within=numbers.get(action.within, -1)))
     return kept

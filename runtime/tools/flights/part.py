@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import importlib.util
 import json
 import os
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -89,27 +92,42 @@ def _hashed(parts: Iterable[str | bytes]) -> str:
 
 
 def _sources(modules: Iterable[str]) -> Iterator[Path]:
-    """Yield the files of some modules, and of what they import of their own or of our packages."""
-    todo = [*modules]
-    roots = {*(name.partition(".")[0] for name in todo), "runtime", "events"}
-    seen: set[str] = set()
+    """Yield the files of some modules and of what they import, but for what else is installed."""
+    todo = [*modules, "events"]
+    roots = {name.partition(".")[0] for name in todo}
+    seen = {""}
     while todo:
         name = todo.pop()
-        if name in seen or name.partition(".")[0] not in roots:
+        root = name.partition(".")[0]
+        if name in seen or not (root in roots or _is_here(root)):
             continue
         seen.add(name)
-        try:
-            spec = importlib.util.find_spec(name)
-        except (ImportError, ValueError):
-            spec = None
-        if spec is None or not spec.has_location or spec.origin is None:
+        path = _origin(name)
+        if path is None:
             continue
-        path = Path(spec.origin)
         package = path.name == "__init__.py"
         yield from (p for p in path.parent.iterdir() if p.is_file()) if package else [path]
+        parent = name.rpartition(".")[0]
+        todo.append(parent)
         for one, other in _IMPORTED.findall(path.read_text(encoding="utf-8", errors="replace")):
-            todo += [one, f"{one}.{other}" if other else one]
-        todo.append(name.rpartition(".")[0] or name)
+            with contextlib.suppress(ImportError):
+                whole = importlib.util.resolve_name(one, name if package else parent)
+                todo += [whole, f"{whole}.{other}" if other else whole]
+
+
+def _origin(name: str) -> Path | None:
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return None
+    return Path(spec.origin) if spec and spec.has_location and spec.origin else None
+
+
+@functools.cache
+def _is_here(root: str) -> bool:
+    """Return whether a module or package is neither Python's own nor installed."""
+    path = None if not root or root in sys.stdlib_module_names else _origin(root)
+    return path is not None and not {"site-packages", "dist-packages"} & {*path.parts}
 
 
 def _paths(value: Any) -> Iterator[Path]:

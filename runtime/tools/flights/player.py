@@ -1,24 +1,23 @@
-"""Nodes in the place of those that fly, which send what a flight's nodes have sent."""
+"""Nodes in the place of those that fly, which send what a flight's nodes have sent.
+
+If another node ends the run before the flight is over, its ticks end there, but what the flight's
+nodes send while the run ends is what they sent at that time when their ticks went on.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import concurrent.futures
 import functools
-import mmap
-import pickle
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Any, ClassVar
 
 from events import Announcement, Event
-from runtime import wire
 from runtime.config.model import Config
 from runtime.lockstep import LockstepLoop
 from runtime.node import Node, senders
 from runtime.ports import Output, on
 from runtime.schedule import Once, Tick
-from runtime.tools.flights.layout import EVENTS, Action, Flight
+from runtime.tools.flights.layout import Action, Flight, Flown, event_at
 
 _DONE: concurrent.futures.Future[None] = concurrent.futures.Future()
 _DONE.set_result(None)
@@ -31,17 +30,13 @@ class StandIn(Node[Any]):
 
     async def on_startup(self) -> None:
         """Tick as the node did."""
-        self.player.enter(self)
-        for what, hz in self.player.flight.tickers[self.name]:
-            ticks = self.player.flight.ticks.get(f"{self.name}.{what}", {})
+        self.flown = self.player.enter(self)
+        for what, (hz, ticks) in self.flown.tickers.items():
             self.every(hz, functools.partial(self._tick, ticks), what)
 
-    def announce(self) -> Iterable[Announcement]:
+    def announce(self) -> list[Announcement]:
         """Announce what the node did."""
-        for frame in self.player.flight.announcements[self.name]:
-            announcement = pickle.loads(frame)  # noqa: S301  # of this user's own cache
-            assert isinstance(announcement, Announcement)
-            yield announcement
+        return self.flown.announcements
 
     @on(Event)
     def hear(self, event: Event) -> bool:
@@ -50,35 +45,31 @@ class StandIn(Node[Any]):
 
     async def run(self) -> None:
         """Begin as the node did."""
-        occasion = self.player.flight.starts.get(self.name)
-        if occasion is not None:
-            self.player.play(occasion, 0)
+        if self.flown.start is not None:
+            self.player.play(self.flown.start, 0)
 
     async def on_shutdown(self) -> None:
         """End: what would come later does not."""
         self.player.leave(self)
 
     def _tick(self, ticks: dict[int, int], tick: Tick) -> None:
-        occasion = ticks.get(tick.index)
-        if occasion is not None:
-            self.player.play(occasion, -1)
+        if tick.index in ticks:
+            self.player.play(ticks[tick.index], -1)
 
 
-def stand_ins(config: Config, flight: Flight, folder: Path) -> dict[str, type[Node[Any]]]:
+def stand_ins(config: Config, flight: Flight, content: memoryview) -> dict[str, type[Node[Any]]]:
     """Return a class in the place of each node of a flight, by the node's name.
 
     Args:
         config: Of the run.
         flight: That is played again.
-        folder: Where its events are.
+        content: Of its file.
     """
-    player = Player(flight, folder)
+    player = Player(flight, content)
     found: dict[str, type[Node[Any]]] = {}
     for spec in config.nodes:
-        if spec.name in flight.announcements:
-            outputs = {
-                port: Output(each.event) for port, each in spec.node.declared.outputs.items()
-            }
+        if spec.name in flight.nodes:
+            outputs = {name: Output(o.event) for name, o in spec.node.declared.outputs.items()}
             found[spec.name] = type(spec.node.__name__, (StandIn,), {**outputs, "player": player})
     return found
 
@@ -88,28 +79,24 @@ class Player:
 
     Args:
         flight: That is played again.
-        folder: Where its events are.
+        content: Of its file.
     """
 
-    def __init__(self, flight: Flight, folder: Path) -> None:
-        self.flight = flight
+    def __init__(self, flight: Flight, content: memoryview) -> None:
+        self._flight = flight
+        self._content = content
         self._nodes: dict[str, Node[Any]] = {}
         self._outputs: dict[str, Any] = {}
         self._delivering: list[tuple[Event, dict[int, Action], list[Action]]] = []
-        self._frames = memoryview(b"")
-        if flight.size:
-            with (folder / EVENTS).open("rb") as file:
-                mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            mapped.madvise(mmap.MADV_SEQUENTIAL)
-            self._frames = memoryview(mapped)
 
-    def enter(self, node: Node[Any]) -> None:
-        """Let a node send."""
+    def enter(self, node: Node[Any]) -> Flown:
+        """Let a node send, and return what there is of it."""
         if not self._nodes:
-            for name, value in self.flight.environment.items():
+            for name, value in self._flight.environment.items():
                 node.note_environment(name, value)
         self._nodes[node.name] = node
         self._outputs |= {sender.name: sender for sender in senders(node).values()}
+        return self._flight.nodes[node.name]
 
     def leave(self, node: Node[Any]) -> None:
         """Let it send no more."""
@@ -123,7 +110,7 @@ class Player:
             turn: Up to which it is done now; the rest follows as the loop turns.
             first: Action to begin with.
         """
-        actions = self.flight.occasions[occasion]
+        actions = self._flight.occasions[occasion]
         index = first
         while index < len(actions) and actions[index].turn <= turn:
             if actions[index].within < 0:
@@ -150,8 +137,7 @@ class Player:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, LockstepLoop)
         if action.kind == "send":
-            begin = int(action.due)
-            event = wire.unpack(self._frames[begin : begin + action.number])
+            event = event_at(self._content, action)
             inner = {i: a for i, a in enumerate(actions[index:], index) if a.within == index}
             self._delivering.append((event, inner, actions))
             self._outputs[action.text].send(event)
@@ -161,10 +147,10 @@ class Player:
         elif action.kind == "stop":
             node.stop(action.text)
         elif action.kind == "once":
-            entry = Once(functools.partial(self.play, action.number, -1))
+            entry = Once(functools.partial(self.play, action.later, -1))
             loop.schedule.add(int(action.due), entry)
         elif action.kind == "held":
             future = loop.hold(_DONE, int(action.due))
-            future.add_done_callback(lambda _: self.play(action.number, 0))
+            future.add_done_callback(lambda _: self.play(action.later, 0))
         elif action.kind == "timer":
-            loop.call_at(action.due, self.play, action.number, 0)
+            loop.call_at(action.due, self.play, action.later, 0)

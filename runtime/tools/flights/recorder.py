@@ -8,13 +8,11 @@ import functools
 import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import msgspec
-import xxhash
 
 from events import Event
-from runtime import wire
 from runtime.config.model import Config, NodeSpec
 from runtime.execute import execute
 from runtime.instruments import Call, Instrument
@@ -23,20 +21,19 @@ from runtime.node import Node, NodeConfig
 from runtime.schedule import Once, Tick, Ticker
 from runtime.sender import Sender
 from runtime.supervisor import Supervisor
-from runtime.tools.flights.layout import EVENTS, INDEX, Action, Flight, Kind, pruned
+from runtime.tools.flights.layout import Action, Flight, Flown, Writer, pruned
 
-_ALIGNED = 64
 _REST = 10.0
 """Seconds of the clock for which a flight goes on without ticks: what is on its way at the end, as
 an image may be, arrives in a run whose estimator takes long to end."""
 
 
-def record(config: Config, folder: Path) -> Flight:
-    """Fly, and write what there is to say of it into a folder.
+def record(config: Config, path: Path) -> None:
+    """Fly, and write what there is to say of it into a file, which is complete when this returns.
 
     Args:
         config: The nodes that fly, on simulated time.
-        folder: Exists; what is in it is complete when this returns.
+        path: Of the file.
 
     Raises:
         VisnavError: Something went wrong in the flight.
@@ -49,12 +46,11 @@ def record(config: Config, folder: Path) -> Flight:
     )  # fmt: skip
     run = msgspec.structs.replace(config.run, digest=False, speed=None)
     config = msgspec.structs.replace(config, run=run, nodes=(*config.nodes, rest))
-    with (folder / EVENTS).open("wb", buffering=1 << 20) as file:
-        recorder = _Recorder(file)
+    with path.open("wb", buffering=1 << 20) as file:
+        writer = Writer(file)
+        recorder = _Recorder(writer)
         execute(config, watch=recorder.watch)
-    flight = recorder.flight()
-    (folder / INDEX).write_bytes(msgspec.msgpack.encode(flight))
-    return flight
+        writer.end(recorder.flight())
 
 
 class _Rest(Node):
@@ -64,10 +60,8 @@ class _Rest(Node):
 
 
 class _Recorder(Instrument):
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self._size = 0
-        self._hash = xxhash.xxh3_128()
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
         self._occasions: list[list[Action]] = []
         self._events: dict[int, Event] = {}  # of this occasion, by action
         self._now = -1
@@ -102,36 +96,28 @@ class _Recorder(Instrument):
     def flight(self) -> Flight:
         """Return what there is to say; called when it is over."""
         state = self._supervisor.state
-        runners = [runner for name, runner in state.runners.items() if name != "(rest)"]
-        announced: dict[str, list[bytes]] = {runner.spec.name: [] for runner in runners}
-        for each in state.announcements:
-            name = each.source.partition("/")[0]
-            if name in announced:
-                announced[name].append(pickle.dumps(each))
-            else:
-                self._unfit = self._unfit or f"{each.source} is announced in another's name"
         if state.stop_requested:  # whatever was to follow is not wanted either
             raise KeyboardInterrupt
+        nodes = {
+            name: Flown([], {}, self._starts.get(name))
+            for name in state.runners
+            if name != "(rest)"
+        }
+        for each in state.announcements:
+            if (node := each.source.partition("/")[0]) in nodes:
+                nodes[node].announcements.append(each)
+            else:
+                self._unfit = f"{each.source} is announced in another's name"
+        for name, ticker in state.tickers.items():
+            node, _, what = name.partition(".")
+            nodes[node].tickers[what] = ticker.hz, self._ticks.get(name, {})
         if state.conclusions or state.outside or state.after_run:
             self._unfit = "a node of the flight concludes, writes or asks something"
         elif len(state.all_nodes) > len(state.runners):
             self._unfit = "a node of the flight was restarted"
         if self._unfit:
-            return Flight(unfit=self._unfit)
-        tickers: dict[str, list[tuple[str, float]]] = {name: [] for name in announced}
-        for name, ticker in state.tickers.items():
-            node, _, what = name.partition(".")
-            tickers[node].append((what, ticker.hz))
-        return Flight(
-            announcements=announced,
-            tickers=tickers,
-            ticks=self._ticks,
-            starts=self._starts,
-            occasions=pruned(self._occasions),
-            environment=dict(state.environment),
-            size=self._size,
-            checksum=self._hash.hexdigest(),
-        )
+            return Flight(self._unfit, {}, [], {})
+        return Flight("", nodes, pruned(self._occasions), dict(state.environment))
 
     # What nodes do.
 
@@ -168,21 +154,18 @@ class _Recorder(Instrument):
         runner = self._supervisor.state.runners[node]
         if runner.shutting_down or runner.phase == "on_end":  # when that is depends on all nodes
             self._unfit = f"{node} sends something at its end"
-        frame = wire.pack(event).frame()
-        action = self._act("send", sender.name, self._size, len(frame), node)
-        self._events[action] = event
-        for part in (frame, bytes(-len(frame) % _ALIGNED)):
-            self._file.write(part)
-            self._hash.update(part)
-            self._size += len(part)
+        try:
+            place, sizes = self._writer.event(event)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            self._unfit, place, sizes = f"{sender.name}: {error}", 0, ()
+        number = self._act("send", sender.name, place, sizes=sizes, node=node)
+        self._events[number] = event
 
-    def _act(
-        self, kind: Kind, text: str = "", due: float = 0, number: int = -1, node: str = ""
-    ) -> int:
+    def _act(self, kind: Any, text: str = "", due: float = 0, node: str = "", **more: Any) -> int:
         own, within = self._doing[-1] if self._doing else (node, -1)
         actions = self._occasions[self._now]
         turn = -1 if self._inside else self._turn - self._begun
-        actions.append(Action(kind, node or own, within, turn, text, due, number))
+        actions.append(Action(kind, node or own, within, turn, text, due, **more))
         return len(actions) - 1
 
     # Occasions.
@@ -208,20 +191,20 @@ class _Recorder(Instrument):
             if self._now >= 0 and isinstance(entry, Ticker):
                 self._unfit = "a node of the flight begins to tick in the middle"
             elif self._now >= 0:
-                self._act("once", due=due, number=(later := self._new()))
+                self._act("once", due=due, later=(later := self._new()))
                 entry = Once(functools.partial(self._from_within(later), entry.fire, due, due))
             add(due, entry)
 
         def held(work: Any, due: int) -> asyncio.Future[Any]:
             future = hold(work, due)
             if self._now >= 0:
-                self._act("held", due=due, number=(later := self._new()))
+                self._act("held", due=due, later=(later := self._new()))
                 future.add_done_callback(lambda f: None if f.cancelled() else self._begin(later))
             return future
 
         def called(when: float, call: Callable[..., Any], *args: Any, context: Any = None) -> Any:
             if self._now >= 0:
-                self._act("timer", due=when, number=(later := self._new()))
+                self._act("timer", due=when, later=(later := self._new()))
                 args, call = (call, *args), self._from_within(later)
             return call_at(when, call, *args, context=context)
 

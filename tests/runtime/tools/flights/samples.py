@@ -6,9 +6,10 @@ import asyncio
 import logging
 import os
 import signal
+import threading
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +60,7 @@ class CraftConfig(NodeConfig):
     latency: Duration = Duration(0.04)
     fail: bool = False
     last_words: bool = False
+    thing: bool = False
     signal: bool = False
 
 
@@ -108,7 +110,10 @@ class Craft(Node[CraftConfig]):
     def orders(self, order: Order) -> bool:
         """Obey, and say so at once; nobody after it gets each seventh."""
         self.heard += order.number
-        echo = Echo(stamp=order.stamp, source=f"{self.name}/echo", number=self.heard)
+        heard = round(self.heard) if order.number > 0.5 else self.heard  # whole, or a float
+        if self.config.thing:
+            heard = cast("float", threading.Lock())
+        echo = Echo(stamp=order.stamp, source=f"{self.name}/echo", number=heard)
         self.echoes.send(echo)
         return int(order.number * 1e6) % 7 == 0
 

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import os
 import threading
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pytest
+import xxhash
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
 
+from runtime.config.model import Config
 from runtime.config.reading import load
+from runtime.digest import Digest
 from runtime.errors import NodeError
 from runtime.tools.flights.cache import home, kept, recorded, remove_beyond
-from runtime.tools.flights.layout import EVENTS, INDEX
+from runtime.tools.flights.layout import Action, Writer, event_at
 from runtime.tools.flights.part import content_key, flight_of, settings_key
 from runtime.tools.flights.recorder import record
-from tests.runtime.tools.flights.samples import events_of, flown
+from tests.runtime.tools.flights import samples
+from tests.runtime.tools.flights.samples import Seen, events_of, flown
 from tests.runtime.tools.samples_cli import ROOT
 
 
@@ -131,20 +139,67 @@ def test_the_key_knows_what_a_world_includes(tmp_path: Path) -> None:
     assert len(keys) == 4
 
 
-@pytest.mark.parametrize("name", [EVENTS, INDEX])
-@pytest.mark.parametrize("what", ["cut", "changed", "gone"])
-def test_what_is_damaged_is_flown_again(tmp_path: Path, name: str, what: str) -> None:
+_OTHER_CODE = b"cevents\nNoLongerThere\n."  # a pickle that only other code can read
+
+
+@pytest.mark.parametrize("what", ["cut", "gone", "empty", "first", "middle", "last", "other code"])
+def test_what_is_damaged_or_of_other_code_is_flown_again(tmp_path: Path, what: str) -> None:
     config = flown(tmp_path, "captain.end=0.2")
     recorded(config, record=True)
     (flight,) = kept()
-    file, content = flight.folder / name, (flight.folder / name).read_bytes()
+    content = flight.path.read_bytes()
+    place = {"first": 0, "middle": len(content) // 2, "last": -1}.get(what, 0)
+    changed = bytearray(content)
+    changed[place] ^= 1
+    other = _OTHER_CODE + bytes(8)
+    flight.path.write_bytes(
+        {"cut": content[:-7], "empty": b"", "other code": other + xxhash.xxh3_128_digest(other)}
+        .get(what, bytes(changed))
+    )  # fmt: skip
     if what == "gone":
-        file.unlink()
-    else:
-        file.write_bytes(content[:-7] if what == "cut" else b"\xc1" + content[1:])
+        flight.path.unlink()
     assert recorded(config, record=False) == {}
     assert recorded(config, record=True)
-    assert file.read_bytes() == content
+    assert flight.path.read_bytes() == content
+
+
+def test_an_event_that_other_code_has_written_is_flown_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = flown(tmp_path, "captain.end=0.2")
+    assert recorded(config, record=True)
+    with monkeypatch.context() as patch:
+        patch.delattr(samples, "Seen")
+        assert recorded(config, record=False) == {}
+    assert recorded(config, record=False)
+
+
+@given(
+    arrays(st.sampled_from(["u1", "<f4", ">f8", "<i2", "?"]), array_shapes(min_dims=0, min_side=0)),
+    st.sampled_from([0, 1.5, np.float32(2), True]),
+    st.booleans(),
+)
+def test_events_come_back_with_their_very_types(
+    data: npt.NDArray[np.uint8], number: float, transposed: bool
+) -> None:
+    sent = Seen(stamp=1, source="craft", number=number, data=data.T if transposed else data)
+    file = io.BytesIO(b"")
+    writer = Writer(file)
+    writer.event(sent)
+    place, sizes = writer.event(sent)
+    again = event_at(
+        memoryview(file.getvalue()), Action("send", "craft", -1, -1, "", place, -1, sizes)
+    )
+    assert type(again.number) is type(number)
+    digests = [Digest(), Digest()]
+    for digest, event in zip(digests, (sent, again), strict=True):
+        digest(None, event)
+    assert digests[0].hexdigest() == digests[1].hexdigest()
+
+
+def test_an_event_that_is_no_data_makes_a_flight_unfit(tmp_path: Path) -> None:
+    assert recorded(flown(tmp_path, "craft.thing=true", "run.digest=false"), record=True) == {}
+    assert [each.size < 999 for each in kept()] == [True]
 
 
 def test_what_cannot_be_played_again_is_remembered_as_such(tmp_path: Path) -> None:
@@ -173,9 +228,9 @@ def test_one_flies_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyP
     config = flown(tmp_path, "captain.end=0.2")
     flights = []
 
-    def counted(*arguments: object) -> object:
-        flights.append(arguments)
-        return record(*arguments)  # type: ignore[arg-type]
+    def counted(config: Config, path: Path) -> None:
+        flights.append(path)
+        record(config, path)
 
     monkeypatch.setattr("runtime.tools.flights.cache.fly", counted)
     found: list[set[str]] = []
@@ -198,13 +253,13 @@ def test_those_not_used_for_longest_go_first(
     for config in configs:
         recorded(config, record=True)
     for age, each in enumerate(kept()):
-        os.utime(each.folder, (1000 - age, 1000 - age))
+        os.utime(each.path, (1000 - age, 1000 - age))
     newest, _, oldest = kept()
-    used = next(c for c in configs if content_key(flight_of(c) or c) == oldest.folder.name)
+    used = next(c for c in configs if content_key(flight_of(c) or c) == oldest.path.stem)
     stand_ins = recorded(used, record=False)
     (removed,) = remove_beyond((oldest.size + newest.size + 9) / 1e9)
-    assert removed.folder not in {oldest.folder, newest.folder}
-    assert [each.folder for each in kept()] == [oldest.folder, newest.folder]
+    assert removed.path not in {oldest.path, newest.path}
+    assert [each.path for each in kept()] == [oldest.path, newest.path]
     remove_beyond(0)
     assert kept() == []
     summary, lines = events_of(used, stand_ins=stand_ins)  # what is open stays
@@ -213,7 +268,7 @@ def test_those_not_used_for_longest_go_first(
     for config in configs:
         assert recorded(config, record=True)
     assert len(kept()) == 1
-    assert {path.name[0] for path in home().iterdir()} == {".", kept()[0].folder.name[0]}
+    assert {path.suffix for path in home().iterdir()} == {".flight", ".lock"}
 
 
 @pytest.mark.slow
