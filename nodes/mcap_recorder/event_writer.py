@@ -154,6 +154,8 @@ class EventWriter:
 class RecordedTopic:
     """A topic of ROS's messages in the file."""
 
+    wanted = True
+
     def __init__(self, writer: EventWriter, topic: Topic, channel: int) -> None:
         self.topic = topic
         self.channel = channel

@@ -26,7 +26,10 @@ class Publisher:
         failed: How many did not: the session is closed, or a peer did not read for `max_wait`.
         note: Called with each message that was put.
         kept: The last messages and their attachments, if the topic is transient local.
+        wanted: Whether messages are to be made, even where nobody subscribes.
     """
+
+    wanted = True
 
     def __init__(
         self,

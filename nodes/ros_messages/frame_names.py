@@ -28,6 +28,8 @@ class FrameNames:
     def __init__(self) -> None:
         self._cameras: dict[str, tuple[str, str]] = {}
         """Optical frame to the camera's source and its own name."""
+        self.own: set[str] = set()
+        """Frames whose names say already whose they are: ROS calls them the same."""
         self.vehicles = Vehicles()
         """Whose frames are distinguished."""
 
@@ -56,7 +58,7 @@ class FrameNames:
 
     def name(self, frame_id: str, source: str = "") -> str:
         """Return what ROS calls a frame that a source names."""
-        if frame_id == "map":
+        if frame_id == "map" or frame_id in self.own:
             return frame_id
         camera = self.camera(frame_id)
         if camera is not None:

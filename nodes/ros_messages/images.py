@@ -17,7 +17,7 @@ import numpy.typing as npt
 from events import DepthImage, Image, LidarScan
 from nodes.ros_messages.stamps import Time
 from nodes.ros_messages.typestore import TypeStore
-from nodes.viewing.encoding import encode_image
+from nodes.viewing.encoding import depth_in_steps, encode_image
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 
@@ -57,7 +57,7 @@ class ImageWriter:
     Args:
         store: Of the types.
         frame_id: Optical frame.
-        encoding: ``rgb8``, ``mono8``, ``32FC1`` or ``32SC1``.
+        encoding: ``rgb8``, ``mono8``, ``32FC1``, ``32SC1``; ``16UC1``: metres to millimetres.
     """
 
     def __init__(self, store: TypeStore, frame_id: str, encoding: str) -> None:
@@ -74,6 +74,8 @@ class ImageWriter:
             time: Seconds and nanoseconds.
             data: Pixels, shape (height, width) or (height, width, channels).
         """
+        if self.encoding == "16UC1":
+            data = depth_in_steps(data, 1000.0)
         if data.shape != self._shape:
             self._begin(data)
         _STAMP.pack_into(self._buffer, _STAMP_AT, *time)

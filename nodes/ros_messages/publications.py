@@ -27,7 +27,6 @@ TopicKind = str
 
 TOPICS: dict[TopicKind, tuple[str, str, TopicGroup]] = {
     "image": ("{}/image_raw", "sensor_msgs/msg/Image", "images"),
-    "mono": ("{}/image_mono", "sensor_msgs/msg/Image", "images"),
     "info": ("{}/camera_info", "sensor_msgs/msg/CameraInfo", "images"),
     "compressed": ("{}/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "images"),
     "depth": ("{}/depth/image_raw", "sensor_msgs/msg/Image", "depth_images"),
@@ -66,7 +65,7 @@ _QOS: dict[TopicKind, Qos] = {
 }
 
 IMAGES: tuple[TopicKind, ...] = (
-    "image", "mono", "compressed", "depth", "compressed_depth", "segmentation", "lidar",
+    "image", "compressed", "depth", "compressed_depth", "segmentation", "lidar",
 )  # fmt: skip
 """Of which an estimator subscribes to one at least."""
 
@@ -131,9 +130,13 @@ def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Publi
 def announced_topics(announcement: Announcement, config: PublishingConfig) -> Iterator[Publication]:
     """Yield the topics for what a node announced."""
     kinds: list[TopicKind] = []
+    extra: list[tuple[TopicKind, str]] = []
     match announcement:
         case CameraAnnouncement(images=images):
             kinds = [*camera_topics(images, config), "pose"]
+            if {"rgb", "grey"} <= {*images}:  # which it sends as images of another source
+                grey = f"{announcement.source}/grey"
+                extra = [(kind, grey) for kind in kinds if kind in {"image", "compressed"}]
         case VehicleAnnouncement():
             kinds = ["odometry", "path"]
         case EstimatorAnnouncement():
@@ -142,8 +145,8 @@ def announced_topics(announcement: Announcement, config: PublishingConfig) -> It
             kinds = ["fix", "fix_velocity"]
         case _:
             kinds = [kind for of, kind in _KINDS.items() if isinstance(announcement, of)]
-    for kind in kinds:
-        if found := publication(kind, announcement.source, config):
+    for kind, source in [*((kind, announcement.source) for kind in kinds), *extra]:
+        if found := publication(kind, source, config):
             yield found
 
 
@@ -153,8 +156,6 @@ def camera_topics(images: tuple[str, ...], config: PublishingConfig) -> Iterator
         yield "info"
         if config.raw_images:
             yield "image"
-            if "rgb" in images and "grey" in images:
-                yield "mono"
         if config.compressed_images:
             yield "compressed"
     if "depth" in images:

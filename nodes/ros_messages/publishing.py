@@ -79,10 +79,15 @@ class Publisher(Protocol):
     def topic(self) -> Topic:
         """Return the topic."""
 
+    @property
+    def wanted(self) -> bool:
+        """Tell whether messages are to be made at all; large ones cost time."""
+
     def put(self, message: bytearray) -> None:
         """Take a message as CDR, whose bytes may be overwritten afterwards."""
 
 
+E = TypeVar("E", bound=Event)
 P = TypeVar("P", bound=Publisher)
 P_co = TypeVar("P_co", bound=Publisher, covariant=True)
 
@@ -115,11 +120,12 @@ class Publishing(Generic[P]):
         self._store = store
         self._config = config
         self._time = time
-        self._names = FrameNames()
-        self.builder = MessageBuilder(store, self._names, time)
+        self.names = FrameNames()
+        """What ROS calls the frames of the run."""
+        self.builder = MessageBuilder(store, self.names, time)
         """For mappings of the user's own."""
-        self._messages = Messages(store, self._names)
-        self._transforms = Transforms(self._names, config.vehicle, config.tf)
+        self._messages = Messages(store, self.names)
+        self._transforms = Transforms(self.names, config.vehicle, config.tf)
         self._cameras: dict[str, CameraAnnouncement] = {}
         self._announced: dict[tuple[TopicKind, str], Announcement] = {}
         """By kind and source of the topic."""
@@ -129,7 +135,7 @@ class Publishing(Generic[P]):
         self._publishers: dict[tuple[TopicKind, str], P | None] = {}
         self._writers: dict[tuple[TopicKind, str, str, str], Any] = {}
         """By kind and source of the topic, frame and encoding."""
-        self._paths = Paths(store, self._names, config)
+        self._paths = Paths(store, self.names, config)
         self._lock = threading.Lock()
         self.large: dict[type[Event], Callable[[Any], None]] = {
             Image: self._image,
@@ -152,7 +158,7 @@ class Publishing(Generic[P]):
             NavSatFix: self._fix,
             Wind: lambda event: self._plain("wind", event, messages.wind),
             Score: self._score,
-            TrackedFeatures: self._names.vehicles.tracked,  # no message: whose estimates they are
+            TrackedFeatures: self.names.vehicles.tracked,  # no message: whose estimates they are
         }
 
     @property
@@ -226,11 +232,10 @@ class Publishing(Generic[P]):
 
     def _image(self, event: Image) -> None:
         self._info("info", event)
-        camera, config = self._cameras.get(event.source), self._config
-        grey = event.encoding == "mono8" and camera is not None and "rgb" in camera.images
+        config = self._config
         if config.raw_images:
-            self._raw("mono" if grey else "image", event, event.encoding)
-        if (form := config.compressed_images) and not grey:
+            self._raw("image", event, event.encoding)
+        if form := config.compressed_images:
             self._pixels(
                 "compressed",
                 event,
@@ -241,7 +246,7 @@ class Publishing(Generic[P]):
         self._info("depth_info", event)
         config = self._config
         if config.raw_depth:
-            self._raw("depth", event, "32FC1")
+            self._raw("depth", event, "16UC1" if config.raw_depth == "millimetres" else "32FC1")
         if config.compressed_depth:
             self._pixels(
                 "compressed_depth",
@@ -272,7 +277,7 @@ class Publishing(Generic[P]):
     ) -> None:
         """Put an image by a writer, which `make` makes of the frame's name if it is not there."""
         if publisher := self._publisher(kind, event.source):
-            frame = self._names.name(event.frame_id, event.source)
+            frame = self.names.name(event.frame_id, event.source)
             key = kind, event.source, frame, encoding
             if (writer := self._writers.get(key)) is None:
                 writer = self._writers[key] = make(frame)
@@ -288,8 +293,8 @@ class Publishing(Generic[P]):
         self, kind: TopicKind, event: PointCloud | LidarScan, write: Callable[..., bytearray]
     ) -> None:
         if publisher := self._publisher(kind, event.source):
-            frame = self._names.name(event.frame_id, event.source)
-            points = convert_points(self._names.axes(event.frame_id), event.points)
+            frame = self.names.name(event.frame_id, event.source)
+            points = convert_points(self.names.axes(event.frame_id), event.points)
             writer = CloudWriter(self._store, frame)
             publisher.put(write(writer, self._time(event.stamp), points))
 
@@ -303,30 +308,30 @@ class Publishing(Generic[P]):
     def _odometry(self, event: Odometry) -> None:
         """Put a body's pose and twist, and where that puts ``base_link``."""
         self._plain("odometry", event, self._messages.odometry)
-        self._tf(event.stamp, self._transforms.odometry(event))
+        self._tf(event, self._transforms.odometry)
         self._path(event)
 
     def _pose(self, event: PoseStamped) -> None:
         """Put a pose: of a camera's optical frame, or of a body that moves by itself."""
         camera = self._cameras.get(event.source)
-        axes = "body" if camera is None else self._names.axes(camera.frame_id)
+        axes = "body" if camera is None else self.names.axes(camera.frame_id)
         kind: TopicKind = "body_pose" if event.source in self._bodies else "pose"
         self._plain(kind, event, lambda time, each: self._messages.pose(time, each, axes))
-        self._tf(event.stamp, self._transforms.pose(event))
+        self._tf(event, self._transforms.pose)
 
     def _estimate(self, event: PoseEstimate) -> None:
-        child = self._names.axes(event.child_frame_id)
+        child = self.names.axes(event.child_frame_id)
         make: Callable[..., bytearray] = self._messages.pose
         if self._config.covariance:
             make = self._messages.pose_with_covariance
         self._plain("estimate", event, lambda time, each: make(time, each, child))
-        self._tf(event.stamp, self._transforms.estimate(event))
+        self._tf(event, self._transforms.estimate)
         self._path(event)
 
     def _transform(self, event: TransformStamped) -> None:
         """Put a transform that a node sent, unless the tree of frames has it already."""
         if not event.static:
-            self._tf(event.stamp, self._transforms.moving(event))
+            self._tf(event, self._transforms.moving)
         elif self._transforms.add_static(event):
             self._put_static()
 
@@ -360,9 +365,9 @@ class Publishing(Generic[P]):
             if message is not None:
                 publisher.put(message)
 
-    def _tf(self, stamp: int, transforms: Sequence[Transform]) -> None:
-        if transforms and (publisher := self._publisher("tf", "")):
-            publisher.put(self._messages.transforms(self._time(stamp), transforms))
+    def _tf(self, event: E, place: Callable[[E], Sequence[Transform]]) -> None:
+        if (publisher := self._publisher("tf", "")) and (transforms := place(event)):
+            publisher.put(self._messages.transforms(self._time(event.stamp), transforms))
 
     def _put_static(self) -> None:
         transforms = self._transforms.static()
@@ -370,15 +375,14 @@ class Publishing(Generic[P]):
             publisher.put(self._messages.transforms(self._time(0), transforms))
 
     def _publisher(self, kind: TopicKind, source: str) -> P | None:
-        """Return a publisher, declared now if nobody announced the source."""
+        """Return a publisher that wants messages, declared now if nobody announced the source."""
         try:
-            return self._publishers[kind, source]
+            publisher = self._publishers[kind, source]
         except KeyError:
             found = publication(kind, source, self._config)
-            if found is None:
-                self._publishers[kind, source] = None
-                return None
-            return self._declare(found)
+            publisher = None if found is None else self._declare(found)
+            self._publishers[kind, source] = publisher
+        return publisher if publisher is not None and publisher.wanted else None
 
     def _declare(self, found: Publication) -> P:
         with self._lock:  # two threads may want one for the first time together

@@ -57,7 +57,8 @@ class PublishingConfig(NodeConfig):
         covariance: Publish estimates as PoseWithCovarianceStamped.
         raw_images: Publish images as ``Image``.
         compressed_images: Publish images as ``CompressedImage`` of this format.
-        raw_depth: Publish depth images as ``Image`` (32FC1, metres).
+        raw_depth: Publish depth images as ``Image``: in metres (32FC1), or in whole
+            ``millimetres`` up to 65.535 m (16UC1).
         compressed_depth: Publish depth images as compressed_depth_image_transport does:
             ``inverse`` depth in 16 bits (32FC1), or whole ``millimetres`` up to 65.535 m (16UC1).
         depth_max: Metres beyond which ``inverse`` depth is unknown.
@@ -80,7 +81,7 @@ class PublishingConfig(NodeConfig):
     covariance: bool = False
     raw_images: bool = True
     compressed_images: Literal["", "jpeg", "png"] = ""
-    raw_depth: bool = True
+    raw_depth: bool | Literal["millimetres"] = True
     compressed_depth: Literal["", "inverse", "millimetres"] = ""
     depth_max: Rate = 10.0
     depth_quantization: Rate = 100.0

@@ -10,6 +10,7 @@ from events import (
     Announcement,
     BodyAnnouncement,
     CameraAnnouncement,
+    ImuAnnouncement,
     Odometry,
     PoseEstimate,
     PoseStamped,
@@ -68,8 +69,7 @@ class Transforms:
             else:
                 mounting = announcement.position, announcement.orientation
                 self._mounted[optical] = announcement.source, parent, mounting
-
-        elif isinstance(announcement, SensorAnnouncement):
+        elif isinstance(announcement, SensorAnnouncement | ImuAnnouncement):
             if announcement.frame_id != announcement.parent_frame_id:
                 mounting = announcement.position, announcement.orientation
                 key = announcement.source, announcement.frame_id

@@ -58,7 +58,7 @@ class TypeStore:
             _hash_as_ros_2_does()
         except ImportError as error:
             raise MissingDependencyError(
-                f"the ROS 2 bridge needs rosbags: {install_command('ros2')}"
+                f"messages of ROS 2 need rosbags: {install_command('ros2')}"
             ) from error
         self._error = SerdeError
         self._node, self._parse = Nodetype, get_types_from_msg

@@ -21,6 +21,7 @@ class Taken:
     """
 
     failed = 0
+    wanted = True
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic

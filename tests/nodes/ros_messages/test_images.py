@@ -55,6 +55,16 @@ def test_an_image_has_the_bytes_that_rosbags_makes(
         assert bytes(writer.write(stamp, data)) == expected
 
 
+def test_depth_in_millimetres_is_read_back_as_metres() -> None:
+    metres = np.array([[0.5, np.inf, 70.0], [2.0004, 0.0, 65.535]], np.float32)
+    data = ImageWriter(samples.store(), "f", "16UC1").write((1, 2), metres)
+    message = samples.store().deserialize(bytes(data), IMAGE)
+    assert (message.encoding, message.step, message.data.nbytes) == ("16UC1", 6, 12)
+    read = read_depth(message, "camera", 0, "f").data
+    expected = np.array([[0.5, np.inf, np.inf], [2.0, np.inf, 65.535]])
+    np.testing.assert_allclose(read, expected, rtol=1e-6)
+
+
 def test_a_writer_follows_a_new_size_and_takes_views() -> None:
     writer = ImageWriter(samples.store(), "f", "rgb8")
     big = RANDOM.integers(0, 256, (8, 6, 3), np.uint8)

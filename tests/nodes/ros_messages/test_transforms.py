@@ -168,6 +168,14 @@ def lidar(source: str) -> LidarAnnouncement:
     )
 
 
+def test_an_imu_is_where_it_is_mounted() -> None:
+    imu = msgspec.structs.replace(samples.imu(), frame_id="imu", position=(0.1, 0.2, -0.3))
+    tree = made(samples.vehicle(), imu)
+    every = tree.static() + tree.odometry(samples.odometry())
+    np.testing.assert_allclose(lookup(every, "imu")[:3, 3], (2.6, 0.8, 3.3), atol=1e-12)
+    assert not any(each.child == "base_link" for each in made(samples.imu()).static())
+
+
 def test_a_sensor_is_where_it_is_mounted() -> None:
     tree = made(samples.vehicle(), lidar("drone/lidar"))
     every = tree.static() + tree.odometry(samples.odometry())
