@@ -39,8 +39,10 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         name = "foxglove"
         type = "nodes.foxglove_server:FoxgloveServer"
 
-    What is announced has its topics from the start; what is not, from its first event. A viewer
-    that connects late gets calibrations, fixed transforms, clouds and the paths flown so far.
+    Topics, types and frames are those of ROS 2, as of `nodes.ros2_bridge` and of a recording;
+    paths, bodies, features and the log are Foxglove's own. What is announced has its topics from
+    the start; what is not, from its first event. A viewer that connects late gets fixed
+    transforms, clouds and the paths flown so far.
     """
 
     def __init__(self) -> None:
@@ -76,7 +78,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         except VisnavError as error:
             self.log.fatal("%s", error)
         self._server = server
-        self._publishing = Publishing(server, self.config)
+        self._publishing = await self.offload(Publishing, server, self.config)
         self.log.info("open %s in Foxglove", server.address)
 
     def on_announcement(self, announcement: Announcement) -> None:
@@ -88,6 +90,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         """Pass on images and point clouds beside the loop, each kind in order."""
         publishing = self._publishing
         assert publishing is not None
+        publishing.begin()
         for kind, put in publishing.large.items():
             self.start(self._pass_on(self._queues[kind], put))
 
@@ -111,7 +114,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
     def features(self, event: TrackedFeatures) -> None:
         """Pass on the features of those images."""
         if self._publishing is not None:
-            self._publishing.tracked(event)
+            self._publishing.small(event)
         if self._selection.selected(event.frame_id, event.stamp):
             self._queues[TrackedFeatures].offer(event)
 

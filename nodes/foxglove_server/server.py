@@ -7,7 +7,7 @@ looks, and 30 µs where somebody does (most of it to wake such a thread): done o
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from nodes.foxglove_server.gate import Gate, hidden_host
@@ -48,7 +48,8 @@ class Server:
                 f"the server needs foxglove ({error}): {install_command('foxglove')}"
             ) from error
         self.types: Any = foxglove.messages
-        self._channel, self._typed = foxglove.Channel, foxglove.channels
+        self._channel, self._schema = foxglove.Channel, foxglove.Schema
+        self._typed = foxglove.channels
         self._context = foxglove.Context()
         self._channels: dict[str, Any] = {}
         self._latched: dict[str, tuple[Make, int]] = {}
@@ -84,10 +85,12 @@ class Server:
             channel = getattr(self._typed, f"{kind}Channel")
             self._channels[topic] = channel(topic, context=self._context)
 
-    def declare_json(self, topic: str, schema: Mapping[str, Any]) -> None:
-        """Declare a topic of objects that a JSON schema describes."""
-        if topic not in self._channels:
-            self._channels[topic] = self._channel(topic, schema=dict(schema), context=self._context)
+    def declare_ros(self, topic: str, type_: str, definition: str) -> None:
+        """Declare a topic of ROS's messages, with their type and its definition."""
+        schema = self._schema(name=type_, encoding="ros2msg", data=definition.encode())
+        self._channels[topic] = self._channel(
+            topic, schema=schema, message_encoding="cdr", context=self._context
+        )
 
     def wanted(self, topic: str) -> bool:
         """Tell whether anybody looks at a topic."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 from events import Event, FluidPressure, Imu, MagneticField, NavSatFix, Range, Wind
 
 MEASURED: dict[type[Event], dict[str, str]] = {
@@ -27,12 +24,3 @@ def numbers(event: Event, field: str) -> tuple[float, ...]:
     """Return what an event measures in a field: one number, or x, y and z."""
     value = getattr(event, field)
     return value if isinstance(value, tuple) else (value,)
-
-
-def as_json(event: Event) -> dict[str, Any]:
-    """Return a measurement as JSON has it; what is not finite (out of reach) is null."""
-    found: dict[str, Any] = {}
-    for field in fields_of(type(event)):
-        values = [each if math.isfinite(each) else None for each in numbers(event, field)]
-        found[field] = dict(zip("xyz", values, strict=True)) if len(values) > 1 else values[0]
-    return found

@@ -6,7 +6,6 @@ https://protobuf.dev/programming-guides/encoding.
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import struct
@@ -80,10 +79,6 @@ class Viewer:
         while not self.messages[topic]:
             self.take(max(end - time.monotonic(), 0.01))
         return self.messages[topic].pop(0)[1]
-
-    def schema(self, topic: str) -> bytes:
-        """Return a topic's schema."""
-        return base64.b64decode(self.channels[topic]["schema"])
 
 
 Fields = dict[int, list[Any]]
