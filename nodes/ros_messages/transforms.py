@@ -101,8 +101,9 @@ class Transforms:
         return found
 
     def odometry(self, event: Odometry) -> list[Transform]:
-        """Return where a vehicle's true pose puts its body."""
-        if self._starts and event.source not in self._starts:
+        """Return where a true pose puts a vehicle's body, or one that has a frame of its own."""
+        known = not self._starts or event.source in self._starts
+        if not known and (self._only or event.child_frame_id == "base_link"):
             return []
         if self._body != "truth" and self._of_body(event.source):
             return []

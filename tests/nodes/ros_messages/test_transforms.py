@@ -168,6 +168,17 @@ def lidar(source: str) -> LidarAnnouncement:
     )
 
 
+def test_a_free_camera_s_body_is_placed_beside_a_vehicle() -> None:
+    tree = made()
+    corner = msgspec.structs.replace(samples.odometry(), source="corner", child_frame_id="corner")
+    every = tree.static() + tree.odometry(samples.odometry()) + tree.odometry(corner)
+    np.testing.assert_allclose(lookup(every, "corner"), lookup(every, "base_link"), atol=1e-12)
+    assert not tree.odometry(msgspec.structs.replace(corner, child_frame_id="base_link"))
+    only = Transforms(FrameNames(), "drone", "truth")
+    only.announced(samples.vehicle())
+    assert not only.odometry(corner)
+
+
 def test_an_imu_is_where_it_is_mounted() -> None:
     imu = msgspec.structs.replace(samples.imu(), frame_id="imu", position=(0.1, 0.2, -0.3))
     tree = made(samples.vehicle(), imu)
