@@ -18,6 +18,7 @@ from __future__ import annotations
 import mmap
 import pickle
 import struct
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
@@ -38,9 +39,8 @@ class Action(NamedTuple):
             what is due later: in the schedule (``once``), work done elsewhere (``held``), a timer
             of asyncio's.
         node: Which did it.
-        within: The action, of the same occasion, while whose event was delivered it was done; -1
-            if there is none.
         turn: Turns of the loop since the occasion; -1 before the loop went on.
+        inner: What was done while the event was delivered, by those that got it.
         text: The output (``node.port``), or why the run is to stop.
         due: Place of the event in the file; or when the later occasion is due, ns (of a timer: s).
         later: The later occasion.
@@ -49,8 +49,8 @@ class Action(NamedTuple):
 
     kind: Literal["send", "handled", "stop", "once", "held", "timer"]
     node: str
-    within: int
     turn: int
+    inner: list[Action]
     text: str = ""
     due: float = 0
     later: int = -1
@@ -138,12 +138,17 @@ def opened(path: Path) -> tuple[Flight, memoryview] | None:
         end = len(content) - _CHECKSUM - _BEGIN.size
         (begin,) = _BEGIN.unpack_from(content, end)
         flight: Flight = pickle.loads(content[begin:end])  # noqa: S301  # of this user's own cache
-        sent = {each.text: each for actions in flight.occasions for each in actions if each.sizes}
-        for one in sent.values():  # of each output
-            event_at(content, one)
+        for sent in {each.text: each for each in _all(flight.occasions) if each.sizes}.values():
+            event_at(content, sent)  # one of each output
     except Exception:  # what was written by other code may raise anything
         return None
     return flight, content
+
+
+def _all(occasions: Iterable[list[Action]]) -> Iterator[Action]:
+    for actions in occasions:
+        yield from actions
+        yield from _all(each.inner for each in actions if each.inner)
 
 
 def event_at(content: memoryview, sent: Action) -> Any:
@@ -155,13 +160,13 @@ def event_at(content: memoryview, sent: Action) -> Any:
     return pickle.loads(frames[0], buffers=frames[1:])  # noqa: S301  # as above
 
 
-def pruned(occasions: list[list[Action]]) -> list[list[Action]]:
-    """Return occasions without the actions that come to nothing."""
-    kept: list[list[Action]] = [[] for _ in occasions]
-    for index in reversed(range(len(occasions))):  # what is due later has a higher number
-        numbers: dict[int, int] = {}
-        for number, action in enumerate(occasions[index]):
-            if action.later < 0 or kept[action.later]:
-                numbers[number] = len(kept[index])
-                kept[index].append(action._replace(within=numbers.get(action.within, -1)))
-    return kept
+def prune(occasions: list[list[Action]]) -> None:
+    """Remove the actions that come to nothing."""
+    for actions in reversed(occasions):  # what is due later has a higher number
+        _prune(actions, occasions)
+
+
+def _prune(actions: list[Action], occasions: list[list[Action]]) -> None:
+    actions[:] = [each for each in actions if each.later < 0 or occasions[each.later]]
+    for each in actions:
+        _prune(each.inner, occasions)

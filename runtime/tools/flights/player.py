@@ -87,7 +87,7 @@ class Player:
         self._content = content
         self._nodes: dict[str, Node[Any]] = {}
         self._outputs: dict[str, Any] = {}
-        self._delivering: list[tuple[Event, dict[int, Action], list[Action]]] = []
+        self._delivering: list[tuple[Event, list[Action]]] = []
 
     def enter(self, node: Node[Any]) -> Flown:
         """Let a node send, and return what there is of it."""
@@ -111,38 +111,35 @@ class Player:
             first: Action to begin with.
         """
         actions = self._flight.occasions[occasion]
-        index = first
-        while index < len(actions) and actions[index].turn <= turn:
-            if actions[index].within < 0:
-                self._do(index, actions[index], actions)
-            index += 1
-        if index < len(actions):
-            asyncio.get_running_loop().call_soon(self.play, occasion, turn + 1, index)
+        while first < len(actions) and actions[first].turn <= turn:
+            self._do(actions[first])
+            first += 1
+        if first < len(actions):
+            asyncio.get_running_loop().call_soon(self.play, occasion, turn + 1, first)
 
     def heard(self, node: str, event: Event) -> bool:
         """Do what a node did while an event was delivered to it; return whether it ends there."""
-        for sent, inner, actions in reversed(self._delivering):
+        for sent, inner in reversed(self._delivering):
             if sent is event:
-                for index, action in [(i, a) for i, a in inner.items() if a.node == node]:
-                    del inner[index]
+                for action in [each for each in inner if each.node == node]:
+                    inner.remove(action)
                     if action.kind == "handled":
                         return True
-                    self._do(index, action, actions)
+                    self._do(action)
         return False
 
-    def _do(self, index: int, action: Action, actions: list[Action]) -> None:
+    def _do(self, action: Action) -> None:
         node = self._nodes.get(action.node)
         if node is None:  # it has ended
             return
         loop = asyncio.get_running_loop()
         assert isinstance(loop, LockstepLoop)
         if action.kind == "send":
-            event = event_at(self._content, action)
-            inner = {i: a for i, a in enumerate(actions[index:], index) if a.within == index}
-            self._delivering.append((event, inner, actions))
+            event, inner = event_at(self._content, action), [*action.inner]
+            self._delivering.append((event, inner))
             self._outputs[action.text].send(event)
-            for each in list(inner.items()):
-                self._do(*each, actions)
+            for each in [*inner]:
+                self._do(each)
             self._delivering.pop()
         elif action.kind == "stop":
             node.stop(action.text)

@@ -21,7 +21,7 @@ from runtime.node import Node, NodeConfig
 from runtime.schedule import Once, Tick, Ticker
 from runtime.sender import Sender
 from runtime.supervisor import Supervisor
-from runtime.tools.flights.layout import Action, Flight, Flown, Writer, pruned
+from runtime.tools.flights.layout import Action, Flight, Flown, Writer, prune
 
 _REST = 10.0
 """Seconds of the clock for which a flight goes on without ticks: what is on its way at the end, as
@@ -47,8 +47,7 @@ def record(config: Config, path: Path) -> None:
     run = msgspec.structs.replace(config.run, digest=False, speed=None)
     config = msgspec.structs.replace(config, run=run, nodes=(*config.nodes, rest))
     with path.open("wb", buffering=1 << 20) as file:
-        writer = Writer(file)
-        recorder = _Recorder(writer)
+        recorder = _Recorder(writer := Writer(file))
         execute(config, watch=recorder.watch)
         writer.end(recorder.flight())
 
@@ -63,11 +62,11 @@ class _Recorder(Instrument):
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
         self._occasions: list[list[Action]] = []
-        self._events: dict[int, Event] = {}  # of this occasion, by action
-        self._now = -1
+        self._events: list[tuple[Event, list[Action]]] = []  # of this occasion
+        self._actions: list[Action] = []  # of this occasion
         self._turn = self._begun = 0
         self._inside = False
-        self._doing: list[tuple[str, int]] = []  # node, and the event that it has got
+        self._doing: list[tuple[str, list[Action] | None]] = []  # node, and within which event
         self._ticks: dict[str, dict[int, int]] = {}
         self._starts: dict[str, int] = {}
         self._unfit = ""
@@ -79,18 +78,6 @@ class _Recorder(Instrument):
         """Look at a run, from within its loop."""
         self._supervisor = supervisor
         supervisor.instruments.attach(self)
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, LockstepLoop)
-        self._hook(loop)
-        host = supervisor._host
-        stop = host.stop
-
-        def stopped(reason: str) -> None:
-            if self._now >= 0:
-                self._act("stop", text=reason)
-            stop(reason)
-
-        host.stop = stopped
         yield
 
     def flight(self) -> Flight:
@@ -117,7 +104,8 @@ class _Recorder(Instrument):
             self._unfit = "a node of the flight was restarted"
         if self._unfit:
             return Flight(self._unfit, {}, [], {})
-        return Flight("", nodes, pruned(self._occasions), dict(state.environment))
+        prune(self._occasions)
+        return Flight("", nodes, self._occasions, dict(state.environment))
 
     # What nodes do.
 
@@ -125,13 +113,12 @@ class _Recorder(Instrument):
         """Note what a node does in a call."""
 
         def wrapped(given: Any) -> Any:
-            within = -1
+            within = None
             ticks = isinstance(given, Tick)
             if ticks:
                 self._ticks.setdefault(f"{node}.{what}", {})[given.index] = self._begin(self._new())
             elif isinstance(given, Event):
-                found = (n for n, event in reversed(self._events.items()) if event is given)
-                within = next(found, -1)
+                within = next((i for each, i in reversed(self._events) if each is given), None)
             elif what == "run" and node not in self._starts:
                 self._starts[node] = self._begin(self._new())
             self._inside = self._inside or ticks
@@ -158,69 +145,75 @@ class _Recorder(Instrument):
             place, sizes = self._writer.event(event)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             self._unfit, place, sizes = f"{sender.name}: {error}", 0, ()
-        number = self._act("send", sender.name, place, sizes=sizes, node=node)
-        self._events[number] = event
+        action = self._act("send", node, text=sender.name, due=place, sizes=sizes)
+        self._events.append((event, action.inner))
 
-    def _act(self, kind: Any, text: str = "", due: float = 0, node: str = "", **more: Any) -> int:
-        own, within = self._doing[-1] if self._doing else (node, -1)
-        actions = self._occasions[self._now]
+    def _act(self, kind: Any, node: str = "", **more: Any) -> Action:
+        own, within = self._doing[-1] if self._doing else (node, None)
         turn = -1 if self._inside else self._turn - self._begun
-        actions.append(Action(kind, node or own, within, turn, text, due, **more))
-        return len(actions) - 1
+        action = Action(kind, node or own, turn, [], **more)
+        (self._actions if within is None else within).append(action)
+        return action
 
     # Occasions.
 
     def _new(self) -> int:
+        if not self._occasions:  # what was set before the first is set anew in each run
+            self._hook()
         self._occasions.append([])
         return len(self._occasions) - 1
 
     def _begin(self, occasion: int) -> int:
-        self._now, self._begun = occasion, self._turn
+        self._actions, self._begun = self._occasions[occasion], self._turn
         self._events.clear()
         return occasion
 
-    def _hook(self, loop: LockstepLoop) -> None:
+    def _hook(self) -> None:
+        host, loop = self._supervisor._host, asyncio.get_running_loop()
+        assert isinstance(loop, LockstepLoop)
         schedule: Any = loop.schedule
-        add, hold, call_at, run_once = schedule.add, loop.hold, loop.call_at, loop._run_once  # type: ignore[attr-defined]
+        stop, add, hold, call_at = host.stop, schedule.add, loop.hold, loop.call_at
+        run_once = loop._run_once  # type: ignore[attr-defined]
 
         def turned() -> None:
             self._turn += 1
             run_once()
 
+        def stopped(reason: str) -> None:
+            self._act("stop", text=reason)
+            stop(reason)
+
         def added(due: int, entry: Any) -> None:
-            if self._now >= 0 and isinstance(entry, Ticker):
+            if isinstance(entry, Ticker):
                 self._unfit = "a node of the flight begins to tick in the middle"
-            elif self._now >= 0:
-                self._act("once", due=due, later=(later := self._new()))
-                entry = Once(functools.partial(self._from_within(later), entry.fire, due, due))
+            else:
+                fire = functools.partial(self._on, self._later("once", due), entry.fire, due, due)
+                entry = Once(fire)
             add(due, entry)
 
         def held(work: Any, due: int) -> asyncio.Future[Any]:
-            future = hold(work, due)
-            if self._now >= 0:
-                self._act("held", due=due, later=(later := self._new()))
-                future.add_done_callback(lambda f: None if f.cancelled() else self._begin(later))
+            future, later = hold(work, due), self._later("held", due)
+            future.add_done_callback(lambda f: None if f.cancelled() else self._begin(later))
             return future
 
         def called(when: float, call: Callable[..., Any], *args: Any, context: Any = None) -> Any:
-            if self._now >= 0:
-                self._act("timer", due=when, later=(later := self._new()))
-                args, call = (call, *args), self._from_within(later)
-            return call_at(when, call, *args, context=context)
+            return call_at(when, self._on, self._later("timer", when), call, *args, context=context)
 
         patched: Any = loop
-        schedule.add, patched.hold, patched.call_at = added, held, called
+        host.stop, schedule.add, patched.hold, patched.call_at = stopped, added, held, called
         patched._run_once = turned
 
-    def _from_within(self, occasion: int) -> Callable[..., Any]:
-        """Return what calls a function on an occasion."""
+    def _later(self, kind: str, due: float) -> int:
+        """Note that something is due later, and return that occasion."""
+        occasion = self._new()
+        self._act(kind, due=due, later=occasion)
+        return occasion
 
-        def call(function: Callable[..., Any], *args: Any) -> Any:
-            self._begin(occasion)
-            self._inside = True
-            try:
-                return function(*args)
-            finally:
-                self._inside = False
-
-        return call
+    def _on(self, occasion: int, function: Callable[..., Any], *args: Any) -> Any:
+        """Call a function on an occasion."""
+        self._begin(occasion)
+        self._inside = True
+        try:
+            return function(*args)
+        finally:
+            self._inside = False

@@ -187,9 +187,8 @@ def test_events_come_back_with_their_very_types(
     writer = Writer(file)
     writer.event(sent)
     place, sizes = writer.event(sent)
-    again = event_at(
-        memoryview(file.getvalue()), Action("send", "craft", -1, -1, "", place, -1, sizes)
-    )
+    action = Action("send", "craft", -1, [], due=place, sizes=sizes)
+    again = event_at(memoryview(file.getvalue()), action)
     assert type(again.number) is type(number)
     digests = [Digest(), Digest()]
     for digest, event in zip(digests, (sent, again), strict=True):
