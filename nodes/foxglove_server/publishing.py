@@ -29,6 +29,7 @@ from events import (
     VehicleEvent,
 )
 from events.frames import convert_vector
+from events.poses import Pose
 from nodes.foxglove_server.messages import Messages
 from nodes.foxglove_server.ros_topics import RosTopic, RosTopics
 from nodes.foxglove_server.server import Server
@@ -61,7 +62,7 @@ Foxglove cannot show."""
 
 
 class Publishing:
-    """Turns events into messages."""
+    """Turns events into messages. To make one takes some tenths of a second: not on the loop."""
 
     def __init__(self, server: Server, config: FoxgloveConfig) -> None:
         self._server = server
@@ -79,6 +80,7 @@ class Publishing:
         store = TypeStore()
         topics = RosTopics(server, store)
         self._ros: ros.Publishing[RosTopic] = ros.Publishing(topics, store, published, Stamps().out)
+        self._ros.warm_up()
         self._put = topics.stamped(self._ros.small)
         self._names = self._ros.names
         self._frames: dict[str, str] = {}  # sources of images, by optical frame
@@ -169,7 +171,7 @@ class Publishing:
             parent = self._estimators[source] = self._parent_of(event)
             self._names.own.add(body)
         self._put(msgspec.structs.replace(event, frame_id=parent))
-        self._place(event, parent, body, event.position, event.orientation)
+        self._place(event, parent, body, (event.position, event.orientation))
         colour = estimate_colour(list(self._estimators).index(source))
         self._extend(f"estimate/{source}", parent, colour, event)
 
@@ -191,22 +193,21 @@ class Publishing:
         self._renamed.setdefault(event.frame_id, frame_id)
         truth = self._truths.get(self._names.vehicles.of(event.source))
         if (pose := estimate_frame(event, truth)) is not None:
-            self._place(event, "map", frame_id, *pose, static=True)
+            self._place(event, "map", frame_id, pose, static=True)
         return frame_id
 
     def _place(
-        self, event: Event, parent: str, child: str, *pose: Any, static: bool = False
+        self, event: Event, parent: str, child: str, pose: Pose, *, static: bool = False
     ) -> None:
         """Put a transform."""
-        position, orientation = pose
         self._put(
             TransformStamped(
                 stamp=event.stamp,
                 source=event.source,
                 frame_id=parent,
                 child_frame_id=child,
-                translation=position,
-                rotation=orientation,
+                translation=pose[0],
+                rotation=pose[1],
                 static=static,
             )
         )

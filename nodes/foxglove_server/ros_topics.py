@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from events import Event
 from nodes.foxglove_server.server import Server
+from nodes.ros_messages.publications import TOPICS
 from nodes.ros_messages.topics import Topic
 from nodes.ros_messages.typestore import TypeStore
 
@@ -24,12 +25,12 @@ class RosTopics:
 
     def __init__(self, server: Server, store: TypeStore) -> None:
         self.server = server
-        self._store = store
+        self._definitions = {type_: store.definition(type_) for _, type_, _ in TOPICS.values()}
         self._stamps = threading.local()  # of what each thread puts
 
     def publisher(self, topic: Topic) -> RosTopic:
         """Declare a topic."""
-        self.server.declare_ros(topic.name, topic.type, self._store.definition(topic.type))
+        self.server.declare_ros(topic.name, topic.type, self._definitions[topic.type])
         return RosTopic(self, topic)
 
     def stamped(self, put: Callable[[E], None]) -> Callable[[E], None]:
