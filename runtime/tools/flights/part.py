@@ -78,7 +78,7 @@ def content_key(flight: Config) -> str:
     here = (f"runtime.tools.flights.{name}" for name in ("layout", "recorder", "player"))
     files = {*_sources([*(spec.node.__module__ for spec in flight.nodes), *here])}
     for path in _paths(to_builtins(flight)["nodes"]):
-        files |= {*_read_by(path, (path.parent,))}
+        files |= _read_by(path)
     texts += [f"{path} {_hashed([path.read_bytes()])}" for path in sorted(files)]
     return _hashed(texts)
 
@@ -118,7 +118,7 @@ def _sources(modules: Iterable[str]) -> Iterator[Path]:
 def _origin(name: str) -> Path | None:
     try:
         spec = importlib.util.find_spec(name)
-    except (ImportError, ValueError):
+    except Exception:  # a package is imported for what is in it, and may raise anything
         return None
     return Path(spec.origin) if spec and spec.has_location and spec.origin else None
 
@@ -139,16 +139,16 @@ def _paths(value: Any) -> Iterator[Path]:
             yield from _paths(each)
 
 
-def _read_by(path: Path, folders: tuple[Path, ...]) -> Iterator[Path]:
-    """Yield a file, what a folder holds, and what a model of MuJoCo's includes."""
+def _read_by(path: Path) -> set[Path]:
+    """Return a file and what a model of MuJoCo's includes, or what a folder holds."""
     if path.is_dir():
-        yield from (each for each in path.rglob("*") if each.is_file())
-        return
-    yield path
-    if path.suffix == ".xml":
-        text = path.read_text(encoding="utf-8", errors="replace")
-        folders += tuple(folders[0] / name for name in _FOLDERS.findall(text))
-        for name in _NAMED.findall(text):
-            for each in {folder / name for folder in folders}:
-                if each.is_file() and each != path:
-                    yield from _read_by(each, folders)
+        return {each for each in path.rglob("*") if each.is_file()}
+    found, todo, folders = {path}, [path], {path.parent}
+    while todo:
+        if (file := todo.pop()).suffix == ".xml":
+            text = file.read_text(encoding="utf-8", errors="replace")
+            folders |= {path.parent / name for name in _FOLDERS.findall(text)}
+            named = {folder / name for folder in folders for name in _NAMED.findall(text)}
+            todo += (new := sorted({each for each in named if each.is_file()} - found))
+            found.update(new)
+    return found

@@ -126,7 +126,9 @@ def test_the_key_knows_what_a_world_includes(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     mesh, part = tmp_path / "meshes" / "rock.obj", tmp_path / "part.xml"
     mesh.write_text("v 0 0 0")
-    part.write_text('<mujoco><asset><mesh file="rock.obj"/></asset></mujoco>')
+    part.write_text(  # which includes itself, too: MuJoCo says so later
+        '<mujoco><asset><mesh file="rock.obj"/></asset><include file="part.xml"/></mujoco>'
+    )
     world = tmp_path / "world.xml"
     world.write_text('<mujoco><compiler meshdir="meshes"/><include file="part.xml"/></mujoco>')
     config = load(ROOT / "config.toml", [f"drone.world={world}"])
@@ -137,6 +139,34 @@ def test_the_key_knows_what_a_world_includes(tmp_path: Path) -> None:
         file.write_text(file.read_text() + "\n")
         keys.add(content_key(found))
     assert len(keys) == 4
+
+
+def test_the_key_knows_modules_beside_a_node_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    package = tmp_path / "beside_physics"
+    package.mkdir()
+    files = [tmp_path / "beside_craft.py", tmp_path / "beside_tools.py"]
+    files += [package / name for name in ("__init__.py", "drag.py", "air.py")]
+    texts = [
+        "import beside_tools\nimport numpy as np\nfrom beside_physics import drag\n"
+        "from tests.runtime.tools.flights.samples import Craft\nclass Own(Craft):\n    pass\n",
+        "def tool():\n    from no_such_module import it\n",
+        "",
+        "from . import air\n",
+        "DENSITY = 1.2\n",
+    ]
+    for file, text in zip(files, texts, strict=True):
+        file.write_text(text)
+    own = "[[nodes]]\nname = 'own'\ntype = 'beside_craft:Own'\n"
+    part = flight_of(flown(tmp_path, text=own))
+    assert part is not None
+    keys = {content_key(part)}
+    for file in files:
+        file.write_text(file.read_text() + "# changed\n")
+        keys.add(content_key(part))
+    assert len(keys) == 1 + len(files)
 
 
 _OTHER_CODE = b"cevents\nNoLongerThere\n."  # a pickle that only other code can read
