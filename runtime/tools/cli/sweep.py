@@ -16,7 +16,7 @@ from runtime.tools.cli.common import ConfigFile, Overrides
 if TYPE_CHECKING:
     from runtime.tools.sweep import Children, Plan, Row
 
-_WIDTH = 160
+_WIDTH = 240
 """Of the table where there is no terminal, in letters; 80 would break its words."""
 
 
