@@ -55,8 +55,12 @@ _AGREES = 4.0
 """Standard deviations up to which a landmark agrees with a pose."""
 _FEW = 120
 """Corners that suffice for an approximate pose, at most."""
-_ENOUGH = 60
-"""Agreeing landmarks that give a pose alone; with fewer, edges and surfaces are aligned, too."""
+_ENOUGH = 60 / 512**2
+"""Agreeing landmarks a pixel that give a pose alone: a smaller image has room for fewer of them. With
+less than that, edges and surfaces are aligned, too."""
+_BELIEVED = 0.03
+"""Share of an alignment's information that counts beside landmarks: errors of pixels that lie beside
+each other are not independent, and some of the pixels may be on things that move."""
 _FEWEST = 4
 """Agreeing landmarks that are of use beside that."""
 _SEARCHED = 20
@@ -101,6 +105,7 @@ class FeatureTracker:
         self._matrix = info.matrix()
         large = self._settings.levels and min(info.width, info.height) >= _LARGE
         self._reduction = 2 if large else 1
+        self._enough = max(_ENOUGH * info.width * info.height, self._settings.min_inliers)
         self._pose = np.eye(4)  # world (the first camera) to camera
         self._lost_since: int | None = None
         self._count = 0  # images so far
@@ -121,14 +126,15 @@ class FeatureTracker:
             return self._start_map(stamp, grey, inverse_of, first)
         lost, alignment = self._lost_since is not None, None
         match = self._match(grey, inverse_of)
-        if self._aligns and (match is None or match.agree.sum() < _ENOUGH):
+        if self._aligns and (match is None or match.agree.sum() < self._enough):
             view = View.of(grey, inverse_of)
             starts = [match.pose] if match and lost else [self._motion.expected(stamp)]
             if match is None and lost:
                 starts += [self._motion.steady(stamp), self._pose]
             alignment = self._references.align(view, starts, lost)
             if alignment is not None:
-                match = self._find(grey, inverse_of, alignment.pose, alignment.information)
+                believed = _BELIEVED * alignment.information
+                match = self._find(grey, inverse_of, alignment.pose, believed)
                 match = match or MapMatch.without_landmarks(alignment.pose)
         if match is None:
             return self._lose(stamp, grey, inverse_of)
