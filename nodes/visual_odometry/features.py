@@ -56,11 +56,11 @@ _AGREES = 4.0
 _FEW = 120
 """Corners that suffice for an approximate pose, at most."""
 _ENOUGH = 60 / 512**2
-"""Agreeing landmarks a pixel that give a pose alone: a smaller image has room for fewer of them. With
-less than that, edges and surfaces are aligned, too."""
+"""Agreeing landmarks a pixel that give a pose alone: a smaller image has room for fewer of them.
+With less than that, edges and surfaces are aligned, too."""
 _BELIEVED = 0.03
-"""Share of an alignment's information that counts beside landmarks: errors of pixels that lie beside
-each other are not independent, and some of the pixels may be on things that move."""
+"""Share of an alignment's information that counts beside landmarks: errors of pixels that lie
+beside each other are not independent, and some of the pixels may be on things that move."""
 _FEWEST = 4
 """Agreeing landmarks that are of use beside that."""
 _SEARCHED = 20
