@@ -32,6 +32,7 @@ BRIDGES = {
     "foxglove",
     "kiss_icp",
     "mcap",
+    "msgpack",
     "pyorbslam3",
     "rosbags",
     "svo_cpp",

@@ -158,16 +158,34 @@ class Worker(Generic[W]):
         **kwargs: P.kwargs,
     ) -> R:
         """Call a method as `call` does, with a latency (seconds of the clock) of its own."""
-        if not self._processes:
-            raise WorkerError(f"worker {self.name}: expected a call from ready() until close()")
+        work = self._request(method, args, kwargs)
         if latency != self.costs.latency:
             self.costs.latency = None
+        result: R = await self._clock.beside(work, round(latency * SECOND))
+        return result
+
+    async def call_untimed(
+        self, method: Callable[Concatenate[W, P], R], *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """Call a method and await its result, for which simulated time does not wait.
+
+        For what leaves the run, such as an image for a client outside: at which simulated time the
+        result comes is not the same in every run, unless time stands meanwhile.
+        """
+        self.costs.latency = None
+        result: R = await asyncio.wrap_future(self._request(method, args, kwargs))
+        return result
+
+    def _request(
+        self, method: Callable[..., R], args: Any, kwargs: Any
+    ) -> concurrent.futures.Future[R]:
+        if not self._processes:
+            raise WorkerError(f"worker {self.name}: expected a call from ready() until close()")
         process = min(self._processes, key=_Process.outstanding)
         work = process.request((method.__name__, args, kwargs))
         if self.called is not None:
             self.called(process.name, method.__name__, work)
-        result: R = await self._clock.beside(work, round(latency * SECOND))
-        return result
+        return work
 
     def outstanding(self) -> int:
         """Return how many calls wait for their answer."""

@@ -1,0 +1,146 @@
+"""From a call's name and arguments to a handler: the table of methods.
+
+A group of methods is a class whose functions are marked with `rpc`. The name, the annotated
+parameters and the docstring of each give arity, conversion, errors and documentation.
+"""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Awaitable, Callable, Iterable
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+
+import msgspec
+
+Flavour = Literal["airsim", "cosys"]
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class RpcError(Exception):
+    """A call that cannot be served; the text is sent to the client."""
+
+
+class Caller(Protocol):
+    """The client that calls.
+
+    Attributes:
+        address: Of the client, for messages.
+        flavour: Whose structures it expects; a handler may set it.
+    """
+
+    address: str
+    flavour: Flavour
+
+
+def rpc(name: str, *, cosys: int | None = None) -> Callable[[F], F]:
+    """Mark a function of a group as the handler of a method.
+
+    Its parameters are converted as annotated (whole numbers to floats; maps to structures). One
+    that is annotated with `Caller` gets the client and is no argument. Defaults stand for
+    arguments that one of the flavours does not have.
+
+    What a handler does before its first wait is done when it is called, in the order in which
+    the requests came: one that waits is a plain function that returns an awaitable.
+
+    Args:
+        name: Of the method, on the wire.
+        cosys: Number of arguments of Cosys-AirSim's clients, if it is another than AirSim's.
+    """
+
+    def mark(function: F) -> F:
+        function.__dict__["rpc"] = name, cosys
+        return function
+
+    return mark
+
+
+class Method(NamedTuple):
+    """One method.
+
+    Attributes:
+        name: On the wire.
+        call: The handler.
+        parameters: Names of its arguments.
+        shapes: Type of the tuple of its arguments, by their number.
+        wants_caller: Whether the client is its first argument.
+        expected: Number of arguments by flavour, for messages.
+        description: First line of the handler's docstring.
+    """
+
+    name: str
+    call: Callable[..., Any]
+    parameters: tuple[str, ...]
+    shapes: dict[int, Any]
+    wants_caller: bool
+    expected: dict[Flavour, int]
+    description: str
+
+
+class Table:
+    """All methods by name.
+
+    Args:
+        groups: Objects with functions that are marked with `rpc`.
+    """
+
+    def __init__(self, groups: Iterable[object]) -> None:
+        self.methods: dict[str, Method] = {}
+        for group in groups:
+            for _, function in inspect.getmembers(group, callable):
+                if marked := getattr(function, "rpc", None):
+                    method = _method(function, *marked)
+                    assert method.name not in self.methods, method.name
+                    self.methods[method.name] = method
+
+    def call(self, caller: Caller, name: str, arguments: list[Any]) -> Awaitable[Any] | Any:
+        """Call a method, and return its result or an awaitable of it.
+
+        Raises:
+            RpcError: There is no such method, or the arguments are not those it takes, or it
+                cannot be served; the text is that of rpclib.
+        """
+        method = self.methods.get(name)
+        count = len(arguments)
+        if method is None:
+            raise RpcError(
+                f"rpclib: server could not find function '{name}' with argument count {count}."
+            )
+        shape = method.shapes.get(count)
+        if shape is None:
+            expected = method.expected[caller.flavour]
+            raise RpcError(
+                f"rpclib: Function '{name}' was called with an invalid number of arguments. "
+                f"Expected: {expected}, got: {count}"
+            )
+        try:
+            converted = msgspec.convert(arguments, shape)
+            first = (caller,) if method.wants_caller else ()
+            return method.call(*first, *converted)
+        except (msgspec.ValidationError, RpcError, ValueError) as error:
+            raise RpcError(thrown(name, count, str(error))) from None
+
+
+def thrown(name: str, count: int, text: str) -> str:
+    """Return rpclib's text of an exception in a handler."""
+    return (
+        f"rpclib: function '{name}' (called with {count} arg(s)) threw an exception. "
+        f"The exception contained this information: {text}."
+    )
+
+
+def _method(function: Callable[..., Any], name: str, cosys: int | None) -> Method:
+    hints = typing.get_type_hints(function)
+    signature = list(inspect.signature(function).parameters.values())
+    wants_caller = bool(signature) and hints[signature[0].name] is Caller
+    parameters = signature[wants_caller:]
+    types = [hints[each.name] for each in parameters]
+    least = sum(each.default is inspect.Parameter.empty for each in parameters)
+    shapes = {
+        count: tuple.__class_getitem__(tuple(types[:count]) or ((),))
+        for count in range(least, len(types) + 1)
+    }
+    expected: dict[Flavour, int] = {"airsim": len(types), "cosys": cosys or len(types)}
+    first = (inspect.getdoc(function) or "").partition("\n")[0]
+    names = tuple(each.name for each in parameters)
+    return Method(name, function, names, shapes, wants_caller, expected, first)
