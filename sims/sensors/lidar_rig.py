@@ -16,6 +16,9 @@ from sims.sensors.scanner import Scanner
 from sims.sensors.sensor import generator_of
 from sims.vehicle import TIMESTEP_NS, Physics
 
+LATE = 1.0
+"""Seconds by which a turn may end late, as it may in real time; one that ends later is skipped."""
+
 
 class LidarRig:
     """All lidars of one vehicle.
@@ -56,7 +59,7 @@ class LidarRig:
         self._scanner = await self._node.worker(
             Scanner, model, world.dynamics, specs, self._node.name, seed
         )
-        self._physics.history.keep(max(1.0 / spec.rate for spec in specs) + 2e-3)
+        self._physics.history.keep(max(1.0 / spec.rate for spec in specs) + LATE + 2e-3)
         for lidar in self._lidars:
             self._node.every(lidar.spec.rate, functools.partial(self._turn, lidar), lidar.spec.name)
 
@@ -68,7 +71,9 @@ class LidarRig:
         if start == end or start < lidar.spec.startup_delay * 1e9:
             return
         on_their_way = math.ceil(lidar.spec.latency * lidar.spec.rate) + 1
-        if self._in_flight[lidar.source] > on_their_way:  # in real time it may fall behind
+        too_long = end - start > (1.0 / lidar.spec.rate + LATE) * 1e9
+        # In real time it, or what calls this, may fall behind.
+        if too_long or self._in_flight[lidar.source] > on_their_way:
             if lidar.source not in self._skipped:
                 self._node.log.warning("%s: turns skipped, scanning is too slow", lidar.source)
             self._skipped.add(lidar.source)
