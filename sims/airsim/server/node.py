@@ -17,6 +17,7 @@ from runtime.node import Node
 from runtime.paths import NameOrPath
 from sims.airsim.server.connection import Connection
 from sims.airsim.server.methods import RpcError, Table
+from sims.airsim.server.objects import Objects
 from sims.airsim.server.session import Session
 from sims.airsim.server.time import Time
 from sims.airsim.server.vehicles import ServedVehicle
@@ -63,14 +64,15 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
     async def on_startup(self) -> None:
         """Join the world, and listen."""
         self.deterministic = self.config.time != "running"  # type: ignore[misc]
-        self._world = await join_world(self)
-        simulation = self._world.simulation
+        self.world = await join_world(self)
+        simulation = self.world.simulation
         self.vehicles: dict[str, ServedVehicle] = {}
         for each in self.siblings(Multirotor):
             assert simulation is not None
             physics = Physics(simulation, each.name)
             self.vehicles[each.name] = ServedVehicle(each.name, physics, self.clock.now)
-        self.table = Table([Session(self), Time(self)])
+        self.objects = Objects(self)
+        self.table = Table([Session(self), Time(self), self.objects])
         self._connections: set[Connection] = set()
         self._server: asyncio.Server | None = None
         if self.checking:
