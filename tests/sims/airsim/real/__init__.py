@@ -1,0 +1,1 @@
+"""Tests with AirSim's own clients, which PyPI has."""

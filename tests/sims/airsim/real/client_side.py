@@ -1,0 +1,323 @@
+"""What scripts do with a real client: run by the client's own Python, in a process of its own.
+
+    python client_side.py MODULE PORT FUNCTION [ARGUMENT …]
+
+The function's result is printed as JSON in the last line. No import of this project here.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+airsim: Any = importlib.import_module(sys.argv[1]) if len(sys.argv) > 1 else None
+IS_COSYS = sys.argv[1:2] == ["cosysairsim"]
+
+
+def connect(port: int) -> Any:
+    """Return a client that may fly."""
+    client = airsim.MultirotorClient(port=port)
+    client.confirmConnection()
+    client.enableApiControl(True)
+    client.armDisarm(True)
+    return client
+
+
+def position(client: Any, vehicle: str = "") -> list[float]:
+    """Return where a vehicle is, local NED."""
+    return list(client.getMultirotorState(vehicle).kinematics_estimated.position.to_numpy_array())
+
+
+def handshake(port: int) -> Any:
+    """Connect, and ask what there is."""
+    client = airsim.MultirotorClient(port=port)
+    client.confirmConnection()
+    return {"ping": client.ping(), "vehicles": client.listVehicles()}
+
+
+def hello(port: int) -> Any:
+    """Fly as the first script of everybody does."""
+    client = connect(port)
+    found: dict[str, Any] = {"start": position(client)}
+    found["landed"] = [client.getMultirotorState().landed_state]
+    client.takeoffAsync().join()
+    found["up"] = position(client)
+    found["landed"].append(client.getMultirotorState().landed_state)
+    client.moveToPositionAsync(2, 1, -2.5, 2).join()
+    found["there"] = position(client)
+    client.rotateToYawAsync(90).join()
+    orientation = client.getMultirotorState().kinematics_estimated.orientation
+    angles = airsim.quaternion_to_euler_angles if IS_COSYS else airsim.to_eularian_angles
+    found["yaw"] = float(np.degrees(angles(orientation)[2]))
+    client.moveOnPathAsync(
+        [airsim.Vector3r(2, -1, -2.5), airsim.Vector3r(0, 0, -1)],
+        2,
+        120,
+        airsim.DrivetrainType.ForwardOnly,
+        airsim.YawMode(False, 0),
+    ).join()
+    found["back"] = position(client)
+    client.hoverAsync().join()
+    client.landAsync().join()
+    found["down"] = position(client)
+    found["landed"].append(client.getMultirotorState().landed_state)
+    client.armDisarm(False)
+    client.enableApiControl(False)
+    return found
+
+
+def unjoined(port: int) -> Any:
+    """Let a velocity go on while the script sleeps, as most scripts do."""
+    client = connect(port)
+    client.takeoffAsync().join()
+    before = position(client)
+    client.moveByVelocityAsync(1, 0, 0, 1.5)
+    if IS_COSYS:
+        client.ping()  # its client sends a call when it next turns
+    time.sleep(0.6)
+    moving = client.getMultirotorState().kinematics_estimated.linear_velocity.x_val
+    time.sleep(2.5)
+    state = client.getMultirotorState().kinematics_estimated
+    return {
+        "moving": moving,
+        "still": state.linear_velocity.get_length(),
+        "distance": state.position.x_val - before[0],
+    }
+
+
+def superseded(port: int) -> Any:
+    """Give a task while another is under way, and note in which order they end."""
+    client = connect(port)
+    client.takeoffAsync().join()
+    ended = []
+    far = client.moveToPositionAsync(30, 0, -2, 1)
+    near = client.moveByVelocityAsync(0, 1, 0, 0.5)
+    began = time.monotonic()
+    far.join()
+    ended.append(time.monotonic() - began)
+    near.join()
+    ended.append(time.monotonic() - began)
+    return {"far": far.result, "near": near.result, "ended": ended}
+
+
+def two(port: int) -> Any:
+    """Fly two drones at a time."""
+    client = airsim.MultirotorClient(port=port)
+    client.confirmConnection()
+    names = client.listVehicles()
+    for name in names:
+        client.enableApiControl(True, name)
+        client.armDisarm(True, name)
+    for flight in [client.takeoffAsync(vehicle_name=name) for name in names]:
+        flight.join()
+    moves = [
+        client.moveToPositionAsync(1 + i, 0, -2, 1, vehicle_name=name)
+        for i, name in enumerate(names)
+    ]
+    for move in moves:
+        move.join()
+    return {"names": names, "where": {name: position(client, name) for name in names}}
+
+
+def stepped(port: int) -> Any:
+    """Fly by steps of paused time; the stamps tell how long each took."""
+    client = connect(port)
+    client.simPause(True)
+    stamps = [client.getMultirotorState().timestamp]
+    take_off = client.takeoffAsync()
+    for _ in range(40):
+        client.simContinueForTime(0.25)
+        stamps.append(client.getMultirotorState().timestamp)
+    take_off.join()
+    before = position(client)
+    time.sleep(0.5)
+    return {
+        "stamps": stamps,
+        "paused": client.simIsPause(),
+        "where": before,
+        "later": position(client),
+    }
+
+
+def again(port: int) -> Any:
+    """Reset in the air, and fly once more."""
+    client = connect(port)
+    client.takeoffAsync().join()
+    client.moveToPositionAsync(2, 2, -3, 2)
+    client.reset()
+    found = {"reset": position(client), "control": client.isApiControlEnabled()}
+    client.enableApiControl(True)
+    client.armDisarm(True)
+    client.takeoffAsync().join()
+    found["up"] = position(client)
+    return found
+
+
+def collision(port: int) -> Any:
+    """Fly into the crate's side, and read of it twice."""
+    client = connect(port)
+    client.takeoffAsync().join()
+    client.simGetCollisionInfo()
+    client.moveToZAsync(-0.4, 1).join()
+    first = client.simGetCollisionInfo()
+    client.moveByVelocityZAsync(1.5, 0, -0.4, 4).join()
+    infos = [client.simGetCollisionInfo() for _ in range(2)]
+    return {
+        "before": first.has_collided,
+        "has": [info.has_collided for info in infos],
+        "object": infos[0].object_name,
+        "normal": list(infos[0].normal.to_numpy_array()),
+    }
+
+
+def errors(port: int) -> Any:
+    """Call what cannot be served."""
+    client = airsim.MultirotorClient(port=port)
+    refused = []
+
+    def attempt(call: Any) -> None:
+        try:
+            call()
+        except Exception as error:  # msgpackrpc.error.RPCError, of two packages
+            text = error.args[0] if error.args else ""
+            refused.append(text.decode() if isinstance(text, bytes) else str(text))
+        else:
+            refused.append("")
+
+    attempt(lambda: client.client.call("simNonsense", 1))
+    attempt(lambda: client.client.call("simPause"))
+    attempt(lambda: client.getMultirotorState("nobody"))
+    attempt(lambda: client.getImuData("nothing"))
+    attempt(lambda: client.simGetImages([airsim.ImageRequest("nowhere", 0)]))
+    client.takeoffAsync(vehicle_name="nobody").join()  # never raises
+    future = client.takeoffAsync()  # without control
+    future.join()
+    attempt(future.get)
+    return {"refused": refused, "alive": client.ping()}
+
+
+def sensors(port: int) -> Any:
+    """Read every sensor."""
+    client = connect(port)
+    client.simPause(True)
+    client.simContinueForTime(5.0)  # a satellite receiver needs three seconds
+    imu = client.getImuData()
+    gps = client.getGpsData()
+    state = client.getMultirotorState()
+    return {
+        "imu": list(imu.linear_acceleration.to_numpy_array()),
+        "imu_stamp": imu.time_stamp,
+        "pressure": client.getBarometerData().pressure,
+        "field": list(client.getMagnetometerData().magnetic_field_body.to_numpy_array()),
+        "fix": gps.gnss.fix_type,
+        "latitude": gps.gnss.geo_point.latitude,
+        "home": client.getHomeGeoPoint().latitude,
+        "state_stamp": state.timestamp,
+        "environment": client.simGetGroundTruthEnvironment().air_pressure,
+    }
+
+
+def images(port: int, folder: str) -> Any:
+    """Take one image of each kind in paused time, and keep them beside what the run keeps."""
+    client = connect(port)
+    client.simPause(True)
+    client.simContinueForTime(1.0)
+    requests = [
+        airsim.ImageRequest("front_center", airsim.ImageType.Scene, False, False),
+        airsim.ImageRequest("front_center", airsim.ImageType.Scene, False, True),
+        airsim.ImageRequest("front_center", airsim.ImageType.DepthPlanar, True, False),
+        airsim.ImageRequest("front_center", airsim.ImageType.DepthPerspective, True, False),
+        airsim.ImageRequest("front_center", airsim.ImageType.DepthVis, True, False),
+        airsim.ImageRequest("front_center", airsim.ImageType.DisparityNormalized, True, False),
+        airsim.ImageRequest("front_center", airsim.ImageType.Segmentation, False, False),
+        airsim.ImageRequest("front_center", airsim.ImageType.SurfaceNormals, False, False),
+        airsim.ImageRequest("front_center", airsim.ImageType.Infrared, False, False),
+    ]
+    import cv2  # of the client's environment
+
+    stamps, sizes, poses = [], [], []
+    for number, each in enumerate(client.simGetImages(requests)):
+        if each.pixels_as_float:
+            array = airsim.get_pfm_array(each)
+        elif each.compress:
+            bytes_ = airsim.string_to_uint8_array(each.image_data_uint8)
+            array = cv2.imdecode(bytes_, cv2.IMREAD_UNCHANGED)
+        else:
+            flat = np.frombuffer(each.image_data_uint8, np.uint8)
+            array = flat.reshape(each.height, each.width, 3)
+        np.save(Path(folder) / f"{number}.npy", array)
+        stamps.append(each.time_stamp)
+        sizes.append((each.width, each.height))
+        where, turn = each.camera_position, each.camera_orientation
+        poses.append([*where.to_numpy_array(), *turn.to_numpy_array()])
+    png = client.simGetImage("0", airsim.ImageType.Scene)
+    info = client.simGetCameraInfo("front_center")
+    state = client.simGetGroundTruthKinematics()
+    return {
+        "stamps": [int(stamp) for stamp in stamps],
+        "sizes": sizes,
+        "poses": [[float(number) for number in pose] for pose in poses],
+        "png": len(png),
+        "fov": info.fov,
+        "vehicle": [float(number) for number in state.position.to_numpy_array()],
+    }
+
+
+def computer_vision(port: int, folder: str) -> Any:
+    """Set poses of a camera without a vehicle, and take an image at each."""
+    client = airsim.VehicleClient(port=port)
+    client.confirmConnection()
+    found = []
+    for number, x in enumerate((0.0, 1.0, 2.0)):
+        turn = airsim.Quaternionr(0, 0, 0, 1)
+        client.simSetVehiclePose(airsim.Pose(airsim.Vector3r(x, 0.5, -1.0), turn), True)
+        responses = client.simGetImages(
+            [
+                airsim.ImageRequest("0", airsim.ImageType.Scene, False, False),
+                airsim.ImageRequest("0", airsim.ImageType.DepthPlanar, True, False),
+            ]
+        )
+        pose = client.simGetVehiclePose()
+        depth = airsim.get_pfm_array(responses[1])
+        np.save(Path(folder) / f"depth{number}.npy", depth)
+        found.append(
+            {
+                "pose": [float(each) for each in pose.position.to_numpy_array()],
+                "image": [float(r.camera_position.x_val) for r in responses],
+                "depth": float(depth[depth.shape[0] // 2, depth.shape[1] // 2]),
+            }
+        )
+    return found
+
+
+def threads(port: int) -> Any:
+    """Poll by one client in each of several threads, as scripts do."""
+    counts: list[int] = []
+
+    def poll() -> None:
+        import asyncio
+
+        asyncio.set_event_loop(asyncio.new_event_loop())  # rpc-msgpack's tornado asks for one
+        client = airsim.MultirotorClient(port=port)
+        for _ in range(20):
+            client.getMultirotorState()
+        counts.append(20)
+
+    pollers = [threading.Thread(target=poll) for _ in range(4)]
+    for each in pollers:
+        each.start()
+    for each in pollers:
+        each.join()
+    return counts
+
+
+if __name__ == "__main__":
+    _, _, number_, name_, *rest_ = sys.argv
+    print(json.dumps(globals()[name_](int(number_), *rest_), default=float))
