@@ -36,6 +36,7 @@ from sims.cameras import (
 )
 from sims.shared_world import join_world
 from sims.simulator import Rate, Simulator, SimulatorConfig
+from sims.vehicle import State
 from sims.worlds import Dynamics, Scene
 
 Course = Callable[[int], tuple[Vector3, Quaternion]]
@@ -105,6 +106,11 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         joint = self._world.model.joint(self.name)
         pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
         self._of_pose, self._of_twist = slice(pose, pose + 7), slice(twist, twist + 6)
+        self._world.free_cameras[self.name] = self.state_at
+        still = (0.0, 0.0, 0.0)
+        self._world.starts.setdefault(
+            self.name, State(self._position, self._orientation, still, still)
+        )
         await self.rig.start(self._world)
         self._world.remember(self.rig.past)
 
@@ -134,9 +140,8 @@ class FreeCamera(Simulator[FreeCameraConfig]):
         if self._rows is None:
             self._position, self._orientation = self._course(tick.stamp)(tick.stamp)
         self._stamp = tick.stamp
-        course, half = self._course(tick.stamp), round(MOMENT / 2 * 1e9)
-        before, after = (course(tick.stamp + sign * half) for sign in (-1, 1))
-        qvel = qvel_between(pose_to_qpos(*before), pose_to_qpos(*after), MOMENT)
+        course = self._course(tick.stamp)
+        qvel = _velocity_on(course, tick.stamp)
         vx, vy, vz, wx, wy, wz = qvel.tolist()  # FLU, as MuJoCo has it: half a turn from FRD
         self.odometry.send(
             Odometry(
@@ -160,6 +165,12 @@ class FreeCamera(Simulator[FreeCameraConfig]):
 
         for camera in self.config.cameras:
             self.rig.expose(camera.name, tick.stamp, state, velocities, past_state)
+
+    def state_at(self, stamp: int) -> State:
+        """Return where it is and how it moves at a time (ns) not before its last update."""
+        course = self._course(stamp)
+        vx, vy, vz, wx, wy, wz = _velocity_on(course, stamp).tolist()
+        return State(*course(stamp), (vx, -vy, -vz), (wx, -wy, -wz))
 
     def _course(self, stamp: int) -> Course:
         """Return the way on which the camera is at `stamp`, as poses of times (ns) near it."""
@@ -188,6 +199,13 @@ class FreeCamera(Simulator[FreeCameraConfig]):
             return False
         self._position, self._orientation = pose_at(self._rows, stamp / 1e9)
         return True
+
+
+def _velocity_on(course: Course, stamp: int) -> npt.NDArray[np.float64]:
+    """Return the generalised velocity of a free camera on its way, shape (6,)."""
+    half = round(MOMENT / 2 * 1e9)
+    before, after = (pose_to_qpos(*course(stamp + sign * half)) for sign in (-1, 1))
+    return qvel_between(before, after, MOMENT)
 
 
 def read_tum(path: Path) -> npt.NDArray[np.float64]:

@@ -113,6 +113,7 @@ class Multirotor(Simulator[MultirotorConfig]):
         self._clearance = Clearance(self._world.model, self.name)
         if not self._physics.time_ns:
             await self.offload(self._physics.settle)
+            self._world.starts[self.name] = self._physics.state()
         self._autopilot = Autopilot(
             self._physics.parameters,
             config.gains,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from runtime import Node
 from runtime.host import Sibling
 from sims.cameras import model_to_bytes
-from sims.vehicle import Simulation
+from sims.vehicle import Simulation, State
 from sims.vehicle.air import Air
 from sims.vehicle.simulation import Influence
 from sims.worlds import Dynamics, Scene, WorldError, load_scene
@@ -64,6 +65,8 @@ class SharedWorld:
         simulation: Its physics, which all vehicles share. `None` if there is no vehicle.
         air: Its wind; `None` if there is none, or no vehicle.
         vehicles: Names of the vehicles.
+        starts: State of each vehicle and free camera at its start, once that node has started up.
+        free_cameras: Gives the state of each free camera at a time (ns); no physics knows it.
     """
 
     model: Any
@@ -77,6 +80,8 @@ class SharedWorld:
         self.named_by = named[0].name if named else ""
         self._inhabitants = inhabitants
         self.vehicles = [each.name for each in inhabitants if each.node.vehicle]
+        self.starts: dict[str, State] = {}
+        self.free_cameras: dict[str, Callable[[int], State]] = {}
         self._bare = bare
         self._seed = seed
         self._built = False

@@ -137,6 +137,15 @@ class Physics:
         wx, wy, wz, ax, ay, az = self._imu.tolist()
         return (wx, -wy, -wz), (ax, -ay, -az)
 
+    def accelerations(self) -> tuple[Vector3, Vector3]:
+        """Return the true acceleration (m/s² NED) and angular acceleration (rad/s² FRD).
+
+        At rest both are zero: gravity is not in it, unlike in what an IMU feels.
+        """
+        self.simulation.refresh()
+        ax, ay, az, wx, wy, wz = self.data.qacc[self._of_twist].tolist()
+        return (ax, -ay, -az), (wx, -wy, -wz)
+
     def touching(self) -> bool:
         """Return whether the vehicle touches anything; cheaper than `contacts`."""
         self.simulation.refresh()

@@ -10,20 +10,24 @@ import asyncio
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from events import Command, Setpoint
 from runtime import NodeConfig, Output
 from runtime.node import Node
 from runtime.paths import NameOrPath
 from sims.airsim.server.connection import Connection
-from sims.airsim.server.methods import RpcError, Table
+from sims.airsim.server.control import Control
+from sims.airsim.server.methods import Table
 from sims.airsim.server.objects import Objects
 from sims.airsim.server.session import Session
+from sims.airsim.server.state import VehicleState
 from sims.airsim.server.time import Time
-from sims.airsim.server.vehicles import ServedVehicle
+from sims.airsim.server.vehicles import ServedCamera, ServedMultirotor, ServedVehicle, Vehicles
+from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
 from sims.shared_world import Inhabitant, join_world
-from sims.vehicle import Physics
 from sims.worlds import Dynamics, Scene
 
 PORTS = "ports of AirSim servers"
@@ -42,6 +46,8 @@ class AirsimServerConfig(NodeConfig):
         time: ``running``: time runs, at the run's `speed`. ``paused``: it stands from the start,
             and a script steps it. ``awaited``: it runs only while a client waits for a vehicle.
             With the last two, a script whose only waiting is for replies gives equal runs.
+        default_vehicle: Name of the vehicle that an empty name stands for; empty for the first by
+            name.
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.
     """
 
@@ -49,6 +55,7 @@ class AirsimServerConfig(NodeConfig):
     port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 41451
     flavour: Literal["airsim", "cosys"] = "airsim"
     time: Literal["running", "paused", "awaited"] = "running"
+    default_vehicle: str = ""
     world: NameOrPath = ""
 
 
@@ -65,33 +72,47 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         """Join the world, and listen."""
         self.deterministic = self.config.time != "running"  # type: ignore[misc]
         self.world = await join_world(self)
-        simulation = self.world.simulation
-        self.vehicles: dict[str, ServedVehicle] = {}
-        for each in self.siblings(Multirotor):
-            assert simulation is not None
-            physics = Physics(simulation, each.name)
-            self.vehicles[each.name] = ServedVehicle(each.name, physics, self.clock.now)
+        self.vehicles = Vehicles(self.world, self.config.default_vehicle)
+        for cls, served in ((Multirotor, ServedMultirotor), (FreeCamera, ServedCamera)):
+            for each in self.siblings(cls):
+                vehicle = served(each.name, self.world, each.config, self.clock.now)
+                self.vehicles[each.name] = vehicle
         self.objects = Objects(self)
-        self.table = Table([Session(self), Time(self), self.objects])
+        self.table = Table(
+            [
+                Session(self),
+                Time(self),
+                Control(self),
+                VehicleState(self),
+                self.objects,
+            ]
+        )
         self._connections: set[Connection] = set()
         self._server: asyncio.Server | None = None
         if self.checking:
             return
         config, loop = self.config, asyncio.get_running_loop()
         try:
-            self._server = await loop.create_server(self._connect, config.host, config.port)
+            self._server = await loop.create_server(
+                self._connect, config.host, config.port, start_serving=False
+            )
         except OSError as error:
             raise ValueError(
                 f"port: expected one that is free on {config.host}, found {config.port}: {error}"
             ) from None
         self.port = self._server.sockets[0].getsockname()[1]
         self.share(PORTS, dict[str, int])[self.name] = self.port
-        self.log.info("AirSim's clients may connect to %s:%d", config.host, self.port)
 
     async def on_ready(self) -> None:
         """Let time stand from the start, if that is asked for."""
         if self.config.time != "running":
             self.stepping.pause()
+
+    async def run(self) -> None:
+        """Let clients in, now that commands can be sent."""
+        if self._server is not None:
+            await self._server.start_serving()
+            self.log.info("AirSim's clients may connect to %s:%d", self.config.host, self.port)
 
     async def on_shutdown(self) -> None:
         """Close all connections."""
@@ -106,18 +127,25 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         return Dynamics()
 
     def find_vehicle(self, name: str) -> ServedVehicle:
-        """Return a vehicle; of an empty name the first, by name.
+        """Return a multirotor or a free camera; see `Vehicles.find`."""
+        return self.vehicles.find(name)
 
-        Raises:
-            RpcError: There is none of that name.
+    def find_multirotor(self, name: str) -> ServedMultirotor:
+        """Return a multirotor; see `Vehicles.find_multirotor`."""
+        return self.vehicles.find_multirotor(name)
+
+    def order(self, kind: type[Command], vehicle: ServedVehicle, **fields: Any) -> None:
+        """Send a command to a vehicle, which obeys it at once."""
+        now = self.clock.now()
+        self.commands.send(kind(stamp=now, source=self.name, vehicle=vehicle.name, **fields))
+
+    def drawn_state(self) -> tuple[int, npt.NDArray[np.float64]]:
+        """Return the world's state as it is to be drawn now: time (ns), and positions.
+
+        These are of the last whole millisecond, so exactly the state that methods tell of; in them
+        free cameras are where they have been put, if only just now. Shape (nq,), a copy.
         """
-        found = self.vehicles.get(name or min(self.vehicles, default=""))
-        if found is None:
-            raise RpcError(
-                f"Vehicle API for '{name}' is not available. This could either because this is "
-                "simulation-only API or this vehicle does not exist"
-            )
-        return found
+        return self.vehicles.drawn_state(self.clock.now())
 
     def _connect(self) -> Connection:
         return Connection(self.table, self.config.flavour, self.log, self._connections)
