@@ -7,18 +7,20 @@ and set-points as any pilot does.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Command, Setpoint
+from events import Announcement, Command, PoseEstimate, Setpoint
 from runtime import NodeConfig, Output
 from runtime.node import Node
 from runtime.paths import NameOrPath
 from sims.airsim.server.connection import Connection
 from sims.airsim.server.control import Control
+from sims.airsim.server.estimates import Estimates, ScriptEstimator
 from sims.airsim.server.methods import Table
 from sims.airsim.server.objects import Objects
 from sims.airsim.server.session import Session
@@ -49,6 +51,7 @@ class AirsimServerConfig(NodeConfig):
         default_vehicle: Name of the vehicle that an empty name stands for; empty for the first by
             name.
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.
+        estimators: Estimators in clients' scripts, whose poses are judged.
     """
 
     host: str = "127.0.0.1"
@@ -57,6 +60,7 @@ class AirsimServerConfig(NodeConfig):
     time: Literal["running", "paused", "awaited"] = "running"
     default_vehicle: str = ""
     world: NameOrPath = ""
+    estimators: tuple[ScriptEstimator, ...] = ()
 
 
 class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
@@ -67,6 +71,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     commands = Output(Command)
     setpoints = Output(Setpoint)
+    estimates = Output(PoseEstimate)
 
     async def on_startup(self) -> None:
         """Join the world, and listen."""
@@ -78,6 +83,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 vehicle = served(each.name, self.world, each.config, self.clock.now)
                 self.vehicles[each.name] = vehicle
         self.objects = Objects(self)
+        self.script_estimates = Estimates(self)
         self.table = Table(
             [
                 Session(self),
@@ -85,6 +91,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 Control(self),
                 VehicleState(self),
                 self.objects,
+                self.script_estimates,
             ]
         )
         self._connections: set[Connection] = set()
@@ -102,6 +109,10 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
             ) from None
         self.port = self._server.sockets[0].getsockname()[1]
         self.share(PORTS, dict[str, int])[self.name] = self.port
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce the estimators that clients will be."""
+        return self.script_estimates.announce()
 
     async def on_ready(self) -> None:
         """Let time stand from the start, if that is asked for."""

@@ -1,0 +1,86 @@
+"""Poses that scripts publish become estimates of the run; what is none is refused."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from events import EstimatorAnnouncement, PoseEstimate
+from runtime.testing import NodeResult
+from tests.sims.airsim.scripts import Caller, RefusedError, Script, drone, with_script
+
+START = (2.0, -1.0)
+
+
+def pose(*numbers: float) -> dict[str, dict[str, float]]:
+    """Return a pose as clients send it: x, y, z, and the quaternion w, x, y, z."""
+    x, y, z, w, a, b, c = (*numbers, *(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)[len(numbers) :])
+    return {
+        "position": {"x_val": x, "y_val": y, "z_val": z},
+        "orientation": {"w_val": w, "x_val": a, "y_val": b, "z_val": c},
+    }
+
+
+def published(world: str, script: Script, **estimator: Any) -> NodeResult:
+    """Run a script beside a drone that does not start at the origin."""
+    settings = {"name": "odometry", **estimator}
+    return with_script(script, [drone(world=world, position=START)], estimators=[settings])
+
+
+def test_a_pose_becomes_an_estimate_of_its_image(tiny_world: str) -> None:
+    def script(airsim: Caller) -> None:
+        airsim("simContinueForTime", 0.5)
+        airsim("visnavPublishPose", "odometry", 400_000_000, pose(1, 2, -3))
+
+    result = published(tiny_world, script, method="sparse", scale_free=True, reads=["grey"])
+    (estimate,) = result.of(PoseEstimate)
+    assert (estimate.stamp, estimate.source, estimate.frame_id) == (400_000_000, "odometry", "odom")
+    assert estimate.position == (1.0, 2.0, -3.0)
+    (said,) = result.of(EstimatorAnnouncement)
+    assert (said.source, said.method, said.scale_free, said.reads) == (
+        "odometry", "sparse", True, ("grey",)
+    )  # fmt: skip
+
+
+def test_the_local_frame_becomes_the_map(tiny_world: str) -> None:
+    def script(airsim: Caller) -> None:
+        airsim("simContinueForTime", 0.5)
+        airsim("visnavPublishPose", "odometry", 1, pose(1, 2, 0))
+
+    result = published(tiny_world, script, frame_id="map", vehicle="drone")
+    (estimate,) = result.of(PoseEstimate)
+    assert estimate.frame_id == "map"
+    assert estimate.source == "drone/odometry"
+    assert estimate.position[:2] == pytest.approx((START[0] + 1, START[1] + 2))
+
+
+@pytest.mark.parametrize(
+    ("call", "error"),
+    [
+        (("nobody", 1, pose()), "expected an estimator of the settings (odometry), found 'nobody'"),
+        (("odometry", 500_000_001, pose()), "expected a stamp after 5 and up to 500000000 ns"),
+        (("odometry", 5, pose()), "expected a stamp after 5 and up to 500000000 ns, found 5"),
+        (("odometry", -1, pose()), "expected a stamp after 5"),
+        (("odometry", 6, pose(math.nan)), "expected a pose of finite numbers"),
+        (("odometry", 6, pose(0, 0, math.inf)), "expected a pose of finite numbers"),
+        (("odometry", 6, pose(0, 0, 0, 0)), "whose orientation is a unit quaternion"),
+        (("odometry", 6, pose(0, 0, 0, math.nan)), "whose orientation is a unit quaternion"),
+        (("odometry", 6, pose(0, 0, 0, 2)), "whose orientation is a unit quaternion"),
+        (("odometry", "6", pose()), "Expected `int`, got `str`"),
+        (("odometry", 6), "invalid number of arguments. Expected: 3, got: 2"),
+    ],
+)
+def test_what_is_no_estimate_is_refused(
+    call: tuple[object, ...], error: str, tiny_world: str
+) -> None:
+    def script(airsim: Caller) -> None:
+        airsim("simContinueForTime", 0.5)
+        airsim("visnavPublishPose", "odometry", 5, pose())
+        with pytest.raises(RefusedError) as refused:
+            airsim("visnavPublishPose", *call)
+        assert error in str(refused.value)
+        airsim("visnavPublishPose", "odometry", 7, pose())  # what was refused has changed nothing
+
+    assert [e.stamp for e in published(tiny_world, script).of(PoseEstimate)] == [5, 7]
