@@ -132,6 +132,21 @@ class Stepping:
         self._steps.append((loop.now, done))
         return done
 
+    def stands(self) -> asyncio.Future[int]:
+        """Return a future that is done once time stands, if it is to stand, or else at once.
+
+        After `pause` what else is due now is still done, before time stands.
+
+        Raises:
+            CommandError: Time cannot be controlled.
+        """
+        loop = self._checked()
+        done: asyncio.Future[int] = loop.create_future()
+        self._steps.append((loop.now, done))
+        if loop.gate is not self:
+            self._end_steps()
+        return done
+
     def pace(self, factor: float | None) -> None:
         """Set the speed of time.
 

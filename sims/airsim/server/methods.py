@@ -9,11 +9,18 @@ from __future__ import annotations
 import inspect
 import typing
 from collections.abc import Awaitable, Callable, Iterable
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
+from runtime.errors import CommandError
+
 Flavour = Literal["airsim", "cosys"]
+
+Finite = Annotated[float, msgspec.Meta(ge=-3.5e38, le=3.5e38)]
+"""A number within those of AirSim's clients (float32) that is neither NaN nor infinite, for the
+parameters of handlers and for fields of structures: others are refused with the field's place."""
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -117,7 +124,7 @@ class Table:
             converted = msgspec.convert(arguments, shape)
             first = (caller,) if method.wants_caller else ()
             return method.call(*first, *converted)
-        except (msgspec.ValidationError, RpcError, ValueError) as error:
+        except (msgspec.ValidationError, RpcError, ValueError, CommandError) as error:
             raise RpcError(thrown(name, count, str(error))) from None
 
 

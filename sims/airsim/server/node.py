@@ -7,6 +7,7 @@ and set-points as any pilot does.
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
@@ -84,10 +85,11 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 self.vehicles[each.name] = vehicle
         self.objects = Objects(self)
         self.script_estimates = Estimates(self)
+        self.time = Time(self)
         self.table = Table(
             [
                 Session(self),
-                Time(self),
+                self.time,
                 Control(self),
                 VehicleState(self),
                 self.objects,
@@ -98,32 +100,28 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self._server: asyncio.Server | None = None
         if self.checking:
             return
-        config, loop = self.config, asyncio.get_running_loop()
+        config = self.config
+        if config.time != "running" and (reason := self.stepping.fixed()):
+            raise ValueError(f'time: expected "running", found "{config.time}": {reason}')
         try:
-            self._server = await loop.create_server(
-                self._connect, config.host, config.port, start_serving=False
-            )
+            self._socket = socket.create_server((config.host, config.port))
         except OSError as error:
             raise ValueError(
                 f"port: expected one that is free on {config.host}, found {config.port}: {error}"
             ) from None
-        self.port = self._server.sockets[0].getsockname()[1]
+        self.port = self._socket.getsockname()[1]
         self.share(PORTS, dict[str, int])[self.name] = self.port
 
     def announce(self) -> Iterable[Announcement]:
         """Announce the estimators that clients will be."""
         return self.script_estimates.announce()
 
-    async def on_ready(self) -> None:
-        """Let time stand from the start, if that is asked for."""
-        if self.config.time != "running":
-            self.stepping.pause()
-
     async def run(self) -> None:
-        """Let clients in, now that commands can be sent."""
-        if self._server is not None:
-            await self._server.start_serving()
-            self.log.info("AirSim's clients may connect to %s:%d", self.config.host, self.port)
+        """Serve those who have connected and will; first, let time stand, if it is to."""
+        await self.time.begin()
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_server(self._connect, sock=self._socket)
+        self.log.info("AirSim's clients may connect to %s:%d", self.config.host, self.port)
 
     async def on_shutdown(self) -> None:
         """Close all connections."""
