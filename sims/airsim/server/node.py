@@ -15,17 +15,19 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Announcement, Command, PoseEstimate, Setpoint
-from runtime import NodeConfig, Output
+from events import Announcement, Command, PoseEstimate, Setpoint, VehicleEvent
+from runtime import NodeConfig, Output, Tick, every, on
 from runtime.node import Node
 from runtime.paths import NameOrPath
 from sims.airsim.server.connection import Connection
 from sims.airsim.server.control import Control
 from sims.airsim.server.estimates import Estimates, ScriptEstimator
+from sims.airsim.server.flight import Flight
 from sims.airsim.server.methods import Table
 from sims.airsim.server.objects import Objects
 from sims.airsim.server.session import Session
 from sims.airsim.server.state import VehicleState
+from sims.airsim.server.tasks import RATE, Tasks
 from sims.airsim.server.time import Time
 from sims.airsim.server.vehicles import ServedCamera, ServedMultirotor, ServedVehicle, Vehicles
 from sims.computer_vision import FreeCamera
@@ -86,6 +88,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self.objects = Objects(self)
         self.script_estimates = Estimates(self)
         self.time = Time(self)
+        self.tasks = Tasks(self)
         self.table = Table(
             [
                 Session(self),
@@ -94,6 +97,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 VehicleState(self),
                 self.objects,
                 self.script_estimates,
+                Flight(self),
             ]
         )
         self._connections: set[Connection] = set()
@@ -129,6 +133,16 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
             self._server.close()
         for connection in tuple(self._connections):
             connection.close()
+
+    @on(VehicleEvent)
+    def vehicle_events(self, event: VehicleEvent) -> None:
+        """Take notice of motors that start or stop."""
+        self.tasks.note(event)
+
+    @every(hz=RATE)
+    def fly(self, tick: Tick) -> None:
+        """Let the vehicles' tasks steer."""
+        self.tasks.update(tick.stamp)
 
     @classmethod
     def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:  # noqa: ARG003
