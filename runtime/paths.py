@@ -25,7 +25,7 @@ import msgspec
 from runtime.errors import CommandError
 from runtime.units import plain
 
-Kind = Literal["input", "name", "output", "secret"]
+Kind = Literal["input", "json", "name", "output", "secret"]
 _MARK = "path"
 
 InputPath = Annotated[str, msgspec.Meta(extra={_MARK: "input"})]
@@ -33,6 +33,9 @@ InputPath = Annotated[str, msgspec.Meta(extra={_MARK: "input"})]
 
 NameOrPath = Annotated[str, msgspec.Meta(extra={_MARK: "name"})]
 """A name; an `InputPath` if it contains a slash or ends with a suffix such as ``.xml``."""
+
+JsonOrPath = Annotated[str, msgspec.Meta(extra={_MARK: "json"})]
+"""An object in JSON, which begins with ``{``; else an `InputPath`."""
 
 Secret = Annotated[str, msgspec.Meta(extra={_MARK: "secret"})]
 """A text; an `InputPath` if ``file:`` stands before it."""
@@ -57,7 +60,7 @@ def resolve(table: Any, type_: Any, folder: Path) -> Any:
     """
 
     def absolute(kind: Kind, text: str) -> str:
-        if kind == "output" or not text:
+        if kind == "output" or not text or (kind == "json" and text.lstrip().startswith("{")):
             return text
         if kind == "secret":
             file = type(text)(text[5:])

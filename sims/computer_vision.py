@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -53,7 +53,8 @@ class FreeCameraConfig(SimulatorConfig):
         position: Position at the start, metres in ``map`` (NED).
         orientation: Roll, pitch, yaw at the start, degrees.
         rate: Updates per second; each exposes all cameras, whatever rate their own settings name.
-        cameras: The cameras that are carried; at least one.
+        cameras: The cameras that are carried. There may be none if others look from where it is,
+            as clients of an AirSim server do.
         trajectory: TUM file (stamp x y z qx qy qz qw; NED, FRD) to follow from its first stamp
             on; the run ends with it. Empty for none.
     """
@@ -61,7 +62,6 @@ class FreeCameraConfig(SimulatorConfig):
     position: Vector3 = (0.0, 0.0, -1.5)
     orientation: Vector3 = (0.0, 0.0, 0.0)
     rate: Rate = 30
-    cameras: Annotated[tuple[CameraSpec, ...], msgspec.Meta(min_length=1)]
     trajectory: InputPath = ""
 
     def __post_init__(self) -> None:

@@ -32,13 +32,13 @@ def selftest(
     from nodes.calibration.page import write_page
     from nodes.calibration.selftest import TITLES, prove, subjects
     from nodes.report.style import number
-    from runtime.config.reading import load
     from runtime.errors import ConfigError
     from runtime.results import claim
     from runtime.tools.cli.run import leave_behind
+    from runtime.tools.plugins import load_configuration
     from runtime.units import Duration
 
-    settings = load(config, overrides or [])
+    settings = load_configuration(config, overrides or [])
     try:
         seconds = float(Duration.parse(standing))
     except ValueError as error:
@@ -84,12 +84,12 @@ def lint(
     """
     import sys
 
-    from runtime.config.reading import load
     from runtime.tools import lint as rules
     from runtime.tools import preflight
     from runtime.tools.cli.run import leave_behind
+    from runtime.tools.plugins import load_configuration
 
-    settings = load(config, overrides or [])
+    settings = load_configuration(config, overrides or [])
     brought_up = preflight.of_nodes(settings)
     errors = brought_up.errors
     found = [] if errors else rules.lint(settings, brought_up.announcements, ignore or [])

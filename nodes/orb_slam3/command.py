@@ -33,17 +33,17 @@ def vocabulary(
 
     from nodes.orb_slam3.training import VocabularyTrainer, VocabularyTrainerConfig
     from runtime.config.model import Config, NodeSpec
-    from runtime.config.reading import load
     from runtime.errors import ConfigError
     from runtime.execute import execute
     from runtime.logs import terminal_handler
     from runtime.tools.cli.progress import progress
     from runtime.tools.cli.run import leave_behind
+    from runtime.tools.plugins import load_configuration
     from runtime.units import Duration
 
     if out is not None and out.suffix != ".txt":  # ORB-SLAM3 would read it as binary
         raise ConfigError(f"--out: expected a name that ends with .txt, found {out}")
-    settings = load(config, overrides or [])
+    settings = load_configuration(config, overrides or [])
     options = VocabularyTrainerConfig(path="" if out is None else str(out.resolve()))
     spec = NodeSpec(
         name="vocabulary_trainer",

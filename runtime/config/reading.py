@@ -24,7 +24,7 @@ import re
 import sys
 import tomllib
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,13 +51,18 @@ class _NodeHead(msgspec.Struct, frozen=True, kw_only=True):
     links: dict[str, Any] = {}
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> Config:
+def load(
+    path: Path,
+    overrides: Sequence[str] = (),
+    read: Callable[[str, str], dict[str, Any]] | None = None,
+) -> Config:
     """Read a file.
 
     Args:
-        path: The TOML file. Its folder is where relative paths in it start, and where modules of
-            its nodes are looked for, too.
+        path: The file. Its folder is where relative paths in it start, and where modules of its
+            nodes are looked for, too.
         overrides: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word.
+        read: Makes the table of a whole file from its text and its name, if it is not TOML.
 
     Raises:
         ConfigError: Something in it is wrong.
@@ -68,19 +73,23 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(f"{path}: expected a readable file, found: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: expected UTF-8 text, found {error.reason}") from None
+    table = (read or _read_toml)(text, str(path))
+    folder = path.resolve().parent
+    find_modules_in(folder)
+    for change in overrides:
+        override(table, change)
+    return parse(table, path.name, folder)
+
+
+def _read_toml(text: str, path: str) -> dict[str, Any]:
     try:
-        table = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: expected TOML, found: {error}") from None
     except ValueError as error:  # of Python's int()
         raise ConfigError(f"{path}: expected numbers of a usual size, found: {error}") from None
     except RecursionError:
         raise ConfigError(f"{path}: expected TOML, found brackets nested too deep") from None
-    folder = path.resolve().parent
-    find_modules_in(folder)
-    for change in overrides:
-        override(table, change)
-    return parse(table, path.name, folder)
 
 
 def find_modules_in(folder: Path) -> None:

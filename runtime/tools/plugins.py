@@ -1,4 +1,4 @@
-"""What installed packages offer to the command line: commands, and nodes to be listed.
+"""What installed packages offer to the command line: commands, nodes to be listed, configurations.
 
 A package names them in its ``pyproject.toml``; this project does the same for its own:
 
@@ -8,22 +8,28 @@ A package names them in its ``pyproject.toml``; this project does the same for i
     [project.entry-points."visnav.nodes"]
     MyNode = "my_package.nodes:MyNode"
 
+    [project.entry-points."visnav.configurations"]
+    json = "my_package.settings:read"     # read(text, path, warn): the table of a TOML file of ours
+
 A file may name any node as ``module:Class``; it need not be listed here to run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
+import sys
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from runtime.config.model import Config
 from runtime.errors import CommandError, VisnavError
 from runtime.node import Node
 
 COMMANDS = "visnav.commands"
 NODES = "visnav.nodes"
+CONFIGURATIONS = "visnav.configurations"
 OURS = "visnav-runtime"
 _PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 """Of a checkout; an installed wheel has none."""
@@ -96,6 +102,31 @@ def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
         except VisnavError as error:
             warn(f"a node of the package {package}: {error}")
     return dict(sorted(found.items()))
+
+
+def load_configuration(path: Path, overrides: Sequence[str] = ()) -> Config:
+    """Read a file that says what to run: TOML, or what a package reads by its suffix.
+
+    Args:
+        path: The file.
+        overrides: As of `runtime.config.reading.load`.
+
+    Raises:
+        ConfigError: Something in it is wrong.
+        CommandError: What reads it cannot be imported.
+    """
+    from runtime.config.reading import load
+
+    for offer in offers(CONFIGURATIONS):
+        if path.suffix.lower() == f".{offer.name}":
+            return load(path, overrides, partial(offer.load(), warn=_warn_once))
+    return load(path, overrides)
+
+
+@cache
+def _warn_once(warning: str) -> None:
+    """Print a warning, but not again if a file is read again, as for a sweep."""
+    print(f"warning: {warning}", file=sys.stderr)
 
 
 def _declared(group: str) -> list[Offer]:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-ConfigFile = Annotated[Path, typer.Argument(help="The TOML file that says what to run.")]
+ConfigFile = Annotated[Path, typer.Argument(help="The file that says what to run.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(

@@ -20,10 +20,10 @@ def graph(
     ] = None,
 ) -> None:
     """Show which node sends which events to which."""
-    from runtime.config.reading import load
     from runtime.graph import edges
+    from runtime.tools.plugins import load_configuration
 
-    settings = load(config, overrides or [])
+    settings = load_configuration(config, overrides or [])
     names = [spec.name for spec in settings.nodes]
     found = edges([(spec.name, spec.node) for spec in settings.nodes])
     if out is None:

@@ -90,15 +90,15 @@ def run(
     Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
     immediate); with 1 if a threshold of the run was not met; with 2 if something failed.
     """
-    from runtime.config.reading import load
     from runtime.execute import execute
     from runtime.results import keep_earlier
     from runtime.tools.cli.observers import Observers
+    from runtime.tools.plugins import load_configuration
 
     changes = list(overrides or [])
     if log is not None and log is not Log.events:
         changes.append(f"run.log={log.value}")
-    settings = load(config, changes)
+    settings = load_configuration(config, changes)
     nodes_here = chosen(settings, only)
     look_at(settings, nodes_here)
     name = "-".join([settings.run.name, *nodes_here[:1]])

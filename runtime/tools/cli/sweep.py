@@ -75,9 +75,9 @@ def sweep(
     """
     from rich.console import Console
 
-    from runtime.config.reading import load
     from runtime.tools import sweep as sweeping
     from runtime.tools.cli.run import look_at
+    from runtime.tools.plugins import load_configuration
     from runtime.tools.sweep.console import summary_table
 
     plan = sweeping.make_plan(
@@ -91,7 +91,7 @@ def sweep(
         limit=_seconds(timeout),
     )
     changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
-    look_at(load(config, [*(overrides or []), *changes]))
+    look_at(load_configuration(config, [*(overrides or []), *changes]))
     rows = carry_out(plan, jobs=jobs, fresh=fresh)
     sweeping.write_tables(plan, rows)
     sweeping.draw_plots(plan, rows)

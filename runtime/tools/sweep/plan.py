@@ -12,9 +12,9 @@ import msgspec
 import tomli_w
 
 from runtime.config.model import Config, to_builtins
-from runtime.config.reading import load
 from runtime.errors import ConfigError
 from runtime.tools.flights.part import flight_of, settings_key
+from runtime.tools.plugins import load_configuration
 from runtime.tools.sweep.values import Parameter, parameter
 
 LEAST_LIMIT, SLOWEST, USUAL = 600.0, 30.0, 120.0
@@ -148,7 +148,7 @@ def _refuse_repeated(varied: list[str], fixed: list[str]) -> None:
 def _load(config: Path, overrides: Sequence[str], settings: tuple[tuple[str, str], ...]) -> Config:
     changes = [f"{path}={text}" for path, text in settings]
     try:
-        return load(config, [*overrides, *changes])
+        return load_configuration(config, [*overrides, *changes])
     except ConfigError as error:
         if not changes:
             raise

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from events import Announcement, Command, PoseEstimate, Setpoint, VehicleEvent
 from runtime import NodeConfig, Output, Tick, every, on
 from runtime.node import Node
-from runtime.paths import NameOrPath
+from runtime.paths import JsonOrPath, NameOrPath
 from sims.airsim.server.connection import Connection
 from sims.airsim.server.control import Control
 from sims.airsim.server.estimates import Estimates, ScriptEstimator
@@ -55,6 +55,8 @@ class AirsimServerConfig(NodeConfig):
             name.
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.
         estimators: Estimators in clients' scripts, whose poses are judged.
+        settings: The settings.json that clients get when they ask for it: its text, or a file;
+            empty for one that says what runs.
     """
 
     host: str = "127.0.0.1"
@@ -64,6 +66,7 @@ class AirsimServerConfig(NodeConfig):
     default_vehicle: str = ""
     world: NameOrPath = ""
     estimators: tuple[ScriptEstimator, ...] = ()
+    settings: JsonOrPath = ""
 
 
 class AirsimServer(Inhabitant, Node[AirsimServerConfig]):

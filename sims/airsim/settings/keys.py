@@ -1,0 +1,154 @@
+"""Typed access to the objects of settings.json, which notes what nobody asks for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar
+
+from runtime.errors import ConfigError, suggest
+
+T = TypeVar("T")
+
+_LARGEST = 1e300
+
+IGNORED = {
+    key: reason
+    for reason, keys in {
+        "it changes only what Unreal shows": "ViewMode, TimeOfDay, SubWindows, CameraDirector, "
+        "PawnPaths, PawnPath, RecordUIVisible, EngineSound, SpeedUnitFactor, SpeedUnitLabel, "
+        "LogMessagesVisible, Default Environment, DrawDebugPoints, EnableTrace, UnrealEngine",
+        "images are of one instant, in perspective, without errors": "MotionBlurAmount, "
+        "TargetGamma, AutoExposureSpeed, AutoExposureBias, AutoExposureMaxBrightness, "
+        "AutoExposureMinBrightness, OrthoWidth, Gimbal",
+        "time is simulated in steps of 1 ms": "ClockType",
+        "vehicles fly by MuJoCo's physics, and bodies are solid": "PhysicsEngineName, "
+        "EnableCollisions, EnableCollisionPassthrogh, EnableCollisionPassthrough",
+        "clients may always command": "EnableRpc, RpcEnabled, AllowAPIAlways, RC",
+        "cameras are carried by vehicles": "ExternalCameras",
+        "IDs begin as AirSim computes them from names": "SegmentationSettings",
+        "it starts armed": "DefaultVehicleState",
+        "only eph is simulated": "EpvInitial, EpvFinal, EpvTimeConstant, EPV_TimeConstant",
+    }.items()
+    for key in keys.split(", ")
+}
+"""Why known keys have no effect."""
+
+
+class Keys:
+    """One object; its keys are asked for by name.
+
+    What is not given, null or NaN has its default, as in AirSim. What is of the wrong type is a
+    `ConfigError`.
+
+    Args:
+        table: As JSON has it.
+        path: Where it stands, for messages: ``settings.json: ``, and then the keys.
+        notes: Lines on what is not honoured.
+    """
+
+    def __init__(self, table: Mapping[str, Any], path: str, notes: list[str]) -> None:
+        self._table = table
+        self._path = path
+        self._notes = notes
+        self._asked: list[str] = []
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._table
+
+    def number(self, key: str, default: T) -> float | T:
+        """Return a finite number."""
+        found = self._get(key, int | float, "a finite number")
+        if found is None or found != found:
+            return default
+        if abs(found) > _LARGEST:
+            raise self.error(key, f"expected a finite number, found {found!r:.80}")
+        return float(found)
+
+    def positive(self, key: str, default: float) -> float:
+        """Return a number above 0."""
+        found = self.number(key, default)
+        if found <= 0.0:
+            raise self.error(key, f"expected a number above 0, found {found:g}")
+        return found
+
+    def whole(self, key: str, default: int) -> int:
+        """Return a whole number; 256.0 is one."""
+        found = self.number(key, default)
+        if found != int(found):
+            raise self.error(key, f"expected a whole number, found {found:g}")
+        return int(found)
+
+    def numbers(self, keys: str, default: float = 0.0) -> list[float]:
+        """Return the numbers of several keys, given with blanks between."""
+        return [self.number(key, default) for key in keys.split()]
+
+    def mount(self) -> dict[str, list[float]]:
+        """Return `position` and `orientation` as our cameras and sensors have them, if given."""
+        places = (("position", "X Y Z"), ("orientation", "Roll Pitch Yaw"))
+        given = ((ours, self.numbers(keys, math.nan)) for ours, keys in places)
+        return {
+            ours: [0.0 if math.isnan(each) else each for each in found]
+            for ours, found in given
+            if not all(map(math.isnan, found))
+        }
+
+    def flag(self, key: str, default: bool = False) -> bool:
+        """Return true or false."""
+        found = self._get(key, bool, "true or false")
+        return default if found is None else bool(found)
+
+    def text(self, key: str, default: str = "") -> str:
+        """Return a text."""
+        found = self._get(key, str, "a text")
+        return default if found is None else str(found)
+
+    def table(self, key: str) -> Keys:
+        """Return an inner object; an empty one if there is none."""
+        return Keys(self._get(key, dict, "an object") or {}, self._at(key), self._notes)
+
+    def tables(self, key: str) -> Iterator[tuple[str, Keys]]:
+        """Yield name and content of each object in an inner object, sorted by name."""
+        outer = self.table(key)
+        for name in sorted(outer._table):
+            yield name, outer.table(name)
+
+    def entries(self, key: str) -> Iterator[Keys]:
+        """Yield the objects of an inner list."""
+        found = enumerate(self._get(key, list, "a list") or ())
+        inner = Keys({f"{key}[{index}]": each for index, each in found}, self._path, self._notes)
+        for name in inner._table:
+            yield inner.table(name)
+
+    def done(self) -> None:
+        """Note each key that nobody asked for."""
+        for key in self._table:
+            if key not in self._asked:
+                unknown = f"no such setting is known{suggest(key, self._asked)}"
+                self.note(key, f"ignored: {IGNORED.get(key, unknown)}")
+
+    def note(self, key: str, text: str) -> None:
+        """Note something about a key, or about the whole if the key is empty."""
+        self._notes.append(_printable(f"{self._at(key)}: {text}"))
+
+    def error(self, key: str, text: str) -> ConfigError:
+        """Return an error about a key, or about the whole if the key is empty."""
+        return ConfigError(_printable(f"{self._at(key)}: {text}"))
+
+    def _get(self, key: str, type_: Any, expected: str) -> Any:
+        self._asked.append(key)
+        found = self._table.get(key)
+        if found is None or (
+            isinstance(found, type_) and isinstance(found, bool) == (type_ is bool)
+        ):
+            return found
+        raise self.error(key, f"expected {expected}, found {found!r:.80}")
+
+    def _at(self, key: str) -> str:
+        between = "." if key and not self._path.endswith(": ") else ""
+        return f"{self._path}{between}{key}"
+
+
+def _printable(line: str) -> str:
+    """Return a line that stays one, whatever the keys in it are made of."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)

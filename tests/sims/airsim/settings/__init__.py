@@ -1,0 +1,1 @@
+"""Tests of reading AirSim's settings.json."""
