@@ -19,20 +19,24 @@ from events import Announcement, Command, PoseEstimate, Setpoint, VehicleEvent
 from runtime import NodeConfig, Output, Tick, every, on
 from runtime.node import Node
 from runtime.paths import JsonOrPath, NameOrPath
+from sims.airsim.server.cameras import Cameras, ServedCamera
 from sims.airsim.server.connection import Connection
 from sims.airsim.server.control import Control
 from sims.airsim.server.estimates import Estimates, ScriptEstimator
 from sims.airsim.server.flight import Flight
+from sims.airsim.server.images import Images
 from sims.airsim.server.methods import Table
 from sims.airsim.server.objects import Objects
+from sims.airsim.server.segmentation import Segmentation
 from sims.airsim.server.session import Session
 from sims.airsim.server.state import VehicleState
 from sims.airsim.server.tasks import RATE, Tasks
 from sims.airsim.server.time import Time
-from sims.airsim.server.vehicles import ServedCamera, ServedMultirotor, ServedVehicle, Vehicles
+from sims.airsim.server.vehicles import ServedFreeCamera, ServedMultirotor, ServedVehicle, Vehicles
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
 from sims.shared_world import Inhabitant, join_world
+from sims.simulator import Count
 from sims.worlds import Dynamics, Scene
 
 PORTS = "ports of AirSim servers"
@@ -57,6 +61,10 @@ class AirsimServerConfig(NodeConfig):
         estimators: Estimators in clients' scripts, whose poses are judged.
         settings: The settings.json that clients get when they ask for it: its text, or a file;
             empty for one that says what runs.
+        cameras: Cameras that clients may ask for images, besides those of the vehicles, and
+            AirSim's default ones.
+        camera_processes: Number of processes that render what clients ask for.
+        render_threads: Threads of the software renderer in each of them.
     """
 
     host: str = "127.0.0.1"
@@ -67,6 +75,9 @@ class AirsimServerConfig(NodeConfig):
     world: NameOrPath = ""
     estimators: tuple[ScriptEstimator, ...] = ()
     settings: JsonOrPath = ""
+    cameras: tuple[ServedCamera, ...] = ()
+    camera_processes: Count = 1
+    render_threads: Count = 1
 
 
 class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
@@ -84,11 +95,14 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self.deterministic = self.config.time != "running"  # type: ignore[misc]
         self.world = await join_world(self)
         self.vehicles = Vehicles(self.world, self.config.default_vehicle)
-        for cls, served in ((Multirotor, ServedMultirotor), (FreeCamera, ServedCamera)):
+        for cls, served in ((Multirotor, ServedMultirotor), (FreeCamera, ServedFreeCamera)):
             for each in self.siblings(cls):
                 vehicle = served(each.name, self.world, each.config, self.clock.now)
                 self.vehicles[each.name] = vehicle
         self.objects = Objects(self)
+        self.cameras = Cameras(self)
+        self.segmentation = Segmentation(self)
+        self.images = Images(self)
         self.script_estimates = Estimates(self)
         self.time = Time(self)
         self.tasks = Tasks(self)
@@ -99,10 +113,15 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 Control(self),
                 VehicleState(self),
                 self.objects,
+                self.cameras,
+                self.segmentation,
+                self.images,
                 self.script_estimates,
                 Flight(self),
             ]
         )
+        if self.config.time == "running" and not self.checking:
+            await self.images.start()  # simulated time would wait for it later
         self._connections: set[Connection] = set()
         self._server: asyncio.Server | None = None
         if self.checking:
@@ -149,7 +168,8 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     @classmethod
     def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:  # noqa: ARG003
-        """Leave the world as it is."""
+        """Put a camera into the world that is moved to where one is needed."""
+        scene.spec.worldbody.add_camera(name=f"{name}/camera")
         return Dynamics()
 
     def find_vehicle(self, name: str) -> ServedVehicle:

@@ -154,7 +154,7 @@ class ServedMultirotor(ServedVehicle):
         return slow and thrust < 0.8 * parameters.hover_thrust and self.physics.touching()
 
 
-class ServedCamera(ServedVehicle):
+class ServedFreeCamera(ServedVehicle):
     """A free camera: it has no physics, and is where it has been put."""
 
     @property

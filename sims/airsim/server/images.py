@@ -1,0 +1,182 @@
+"""Methods that take images: all of one call show one state, at one time, from its true poses."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Sequence
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from runtime import Worker
+from sims.airsim.server.image_types import Form, ImageType
+from sims.airsim.server.methods import Caller, Flavour, RpcError, rpc
+from sims.airsim.server.rendering import Renderer, Wanted
+from sims.airsim.structures import CosysImageResponse, ImageRequest, ImageResponse
+from sims.cameras import GraphicsError
+
+if TYPE_CHECKING:
+    from sims.airsim.server.node import AirsimServer
+
+MOST = 64
+"""Images of one call, and calls that wait for their images at a time."""
+
+LONGEST = 100_000_000
+"""Bytes of all images of one call: Cosys-AirSim's client takes no more."""
+
+
+class Images:
+    """Takes images of what clients ask for."""
+
+    def __init__(self, server: AirsimServer) -> None:
+        self._server = server
+        self._renderer: Worker[Renderer] | None = None
+        self._starting = asyncio.Lock()
+        self._waiting = 0
+
+    async def start(self) -> None:
+        """Start what renders, unless that is done.
+
+        Raises:
+            GraphicsError: This machine cannot render.
+        """
+        async with self._starting:
+            if self._renderer is None:
+                server = self._server
+                self._renderer = await server.worker(
+                    Renderer,
+                    await server.offload(lambda: server.world.model_bytes),
+                    f"{server.name}/camera",
+                    server.cameras.largest,
+                    server.config.render_threads,
+                    server.world.dynamics,
+                    processes=server.config.camera_processes,
+                )
+
+    @rpc("simGetImages", cosys=2)
+    def get_images(
+        self,
+        caller: Caller,
+        requests: list[ImageRequest],
+        vehicle: str,
+        external: bool = False,
+    ) -> Awaitable[list[ImageResponse]]:
+        """Return images of one instant, with one stamp, and the camera's true pose of then."""
+        return self.take(requests, vehicle, caller.flavour, external=external)
+
+    @rpc("simGetImage")
+    def get_image(
+        self,
+        camera: str,
+        image_type: int,
+        vehicle: str,
+        external: bool | str = False,
+    ) -> Awaitable[bytes]:
+        """Return an image as PNG; it is empty if images of that type are not drawn."""
+        self._server.cameras.find(self._server.find_vehicle(vehicle), camera, external)
+        requests = [ImageRequest(camera, image_type)]
+        if image_type not in ImageType.__members__.values():
+            requests = []
+            self._server.log.warning("simGetImage: %s", _not_drawn(image_type))
+        responses = self.take(requests, vehicle)
+
+        async def taken() -> bytes:
+            return b"".join(each.image_data_uint8 for each in await responses)
+
+        return taken()
+
+    def take(
+        self,
+        requests: Sequence[ImageRequest],
+        vehicle: str,
+        flavour: Flavour = "airsim",
+        *,
+        external: bool = False,
+    ) -> Awaitable[list[ImageResponse]]:
+        """Take images of the present state, and return an awaitable of them.
+
+        The state is that of the call. Simulated time does not wait for the images.
+
+        Args:
+            requests: What is wanted.
+            vehicle: Name of the vehicle that carries the cameras; empty for the first.
+            flavour: Whose structures, and order of colours, are wanted.
+            external: Whether cameras that no vehicle carries are meant: there are none.
+
+        Raises:
+            RpcError: There is no such vehicle, camera or type, or it is too much.
+        """
+        if len(requests) > MOST:
+            raise RpcError(f"expected at most {MOST} images of one call, found {len(requests)}")
+        on = self._server.find_vehicle(vehicle)
+        stamp, qpos = self._server.drawn_state()
+        wanted, responses, length = [], list[ImageResponse](), 0
+        for each in requests:
+            camera = self._server.cameras.find(on, each.camera_name, external)
+            if each.image_type not in ImageType.__members__.values():
+                raise RpcError(_not_drawn(each.image_type))
+            eye = camera.eye(each.image_type)
+            form: Form = "rgb" if flavour == "cosys" else "bgr"
+            if each.pixels_as_float:
+                form = "float"
+            elif each.compress:
+                form = "png"
+            wanted.append(Wanted(eye, ImageType(each.image_type), form))
+            length += eye.spec.width * eye.spec.height * (5 if form == "float" else 3)
+            pose = self._server.cameras.pose(on, eye, qpos)
+            response = ImageResponse(
+                camera_position=pose.position,
+                camera_name=each.camera_name,
+                camera_orientation=pose.orientation,
+                time_stamp=stamp,
+                pixels_as_float=each.pixels_as_float,
+                compress=each.compress,
+                width=eye.spec.width,
+                height=eye.spec.height,
+                image_type=each.image_type,
+            )
+            if flavour == "cosys":
+                response = CosysImageResponse(
+                    **msgspec.structs.asdict(response), annotation_name=each.annotation_name
+                )
+            responses.append(response)
+        if length > LONGEST:
+            raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")
+        return self._taken(stamp, qpos, tuple(wanted), responses)
+
+    async def _taken(
+        self,
+        stamp: int,
+        qpos: npt.NDArray[np.float64],
+        wanted: tuple[Wanted, ...],
+        responses: list[ImageResponse],
+    ) -> list[ImageResponse]:
+        if self._waiting >= MOST:
+            raise RpcError(f"expected at most {MOST} calls that wait for images")
+        self._waiting += 1
+        try:
+            ids = self._server.segmentation.ids()
+            await self.start()
+            assert self._renderer is not None
+            images = await self._renderer.call_untimed(Renderer.take, stamp, qpos, ids, wanted)
+        except GraphicsError as error:
+            raise RpcError(str(error)) from None
+        finally:
+            self._waiting -= 1
+        return [_filled(*pair) for pair in zip(responses, images, strict=True)]
+
+
+def _filled(response: ImageResponse, image: npt.NDArray[np.uint8]) -> ImageResponse:
+    """Return a response with its image, which is sent as it is."""
+    if response.pixels_as_float:
+        return msgspec.structs.replace(response, image_data_float=msgspec.Raw(image.data))
+    return msgspec.structs.replace(response, image_data_uint8=image.tobytes())
+
+
+def _not_drawn(image_type: int) -> str:
+    return (
+        f"not supported by visnav-runtime: images of type {image_type}: expected one of "
+        + ", ".join(f"{each.value} ({each.name.lower()})" for each in ImageType)
+    )
