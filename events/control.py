@@ -154,6 +154,27 @@ class BodyRateSetpoint(Setpoint):
         check(self, self.angular_velocity, (self.thrust, 0.0, 0.0))
 
 
+class MotorSetpoint(Setpoint):
+    """Drive each motor by itself; nothing keeps the vehicle upright.
+
+    Attributes:
+        motor1: 0 to 1 of the greatest thrust of the vehicle's first motor, and so on. Beyond, it
+            is taken as the nearer end. Our multirotor's are front right, rear left, front left,
+            rear right.
+        motor2: Of the second.
+        motor3: Of the third.
+        motor4: Of the fourth.
+    """
+
+    motor1: float
+    motor2: float
+    motor3: float
+    motor4: float
+
+    def __post_init__(self) -> None:
+        check(self, (self.motor1, self.motor2, self.motor3), (self.motor4, 0.0, 0.0))
+
+
 class PlannedPose(Event):
     """Where a pilot means the vehicle to be at `stamp`; for the record, not an order.
 

@@ -85,8 +85,8 @@ class Multirotor(Simulator[MultirotorConfig]):
     """A quadrotor with cameras, an IMU and ground truth, in a MuJoCo world.
 
     It obeys commands (`Arm`, `Takeoff`, `Hover`, `Land`, `Disarm`), and follows set-points of
-    position, velocity, attitude or body rates while it flies. Ground truth is sent as `odometry`
-    and `camera_poses`, without noise.
+    position, velocity, attitude, body rates or motors while it flies. Ground truth is sent as
+    `odometry` and `camera_poses`, without noise.
 
     Several are in one world: they collide, see one another, and obey what names them.
     """

@@ -35,6 +35,7 @@ from events import (
     Hover,
     Land,
     Landed,
+    MotorSetpoint,
     PositionSetpoint,
     TakenOff,
     Takeoff,
@@ -81,9 +82,9 @@ class Autopilot:
       many times a second, and those under way must not undo a command that was sent once.
       `Hover` ends either manoeuvre, `Land` ends a take-off; then set-points count again.
     - Armed on the ground, a set-point starts the flight, without a `TakenOff`.
-    - A velocity, attitude or body-rate set-point whose stamp is older than `setpoint_timeout` is
-      replaced by `Hover`: with a lost link the vehicle must not fly on. A position set-point
-      holds for ever, since it ends at a position.
+    - A velocity, attitude, body-rate or motor set-point whose stamp is older than
+      `setpoint_timeout` is replaced by `Hover`: with a lost link the vehicle must not fly on. A
+      position set-point holds for ever, since it ends at a position.
     - `Land` stops first, then goes down at `descent`.
 
     Args:
@@ -179,7 +180,13 @@ class Autopilot:
         grounded = phase in (Phase.DISARMED, Phase.ARMED)
         reason = None
         match event:
-            case PositionSetpoint() | VelocitySetpoint() | AttitudeSetpoint() | BodyRateSetpoint():
+            case (
+                PositionSetpoint()
+                | VelocitySetpoint()
+                | AttitudeSetpoint()
+                | BodyRateSetpoint()
+                | MotorSetpoint()
+            ):
                 reason = _NO_SETPOINTS.get(phase) or fault(event)
             case Arm():
                 reason = "already armed" if phase is not Phase.DISARMED else None
@@ -235,7 +242,7 @@ class Autopilot:
         match order:
             case PositionSetpoint():
                 self._controller.follow(order, state)
-            case VelocitySetpoint() | AttitudeSetpoint() | BodyRateSetpoint():
+            case VelocitySetpoint() | AttitudeSetpoint() | BodyRateSetpoint() | MotorSetpoint():
                 self._controller.follow(order, state)
                 self._expires_ns = order.stamp + self._timeout_ns
             case Takeoff():

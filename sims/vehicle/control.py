@@ -8,6 +8,7 @@ from __future__ import annotations
 from events import (
     AttitudeSetpoint,
     BodyRateSetpoint,
+    MotorSetpoint,
     PositionSetpoint,
     Quaternion,
     Vector3,
@@ -30,7 +31,7 @@ class Controller:
 
     Position and velocity set-points go through the whole cascade and its limits. Attitude and
     body-rate set-points enter further down: of the limits only those on body rates hold for them,
-    and the thrust is theirs.
+    and the thrust is theirs. Motor set-points pass all of it by.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class Controller:
         self._target: Quaternion | None = None
         self._target_rates: Vector3 = (0.0, 0.0, 0.0)
         self._thrust = 0.0
+        self._motors: Motors | None = None
 
     def reset(self) -> None:
         """Forget what was learnt in flight (integrals, last measurements)."""
@@ -98,6 +100,10 @@ class Controller:
                 self._target = None
                 self._target_rates = (_clip(x, tilt), _clip(y, tilt), _clip(z, yaw))
                 self._take_thrust(setpoint.thrust)
+            case MotorSetpoint():
+                a, b, c, d = setpoint.motor1, setpoint.motor2, setpoint.motor3, setpoint.motor4
+                self._take_thrust(0.0)
+                self._motors = (_share(a), _share(b), _share(c), _share(d))
 
     def hold(self, position: Vector3, velocity: Vector3, yaw: float) -> None:
         """Fly to a position (m, NED) with a velocity (m/s, NED), for the autopilot's manoeuvres."""
@@ -116,6 +122,8 @@ class Controller:
             state: State of the vehicle.
             dt: Seconds since the last update, > 0.
         """
+        if self._motors is not None:
+            return self._motors
         if self._in_position:
             target, thrust, yaw_rate = self.position.update(state, dt)
             rates = self.attitude.update(state.orientation, target, yaw_rate)
@@ -133,19 +141,31 @@ class Controller:
         """Go to position or velocity flight; what its loops remember from before is stale."""
         if not self._in_position:
             self.position.reset()
+        self._leave_motors()
         self._in_position = True
         self._in_velocity = False
 
+    def _leave_motors(self) -> None:
+        """Let the loops turn the motors again; what they remember from before is stale."""
+        if self._motors is not None:
+            self._motors = None
+            self.rates.reset()
+
     def _take_thrust(self, thrust: float) -> None:
-        self._thrust = min(1.0, max(0.0, thrust)) * self._max_thrust
+        self._leave_motors()
+        self._thrust = _share(thrust) * self._max_thrust
         self._in_position = self._in_velocity = False
+
+
+def _share(value: float) -> float:
+    return min(1.0, max(0.0, value))
 
 
 def _clip(value: float, limit: float) -> float:
     return min(limit, max(-limit, value))
 
 
-Setpoint = PositionSetpoint | VelocitySetpoint | AttitudeSetpoint | BodyRateSetpoint
+Setpoint = PositionSetpoint | VelocitySetpoint | AttitudeSetpoint | BodyRateSetpoint | MotorSetpoint
 """What the cascade can follow."""
 
 MOST = 1e6
@@ -169,6 +189,8 @@ def fault(setpoint: Setpoint) -> str | None:
             numbers = [setpoint.thrust]
         case BodyRateSetpoint():
             numbers = [*setpoint.angular_velocity, setpoint.thrust]
+        case MotorSetpoint():
+            numbers = [setpoint.motor1, setpoint.motor2, setpoint.motor3, setpoint.motor4]
     if not all(-MOST <= number <= MOST for number in numbers):
         return f"{type(setpoint).__name__}: expected numbers up to {MOST:g}, found {setpoint}"
     return None

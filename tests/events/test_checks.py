@@ -102,6 +102,8 @@ def test_no_field_of_any_event_may_be_wrong(cls: type[Event]) -> None:
         (events.VelocitySetpoint, "yaw_rate"),
         (events.AttitudeSetpoint, "thrust"),
         (events.BodyRateSetpoint, "thrust"),
+        (events.MotorSetpoint, "motor1"),
+        (events.MotorSetpoint, "motor4"),
         (events.PlannedPose, "yaw"),
         (events.Takeoff, "altitude"),
         (events.NavSatFix, "latitude"),

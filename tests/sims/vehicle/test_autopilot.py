@@ -17,6 +17,7 @@ from events import (
     Hover,
     Land,
     Landed,
+    MotorSetpoint,
     Shutdown,
     TakenOff,
     Takeoff,
@@ -201,6 +202,9 @@ def test_hover_stops_and_stays_where_it_stopped() -> None:
         ),
         BodyRateSetpoint(
             stamp=2_500_000, source="test", angular_velocity=(0.0, -0.5, 0.0), thrust=0.5
+        ),
+        MotorSetpoint(
+            stamp=2_500_000, source="test", motor1=0.6, motor2=0.6, motor3=0.6, motor4=0.6
         ),
     ],
     ids=lambda setpoint: type(setpoint).__name__,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from math import cos, hypot, pi, radians, sin
+from typing import Any
 
 import pytest
 
-from events import AttitudeSetpoint, BodyRateSetpoint, Event, PositionSetpoint
+from events import AttitudeSetpoint, BodyRateSetpoint, Event, MotorSetpoint, PositionSetpoint
 from events.rotations import from_rpy, yaw_of
 from sims.vehicle import Controller, Limits, State
 from tests.sims.vehicle.flight import UP, airborne, place, step_response, velocity
@@ -158,3 +159,41 @@ def test_a_faulty_setpoint_is_an_error() -> None:
     state = State((0.0,) * 3, (1.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3)
     with pytest.raises(ValueError, match="expected 'map' or 'heading', found 'body'"):
         controller.follow(velocity(0, 1.0, 0.0, frame_id="body"), state)
+
+
+@pytest.mark.parametrize(
+    ("change", "axis", "sign"),
+    [((-1, 1, 1, -1), 0, 1), ((1, -1, 1, -1), 1, 1), ((-1, -1, 1, 1), 2, -1)],
+    ids=["roll", "pitch", "yaw"],
+)
+def test_motors_are_front_right_rear_left_front_left_rear_right(
+    change: tuple[int, int, int, int], axis: int, sign: int
+) -> None:
+    """More on the left rolls right, more in front pitches up, clockwise rotors turn it left."""
+    flight = airborne()
+    flight.fly(0.1)
+    share = flight.physics.parameters.hover_thrust
+    motors = [share + 0.02 * each for each in change]
+    values: dict[str, Any] = {f"motor{i + 1}": each for i, each in enumerate(motors)}
+    flight.fly(
+        0.2,
+        lambda stamp: MotorSetpoint(stamp=stamp, source="test", **values),
+    )
+    rates = flight.physics.state().angular_velocity
+    assert sign * rates[axis] > 0.05
+    assert all(abs(rate) < 0.01 for i, rate in enumerate(rates) if i != axis)
+    assert flight.physics.data.ctrl[:4].tolist() == pytest.approx(motors)
+
+
+def test_the_loops_take_over_from_motor_setpoints() -> None:
+    flight = airborne()
+    flight.fly(0.1)
+    flight.fly(
+        0.15,
+        lambda stamp: MotorSetpoint(
+            stamp=stamp, source="test", motor1=0.6, motor2=0.4, motor3=0.6, motor4=0.4
+        ),
+    )
+    flight.autopilot.command(place(0.0, 0.0, -UP))
+    state = flight.fly(6.0)[-1][1]
+    assert hypot(state.position[0], state.position[1], state.position[2] + UP) < 0.05
