@@ -28,6 +28,7 @@ from sims.airsim.server.images import Images
 from sims.airsim.server.methods import Table
 from sims.airsim.server.objects import Objects
 from sims.airsim.server.segmentation import Segmentation
+from sims.airsim.server.sensors import SAMPLES, Sensors
 from sims.airsim.server.session import Session
 from sims.airsim.server.state import VehicleState
 from sims.airsim.server.tasks import RATE, Tasks
@@ -65,6 +66,8 @@ class AirsimServerConfig(NodeConfig):
             AirSim's default ones.
         camera_processes: Number of processes that render what clients ask for.
         render_threads: Threads of the software renderer in each of them.
+        lidar_frame: Frame of lidars' points, as AirSim's ``DataFrame``.
+        sensor_names: Names of vehicles' sensors by those by which scripts call them.
     """
 
     host: str = "127.0.0.1"
@@ -78,6 +81,8 @@ class AirsimServerConfig(NodeConfig):
     cameras: tuple[ServedCamera, ...] = ()
     camera_processes: Count = 1
     render_threads: Count = 1
+    lidar_frame: Literal["VehicleInertialFrame", "SensorLocalFrame"] = "VehicleInertialFrame"
+    sensor_names: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
@@ -103,6 +108,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self.cameras = Cameras(self)
         self.segmentation = Segmentation(self)
         self.images = Images(self)
+        self.sensors = Sensors(self)
         self.script_estimates = Estimates(self)
         self.time = Time(self)
         self.tasks = Tasks(self)
@@ -116,6 +122,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 self.cameras,
                 self.segmentation,
                 self.images,
+                self.sensors,
                 self.script_estimates,
                 Flight(self),
             ]
@@ -171,6 +178,15 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         """Put a camera into the world that is moved to where one is needed."""
         scene.spec.worldbody.add_camera(name=f"{name}/camera")
         return Dynamics()
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Take note of the vehicles' sensors."""
+        self.sensors.announced(announcement)
+
+    @on(*SAMPLES)
+    def samples(self, event: Any) -> None:
+        """Take note of the vehicles' samples."""
+        self.sensors.note(event)
 
     def find_vehicle(self, name: str) -> ServedVehicle:
         """Return a multirotor or a free camera; see `Vehicles.find`."""
