@@ -1,0 +1,419 @@
+"""The node in the simulator's place: when what is asked, sent and counted."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import math
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterable
+from typing import Any, ClassVar, TypeVar
+
+import msgspec
+
+import events as ev
+from events.frames import OPTICAL_TO_FRD
+from events.rotations import multiply
+from runtime import Node, Output, Worker, on
+from runtime.errors import UncheckableError
+from runtime.schedule import SECOND
+from sims.addressing import Addressee
+from sims.airsim.client import conversion
+from sims.airsim.client.calls import Calls
+from sims.airsim.client.images import ImageSet, ImageSource
+from sims.airsim.client.orders import Orders
+from sims.airsim.client.remote import KnownCamera, ask
+from sims.airsim.client.rpc import RpcCallError
+from sims.airsim.client.settings import AirsimClientConfig
+from sims.airsim.structures import CollisionInfo, ImuData, MultirotorState
+
+T = TypeVar("T")
+E = TypeVar("E", bound=ev.Event)
+
+FRAME = "base_link"
+_MASS, _THRUST = 1.0, 4 * 4.18
+"""Kilograms and newtons of AirSim's default quadrotor, for which no method asks."""
+_NEW_CLOCK = 600 * SECOND
+"""If the server's clock is further ahead after a loss (ns), or is behind, it is another one."""
+_LAST_WORDS = 2.0
+"""Real seconds that a server has for each of the last calls."""
+
+
+class AirsimClient(Node[AirsimClientConfig]):
+    """A vehicle of a server of AirSim's, Colosseum's or Cosys-AirSim's, in a simulator's place.
+
+    It announces and sends what `Multirotor` does, and obeys the same commands and set-points. On a
+    real clock, images, state and commands have connections of their own, and come as they can. In
+    lockstep the server is paused and stepped, and the run never goes further than one step ahead.
+    """
+
+    flies = True
+    deterministic = False
+    vehicle: ClassVar[bool] = True
+
+    images = Output(ev.Image)
+    depth_images = Output(ev.DepthImage)
+    segmentation_images = Output(ev.SegmentationImage)
+    camera_poses = Output(ev.PoseStamped)
+    transforms = Output(ev.TransformStamped)
+    odometry = Output(ev.Odometry)
+    imu = Output(ev.Imu)
+    vehicle_events = Output(ev.VehicleEvent)
+
+    def __init__(self) -> None:
+        config = self.config
+        self._lockstep = self.clock.kind == "lockstep"
+        self.deterministic = self._lockstep  # type: ignore[misc]  # while the server steps exactly
+        self.counts: Counter[str] = Counter()
+        """How often each thing went wrong."""
+        self._where = config.host, config.port
+        self._addressee = Addressee(self.name, self.siblings(AirsimClient), self.sources)
+        limit = float(config.call_timeout)
+        self._state, self._commands = (
+            Calls(self, self._where, limit),
+            Calls(self, self._where, limit),
+        )
+        self._connected = 0
+        """How often the connections were made."""
+        self._mending = asyncio.Lock()
+        self._was_paused = True
+        self._shift = 0
+        """The server's clock less the run's (ns)."""
+        self._newest: dict[str, int] = {}
+        """Stamps by kind of event, or by camera."""
+        self._pose: ev.Odometry | None = None
+        self._orders: Orders | None = None
+
+    # Before the run.
+
+    async def on_startup(self) -> None:
+        """Connect, ask what is there, and take a first set of images."""
+        if self.checking:
+            return
+        try:
+            await self._connect()
+            await self._look()
+        except BaseException as error:
+            self._close()
+            if isinstance(error, RpcCallError | ValueError | OSError):
+                self.log.fatal("%s:%d: %s", *self._where, error)
+            raise
+
+    async def _look(self) -> None:
+        limit = float(self.config.call_timeout)
+        self._remote = remote = await ask(self._state.call, self.config, self.log.warning)
+        wanted = tuple((each.name, kind) for each in remote.cameras for kind in each.images)
+        what = self._where, remote.vehicle, remote.cosys, wanted, limit
+        self._source: Worker[ImageSource] = await self.worker(
+            ImageSource, *what, timeout=2.0 * limit + 10.0
+        )
+        first = await self._source.call_for(0.0, ImageSource.fetch)
+        if isinstance(first, str):
+            raise ValueError(f"cameras: expected images from the server, found: {first}")
+        for camera in first.resampled:
+            self.log.warning("%s: its depth has another size than its image: resampled", camera)
+        self._sizes = {name: array.shape[:2] for (name, _), array in first.images.items()}
+        if remote.clock_speed != 1.0 and not self._lockstep:
+            self.log.warning(
+                "expected a ClockSpeed of 1 in real time, found %g", remote.clock_speed
+            )
+
+    def announce(self) -> Iterable[ev.Announcement]:
+        """Announce the vehicle, its IMU and its cameras."""
+        if self.checking:
+            raise UncheckableError("which cameras there are is known to the server only")
+        config, remote = self.config, self._remote
+        state = conversion.odometry(0, self.name, remote.state, remote.origin)
+        yield ev.VehicleAnnouncement(
+            stamp=0,
+            source=self.name,
+            mass=_MASS,
+            max_thrust=_THRUST,
+            control_rate=config.control_rate,
+            position=state.position,
+            orientation=state.orientation,
+        )
+        yield ev.ImuAnnouncement(
+            stamp=0, source=self.name, rate=config.imu_rate, frame_id=FRAME, **remote.imu
+        )
+        for camera in remote.cameras:
+            height, width = self._sizes[camera.name]
+            yield ev.CameraAnnouncement(
+                stamp=0,
+                source=f"{self.name}/{camera.name}",
+                images=camera.images,
+                # AirSim's users have the centre at W/2, from the image's corner. Here whole
+                # coordinates are those of pixels' centres: the same point is at (W - 1)/2.
+                info=ev.CameraInfo.from_fov(width, height, math.radians(camera.fov)),
+                rate=config.image_rate,
+                latency=0.0,
+                frame_id=self._frame(camera),
+                parent_frame_id=FRAME,
+                position=camera.position,
+                orientation=multiply(camera.orientation, OPTICAL_TO_FRD),
+            )
+
+    def check(self) -> Iterable[str]:
+        """Return why the server's time cannot be led."""
+        peers = (each.config for each in self.siblings(AirsimClient))
+        if self._lockstep and [(p.host, p.port) for p in peers].count(self._where) > 1:
+            yield "port: expected one AirsimClient for each server in lockstep, found several"
+
+    async def on_ready(self) -> None:
+        """Take the vehicle over, and let the server's time stand in lockstep."""
+        await self._begin()
+
+    # In the run.
+
+    async def run(self) -> None:
+        """Send the cameras' poses on the body, then what the server gives, until the end."""
+        for camera in self._remote.cameras:
+            self.transforms.send(
+                ev.TransformStamped(
+                    stamp=self.clock.now(),
+                    source=f"{self.name}/{camera.name}",
+                    frame_id=FRAME,
+                    child_frame_id=self._frame(camera),
+                    translation=camera.position,
+                    rotation=multiply(camera.orientation, OPTICAL_TO_FRD),
+                    static=True,
+                )
+            )
+        if self._lockstep:
+            await self._lead()
+        self.start(self._repeat(self.config.image_rate, self._take_images))
+        self.start(self._repeat(self.config.control_rate, self._obey))
+        await self._repeat(self.config.imu_rate, self._read)
+
+    @on(ev.Command)
+    def commands(self, event: ev.Command) -> None:
+        """Take a command that is for this vehicle, or log why it is refused."""
+        self._take(event, "commands")
+
+    @on(ev.Setpoint)
+    def setpoints(self, event: ev.Setpoint) -> None:
+        """Take a set-point that is for this vehicle, or log why it is refused."""
+        self._take(event, "setpoints")
+
+    def _take(self, order: ev.Command | ev.Setpoint, port: str) -> None:
+        if self._orders is None or not self._addressee.obeys(order, port):
+            return
+        if refusal := self._orders.take(order):
+            self._report(f"{type(order).__name__} refused", refusal)
+
+    async def _lead(self) -> None:
+        """Step the server's time, send what is measured after each step, and pass on the orders."""
+        rate, period = self.config.imu_rate, round(SECOND / self.config.imu_rate)
+        images = max(round(rate / self.config.image_rate), 1)
+        control = max(round(rate / self.config.control_rate), 1)
+        step = 0
+
+        async def work() -> None:
+            if step:
+                seconds = period / SECOND / self._remote.clock_speed
+                await self._state.call("simContinueForTime", seconds)
+            await self._read()
+            if step % images == 0:
+                await self._take_images()
+            if step % control == 0:
+                await self._obey()
+
+        while True:
+            await self.clock.sleep_until(self._newest.get("state", 0) + period if step else 0)
+            await self._guarded(work)
+            step += 1
+
+    async def _repeat(self, rate: float, work: Callable[[], Awaitable[None]]) -> None:
+        """Do something at a rate, or as often as it can be done."""
+        due, period = self.clock.now(), round(SECOND / rate)
+        while True:
+            await self._guarded(work)
+            due = max(due + period, self.clock.now())
+            await self.clock.sleep_until(due)
+
+    async def _read(self) -> None:
+        """Send a sample of the IMU and the true state."""
+        vehicle, origin = self._remote.vehicle, self._remote.origin
+        state = await self._ask("getMultirotorState", MultirotorState, vehicle)
+        sample = await self._ask("getImuData", ImuData, "", vehicle)
+        if state is not None and self._lockstep:
+            await self._reach(state.timestamp - self._shift)
+        if sample is not None:
+            before = self._newest.get("imu")
+            if event := self._made("imu", sample.time_stamp, conversion.imu, sample):
+                if (
+                    before is not None
+                    and event.stamp - before > 1.5 * SECOND / self.config.imu_rate
+                ):
+                    self.counts["gaps between samples of the IMU"] += 1
+                self.imu.send(event)
+        if state is not None:
+            found = self._made("state", state.timestamp, conversion.odometry, state, origin)
+            if found is not None:
+                self._pose = found
+                self.odometry.send(found)
+
+    async def _reach(self, stamp: int) -> None:
+        """Wait in simulated time for the instant that the server has reached."""
+        if (ahead := stamp - self.clock.now()) and self.deterministic:
+            self.deterministic = False  # type: ignore[misc]
+            self.log.warning(
+                "the server's time is %+.3f ms from where it was to step to: the run follows it, "
+                "and is not the same each time",
+                ahead / 1e6,
+            )
+        await self.clock.sleep_until(stamp)
+
+    async def _take_images(self) -> None:
+        """Send a set of images, and a new contact."""
+        found = await self._source.call_for(0.0, ImageSource.fetch)
+        if isinstance(found, str):
+            self._report("a set of images is lost", found)
+        else:
+            self._send_images(found)
+        contact = await self._ask("simGetCollisionInfo", CollisionInfo, self._remote.vehicle)
+        if contact is not None and contact.has_collided and self._pose is not None:
+            known = contact, self._remote.origin, self._pose
+            event = self._made("collision", contact.time_stamp, conversion.collision, *known)
+            if event is not None and (
+                event.normal[2] > -0.7 or event.speed > 1.0
+            ):  # not: it stands
+                self.vehicle_events.send(event)
+
+    def _send_images(self, found: ImageSet) -> None:
+        outputs: tuple[tuple[str, Any, Any], ...] = (
+            ("depth", self.depth_images, ev.DepthImage),
+            ("segmentation", self.segmentation_images, ev.SegmentationImage),
+            ("rgb", self.images, ev.Image),
+        )
+        for camera in self._remote.cameras:
+            known = found.poses[camera.name], self._remote.origin
+            pose = self._made(camera.name, found.stamp, conversion.camera_pose, *known)
+            if pose is None:
+                continue
+            self.camera_poses.send(pose)
+            fields: Any = {"source": pose.source, "frame_id": self._frame(camera)}
+            for kind, output, event in outputs:
+                data = found.images.get((camera.name, kind))
+                if data is not None and data.shape[:2] == self._sizes[camera.name]:
+                    output.send(event(stamp=pose.stamp, **fields, data=data))
+                elif data is not None:
+                    self._report(pose.source, f"its {kind} images have another size now")
+
+    async def _obey(self) -> None:
+        """Pass on orders, and tell what came of them."""
+        if self._orders is not None and self._pose is not None:
+            for event in await self._orders.obey(self.clock.now(), self._pose):
+                self.vehicle_events.send(event(stamp=self.clock.now(), source=self.name))
+
+    def _frame(self, camera: KnownCamera) -> str:
+        return f"{self.name}/{camera.name}_optical"
+
+    # What the server says, and when it says nothing any more.
+
+    async def _ask(self, method: str, kind: type[T], *arguments: Any) -> T | None:
+        """Call a method, and return what it gave; `None` if that cannot be used."""
+        try:
+            return msgspec.convert(await self._state.call(method, *arguments), kind)
+        except (RpcCallError, msgspec.ValidationError) as error:
+            self._report(method, str(error))
+            return None
+
+    def _made(self, kind: str, stamp: int, make: Callable[..., E], *arguments: Any) -> E | None:
+        """Return an event of the server's stamp; `None` if it is not a new one, or no right one."""
+        stamp -= self._shift
+        if stamp <= self._newest.get(kind, -1):
+            self.counts[f"{kind}: not newer than the last"] += 1
+            return None
+        own = kind in ("imu", "state", "collision")
+        try:
+            event = make(stamp, self.name if own else f"{self.name}/{kind}", *arguments)
+        except (ValueError, TypeError) as error:
+            self._report(kind, str(error))
+            return None
+        self._newest[kind] = stamp
+        return event
+
+    def _report(self, what: str, why: str) -> None:
+        """Count something that went wrong, and log why the first time."""
+        self.counts[what] += 1
+        if self.counts[what] == 1:
+            self.log.warning("%s: %s", what, why)
+
+    async def _guarded(self, work: Callable[[], Awaitable[None]]) -> None:
+        """Do something with the server; go on with new connections if one is lost meanwhile."""
+        before = self._connected
+        try:
+            await work()
+        except OSError as error:
+            async with self._mending:
+                while before == self._connected:  # nobody else has seen to it
+                    if self.config.on_loss == "stop":
+                        self.log.fatal("the connection to %s:%d is lost: %s", *self._where, error)
+                    self._report("a connection is lost", str(error))
+                    await self._connect()
+                    with contextlib.suppress(OSError):
+                        await self._begin()
+                        return
+                    before = self._connected
+
+    async def _connect(self) -> None:
+        """Make both connections, or end the run."""
+        seconds = float(self.config.start_timeout)
+        try:
+            await self._state.connect(seconds)
+            await self._commands.connect(seconds)
+        except OSError as error:
+            self.log.fatal(
+                "expected a server of AirSim's at %s:%d within %g s, found none: %s",
+                *self._where,
+                seconds,
+                error,
+            )
+        self._connected += 1
+
+    async def _begin(self) -> None:
+        """Let the server's time stand in lockstep, relate it to ours, and take the vehicle over."""
+        config, call, vehicle = self.config, self._state.call, self._remote.vehicle
+        if self._lockstep:
+            paused = await call("simIsPaused") is True
+            self._was_paused = paused if self._connected == 1 else self._was_paused
+            await call("simPause", True)
+        found = msgspec.convert(await call("getMultirotorState", vehicle), MultirotorState)
+        ahead = found.timestamp - self._shift - self._newest.get("state", 0)
+        if self._connected == 1 or not 0 <= ahead < _NEW_CLOCK:
+            self._shift = found.timestamp - self.clock.now()
+        if not config.takeover:
+            return
+        await self._commands.call("enableApiControl", True, vehicle)
+        if self._orders is not None:
+            self._orders.resume()
+            return
+        self._orders = Orders(
+            self._commands,
+            vehicle,
+            found.landed_state == 1,
+            round(config.setpoint_timeout * SECOND),
+            1.0 / config.control_rate,
+            functools.partial(self._report, "refused by the server"),
+        )
+
+    # After the run.
+
+    async def on_shutdown(self) -> None:
+        """Give the vehicle back, let the server's time run again, and log what went wrong."""
+        for what, count in sorted(self.counts.items()):
+            self.log.info("%s: %d times", what, count)
+        with contextlib.suppress(OSError, RpcCallError):
+            if self._orders is not None:
+                vehicle, call = self._remote.vehicle, self._commands.call
+                await call("cancelLastTask", vehicle, limit=_LAST_WORDS)
+                await call("enableApiControl", False, vehicle, limit=_LAST_WORDS)
+            if not self._was_paused:
+                await self._state.call("simPause", False, limit=_LAST_WORDS)
+        self._close()
+
+    def _close(self) -> None:
+        self._state.close()
+        self._commands.close()
