@@ -7,6 +7,7 @@ of msgpack-rpc (https://github.com/msgpack-rpc/msgpack-rpc) and rpclib, which Ai
 
 from __future__ import annotations
 
+import reprlib
 import struct
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 REQUEST, REPLY, NOTIFICATION = 0, 1, 2
 
-LONGEST = 16 << 20
+LONGEST = 4 << 20
 """Bytes of a message that a server takes."""
 
 LONGEST_REPLY = 1 << 30
@@ -46,20 +47,21 @@ class Reply(NamedTuple):
 
 
 class Decoder:
-    """Makes messages of the bytes of one connection.
+    """Makes messages of the bytes of one connection, however they are split.
+
+    A message is decoded once it is complete: until then it takes no more memory than its bytes,
+    whatever lengths it claims.
 
     Args:
         longest: Bytes of a message beyond which it is refused.
     """
 
     def __init__(self, longest: int = LONGEST) -> None:
-        self._unpacker = msgpack.Unpacker(
-            raw=False,
-            unicode_errors="replace",
-            strict_map_key=False,
-            max_buffer_size=longest,
-            timestamp=0,
-        )
+        self._longest = longest
+        self._splitter = msgpack.Unpacker(max_buffer_size=2**31 - 1)
+        self._bytes = bytearray()
+        self._begin = 0
+        """Where in the stream `_bytes` begins."""
 
     def feed(self, data: bytes) -> Iterator[Request | Reply]:
         """Yield the messages that are complete with these bytes, in order.
@@ -67,18 +69,42 @@ class Decoder:
         Raises:
             WireFormatError: They are no messages, or one is longer than allowed.
         """
+        self._bytes += data
         try:
-            self._unpacker.feed(data)
-            for message in self._unpacker:
-                yield _message(message)
-        except WireFormatError:
-            raise
-        except Exception as error:  # of many kinds, by the bytes
-            what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            raise WireFormatError(f"expected messages in msgpack, found {what}") from None
+            self._splitter.feed(data)
+            while self._next_is_complete():
+                end: int = self._splitter.tell()
+                length, self._begin = end - self._begin, end
+                message = bytes(self._bytes[:length])
+                del self._bytes[:length]
+                yield decode(message)
+        except msgpack.UnpackException as error:
+            raise WireFormatError(f"expected msgpack, found {type(error).__name__}") from None
+
+    def _next_is_complete(self) -> bool:
+        try:
+            self._splitter.skip()
+        except msgpack.OutOfData:
+            if len(self._bytes) > self._longest:
+                raise WireFormatError(
+                    f"expected messages of at most {self._longest} bytes, found a longer one"
+                ) from None
+            return False
+        return True
 
 
-def _message(found: Any) -> Request | Reply:
+def decode(message: bytes) -> Request | Reply:
+    """Return the message that these bytes are; text that is not UTF-8 is made so.
+
+    Raises:
+        WireFormatError: They are none.
+    """
+    try:
+        found = msgpack.unpackb(
+            message, raw=False, unicode_errors="replace", strict_map_key=False, timestamp=0
+        )
+    except Exception as error:  # of many kinds, by the bytes
+        raise WireFormatError(f"expected msgpack, found {type(error).__name__}: {error}") from None
     match found:
         case [0, int(id_), str(method), list(arguments)]:
             return Request(id_, method, arguments)
@@ -86,7 +112,7 @@ def _message(found: Any) -> Request | Reply:
             return Reply(id_, error, result)
         case [2, str(method), list(arguments)]:
             return Request(None, method, arguments)
-    raise WireFormatError(f"expected a request or a reply, found {found!r:.80}")
+    raise WireFormatError(f"expected a request or a reply, found {reprlib.repr(found)}")
 
 
 _encode = msgspec.msgpack.Encoder().encode

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar
 import msgspec
 
 from runtime.errors import CommandError
+from sims.airsim.server.absent import reason_of_absence
 
 Flavour = Literal["airsim", "cosys"]
 
@@ -24,8 +25,16 @@ parameters of handlers and for fields of structures: others are refused with the
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+LONGEST_NAME = 100
+"""Characters of an unknown method's name that are repeated in the answer."""
+
+
 class RpcError(Exception):
     """A call that cannot be served; the text is sent to the client."""
+
+
+EXPECTED_ERRORS = (RpcError, ValueError, msgspec.ValidationError, CommandError)
+"""Errors of handlers that are the client's to mend; any other is a bug of the server."""
 
 
 class Caller(Protocol):
@@ -52,7 +61,8 @@ def rpc(name: str, *, cosys: int | None = None) -> Callable[[F], F]:
 
     Args:
         name: Of the method, on the wire.
-        cosys: Number of arguments of Cosys-AirSim's clients, if it is another than AirSim's.
+        cosys: Number of arguments of Cosys-AirSim's clients, if it is another than AirSim's; a
+            call then tells whose client it is.
     """
 
     def mark(function: F) -> F:
@@ -72,6 +82,7 @@ class Method(NamedTuple):
         shapes: Type of the tuple of its arguments, by their number.
         wants_caller: Whether the client is its first argument.
         expected: Number of arguments by flavour, for messages.
+        flavours: The flavour of clients that send so many arguments, if it shows.
         description: First line of the handler's docstring.
     """
 
@@ -81,6 +92,7 @@ class Method(NamedTuple):
     shapes: dict[int, Any]
     wants_caller: bool
     expected: dict[Flavour, int]
+    flavours: dict[int, tuple[Flavour]]
     description: str
 
 
@@ -110,6 +122,9 @@ class Table:
         method = self.methods.get(name)
         count = len(arguments)
         if method is None:
+            name = name[:LONGEST_NAME]
+            if reason := reason_of_absence(name):
+                raise RpcError(thrown(name, count, f"not supported by visnav-runtime: {reason}"))
             raise RpcError(
                 f"rpclib: server could not find function '{name}' with argument count {count}."
             )
@@ -120,11 +135,15 @@ class Table:
                 f"rpclib: Function '{name}' was called with an invalid number of arguments. "
                 f"Expected: {expected}, got: {count}"
             )
+        for flavour in method.flavours.get(count, ()):
+            caller.flavour = flavour
         try:
             converted = msgspec.convert(arguments, shape)
             first = (caller,) if method.wants_caller else ()
             return method.call(*first, *converted)
-        except (msgspec.ValidationError, RpcError, ValueError, CommandError) as error:
+        except RecursionError:
+            raise RpcError(thrown(name, count, "the arguments are nested too deeply")) from None
+        except EXPECTED_ERRORS as error:
             raise RpcError(thrown(name, count, str(error))) from None
 
 
@@ -150,4 +169,7 @@ def _method(function: Callable[..., Any], name: str, cosys: int | None) -> Metho
     expected: dict[Flavour, int] = {"airsim": len(types), "cosys": cosys or len(types)}
     first = (inspect.getdoc(function) or "").partition("\n")[0]
     names = tuple(each.name for each in parameters)
-    return Method(name, function, names, shapes, wants_caller, expected, first)
+    flavours: dict[int, tuple[Flavour]] = {}
+    if cosys is not None:
+        flavours = {len(types): ("airsim",), cosys: ("cosys",)}
+    return Method(name, function, names, shapes, wants_caller, expected, flavours, first)

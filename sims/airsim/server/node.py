@@ -6,8 +6,6 @@ and set-points as any pilot does.
 
 from __future__ import annotations
 
-import asyncio
-import socket
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
@@ -20,11 +18,11 @@ from runtime import NodeConfig, Output, Tick, every, on
 from runtime.node import Node
 from runtime.paths import JsonOrPath, NameOrPath
 from sims.airsim.server.cameras import Cameras, ServedCamera
-from sims.airsim.server.connection import Connection
 from sims.airsim.server.control import Control
 from sims.airsim.server.estimates import Estimates, ScriptEstimator
 from sims.airsim.server.flight import Flight
 from sims.airsim.server.images import Images
+from sims.airsim.server.listener import Listener
 from sims.airsim.server.methods import Table
 from sims.airsim.server.objects import Objects
 from sims.airsim.server.segmentation import Segmentation
@@ -51,6 +49,7 @@ class AirsimServerConfig(NodeConfig):
         host: Address to listen on; ``0.0.0.0`` for all of this machine's. Whoever can connect
             can fly.
         port: Port to listen on; 0 for any that is free.
+        connections: Clients that may be connected at once.
         flavour: Whose clients call: ``airsim`` (1.8.1, and Colosseum's) or ``cosys``
             (Cosys-AirSim 3.5). They differ in the colours' order, among others.
         time: ``running``: time runs, at the run's `speed`. ``paused``: it stands from the start,
@@ -72,6 +71,7 @@ class AirsimServerConfig(NodeConfig):
 
     host: str = "127.0.0.1"
     port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 41451
+    connections: Annotated[int, msgspec.Meta(ge=1, le=1024)] = 64
     flavour: Literal["airsim", "cosys"] = "airsim"
     time: Literal["running", "paused", "awaited"] = "running"
     default_vehicle: str = ""
@@ -129,20 +129,14 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         )
         if self.config.time == "running" and not self.checking:
             await self.images.start()  # simulated time would wait for it later
-        self._connections: set[Connection] = set()
-        self._server: asyncio.Server | None = None
+        self._listener: Listener | None = None
         if self.checking:
             return
         config = self.config
         if config.time != "running" and (reason := self.stepping.fixed()):
             raise ValueError(f'time: expected "running", found "{config.time}": {reason}')
-        try:
-            self._socket = socket.create_server((config.host, config.port))
-        except OSError as error:
-            raise ValueError(
-                f"port: expected one that is free on {config.host}, found {config.port}: {error}"
-            ) from None
-        self.port = self._socket.getsockname()[1]
+        self._listener = Listener(config.host, config.port, config.connections, self.log)
+        self.port = self._listener.port
         self.share(PORTS, dict[str, int])[self.name] = self.port
 
     def announce(self) -> Iterable[Announcement]:
@@ -152,16 +146,14 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
     async def run(self) -> None:
         """Serve those who have connected and will; first, let time stand, if it is to."""
         await self.time.begin()
-        loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(self._connect, sock=self._socket)
+        assert self._listener is not None  # a run that is only checked has no updates
+        self._listener.serve(self.table, self.config.flavour)
         self.log.info("AirSim's clients may connect to %s:%d", self.config.host, self.port)
 
     async def on_shutdown(self) -> None:
         """Close all connections."""
-        if self._server is not None:
-            self._server.close()
-        for connection in tuple(self._connections):
-            connection.close()
+        if self._listener is not None:
+            self._listener.close()
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
@@ -208,6 +200,3 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         free cameras are where they have been put, if only just now. Shape (nq,), a copy.
         """
         return self.vehicles.drawn_state(self.clock.now())
-
-    def _connect(self) -> Connection:
-        return Connection(self.table, self.config.flavour, self.log, self._connections)
