@@ -21,7 +21,7 @@ def test_objects_have_names_and_poses(tiny_world: str) -> None:
         assert airsim("simListSceneObjects", ".*") == ["ball", "drone", "floor", "wall"]
         assert airsim("simListSceneObjects", "(?:w|b)al{2}") == ["ball", "wall"]
         assert airsim("simListSceneObjects", "Wall") == airsim("simListSceneObjects", "wal") == []
-        with pytest.raises(RefusedError, match="closing bracket"):
+        with pytest.raises(RefusedError, match="missing \\)"):
             airsim("simListSceneObjects", "(wall")
         wall = airsim("simGetObjectPose", "wall")
         assert wall["position"] == {"x_val": 5.0, "y_val": 0.0, "z_val": -3.0}
@@ -42,21 +42,18 @@ def test_an_object_has_its_look() -> None:
     assert [model.geom(geom).name for geom in geoms["crate_0"]] == ["crate_0.look", "crate_0"]
 
 
-_pieces = st.recursive(
-    st.sampled_from(["a", "b", ".", "[ab]", "[^a]", r"\w", r"\."]),
-    lambda inner: st.one_of(
-        st.tuples(inner, inner).map("".join),
-        st.tuples(inner, inner).map(lambda two: f"({two[0]}|{two[1]})"),
-        st.tuples(
-            inner, st.sampled_from(["*", "+", "?", "*?", "{2}", "{1,3}", "{0}", "{2,}", "{0,2}"])
-        ).map(lambda two: f"(?:{two[0]}){two[1]}"),
-    ),
-    max_leaves=6,
+_pieces = st.sampled_from(["a", "b", ".", "[ab]", "[^]a*]", r"\w", r"\.", r"\*", "(a|b)", "(?:ab)"])
+_repeated = st.tuples(
+    st.sampled_from(["a", ".", "[^]a*]", r"\*"]),
+    st.sampled_from(["*", "+", "?", "*?", "{2}", "{1,3}", "{0}", "{2,}", "{,2}"]),
+).map("".join)
+_expressions = st.tuples(st.lists(_pieces, max_size=3), st.lists(_repeated, max_size=1)).map(
+    lambda parts: "".join(parts[0] + parts[1] + parts[0])
 )
 
 
-@given(expression=_pieces, texts=st.lists(st.text("abcA._", max_size=7)), ignore=st.booleans())
-def test_expressions_match_what_those_of_python_match(
+@given(_expressions, st.lists(st.text("abcA._*", max_size=9)), st.booleans())
+def test_expressions_match_as_those_of_python_do(
     expression: str, texts: list[str], ignore: bool
 ) -> None:
     flags = re.IGNORECASE if ignore else re.NOFLAG
@@ -64,16 +61,16 @@ def test_expressions_match_what_those_of_python_match(
     assert whole_matches(expression, texts, ignore_case=ignore) == expected
 
 
-@given(st.text("ab()[]{}|*+?^$\\.,-19:", max_size=130))
+@given(st.text("ab()[]{}|*+?^$\\.,-19:=!<P", max_size=210))
 @settings(deadline=1000)  # milliseconds; that of the worst is a tenth
 def test_any_expression_is_matched_or_refused_in_bounded_time(expression: str) -> None:
     with contextlib.suppress(ValueError):
         whole_matches(expression, ["a" * 60 + str(number) for number in range(100)])
 
 
-def test_expressions_that_take_python_for_ever_are_quick() -> None:
-    assert whole_matches("((a*)*)*b", ["a" * 60] * 100) == []
-    with pytest.raises(ValueError, match="fewer repetitions"):
-        whole_matches("((a{99}){99}){99}", ["a"])
-    with pytest.raises(ValueError, match="up to 120 characters"):
-        whole_matches("a" * 121, ["a"])
+@pytest.mark.parametrize(
+    "expression", ["((a*)*)*b", "(a|a)*b", "(?:aa?)+b", "a*a*a*a*b", "((a{99}){99}){99}", "a" * 201]
+)
+def test_expressions_that_would_take_python_for_ever_are_refused(expression: str) -> None:
+    with pytest.raises(ValueError, match="regular expression: expected"):
+        whole_matches(expression, ["a" * 60])
