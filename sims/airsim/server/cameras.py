@@ -7,6 +7,7 @@ as they are. Source of the default mounts: the multirotor's blueprint in AirSim 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
@@ -153,25 +154,11 @@ class Cameras:
             free = not each.node.vehicle
             body = server.world.model.body(each.name if free else f"{each.name}/base_link").id
             entries = [e for e in server.config.cameras if e.vehicle in {"", each.name}]
-            if twice := {e.name for e in entries if [o.name for o in entries].count(e.name) > 1}:
-                raise ValueError(
-                    f"cameras: expected names of their own on {each.name}, found {sorted(twice)} "
-                    "more than once"
-                )
-            files = [eye for spec in each.config.cameras for eye in eyes(spec)]
-            own = {spec.name: _of_file(spec, body) for spec in files}
-            own |= {entry.name: _of_entry(entry, body, free) for entry in entries}
-            self._named[each.name] = own.copy()
+            named = cameras_by_name(each.config.cameras, entries, body, free)
+            self._named[each.name] = named
             for names, _, _ in _DEFAULTS:
-                taken = [name for name in names if name in own]
-                default = _of_entry(ServedCamera(name=names[0]), body, free)
-                camera = own[taken[0]] if taken else default
-                aliases = {name: camera for name in names if name not in own}
-                self._named[each.name] |= aliases
-                if taken and aliases:
-                    server.log.info(
-                        "camera %s of %s is also %s", taken[0], each.name, sorted(aliases)
-                    )
+                if given := {e.name for e in (*entries, *each.config.cameras)} & set(names):
+                    server.log.info("%s: %s are one camera, %s", each.name, names, min(given))
         cameras = [camera for named in self._named.values() for camera in named.values()]
         sizes = [View(camera_info(s)).largest() for c in cameras for s in c.specs()]
         width, height = np.max([(1, 1), *sizes], axis=0)
@@ -257,8 +244,39 @@ class Cameras:
             raise RpcError(f"not supported by visnav-runtime: distortion ({name} = {value})")
 
 
-def _of_file(spec: CameraSpec, body: int) -> Camera:
-    """Return a simulator's camera, without lens and noise, which takes images of all types."""
+def cameras_by_name(
+    files: Iterable[CameraSpec], entries: Sequence[ServedCamera], body: int, free: bool
+) -> dict[str, Camera]:
+    """Return a vehicle's cameras by all their names.
+
+    A camera that has one of the names of one of AirSim's cameras takes its other names over,
+    unless they are given, too.
+
+    Args:
+        files: Its own cameras.
+        entries: Those of the server's settings, which go before its own of the same name.
+        body: Number of the body that carries them.
+        free: Whether it is that of the computer-vision mode.
+
+    Raises:
+        ValueError: Two entries have one name.
+    """
+    given = {eye.name: camera_of_file(eye, body) for spec in files for eye in eyes(spec)}
+    named = {entry.name: _of_entry(entry, body, free) for entry in entries}
+    if len(named) < len(entries):
+        found = sorted(entry.name for entry in entries)
+        raise ValueError(f"cameras: expected names of their own on a vehicle, found {found}")
+    given |= named
+    cameras = given.copy()
+    for names, _, _ in _DEFAULTS:
+        first = next((given[name] for name in names if name in given), None)
+        camera = first or _of_entry(ServedCamera(name=names[0]), body, free)
+        cameras |= {name: camera for name in names if name not in given}
+    return cameras
+
+
+def camera_of_file(spec: CameraSpec, body: int) -> Camera:
+    """Return a camera of a vehicle's own settings, without lens and errors, for all types."""
     info = camera_info(spec)
     given = spec.intrinsics if spec.lens is None else (info.fx, info.fy, info.cx, info.cy)
     plain = CameraSpec(

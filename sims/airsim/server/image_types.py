@@ -139,38 +139,44 @@ def as_colours(kind: ImageType, seen: Seen) -> Colours:
         if kind is ImageType.SEGMENTATION:
             return np.asarray(_PALETTE[grey])
     elif kind is ImageType.SURFACE_NORMALS and depth is not None:
-        levels = np.rint((surface_normals(depth, seen.info) @ seen.turn.T + 1.0) * 127.5)
+        turned = surface_normals(depth, seen.info) @ seen.turn.T.astype(np.float32)
+        levels = np.rint((turned + np.float32(1.0)) * np.float32(127.5))
         return np.where(np.isfinite(depth)[..., None], levels, 0.0).astype(np.uint8)
     else:
         grey = np.rint(np.minimum(as_numbers(kind, seen), 1.0) * 255.0).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)
 
 
-def surface_normals(depth: Depths, info: CameraInfo) -> Floats:
+def surface_normals(depth: Depths, info: CameraInfo) -> Depths:
     """Return the unit normals, towards the camera, in its optical frame, shape (h, w, 3).
 
     On a plane the inverse of the depth is affine in the pixel, and its gradient gives the normal.
-    Of the differences to a pixel's two neighbours the smaller one is taken: at an edge of an
-    object that is the neighbour on the same surface. Where nothing is they mean nothing.
+    Where nothing is they mean nothing.
 
     Args:
         depth: Planar depth, metres, shape (h, w); ``inf`` where nothing is.
         info: The camera's intrinsics.
     """
-    inverse = np.reciprocal(depth.astype(np.float64))
+    inverse = np.reciprocal(depth)
     columns, rows = _slopes(info)
-    across, down = info.fx * _slope_along(inverse), info.fy * _slope_along(inverse.T).T
+    across = np.float32(info.fx) * _slope_along(inverse)
+    down = np.float32(info.fy) * _slope_along(inverse.T).T
     inward = np.stack([across, down, inverse - columns * across - rows * down], axis=-1)
-    length = np.linalg.norm(inward, axis=-1, keepdims=True)
-    return np.asarray(-inward / np.maximum(length, np.finfo(np.float64).tiny))
+    length = np.sqrt(np.einsum("ijk,ijk->ij", inward, inward))[..., None]
+    return np.asarray(-inward / np.maximum(length, np.finfo(np.float32).tiny))
 
 
-def _slope_along(values: Floats) -> Floats:
-    """Return the difference to the next or from the last value of a row, the smaller one."""
-    steps = np.pad(np.diff(values), ((0, 0), (1, 1)), constant_values=np.inf)
-    before, after = steps[:, :-1], steps[:, 1:]
-    slope = np.where(np.abs(before) < np.abs(after), before, after)
-    return np.where(np.isfinite(slope), slope, 0.0)  # an image of one column has none
+def _slope_along(values: Depths) -> Depths:
+    """Return the differences of each value in a row to the last or to the next one.
+
+    Of the two it is the one that changes less further on: at the edge of an object that is on the
+    side of the pixel's own surface.
+    """
+    if values.shape[1] < 2:
+        return np.zeros_like(values)
+    steps = np.pad(np.diff(values), ((0, 0), (2, 2)), "edge")
+    bends = np.abs(np.diff(steps))
+    return np.where(bends[:, :-2] <= bends[:, 2:], steps[:, 1:-2], steps[:, 2:-1])
 
 
 def _slopes(info: CameraInfo) -> tuple[Depths, Depths]:
