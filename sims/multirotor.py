@@ -23,7 +23,9 @@ from events import (
     PathAnnouncement,
     PilotAnnouncement,
     Range,
+    Reset,
     Setpoint,
+    Teleport,
     Vector3,
     VehicleAnnouncement,
     VehicleEvent,
@@ -51,6 +53,9 @@ from sims.worlds import Dynamics, Scene
 
 FRAME = "base_link"
 """Frame of the vehicle's body."""
+
+DEEPEST = 100.0
+"""Metres inside something from which on the physics would not push the vehicle out, but diverge."""
 
 
 class MultirotorConfig(SensorsConfig):
@@ -85,8 +90,8 @@ class Multirotor(Simulator[MultirotorConfig]):
     """A quadrotor with cameras, an IMU and ground truth, in a MuJoCo world.
 
     It obeys commands (`Arm`, `Takeoff`, `Hover`, `Land`, `Disarm`), and follows set-points of
-    position, velocity, attitude, body rates or motors while it flies. Ground truth is sent as
-    `odometry` and `camera_poses`, without noise.
+    position, velocity, attitude, body rates or motors while it flies. `Teleport` and `Reset` put
+    it somewhere at once. Ground truth is sent as `odometry` and `camera_poses`, without noise.
 
     Several are in one world: they collide, see one another, and obey what names them.
     """
@@ -214,7 +219,10 @@ class Multirotor(Simulator[MultirotorConfig]):
     @on(Command)
     def commands(self, event: Command) -> None:
         """Obey a command that is for this vehicle, or log why it is refused."""
-        if self._is_for_this(event, "commands") and (reason := self._autopilot.command(event)):
+        if not self._is_for_this(event, "commands"):
+            return
+        jumps = isinstance(event, Teleport | Reset)
+        if reason := self._autopilot.command(event) or (jumps and self._jump(event)):
             self.log.warning("%s refused: %s", type(event).__name__, reason)
 
     @on(Setpoint)
@@ -229,6 +237,25 @@ class Multirotor(Simulator[MultirotorConfig]):
         if reason and reason != self._refused:
             self.log.warning("%s refused: %s", type(event).__name__, reason)
         self._refused = reason
+
+    def _jump(self, order: Command) -> str:
+        """Be somewhere else at once, or return why not."""
+        physics, suite = self._physics, self._suite
+        physics.advance_to(self.clock.now())
+        if isinstance(order, Teleport):
+            before, velocities = physics.state(), (order.linear_velocity, order.angular_velocity)
+            physics.put(State(order.position, order.orientation, *velocities))
+            depth = max((contact.depth for contact in physics.contacts()), default=0.0)
+            if depth > DEEPEST:
+                physics.put(before)
+                return f"position: expected one at most {DEEPEST:g} m inside anything, found {depth:.3g} m"
+            suite.imu.forget()
+        else:
+            physics.put(self._world.starts[self.name])
+            physics.stop_rotors()
+            suite.reset()
+        self._touched = frozenset()
+        return ""
 
     def _is_for_this(self, order: Command | Setpoint, port: str) -> bool:
         if self._addressee.obeys(order, port):
