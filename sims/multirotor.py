@@ -248,12 +248,13 @@ class Multirotor(Simulator[MultirotorConfig]):
             depth = max((contact.depth for contact in physics.contacts()), default=0.0)
             if depth > DEEPEST:
                 physics.put(before)
-                return f"position: expected one at most {DEEPEST:g} m inside anything, found {depth:.3g} m"
+                return f"position: expected less than {DEEPEST:g} m in things, found {depth:.3g}"
             suite.imu.forget()
         else:
             physics.put(self._world.starts[self.name])
             physics.stop_rotors()
             suite.reset()
+            self._send_events()
         self._touched = frozenset()
         return ""
 
@@ -272,12 +273,15 @@ class Multirotor(Simulator[MultirotorConfig]):
         physics.advance_to(tick.stamp)
         touching = physics.touching()
         physics.set_motors(*autopilot.update(tick.stamp, physics.state(), touching))
-        for event in autopilot.take_events():
-            self.vehicle_events.send(event(stamp=physics.time_ns, source=self.name))
+        self._send_events()
         if touching and autopilot.phase is not Phase.DISARMED:
             self._send_collisions()
         elif not touching:
             self._touched = frozenset()
+
+    def _send_events(self) -> None:
+        for event in self._autopilot.take_events():
+            self.vehicle_events.send(event(stamp=self._physics.time_ns, source=self.name))
 
     def sample_sensors(self, tick: Tick) -> None:
         """Send an IMU sample and the ground truth, and expose the cameras that this triggers."""
