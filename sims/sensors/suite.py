@@ -88,10 +88,6 @@ class VehicleImu:
         """Return what the IMU will provide."""
         return self._model.announcement(self.source, self._body)
 
-    def forget(self) -> None:
-        """Forget how its place has moved, which did not lead to where it is now."""
-        self._before = None
-
 
 class SensorSuite:
     """All sensors of one vehicle but its cameras.
@@ -124,26 +120,26 @@ class SensorSuite:
         self._world = world
         self._config = config
         self._frame_id = frame_id
-        self._random = node.rng.bit_generator.state
+        self.imu = VehicleImu(node, config, physics, frame_id)
+        """The IMU, whose samples the vehicle's node takes and sends itself."""
 
         def place(name: str) -> Place:
             return Place(f"{node.name}/{name}", frame_id, config.origin)
 
-        def making(
+        def make(
             model: Callable[..., Sensor[Any]], spec: Any, name: str, *rest: Any
-        ) -> Callable[[], Sensor[Any]]:
-            return lambda: model(spec, place(name), generator_of(node.rng, name), *rest)
+        ) -> Sensor[Any]:
+            return model(spec, place(name), generator_of(node.rng, name), *rest)
 
         single = {"barometer": Barometer, "gnss": Gnss, "magnetometer": Magnetometer}
-        self._making = [
-            making(model, getattr(config, name), name)
+        self.sensors = [
+            make(model, getattr(config, name), name)
             for name, model in single.items()
             if getattr(config, name) is not None
         ]
         if config.range_finders:
             rays = Rays(physics.model, world.dynamics, f"{node.name}/base_link")
-            self._making += [making(RangeFinder, s, s.name, rays) for s in config.range_finders]
-        self._begin()
+            self.sensors += [make(RangeFinder, s, s.name, rays) for s in config.range_finders]
         lidars = [Lidar(spec, place(spec.name)) for spec in config.lidars]
         self.mounted: list[Mounted[Any]] = [*self.sensors, *lidars]
         self.lidars = LidarRig(node, lidars, physics, advance)
@@ -151,20 +147,9 @@ class SensorSuite:
     async def start(self) -> None:
         """Have all sensors measure at their rates; call it in `on_startup`."""
         await self.lidars.start(self._world)
-        self._random = self._node.rng.bit_generator.state
-        for index, sensor in enumerate(self.sensors):
-            measure = functools.partial(self._measure, index)
+        for sensor in self.sensors:
+            measure = functools.partial(self._measure, sensor)
             self._node.every(sensor.spec.rate, measure, sensor.source.partition("/")[2])
-
-    def reset(self) -> None:
-        """Begin anew, with the random numbers of the start; lidars, and what is due, go on."""
-        self._node.rng.bit_generator.state = self._random
-        self._begin()
-
-    def _begin(self) -> None:
-        self.imu = VehicleImu(self._node, self._config, self._physics, self._frame_id)
-        """The IMU, whose samples the vehicle's node takes and sends itself."""
-        self.sensors = [make() for make in self._making]
 
     def announcements(self) -> Iterable[Announcement]:
         """Return the announcements of the sensors."""
@@ -188,8 +173,7 @@ class SensorSuite:
                 static=True,
             )
 
-    def _measure(self, index: int, tick: Tick) -> None:
-        sensor = self.sensors[index]
+    def _measure(self, sensor: Sensor[Any], tick: Tick) -> None:
         if tick.stamp >= sensor.spec.startup_delay * 1e9:
             stamp = self._advance(tick)
             state, qpos, _ = self._physics.state_at(stamp)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 
 from events import EstimatorAnnouncement, PoseEstimate, Quaternion, Vector3
-from events.rotations import normalize
+from events.rotations import inverse, multiply, normalize, rotate
 from sims.airsim.server.methods import RpcError, rpc
 from sims.airsim.structures import Pose
 
@@ -28,6 +28,8 @@ class ScriptEstimator(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         method: What it is, in a word or two, for the report.
         vehicle: The vehicle whose pose it estimates, named before its own in the source
             (``drone/odometry``); empty for the first one by name.
+        camera: The camera whose poses the client publishes, with AirSim's axes (x forward, y
+            right, z down); they become those of the vehicle. Empty: the vehicle's poses.
         frame_id: ``odom``: poses are in a frame of the estimator's own, and aligned by the first
             one. ``map``: they are in the vehicle's local frame, and not aligned.
         scale_free: Whether its unit of length is its own, as that of a single camera is.
@@ -37,6 +39,7 @@ class ScriptEstimator(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     name: str
     method: str = "a script's"
     vehicle: str = ""
+    camera: str = ""
     frame_id: Literal["odom", "map"] = "odom"
     scale_free: bool = False
     reads: tuple[str, ...] = ()
@@ -58,7 +61,7 @@ class Estimates:
             raise ValueError("estimators: expected names of their own, found one twice")
         for each in server.config.estimators:
             try:
-                server.vehicles.find(each.vehicle)
+                self._mount(each)
             except RpcError as error:
                 raise ValueError(f"estimators: {each.name}: {error}") from None
 
@@ -89,8 +92,12 @@ class Estimates:
         if not last < stamp <= now:
             raise RpcError(f"expected a stamp after {last} and up to {now} ns, found {stamp}")
         position, orientation = _checked(pose)
+        if (mount := self._mount(found)) is not None:
+            offset, turn = mount
+            orientation = normalize(multiply(orientation, inverse(turn)))
+            position = _sum(position, rotate(orientation, offset), -1.0)
         if found.frame_id == "map":
-            position = self._server.vehicles.find(found.vehicle).in_map(pose.position)
+            position = _sum(position, self._server.vehicles.find(found.vehicle).origin)
         estimate = PoseEstimate(
             stamp=stamp,
             source=found.source,
@@ -100,6 +107,13 @@ class Estimates:
         )
         self._last[estimator] = stamp
         self._server.estimates.send(estimate)
+
+    def _mount(self, estimator: ScriptEstimator) -> tuple[Vector3, Quaternion] | None:
+        """Return where on its vehicle the camera is whose poses are published, if one's are."""
+        vehicle = self._server.vehicles.find(estimator.vehicle)
+        if not estimator.camera:
+            return None
+        return self._server.cameras.find(vehicle, estimator.camera).mount
 
 
 def _checked(pose: Pose) -> tuple[Vector3, Quaternion]:
@@ -113,3 +127,7 @@ def _checked(pose: Pose) -> tuple[Vector3, Quaternion]:
             f"found {position}, {orientation}"
         )
     return position, normalize(orientation)
+
+
+def _sum(a: Vector3, b: Vector3, factor: float = 1.0) -> Vector3:
+    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from events import EstimatorAnnouncement, PoseEstimate
+from events.rotations import angle_between, from_rpy, multiply
 from runtime.testing import NodeResult
 from tests.sims.airsim.scripts import Caller, RefusedError, Script, drone, with_script
 
@@ -84,3 +85,37 @@ def test_what_is_no_estimate_is_refused(
         airsim("visnavPublishPose", "odometry", 7, pose())  # what was refused has changed nothing
 
     assert [e.stamp for e in published(tiny_world, script).of(PoseEstimate)] == [5, 7]
+
+
+def test_poses_of_a_camera_become_those_of_the_vehicle(tiny_world: str) -> None:
+    """Of a camera that looks down from 0.3 m ahead, on a body that has turned by 90°."""
+    mount = {"name": "eye", "position": [0.3, 0.0, 0.1], "orientation": [0.0, -90.0, 0.0]}
+    body = from_rpy(0.0, 0.0, math.radians(90.0))
+    turn = multiply(body, from_rpy(0.0, math.radians(-90.0), 0.0))
+
+    def script(airsim: Caller) -> None:
+        airsim("simContinueForTime", 0.1)
+        airsim("visnavPublishPose", "odometry", 1, pose(1.0, 2.3, -1.9, *turn))
+
+    with_camera: dict[str, Any] = {
+        "estimators": [{"name": "odometry", "camera": "eye"}],
+        "cameras": [mount],
+    }
+    (estimate,) = with_script(script, [drone(world=tiny_world)], **with_camera).of(PoseEstimate)
+    assert estimate.position == pytest.approx((1.0, 2.0, -2.0))
+    assert angle_between(estimate.orientation, body) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("estimators", "error"),
+    [
+        ([{"name": "a", "camera": "nowhere"}], "estimators: a: expected a camera of drone"),
+        ([{"name": "a", "vehicle": "nobody"}], "estimators: a: .*'nobody' is not available"),
+        ([{"name": "a"}, {"name": "a"}], "estimators: expected names of their own"),
+    ],
+)
+def test_an_estimator_of_nothing_is_an_error_of_the_file(
+    estimators: list[dict[str, str]], error: str, tiny_world: str
+) -> None:
+    with pytest.raises(Exception, match=error):
+        with_script(lambda _: None, [drone(world=tiny_world)], estimators=estimators)
