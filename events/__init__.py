@@ -36,10 +36,8 @@ from events.control import (
     PlannedPose,
     PoseSetpoint,
     PositionSetpoint,
-    Reset,
     Setpoint,
     Takeoff,
-    Teleport,
     VelocitySetpoint,
 )
 from events.estimates import (
@@ -115,7 +113,6 @@ __all__ = [
     "Quaternion",
     "Range",
     "RangeAnnouncement",
-    "Reset",
     "Score",
     "SegmentationImage",
     "SensorAnnouncement",
@@ -123,7 +120,6 @@ __all__ = [
     "Shutdown",
     "TakenOff",
     "Takeoff",
-    "Teleport",
     "TrackedFeatures",
     "TrackingEvent",
     "TrackingLost",

@@ -121,7 +121,7 @@ def flown(
     settings: str = "",
     drone: str = CAMERA,
     nodes: str = "",
-    speed: float = 1.0,
+    speed: str = "1.0",
     duration: str = "300s",
 ) -> Iterator[Rig]:
     """Start a run in a small world, with a server that a real client may connect to."""
