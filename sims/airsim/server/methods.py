@@ -78,7 +78,7 @@ class Method(NamedTuple):
     Attributes:
         name: On the wire.
         call: The handler.
-        parameters: Names of its arguments.
+        parameters: Types of its arguments by their names.
         shapes: Type of the tuple of its arguments, by their number.
         wants_caller: Whether the client is its first argument.
         expected: Number of arguments by flavour, for messages.
@@ -88,7 +88,7 @@ class Method(NamedTuple):
 
     name: str
     call: Callable[..., Any]
-    parameters: tuple[str, ...]
+    parameters: dict[str, Any]
     shapes: dict[int, Any]
     wants_caller: bool
     expected: dict[Flavour, int]
@@ -106,11 +106,9 @@ class Table:
     def __init__(self, groups: Iterable[object]) -> None:
         self.methods: dict[str, Method] = {}
         for group in groups:
-            for _, function in inspect.getmembers(group, callable):
-                if marked := getattr(function, "rpc", None):
-                    method = _method(function, *marked)
-                    assert method.name not in self.methods, method.name
-                    self.methods[method.name] = method
+            found = methods_of(group)
+            assert not found.keys() & self.methods.keys(), found.keys() & self.methods.keys()
+            self.methods |= found
 
     def call(self, caller: Caller, name: str, arguments: list[Any]) -> Awaitable[Any] | Any:
         """Call a method, and return its result or an awaitable of it.
@@ -155,9 +153,18 @@ def thrown(name: str, count: int, text: str) -> str:
     )
 
 
+def methods_of(group: object) -> dict[str, Method]:
+    """Return the methods of a group by name; those of its class, too, for the documentation."""
+    marked = (function for _, function in inspect.getmembers(group, callable))
+    methods = (_method(each, *each.rpc) for each in marked if hasattr(each, "rpc"))
+    return {method.name: method for method in methods}
+
+
 def _method(function: Callable[..., Any], name: str, cosys: int | None) -> Method:
     hints = typing.get_type_hints(function)
-    signature = list(inspect.signature(function).parameters.values())
+    signature = [
+        each for each in inspect.signature(function).parameters.values() if each.name != "self"
+    ]
     wants_caller = bool(signature) and hints[signature[0].name] is Caller
     parameters = signature[wants_caller:]
     types = [hints[each.name] for each in parameters]
@@ -168,8 +175,8 @@ def _method(function: Callable[..., Any], name: str, cosys: int | None) -> Metho
     }
     expected: dict[Flavour, int] = {"airsim": len(types), "cosys": cosys or len(types)}
     first = (inspect.getdoc(function) or "").partition("\n")[0]
-    names = tuple(each.name for each in parameters)
+    named = {each.name: hints[each.name] for each in parameters}
     flavours: dict[int, tuple[Flavour]] = {}
     if cosys is not None:
         flavours = {len(types): ("airsim",), cosys: ("cosys",)}
-    return Method(name, function, names, shapes, wants_caller, expected, flavours, first)
+    return Method(name, function, named, shapes, wants_caller, expected, flavours, first)

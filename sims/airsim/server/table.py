@@ -1,0 +1,80 @@
+"""The methods as a table for the documentation: ``python -m sims.airsim.server.table PAGE``.
+
+It stands below the heading `HEADING` of the page, in Markdown, to the page's end.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import sys
+import types
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import sims.airsim.server
+from sims.airsim.server.methods import Method, methods_of
+
+HEADING = "## Methods\n"
+
+
+class Row(NamedTuple):
+    """A method in the documentation."""
+
+    name: str
+    arguments: str
+    description: str
+
+
+def rows() -> Iterator[Row]:
+    """Yield all methods of all groups in this package, by name."""
+    methods: dict[str, Method] = {}
+    for module in pkgutil.iter_modules(sims.airsim.server.__path__, "sims.airsim.server."):
+        if module.name == __name__:
+            continue
+        for _, group in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
+            if group.__module__ == module.name:
+                methods |= methods_of(group)
+    for name, method in sorted(methods.items(), key=lambda item: item[0].lower()):
+        arguments = (f"{each}: {_type_name(hint)}" for each, hint in method.parameters.items())
+        yield Row(name, ", ".join(arguments), method.description)
+
+
+def markdown() -> str:
+    """Return the table."""
+    lines = [
+        f"| `{row.name}` | {f'`{row.arguments}`' if row.arguments else ''} | {row.description} |"
+        for row in rows()
+    ]
+    return "\n".join(["| method | arguments | what it does here |", "|---|---|---|", *lines, ""])
+
+
+def rewritten(page: str) -> str:
+    """Return a page with the table as it should be.
+
+    Raises:
+        ValueError: It lacks the heading.
+    """
+    before, heading, _ = page.partition(HEADING)
+    if not heading:
+        raise ValueError(f"expected the heading {HEADING.strip()!r} in the page")
+    return f"{before}{heading}\n{markdown()}"
+
+
+def _type_name(hint: Any) -> str:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        return _type_name(arguments[0])
+    if origin is types.UnionType:
+        return " or ".join(map(_type_name, arguments))
+    if origin is not None:
+        return f"{origin.__name__}[{', '.join(map(_type_name, arguments))}]"
+    return "any" if hint is Any else "..." if hint is ... else getattr(hint, "__name__", str(hint))
+
+
+if __name__ == "__main__":
+    path = Path(sys.argv[1])
+    path.write_text(rewritten(path.read_text(encoding="utf-8")), encoding="utf-8")
