@@ -65,14 +65,14 @@ class Tasks:
         slot.result = result = asyncio.get_running_loop().create_future()
         if not task.limit > 0.0:
             slot.finish(task.at_limit)
-            return result
+            return self._server.time.owed(result)
         slot.task, slot.started = task, self._server.clock.now()
         if not vehicle.motors_on:
             vehicle.motors_on = True
             self._send(slot, Arm)
         elif slot.is_landing:  # until it hovers, it would refuse set-points
             self._send(slot, Hover)
-        return result
+        return self._server.time.owed(result)
 
     def cancel(self, vehicle: str) -> None:
         """End the task of a vehicle, if it has one; its result is `False`."""
