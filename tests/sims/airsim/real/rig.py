@@ -35,7 +35,7 @@ HEAD = """
 name = "real_client"
 clock = "lockstep"
 speed = {speed}
-duration = "{duration}"
+duration = "300s"
 
 [[nodes]]
 name = "drone"
@@ -91,12 +91,17 @@ class Rig:
                 self._listening.set()
         self._listening.set()
 
+    @property
+    def port(self) -> int:
+        """The port at which the server listens, once it does."""
+        assert self._listening.wait(120), self.said
+        assert self._port, self.said
+        return self._port
+
     def script(self, client: str, name: str, *arguments: str, limit: float = 120) -> Any:
         """Run a function of `client_side` with a client, and return what it returns."""
-        assert self._listening.wait(60), self.said
-        assert self._port, self.said
         module = CLIENTS[client].module
-        command = [str(python_of(client)), str(SCRIPTS), module, str(self._port), name, *arguments]
+        command = [str(python_of(client)), str(SCRIPTS), module, str(self.port), name, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=limit, check=False)
         assert done.returncode == 0, f"{done.stdout}{done.stderr}\nthe run:\n{self.said}"
         *printed, result = done.stdout.splitlines()
@@ -104,9 +109,10 @@ class Rig:
         assert not [line for line in printed if "WARN" in line.upper()], printed
         return found
 
-    def end(self) -> Any:
-        """End the run as Ctrl-C does, and return its summary."""
-        self._process.send_signal(signal.SIGINT)
+    def end(self, *, interrupt: bool = True) -> Any:
+        """End the run as Ctrl-C does, or wait for its own end, and return its summary."""
+        if interrupt:
+            self._process.send_signal(signal.SIGINT)
         code = self._process.wait(60)
         self._reader.join(10)
         assert code == 0, self.said
@@ -122,14 +128,23 @@ def flown(
     drone: str = CAMERA,
     nodes: str = "",
     speed: str = "1.0",
-    duration: str = "300s",
+    text: str = "",
 ) -> Iterator[Rig]:
-    """Start a run in a small world, with a server that a real client may connect to."""
+    """Start a run in a small world, with a server that a real client may connect to.
+
+    Args:
+        folder: For files, and for the run's results.
+        settings: Of the server.
+        drone: Settings and cameras of the drone.
+        nodes: Tables of further nodes.
+        speed: Of the run.
+        text: The whole file, in place of all these.
+    """
     world = folder / "small.xml"
     world.write_text(WORLD)
     file = folder / "run.toml"
-    head = HEAD.format(world=world, drone=drone, speed=speed, duration=duration)
-    file.write_text(head + nodes + SERVER.format(settings=settings))
+    head = HEAD.format(world=world, drone=drone, speed=speed)
+    file.write_text(text or head + nodes + SERVER.format(settings=settings))
     out = folder / "out"
     with start(["run", file, "--quiet", "--log", "info", "--out", out], ROOT) as process:
         try:
