@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from events import Vector3
 from runtime import Node
 from runtime.host import Sibling
 from sims.cameras import model_to_bytes
@@ -125,6 +126,18 @@ class SharedWorld:
             return self.state_at(stamp_ns)[1]
         self.simulation.advance_to(stamp_ns)
         return self.simulation.history.at(stamp_ns)[0].copy()
+
+    def set_wind(self, velocity: Vector3) -> None:
+        """Set the mean wind, m/s NED, from the next millisecond on; gusts and turbulence stay.
+
+        Without vehicles it blows on nothing.
+        """
+        if self.simulation is not None and self.air is None:
+            random = np.random.default_rng([self._seed, *b"wind"])
+            self.air = Air(self.model, WindSpec(), self.vehicles, random)
+            self.simulation.add_influence(self.air)
+        if self.air is not None:
+            self.air.velocity = velocity
 
     def geoms_of(self, body: str) -> tuple[int, ...]:
         """Return the numbers of a body's geoms, which are those in segmentation images."""

@@ -46,6 +46,7 @@ class Simulation:
             that instant, or calls `changed`.
         history: The states of the past.
         mocap_velocities: Of the bodies that move by themselves, m/s NWU, shape (nmocap, 3).
+        influences: What is applied at each millisecond, in this order.
         diverged: Whether its state was no longer finite once: it is of no use any more.
 
     Raises:
@@ -61,7 +62,7 @@ class Simulation:
         self.data: Any = mujoco.MjData(model)
         self.history = History(self)
         self.diverged = False
-        self._influences = tuple(influences)
+        self.influences = tuple(influences)
         self._steps = 0
         self._fresh = False
         self._apply()
@@ -82,7 +83,7 @@ class Simulation:
         steps = stamp_ns // TIMESTEP_NS - self._steps
         if steps <= 0:
             return
-        if self.history.kept or self._influences:
+        if self.history.kept or self.influences:
             for _ in range(steps):
                 if self.history.kept:
                     self.history.add()
@@ -134,6 +135,13 @@ class Simulation:
         """Take note that somebody has written a state into `data`."""
         self._fresh = False
 
+    def add_influence(self, influence: Influence) -> None:
+        """Have an influence be applied at each millisecond from the next one on, after the others.
+
+        `reset` does not take it away.
+        """
+        self.influences += (influence,)
+
     def trial(self, seconds: float) -> Any:
         """Return MuJoCo's data of some seconds after the start, if nothing is done meanwhile."""
         trial = mujoco.MjData(self.model)
@@ -150,7 +158,7 @@ class Simulation:
 
     def _apply(self) -> None:
         before = self.data.mocap_pos.copy()
-        for influence in self._influences:
+        for influence in self.influences:
             influence.apply(self.model, self.data, self._steps * TIMESTEP_NS * 1e-9)
         self.mocap_velocities = (self.data.mocap_pos - before) / (TIMESTEP_NS * 1e-9)
 

@@ -178,22 +178,36 @@ def add_bodies(scene: Scene, node: str, specs: tuple[BodySpec, ...]) -> Dynamics
         body = scene.spec.worldbody.add_body(
             name=name, mocap=True, pos=flip_yz(place), quat=flip_yz_rotation(turn)
         )
-        shape = _Shape(scene.spec, body, name, spec)
-        for each in _shapes().iterfind(f"{spec.kind}/*"):
-            getattr(shape, each.tag)(each)
+        size, colour = spec.size or SIZES[spec.kind], spec.colour or COLOURS[spec.kind]
+        add_shape(scene, body, spec.kind, size, colour)
         motions.append(motion)
     return Dynamics(tuple(motions))
+
+
+def add_shape(scene: Scene, body: Any, kind: Kind, size: Vector3, colour: Vector3) -> None:
+    """Give a body of a world the shape of a kind: its parts, called after it, and their materials.
+
+    Args:
+        scene: The world.
+        body: MuJoCo's body, with its origin in the middle of its foot.
+        kind: What it is to be.
+        size: Length, width and height, metres.
+        colour: Red, green and blue, 0 to 1.
+    """
+    shape = _Shape(scene.spec, body, size, colour)
+    for each in _shapes().iterfind(f"{kind}/*"):
+        getattr(shape, each.tag)(each)
 
 
 class _Shape:
     """Adds the parts of ``bodies.xml`` to a body."""
 
-    def __init__(self, world: Any, body: Any, name: str, spec: BodySpec) -> None:
+    def __init__(self, world: Any, body: Any, size: Vector3, colour: Vector3) -> None:
         self._world = world
         self._body = body
-        self._name = name
-        self._colour: Vector3 = spec.colour or COLOURS[spec.kind]
-        self._size = spec.size or SIZES[spec.kind]
+        self._name = body.name
+        self._colour = colour
+        self._size = size
         self._parts = 0
 
     def cloth(self, given: ET.Element) -> None:

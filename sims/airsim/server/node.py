@@ -24,6 +24,7 @@ from sims.airsim.server.flight import Flight
 from sims.airsim.server.images import Images
 from sims.airsim.server.listener import Listener
 from sims.airsim.server.methods import Table
+from sims.airsim.server.movables import SpareObject, add_movables
 from sims.airsim.server.objects import Objects
 from sims.airsim.server.segmentation import Segmentation
 from sims.airsim.server.sensors import SAMPLES, Sensors
@@ -67,6 +68,9 @@ class AirsimServerConfig(NodeConfig):
         render_threads: Threads of the software renderer in each of them.
         lidar_frame: Frame of lidars' points, as AirSim's ``DataFrame``.
         sensor_names: Names of vehicles' sensors by those by which scripts call them.
+        objects: Objects that clients can bring into the world, and take out again.
+        movable: Regular expressions: the geoms and bodies of the world, by their whole names,
+            that clients can move.
     """
 
     host: str = "127.0.0.1"
@@ -83,6 +87,8 @@ class AirsimServerConfig(NodeConfig):
     render_threads: Count = 1
     lidar_frame: Literal["VehicleInertialFrame", "SensorLocalFrame"] = "VehicleInertialFrame"
     sensor_names: dict[str, str] = msgspec.field(default_factory=dict)
+    objects: tuple[SpareObject, ...] = ()
+    movable: tuple[str, ...] = ()
 
 
 class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
@@ -166,8 +172,9 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self.tasks.update(tick.stamp)
 
     @classmethod
-    def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:  # noqa: ARG003
-        """Put a camera into the world that is moved to where one is needed."""
+    def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
+        """Put a camera into the world that is moved to where one is needed, and objects."""
+        add_movables(scene, name, config.objects, config.movable)
         scene.spec.worldbody.add_camera(name=f"{name}/camera")
         return Dynamics()
 

@@ -1,7 +1,8 @@
 """Regular expressions of clients, of which none may keep the run waiting.
 
 Python's own search goes back and tries again. What makes that long are repetitions: the time grows
-with the text's length to the power of their number, and without bounds if one is in another.
+with the text's length to the power of their number, and without bounds if one is in another. Each
+alternative in groups may double it.
 """
 
 from __future__ import annotations
@@ -10,8 +11,8 @@ import re
 import warnings
 from collections.abc import Iterable
 
-LONGEST, MOST_REPETITIONS = 200, 3
-"""Characters, and repetitions, of an expression."""
+LONGEST, MOST_REPETITIONS, MOST_CHOICES = 200, 3, 12
+"""Characters, repetitions, and alternatives of an expression; each repetition counts as three."""
 
 _PIECE = re.compile(r"\\.|\[\^?\]?(?:\\.|[^\]\\])*\]|\(\?|\)?(?:[*+?]|\{[\d,]*\})|.", re.DOTALL)
 
@@ -27,6 +28,8 @@ def whole_matches(expression: str, texts: Iterable[str], *, ignore_case: bool = 
     repetitions = [each for each in pieces if each[-1] in "*+?}" and each not in ("(?", "}")]
     if len(expression) > LONGEST or len(repetitions) > MOST_REPETITIONS:
         raise _error(f"up to {LONGEST} characters and {MOST_REPETITIONS} repetitions", expression)
+    if 3 * len(repetitions) + pieces.count("|") > MOST_CHOICES:
+        raise _error("fewer alternatives", expression)
     if any(each[0] == ")" for each in repetitions):
         raise _error("no repeated group", expression)
     try:

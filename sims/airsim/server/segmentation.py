@@ -32,6 +32,10 @@ class Segmentation:
         for name in sorted(self._objects, key=lambda each: -len(self._objects[each])):
             self._set(name, initial_id(name))  # that of a part goes before that of the whole
 
+    def added(self, name: str) -> None:
+        """Give an object that has come into the world its first ID."""
+        self._set(name, initial_id(name))
+
     def ids(self) -> npt.NDArray[np.uint8]:
         """Return the ID of each geom as it is drawn, and last that of nothing, shape (n + 1,)."""
         return np.maximum(self._ids, 0).astype(np.uint8)

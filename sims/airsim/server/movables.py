@@ -1,0 +1,264 @@
+"""What of a world scripts may bring in, move and take out: settings, and bodies of the model.
+
+Each is a body with a free joint, so its pose is part of the world's state, which physics, cameras
+and lidars have anyway. A held body is heavy, has no weight, and is put back at each millisecond:
+what flies against it meets a wall. It does not meet the world, which would push it out of whatever
+it was put into.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+import mujoco
+import numpy as np
+
+from sims.airsim.server.regex import whole_matches
+from sims.cameras.stage import LOOK
+from sims.vehicle import Simulation
+from sims.worlds import Scene
+from sims.worlds.bodies import COLOURS, SIZES, Kind, add_shape
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Basic = Literal["Cube", "Sphere", "Cylinder", "Cone"]
+
+AWAY = 1e5
+"""Metres above the world at which what is not there is kept: beyond what cameras and lidars see."""
+
+HELD = 100.0
+"""Inertia that a held body has in addition to its own, kg and kg m²: far more than a vehicle's."""
+
+WORLD, MOVABLE = 1, 2
+"""Bits of MuJoCo's ``contype`` and ``conaffinity``: what geoms are and meet."""
+
+_TYPES = {
+    "Cube": mujoco.mjtGeom.mjGEOM_BOX,
+    "Sphere": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    "Cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "Cone": mujoco.mjtGeom.mjGEOM_MESH,
+}
+_COPIED = (
+    *("conaffinity", "condim", "contype", "density", "friction", "gap", "group", "margin", "mass"),
+    *("material", "meshname", "priority", "rgba", "size", "solimp", "solmix", "solref", "type"),
+)
+
+
+class SpareObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of objects that ``simSpawnObject`` can bring into the world.
+
+    Attributes:
+        asset: What they are: one of AirSim's shapes of 1 m about their middle (a cylinder and a
+            cone stand upright), or a ``person``, ``car``, ``door`` or ``box``, which stands on its
+            position.
+        scale: Factors on its length, width and height, which cannot be changed later.
+        count: How many of them there can be at a time.
+        colour: Red, green and blue, 0 to 1; grey, or that of its kind, if left out. A cylinder is
+            as wide as it is long.
+    """
+
+    asset: Basic | Kind
+    scale: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    count: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
+    colour: tuple[Share, Share, Share] | None = None
+
+
+class Movable(NamedTuple):
+    """A body that scripts may move.
+
+    Attributes:
+        body: Name of the body in the model.
+        asset: What a spare object is; empty for what belongs to the world.
+        scale: Of a spare object.
+    """
+
+    body: str
+    asset: str = ""
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+def spare_objects(node: str, specs: tuple[SpareObject, ...]) -> list[Movable]:
+    """Return the spare objects of a server's settings, as bodies of the model."""
+    each = [spec for spec in specs for _ in range(spec.count)]
+    return [
+        Movable(f"{node}/{spec.asset}_{number}", spec.asset, spec.scale)
+        for number, spec in enumerate(each)
+    ]
+
+
+def add_movables(
+    scene: Scene, node: str, specs: tuple[SpareObject, ...], movable: tuple[str, ...]
+) -> None:
+    """Put spare objects into a world, and free what of it is to be movable; all are held.
+
+    Raises:
+        ValueError: An expression matches nothing, or something that cannot be moved.
+    """
+    if not specs and not movable:
+        return
+    world = scene.spec.copy().compile()
+    # What MuJoCo takes from the mean of all bodies is to be as without these.
+    for name in ("meanmass", "meansize", "extent", "center"):
+        setattr(scene.spec.stat, name, getattr(world.stat, name))
+    each = [spec for spec in specs for _ in range(spec.count)]
+    for number, (spec, spare) in enumerate(zip(each, spare_objects(node, specs), strict=True)):
+        _add_spare(scene, spare.body, spec, (0.0, 0.0, AWAY + 100.0 * number))
+    held = [spare.body for spare in spare_objects(node, specs)]
+    for expression in movable:
+        held += _free(scene.spec, world, expression)
+    for geom in (geom for name in held for geom in scene.spec.body(name).geoms):
+        if geom.contype or geom.conaffinity:
+            geom.contype, geom.conaffinity = MOVABLE, 0
+
+
+def movable_bodies(model: Any) -> list[tuple[int, str]]:
+    """Return number and name of each body with a free joint, but vehicles."""
+    roots = np.flatnonzero((model.body_parentid == 0) & (model.body_jntnum == 1)).tolist()
+    named = [(body, model.body(body).name) for body in roots]
+    free = mujoco.mjtJoint.mjJNT_FREE
+    return [
+        (body, name)
+        for body, name in named
+        if model.jnt_type[model.body_jntadr[body]] == free and not name.endswith("/base_link")
+    ]
+
+
+def have_met(model: Any) -> None:
+    """Have vehicles and all else that physics move meet what is held."""
+    free = (model.body_weldid[model.geom_bodyid] != 0) & (model.geom_contype == WORLD)
+    model.geom_conaffinity[free] |= MOVABLE
+    for body in np.unique(model.geom_bodyid[free]):
+        model.body_conaffinity[body] |= MOVABLE
+
+
+def set_free(model: Any, body: int, free: bool) -> None:
+    """Have physics move a body, or make it one that can be held.
+
+    Args:
+        model: The compiled world, in which `have_met` was called.
+        body: Number of the body.
+        free: Whether physics move it.
+    """
+    dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + 6)
+    geoms = (model.geom_bodyid == body) & (model.geom_contype != 0)
+    model.body_gravcomp[body] = 0.0 if free else 1.0
+    model.dof_armature[dofs] = 0.0 if free else HELD
+    for of, chosen in (("geom", geoms), ("body", body)):
+        getattr(model, f"{of}_contype")[chosen] = WORLD if free else MOVABLE
+        getattr(model, f"{of}_conaffinity")[chosen] = WORLD | MOVABLE if free else 0
+    # What MuJoCo computes of these when it compiles a model.
+    model.dof_M0[dofs] = [*[model.body_mass[body]] * 3, *model.body_inertia[body]]
+    model.dof_M0[dofs] += model.dof_armature[dofs]
+    straight, turn = (1.0 / model.dof_M0[dofs]).reshape(2, 3).mean(axis=1)
+    model.body_invweight0[body] = straight, turn
+    model.dof_invweight0[dofs] = np.repeat((straight, turn), 3)
+
+
+class Holder:
+    """Holds bodies where they are put: an influence on a simulation."""
+
+    @classmethod
+    def of(cls, simulation: Simulation) -> Holder:
+        """Return the one of a simulation, which gets one when this is first asked for."""
+        found = [each for each in simulation.influences if isinstance(each, Holder)]
+        if not found:
+            found.append(cls())
+            simulation.add_influence(found[0])
+        return found[0]
+
+    def __init__(self) -> None:
+        self._poses: dict[int, Any] = {}
+        self._positions = self._velocities = np.empty(0, np.intp)
+        self._held = np.empty(0)
+
+    def hold(self, model: Any, body: int, pose: Any) -> None:
+        """Hold a body at a pose of its free joint, shape (7,); `None` is not to hold it."""
+        self._poses.pop(body, None)
+        if pose is not None:
+            self._poses[body] = pose
+        bodies = list(self._poses)
+        dofs = model.body_dofadr[bodies]
+        poses = model.jnt_qposadr[model.body_jntadr[bodies]]
+        self._positions = np.add.outer(poses, np.arange(7)).ravel()
+        self._velocities = np.add.outer(dofs, np.arange(6)).ravel()
+        self._held = np.concatenate([*self._poses.values(), np.empty(0)])
+
+    def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
+        """Put all bodies back."""
+        data.qpos[self._positions] = self._held
+        data.qvel[self._velocities] = 0.0
+
+
+def _add_spare(
+    scene: Scene, name: str, spec: SpareObject, place: tuple[float, float, float]
+) -> None:
+    body = _held(scene.spec, name, pos=place)
+    if spec.asset in COLOURS:
+        kind: Any = spec.asset
+        length, width, height = (a * b for a, b in zip(SIZES[kind], spec.scale, strict=True))
+        add_shape(scene, body, kind, (length, width, height), spec.colour or COLOURS[kind])
+        return
+    x, y, z = (0.5 * each for each in spec.scale)
+    options: dict[str, Any] = {"size": [x, z, 0.0] if spec.asset == "Cylinder" else [x, y, z]}
+    if spec.asset == "Cone":
+        turns = np.arange(24) * math.pi / 12
+        ring = [(x * math.cos(turn), y * math.sin(turn), -z) for turn in turns]
+        scene.spec.add_mesh(name=name, uservert=np.ravel([(0.0, 0.0, z), *ring]))
+        options = {"meshname": name}
+    rgba = [*(spec.colour or (0.6, 0.6, 0.6)), 1.0]
+    body.add_geom(type=_TYPES[spec.asset], rgba=rgba, group=0, **options)
+
+
+def _free(spec: Any, world: Any, expression: str) -> list[str]:
+    """Free geoms of the world itself, and bodies that stand in it, and return their names."""
+    geoms = {geom.name: geom for geom in spec.worldbody.geoms if geom.name}
+    bodies = {body.name: body for body in spec.worldbody.bodies if body.name}
+    still = {name: body for name, body in bodies.items() if not body.joints and not body.mocap}
+    found = whole_matches(expression, [name for name in geoms if not name.endswith(LOOK)])
+    for name in found:
+        parts = [geoms[each] for each in (name, name + LOOK) if each in geoms]
+        if any(part.type == mujoco.mjtGeom.mjGEOM_PLANE for part in parts):
+            raise ValueError(f"movable: expected what can be moved, found {name}, a plane")
+        place, turn = _pose(world, name)
+        body = _held(spec, name, pos=place, quat=turn)
+        body.explicitinertial, body.mass, body.inertia = True, 100.0, [10.0, 10.0, 10.0]
+        for part in parts:
+            options = {key: getattr(part, key) for key in _COPIED}
+            there, way = _pose(world, part.name)
+            pos, quat, back, away = np.zeros(3), np.zeros(4), np.zeros(4), np.zeros(3)
+            mujoco.mju_negPose(away, back, place, turn)
+            mujoco.mju_mulPose(pos, quat, away, back, there, way)
+            part_name = part.name
+            if part.type != mujoco.mjtGeom.mjGEOM_MESH:
+                options["size"] = world.geom(part_name).size  # of a capsule between two points
+            spec.delete(part)
+            body.add_geom(name=part_name, pos=pos, quat=quat, **options)
+    names = whole_matches(expression, still)
+    for name in names:
+        still[name].add_joint(type=mujoco.mjtJoint.mjJNT_FREE, armature=HELD)
+        still[name].gravcomp = 1.0
+    if not found and not names:
+        raise ValueError(
+            f"movable: expected names of geoms or of bodies without joints, found {expression}"
+        )
+    return found + names
+
+
+def _pose(world: Any, geom: str) -> tuple[Any, Any]:
+    """Return the pose of a geom of the world itself as its file has it: that of a mesh is moved."""
+    number = world.geom(geom).id
+    place, turn = world.geom_pos[number].copy(), world.geom_quat[number].copy()
+    mesh = world.geom_dataid[number]
+    if world.geom_type[number] == mujoco.mjtGeom.mjGEOM_MESH:
+        away, back = np.zeros(3), np.zeros(4)
+        mujoco.mju_negPose(away, back, world.mesh_pos[mesh], world.mesh_quat[mesh])
+        mujoco.mju_mulPose(place, turn, place.copy(), turn.copy(), away, back)
+    return place, turn
+
+
+def _held(spec: Any, name: str, **options: Any) -> Any:
+    body = spec.worldbody.add_body(name=name, gravcomp=1.0, **options)
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_FREE, armature=HELD)
+    return body
