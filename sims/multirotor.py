@@ -23,7 +23,9 @@ from events import (
     PathAnnouncement,
     PilotAnnouncement,
     Range,
+    Reset,
     Setpoint,
+    Teleport,
     Vector3,
     VehicleAnnouncement,
     VehicleEvent,
@@ -51,6 +53,9 @@ from sims.worlds import Dynamics, Scene
 
 FRAME = "base_link"
 """Frame of the vehicle's body."""
+
+DEEPEST = 100.0
+"""Metres inside something from which on the physics would not push the vehicle out, but diverge."""
 
 
 class MultirotorConfig(SensorsConfig):
@@ -85,8 +90,8 @@ class Multirotor(Simulator[MultirotorConfig]):
     """A quadrotor with cameras, an IMU and ground truth, in a MuJoCo world.
 
     It obeys commands (`Arm`, `Takeoff`, `Hover`, `Land`, `Disarm`), and follows set-points of
-    position, velocity, attitude, body rates or motors while it flies. Ground truth is sent as
-    `odometry` and `camera_poses`, without noise.
+    position, velocity, attitude, body rates or motors while it flies. `Teleport` and `Reset` put
+    it somewhere at once. Ground truth is sent as `odometry` and `camera_poses`, without noise.
 
     Several are in one world: they collide, see one another, and obey what names them.
     """
@@ -214,7 +219,10 @@ class Multirotor(Simulator[MultirotorConfig]):
     @on(Command)
     def commands(self, event: Command) -> None:
         """Obey a command that is for this vehicle, or log why it is refused."""
-        if self._is_for_this(event, "commands") and (reason := self._autopilot.command(event)):
+        if not self._is_for_this(event, "commands"):
+            return
+        jumps = isinstance(event, Teleport | Reset)
+        if reason := self._autopilot.command(event) or (jumps and self._jump(event)):
             self.log.warning("%s refused: %s", type(event).__name__, reason)
 
     @on(Setpoint)
@@ -229,6 +237,26 @@ class Multirotor(Simulator[MultirotorConfig]):
         if reason and reason != self._refused:
             self.log.warning("%s refused: %s", type(event).__name__, reason)
         self._refused = reason
+
+    def _jump(self, order: Command) -> str:
+        """Be somewhere else at once, or return why not."""
+        physics, suite = self._physics, self._suite
+        physics.advance_to(self.clock.now())
+        if isinstance(order, Teleport):
+            before, velocities = physics.state(), (order.linear_velocity, order.angular_velocity)
+            physics.put(State(order.position, order.orientation, *velocities))
+            depth = max((contact.depth for contact in physics.contacts()), default=0.0)
+            if depth > DEEPEST:
+                physics.put(before)
+                return f"position: expected less than {DEEPEST:g} m in things, found {depth:.3g}"
+            suite.imu.forget()
+        else:
+            physics.put(self._world.starts[self.name])
+            physics.stop_rotors()
+            suite.reset()
+            self._send_events()
+        self._touched = frozenset()
+        return ""
 
     def _is_for_this(self, order: Command | Setpoint, port: str) -> bool:
         if self._addressee.obeys(order, port):
@@ -245,12 +273,15 @@ class Multirotor(Simulator[MultirotorConfig]):
         physics.advance_to(tick.stamp)
         touching = physics.touching()
         physics.set_motors(*autopilot.update(tick.stamp, physics.state(), touching))
-        for event in autopilot.take_events():
-            self.vehicle_events.send(event(stamp=physics.time_ns, source=self.name))
+        self._send_events()
         if touching and autopilot.phase is not Phase.DISARMED:
             self._send_collisions()
         elif not touching:
             self._touched = frozenset()
+
+    def _send_events(self) -> None:
+        for event in self._autopilot.take_events():
+            self.vehicle_events.send(event(stamp=self._physics.time_ns, source=self.name))
 
     def sample_sensors(self, tick: Tick) -> None:
         """Send an IMU sample and the ground truth, and expose the cameras that this triggers."""

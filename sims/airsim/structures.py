@@ -111,6 +111,13 @@ class MultirotorState(msgspec.Struct, frozen=True):
     rc_data: RCData = RCData()
 
 
+class ComputerVisionState(msgspec.Struct, frozen=True):
+    """State of a free camera, as Cosys-AirSim has it."""
+
+    kinematics_estimated: KinematicsState = KinematicsState()
+    timestamp: int = 0
+
+
 class ImageRequest(msgspec.Struct, frozen=True):
     """An image to take; `image_type` is one of `sims.airsim.server.images`."""
 

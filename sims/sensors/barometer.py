@@ -41,10 +41,18 @@ def pressure_at(altitude: float) -> float:
     Args:
         altitude: Geometric altitude, metres.
     """
+    return float(_SEA_LEVEL * (288.15 / temperature_at(altitude)) ** -5.255877)
+
+
+def temperature_at(altitude: float) -> float:
+    """Return the temperature (K) of the standard atmosphere up to 11 km above sea level.
+
+    Args:
+        altitude: Geometric altitude, metres.
+    """
     kilometres = altitude / 1e3
     geopotential = _RADIUS * kilometres / (_RADIUS + kilometres)
-    temperature = 288.15 - 6.5 * geopotential
-    return float(_SEA_LEVEL * (288.15 / temperature) ** -5.255877)
+    return 288.15 - 6.5 * geopotential
 
 
 def altitude_at(pressure: float) -> float:

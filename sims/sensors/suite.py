@@ -88,6 +88,10 @@ class VehicleImu:
         """Return what the IMU will provide."""
         return self._model.announcement(self.source, self._body)
 
+    def forget(self) -> None:
+        """Forget how its place has moved, which did not lead to where it is now."""
+        self._before = None
+
 
 class SensorSuite:
     """All sensors of one vehicle but its cameras.
@@ -120,26 +124,26 @@ class SensorSuite:
         self._world = world
         self._config = config
         self._frame_id = frame_id
-        self.imu = VehicleImu(node, config, physics, frame_id)
-        """The IMU, whose samples the vehicle's node takes and sends itself."""
+        self._random = node.rng.bit_generator.state
 
         def place(name: str) -> Place:
             return Place(f"{node.name}/{name}", frame_id, config.origin)
 
-        def make(
+        def making(
             model: Callable[..., Sensor[Any]], spec: Any, name: str, *rest: Any
-        ) -> Sensor[Any]:
-            return model(spec, place(name), generator_of(node.rng, name), *rest)
+        ) -> Callable[[], Sensor[Any]]:
+            return lambda: model(spec, place(name), generator_of(node.rng, name), *rest)
 
         single = {"barometer": Barometer, "gnss": Gnss, "magnetometer": Magnetometer}
-        self.sensors = [
-            make(model, getattr(config, name), name)
+        self._making = [
+            making(model, getattr(config, name), name)
             for name, model in single.items()
             if getattr(config, name) is not None
         ]
         if config.range_finders:
             rays = Rays(physics.model, world.dynamics, f"{node.name}/base_link")
-            self.sensors += [make(RangeFinder, s, s.name, rays) for s in config.range_finders]
+            self._making += [making(RangeFinder, s, s.name, rays) for s in config.range_finders]
+        self._begin()
         lidars = [Lidar(spec, place(spec.name)) for spec in config.lidars]
         self.mounted: list[Mounted[Any]] = [*self.sensors, *lidars]
         self.lidars = LidarRig(node, lidars, physics, advance)
@@ -147,9 +151,20 @@ class SensorSuite:
     async def start(self) -> None:
         """Have all sensors measure at their rates; call it in `on_startup`."""
         await self.lidars.start(self._world)
-        for sensor in self.sensors:
-            measure = functools.partial(self._measure, sensor)
+        self._random = self._node.rng.bit_generator.state
+        for index, sensor in enumerate(self.sensors):
+            measure = functools.partial(self._measure, index)
             self._node.every(sensor.spec.rate, measure, sensor.source.partition("/")[2])
+
+    def reset(self) -> None:
+        """Begin anew, with the random numbers of the start; lidars, and what is due, go on."""
+        self._node.rng.bit_generator.state = self._random
+        self._begin()
+
+    def _begin(self) -> None:
+        self.imu = VehicleImu(self._node, self._config, self._physics, self._frame_id)
+        """The IMU, whose samples the vehicle's node takes and sends itself."""
+        self.sensors = [make() for make in self._making]
 
     def announcements(self) -> Iterable[Announcement]:
         """Return the announcements of the sensors."""
@@ -173,7 +188,8 @@ class SensorSuite:
                 static=True,
             )
 
-    def _measure(self, sensor: Sensor[Any], tick: Tick) -> None:
+    def _measure(self, index: int, tick: Tick) -> None:
+        sensor = self.sensors[index]
         if tick.stamp >= sensor.spec.startup_delay * 1e9:
             stamp = self._advance(tick)
             state, qpos, _ = self._physics.state_at(stamp)

@@ -14,9 +14,12 @@ each update.
     FLYING      Land                    LANDING
     LANDING     Hover                   FLYING
     LANDING     the ground felt         DISARMED      Landed, Disarmed
-    (all)       Disarm                  DISARMED      Disarmed
+    TAKING_OFF  Teleport                FLYING
+    LANDING     Teleport                FLYING
+    (all)       Disarm, Reset           DISARMED      Disarmed
 
-Disarm stops the motors in every phase, in the air too.
+Disarm stops the motors in every phase, in the air too. Whoever flies and is teleported holds the
+place where it is then.
 """
 
 from __future__ import annotations
@@ -37,8 +40,10 @@ from events import (
     Landed,
     MotorSetpoint,
     PositionSetpoint,
+    Reset,
     TakenOff,
     Takeoff,
+    Teleport,
     Vector3,
     VehicleEvent,
     VelocitySetpoint,
@@ -64,6 +69,23 @@ class Phase(enum.Enum):
     TAKING_OFF = enum.auto()
     FLYING = enum.auto()
     LANDING = enum.auto()
+
+
+FARTHEST, FASTEST, FASTEST_TURN = 1e4, 50.0, 50.0
+"""Most that a vehicle may be teleported with: m, m/s, rad/s; physics would not bear much more."""
+
+
+def teleport_fault(event: Teleport) -> str | None:
+    """Return what is wrong with a `Teleport`, None if nothing is."""
+    for field, limit, unit in (
+        ("position", FARTHEST, "m"),
+        ("linear_velocity", FASTEST, "m/s"),
+        ("angular_velocity", FASTEST_TURN, "rad/s"),
+    ):
+        found = getattr(event, field)
+        if max(map(abs, found)) > limit:
+            return f"Teleport.{field}: expected numbers up to {limit:g} {unit}, found {found}"
+    return None
 
 
 _NO_SETPOINTS = {
@@ -204,6 +226,10 @@ class Autopilot:
                     reason = "already landing"
             case Hover():
                 reason = "not in the air" if grounded else None
+            case Teleport():
+                reason = teleport_fault(event)
+            case Reset():
+                reason = None
             case _:
                 reason = f"{type(event).__name__} is no command of a vehicle"
         return reason
@@ -216,6 +242,15 @@ class Autopilot:
             case Disarm():
                 self._disarm()
                 return
+            case Reset():
+                if self.phase is not Phase.DISARMED:
+                    self._disarm()
+                return
+            case Teleport():
+                self._controller.reset()
+                if self.phase in (Phase.DISARMED, Phase.ARMED):
+                    return
+                self.phase = Phase.FLYING
             case Takeoff():
                 if self.phase is Phase.DISARMED:
                     self._arm()
@@ -255,7 +290,7 @@ class Autopilot:
                 self._descending = False
                 self._standing_ns = None
                 self._controller.brake(state)
-            case Hover():
+            case Hover() | Teleport():
                 self._controller.brake(state)
 
     def _take_off(self, state: State, dt: float) -> None:

@@ -59,6 +59,7 @@ class Controller:
         """Forget what was learnt in flight (integrals, last measurements)."""
         self.position.reset()
         self.rates.reset()
+        self._in_velocity = False
 
     def follow(self, setpoint: Setpoint, state: State) -> None:
         """Take a set-point; it replaces the last one.

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Quaternion, Vector3
+from events.rotations import normalize
 from sims.vehicle.model import VehicleParameters, mover_of, read_parameters
 from sims.vehicle.simulation import Simulation
 
@@ -45,12 +46,14 @@ class Contact(msgspec.Struct, frozen=True, gc=False):
         position: Metres NED.
         normal: Unit vector NED, from the other towards the vehicle.
         speed: Metres per second at which the two close in along the normal; negative if they part.
+        depth: Metres by which the one is inside the other.
     """
 
     other: str
     position: Vector3
     normal: Vector3
     speed: float
+    depth: float = 0.0
 
 
 class Physics:
@@ -158,6 +161,24 @@ class Physics:
             return []
         return [self._contact(index, own) for index, own in self._own_contacts()]
 
+    def put(self, state: State) -> None:
+        """Have the vehicle be in a state at once, whatever is there; its rotors turn on."""
+        (x, y, z), (vx, vy, vz), (wx, wy, wz) = (
+            state.position,
+            state.velocity,
+            state.angular_velocity,
+        )
+        qw, qx, qy, qz = normalize(state.orientation)
+        self._pose[:] = (x, -y, -z, qw, qx, -qy, -qz)
+        self._twist[:] = (vx, -vy, -vz, wx, -wy, -wz)
+        self.simulation.changed()
+
+    def stop_rotors(self) -> None:
+        """Have the rotors stand still at once."""
+        self.set_motors(0.0, 0.0, 0.0, 0.0)
+        self.thrusts[:] = 0.0
+        self.simulation.changed()
+
     def settle(self) -> None:
         """Have the vehicle rest on the ground, its weight carried, if that is where it starts.
 
@@ -203,7 +224,8 @@ class Physics:
         bx, by, bz = self._velocity_at(int(self.model.geom_bodyid[geom]), point)
         closing = -((ax - bx) * nx + (ay - by) * ny + (az - bz) * nz)
         x, y, z = point
-        return Contact(self._name_of(geom), (x, -y, -z), (nx, -ny, -nz), closing)
+        depth = -float(contact.dist)
+        return Contact(self._name_of(geom), (x, -y, -z), (nx, -ny, -nz), closing, depth)
 
     def _velocity_at(self, body: int, point: Vector3) -> Vector3:
         """Return the velocity (m/s, NWU) of a body's material at a point of the world.

@@ -18,6 +18,7 @@ from runtime import NodeConfig, Output, Tick, every, on
 from runtime.node import Node
 from runtime.paths import JsonOrPath, NameOrPath
 from sims.airsim.server.cameras import Cameras, ServedCamera
+from sims.airsim.server.collisions import Collisions
 from sims.airsim.server.control import Control
 from sims.airsim.server.estimates import Estimates, ScriptEstimator
 from sims.airsim.server.flight import Flight
@@ -110,6 +111,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
             for each in self.siblings(cls):
                 vehicle = served(each.name, self.world, each.config, self.clock.now)
                 self.vehicles[each.name] = vehicle
+        self.collisions = Collisions(self)
         self.objects = Objects(self)
         self.cameras = Cameras(self)
         self.segmentation = Segmentation(self)
@@ -124,6 +126,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 self.time,
                 Control(self),
                 VehicleState(self),
+                self.collisions,
                 self.objects,
                 self.cameras,
                 self.segmentation,
@@ -163,13 +166,15 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Take notice of motors that start or stop."""
+        """Take notice of motors that start or stop, and of collisions."""
         self.tasks.note(event)
+        self.collisions.note(event)
 
     @every(hz=RATE)
     def fly(self, tick: Tick) -> None:
-        """Let the vehicles' tasks steer."""
+        """Let the vehicles' tasks steer, and look what the vehicles touch."""
         self.tasks.update(tick.stamp)
+        self.collisions.watch()
 
     @classmethod
     def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
@@ -195,10 +200,15 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         """Return a multirotor; see `Vehicles.find_multirotor`."""
         return self.vehicles.find_multirotor(name)
 
-    def order(self, kind: type[Command], vehicle: ServedVehicle, **fields: Any) -> None:
-        """Send a command to a vehicle, which obeys it at once."""
-        now = self.clock.now()
-        self.commands.send(kind(stamp=now, source=self.name, vehicle=vehicle.name, **fields))
+    def order(
+        self, kind: type[Command] | type[Setpoint], vehicle: ServedVehicle, **fields: Any
+    ) -> None:
+        """Send a command or a set-point to a vehicle, which obeys it at once."""
+        event = kind(stamp=self.clock.now(), source=self.name, vehicle=vehicle.name, **fields)
+        if isinstance(event, Setpoint):
+            self.setpoints.send(event)
+        else:
+            self.commands.send(event)
 
     def drawn_state(self) -> tuple[int, npt.NDArray[np.float64]]:
         """Return the world's state as it is to be drawn now: time (ns), and positions.

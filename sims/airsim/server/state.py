@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from math import pi, sqrt
 from typing import TYPE_CHECKING
 
 from sims.airsim.server.methods import rpc
-from sims.airsim.structures import KinematicsState, MultirotorState, Pose
+from sims.airsim.structures import (
+    ComputerVisionState,
+    EnvironmentState,
+    GeoPoint,
+    KinematicsState,
+    MultirotorState,
+    Pose,
+    RotorParameters,
+    RotorStates,
+    Vector3r,
+)
+from sims.sensors.barometer import pressure_at, temperature_at
 
 if TYPE_CHECKING:
     from sims.airsim.server.node import AirsimServer
+
+GAS_CONSTANT = 287.053
+"""Of dry air, J/(kg K)."""
 
 
 class VehicleState:
@@ -30,6 +45,12 @@ class VehicleState:
             0 if vehicle.landed() else 1,
         )
 
+    @rpc("getComputerVisionState")
+    def computer_vision_state(self, vehicle_name: str) -> ComputerVisionState:
+        """Return a vehicle's true state, of either kind, with its exact stamp."""
+        vehicle = self._server.find_vehicle(vehicle_name)
+        return ComputerVisionState(vehicle.kinematics(), vehicle.stamp)
+
     @rpc("simGetVehiclePose")
     def vehicle_pose(self, vehicle_name: str) -> Pose:
         """Return a vehicle's true pose in its local frame."""
@@ -39,3 +60,43 @@ class VehicleState:
     def kinematics(self, vehicle_name: str) -> KinematicsState:
         """Return how a vehicle truly moves; the accelerations are those of the physics."""
         return self._server.find_vehicle(vehicle_name).kinematics()
+
+    @rpc("simGetGroundTruthEnvironment")
+    def environment(self, vehicle_name: str) -> EnvironmentState:
+        """Return the standard atmosphere, and the world's gravity, where a vehicle is."""
+        vehicle = self._server.find_vehicle(vehicle_name)
+        position = vehicle.state().position
+        place = vehicle.geo_point(position)
+        pressure, temperature = pressure_at(place.altitude), temperature_at(place.altitude)
+        return EnvironmentState(
+            vehicle.local(position),
+            place,
+            Vector3r(0.0, 0.0, -float(vehicle.world.model.opt.gravity[2])),
+            pressure,
+            temperature,
+            pressure / (GAS_CONSTANT * temperature),
+        )
+
+    @rpc("getHomeGeoPoint")
+    def home(self, vehicle_name: str) -> GeoPoint:
+        """Return where on the earth a vehicle was at the start."""
+        vehicle = self._server.find_vehicle(vehicle_name)
+        return vehicle.geo_point(vehicle.origin)
+
+    @rpc("getRotorStates")
+    def rotors(self, vehicle_name: str) -> RotorStates:
+        """Return speed, thrust and torque of all rotors: front right, rear left, the other two.
+
+        Those are front left and rear right. The physics has no speeds: they are those of which the
+        IMU's vibration is made.
+        """
+        vehicle = self._server.find_multirotor(vehicle_name)
+        vehicle.state()
+        fastest = 2.0 * pi * vehicle.config.imu.vibration.rotor_speed
+        rotors = tuple(
+            RotorParameters(fastest * sqrt(max(x, 0.0)), x * motor.max_thrust, x * motor.max_torque)
+            for x, motor in zip(
+                vehicle.physics.thrusts.tolist(), vehicle.physics.parameters.motors, strict=True
+            )
+        )
+        return RotorStates(vehicle.stamp, rotors)

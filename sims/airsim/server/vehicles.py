@@ -61,6 +61,10 @@ class ServedVehicle(ABC):
         self.armed = True
         self.collision = CollisionInfo()
 
+    def release(self) -> None:
+        """Be as at the start for clients: not under control, armed, without a collision."""
+        self.api_control, self.armed, self.collision = False, True, CollisionInfo()
+
     @property
     def start(self) -> State:
         """Its state at the start, in ``map``: at rest on the ground, if it starts there."""
@@ -69,7 +73,7 @@ class ServedVehicle(ABC):
     @property
     @abstractmethod
     def stamp(self) -> int:
-        """Time of its present state (ns)."""
+        """Time of the state that was last asked for (ns)."""
 
     @abstractmethod
     def state(self) -> State:
@@ -77,7 +81,7 @@ class ServedVehicle(ABC):
 
     @abstractmethod
     def accelerations(self) -> tuple[Vector3, Vector3]:
-        """Return its acceleration, m/s² NED, and angular acceleration, rad/s² FRD, now."""
+        """Return acceleration, m/s² NED, and angular acceleration, rad/s² FRD, in that state."""
 
     @functools.cached_property
     def origin(self) -> Vector3:
@@ -133,7 +137,7 @@ class ServedMultirotor(ServedVehicle):
 
     @property
     def stamp(self) -> int:
-        """Time of its present state (ns)."""
+        """Time of the state that was last asked for (ns)."""
         return self.physics.time_ns
 
     def state(self) -> State:
@@ -142,12 +146,12 @@ class ServedMultirotor(ServedVehicle):
         return self.physics.state()
 
     def accelerations(self) -> tuple[Vector3, Vector3]:
-        """Return its acceleration, m/s² NED, and angular acceleration, rad/s² FRD, now."""
+        """Return acceleration, m/s² NED, and angular acceleration, rad/s² FRD, in that state."""
         return self.physics.accelerations()
 
     def landed(self) -> bool:
-        """Return whether it stands: it rests on something that carries part of its weight."""
-        parameters, state = self.physics.parameters, self.state()
+        """Return whether it stood in that state: something else carried part of its weight."""
+        parameters, state = self.physics.parameters, self.physics.state()
         thrust = float(self.physics.thrusts.mean())
         speeds = (*state.velocity, *state.angular_velocity)
         slow = max(map(abs, speeds)) < LANDED_SPEED
@@ -157,14 +161,17 @@ class ServedMultirotor(ServedVehicle):
 class ServedFreeCamera(ServedVehicle):
     """A free camera: it has no physics, and is where it has been put."""
 
+    _stamp = 0
+
     @property
     def stamp(self) -> int:
-        """The run's time (ns)."""
-        return self._now()
+        """Time of the state that was last asked for (ns)."""
+        return self._stamp
 
     def state(self) -> State:
         """Return its true state now, in ``map``."""
-        return self.world.free_cameras[self.name](self._now())
+        self._stamp = self._now()
+        return self.world.free_cameras[self.name](self._stamp)
 
     def accelerations(self) -> tuple[Vector3, Vector3]:
         """Return zeros."""

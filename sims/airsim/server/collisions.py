@@ -1,0 +1,76 @@
+"""What clients are told of the vehicles' collisions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from events import Collision, VehicleEvent
+from sims.airsim.server.methods import rpc
+from sims.airsim.server.vehicles import ServedMultirotor, ServedVehicle
+from sims.airsim.structures import CollisionInfo, Vector3r
+from sims.vehicle.physics import Contact
+
+if TYPE_CHECKING:
+    from sims.airsim.server.node import AirsimServer
+
+APART = 10
+"""Looks, of 20 ms each, without any contact after which the next contact is a new one."""
+
+
+class Collisions:
+    """Notes each vehicle's last collision.
+
+    That is what its node tells of as such; and, since with AirSim contact with the ground counts,
+    however gentle, any contact after a while without one. So standing at the start does not count,
+    and landing does.
+    """
+
+    def __init__(self, server: AirsimServer) -> None:
+        self._server = server
+        self._apart: dict[str, int] = {}
+
+    @rpc("simGetCollisionInfo")
+    def collision_info(self, vehicle_name: str) -> CollisionInfo:
+        """Return a vehicle's last collision, and count it as read: ``has_collided`` is cleared."""
+        vehicle = self._server.find_vehicle(vehicle_name)
+        found = vehicle.collision
+        vehicle.collision = msgspec.structs.replace(found, has_collided=False)
+        return found
+
+    def forget(self, vehicle: ServedVehicle) -> None:
+        """Forget a vehicle's collision, and take what it touches now as no new one."""
+        vehicle.collision = CollisionInfo()
+        self._apart[vehicle.name] = 0
+
+    def note(self, event: VehicleEvent) -> None:
+        """Take notice of what a vehicle's node tells."""
+        vehicle = self._server.vehicles.get(event.source)
+        if isinstance(event, Collision) and isinstance(vehicle, ServedMultirotor):
+            self._take(vehicle, [c for c in vehicle.physics.contacts() if c.other == event.other])
+
+    def watch(self) -> None:
+        """Look what the vehicles touch; to be called 50 times a second."""
+        for vehicle in self._server.vehicles.values():
+            if not isinstance(vehicle, ServedMultirotor):
+                continue
+            vehicle.state()
+            apart = self._apart.get(vehicle.name, 0)
+            touching = vehicle.physics.touching()
+            self._apart[vehicle.name] = 0 if touching else apart + 1
+            if touching and apart >= APART:
+                self._take(vehicle, vehicle.physics.contacts())
+
+    def _take(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
+        """Keep the deepest of some contacts as a collision."""
+        contact = max(contacts, key=lambda each: each.depth)
+        vehicle.collision = CollisionInfo(
+            True,
+            contact.depth,
+            vehicle.stamp,
+            Vector3r(*contact.normal),
+            vehicle.local(contact.position),
+            vehicle.local(vehicle.state().position),
+            contact.other,
+        )
