@@ -36,8 +36,10 @@ from events.control import (
     PlannedPose,
     PoseSetpoint,
     PositionSetpoint,
+    Reset,
     Setpoint,
     Takeoff,
+    Teleport,
     VelocitySetpoint,
 )
 from events.estimates import (
@@ -113,6 +115,7 @@ __all__ = [
     "Quaternion",
     "Range",
     "RangeAnnouncement",
+    "Reset",
     "Score",
     "SegmentationImage",
     "SensorAnnouncement",
@@ -120,6 +123,7 @@ __all__ = [
     "Shutdown",
     "TakenOff",
     "Takeoff",
+    "Teleport",
     "TrackedFeatures",
     "TrackingEvent",
     "TrackingLost",

@@ -70,6 +70,30 @@ class Hover(Command):
     """Stop and hold the position."""
 
 
+class Teleport(Command):
+    """Be at a place at once, as no real vehicle can, and hold it there if it flies.
+
+    Attributes:
+        position: Metres in ``map``.
+        orientation: Rotation from body to ``map``.
+        linear_velocity: Metres per second in ``map``.
+        angular_velocity: Radians per second in the body frame.
+    """
+
+    position: Vector3
+    orientation: Quaternion
+    linear_velocity: Vector3 = (0.0, 0.0, 0.0)
+    angular_velocity: Vector3 = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_pose(self, self.position, self.orientation)
+        check(self, self.linear_velocity, self.angular_velocity)
+
+
+class Reset(Command):
+    """Be as at the start: there, disarmed, with sensors that begin anew; time goes on."""
+
+
 class PositionSetpoint(Setpoint):
     """Be at a place; velocity and acceleration are feed-forward for one that follows a path.
 

@@ -73,4 +73,5 @@ class Collisions:
             vehicle.local(contact.position),
             vehicle.local(vehicle.state().position),
             contact.other,
+            self._server.segmentation.id_of(contact.other),
         )
