@@ -161,7 +161,7 @@ def methods_of(group: object) -> dict[str, Method]:
 
 
 def _method(function: Callable[..., Any], name: str, cosys: int | None) -> Method:
-    hints = typing.get_type_hints(function)
+    hints = typing.get_type_hints(function, include_extras=True)
     signature = [
         each for each in inspect.signature(function).parameters.values() if each.name != "self"
     ]

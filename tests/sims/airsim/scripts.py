@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import socket
 import threading
@@ -94,9 +95,8 @@ def with_script(
 
             def work() -> None:
                 try:
-                    caller = Caller(port)
-                    script(caller)
-                    caller.close()
+                    with contextlib.closing(Caller(port)) as caller:
+                        script(caller)
                 except BaseException as error:  # raised in the test, below
                     failed.append(error)
                 loop.call_soon_threadsafe(over.set)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 import time
 from collections.abc import Awaitable
@@ -10,10 +11,15 @@ from typing import Any
 
 import pytest
 
+from runtime.node import Node
 from runtime.schedule import SECOND, Once
+from runtime.testing import spec
+from sims.airsim.client.rpc import RpcCallError, RpcClient
 from sims.airsim.server import AirsimServer
 from sims.airsim.server.methods import Table, rpc
-from tests.sims.airsim.scripts import Caller, drone, with_script
+from sims.airsim.server.node import PORTS
+from tests.runtime.samples_runs import supervise
+from tests.sims.airsim.scripts import Caller, RefusedError, drone, with_script
 
 
 class Tasks:
@@ -74,3 +80,97 @@ def test_awaited_time_runs_while_a_task_is_owed_and_stands_when_it_ends(tiny_wor
         assert airsim("now") == last
 
     with_script(script, [drone(world=tiny_world)], time="awaited")
+
+
+def test_a_pause_holds_awaited_time_until_it_is_lifted(tiny_world: str) -> None:
+    def script(airsim: Caller) -> None:
+        airsim("simPause", True)
+        task = airsim.send("task", 0.5, "a")
+        assert airsim("simIsPaused") is True
+        assert airsim("now") == 0.0
+        airsim("simContinueForTime", 0.2)
+        assert airsim("now") == 0.2
+        airsim("simContinueForTime", 0.0)
+        airsim("simPause", False)
+        assert airsim.join(task) == 0.5
+        assert airsim("now") == 0.5
+
+    with_script(script, [drone(world=tiny_world)], time="awaited")
+
+
+@pytest.mark.parametrize(("rates", "rate"), [((), 60), ((10, 25), 25)])
+def test_a_frame_is_an_image_of_the_fastest_camera(
+    rates: tuple[int, ...], rate: int, tiny_world: str
+) -> None:
+    def script(airsim: Caller) -> None:
+        airsim("simContinueForTime", 0.001)
+        for frames, total in ((1, 1), (0, 1), (5, 6)):
+            airsim("simContinueForFrames", frames)
+            assert airsim("now") == max(total * SECOND // rate, 1_000_000) / SECOND
+            assert airsim("simIsPaused") is True
+
+    cameras = [
+        {"name": f"c{hz}", "rate": hz, "width": 8, "height": 8, "images": ["rgb"]} for hz in rates
+    ]
+    with_script(script, [drone(world=tiny_world, cameras=cameras)])
+
+
+@pytest.mark.parametrize("seconds", [math.nan, math.inf, -1.0, 1e300, "1", None])
+def test_steps_that_make_no_sense_are_refused(seconds: object, tiny_world: str) -> None:
+    def script(airsim: Caller) -> None:
+        with pytest.raises(RefusedError, match="simContinueForTime"):
+            airsim("simContinueForTime", seconds)
+        assert airsim("now") == 0.0
+
+    with_script(script, [drone(world=tiny_world)])
+
+
+def test_running_time_is_paused_stepped_and_resumed(tiny_world: str) -> None:
+    def script(airsim: Caller) -> None:
+        airsim("simPause", True)
+        begin = airsim("now")
+        assert airsim("simIsPaused") is True
+        airsim("simContinueForTime", 0.1)
+        assert airsim("now") == pytest.approx(begin + 0.1)
+        airsim("simPause", False)
+        assert airsim("simIsPaused") is False
+
+    with_script(script, [drone(world=tiny_world)], time="running", duration=1e6)
+
+
+def test_a_run_in_real_time_has_no_time_that_stands(tiny_world: str) -> None:
+    nodes = [
+        drone(world=tiny_world),
+        spec(AirsimServer, "airsim", {"port": 0, "time": "paused"}),
+    ]
+    error = supervise(nodes, clock="real").error
+    assert 'time: expected "running", found "paused": the run is in real time' in str(error)
+
+
+def test_a_client_cannot_pause_a_run_in_real_time(tiny_world: str) -> None:
+    refused: list[str] = []
+
+    class Client(Node):
+        """Asks for a pause."""
+
+        async def run(self) -> None:
+            client = await RpcClient.connect(
+                "127.0.0.1", self.share(PORTS, dict[str, int])["airsim"]
+            )
+            for call in (("simPause", True), ("simContinueForTime", 1.0)):
+                with pytest.raises(RpcCallError) as error:
+                    await client.call(*call)
+                refused.append(str(error.value))
+            await client.call("simPause", False)
+            assert await client.call("simIsPaused") is False
+            client.close()
+            self.stop("asked")
+
+    nodes = [
+        drone(world=tiny_world),
+        spec(AirsimServer, "airsim", {"port": 0}),
+        spec(Client, "client"),
+    ]
+    assert supervise(nodes, clock="real", duration=20.0).error is None
+    assert all("the run is in real time, which cannot be stopped" in text for text in refused)
+    assert len(refused) == 2
