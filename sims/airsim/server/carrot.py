@@ -1,7 +1,7 @@
 """A point that runs ahead of a vehicle along a path, for the vehicle to fly to.
 
-The method is "pure pursuit" (R. C. Coulter, CMU-RI-TR-92-01, 1992); the rules of look-ahead,
-braking and ending are those of AirSim's ``moveOnPath``.
+The method is "pure pursuit" (R. C. Coulter, CMU-RI-TR-92-01, 1992); the rules of look-ahead
+and ending are those of AirSim's ``moveOnPath``.
 """
 
 from __future__ import annotations
@@ -37,14 +37,10 @@ def lookahead_of(lookahead: float, adaptive: float, velocity: float) -> float:
 def braked(velocity: float, remaining: float) -> float:
     """Return the speed (m/s) at which to fly with some metres to go.
 
-    Above 3 m/s it falls to 1 m/s, as AirSim's does over 1 to 3 m; and at no more than 3 m/s², for
-    which AirSim overshoots.
+    Before the end it falls to 1 m/s, by 3 m/s². (AirSim brakes later, and only from above 3 m/s,
+    and overshoots.)
     """
-    if velocity <= 3.0:
-        return velocity
-    over = min(max(velocity / 2.0, 1.0), 3.0)
-    gentle = math.sqrt(1.0 + 2.0 * 3.0 * max(remaining - CLOSE, 0.0))
-    return max(1.0, min(velocity, velocity * remaining / over, gentle))
+    return min(velocity, math.sqrt(1.0 + 2.0 * 3.0 * max(remaining - CLOSE, 0.0)))
 
 
 class Carrot:
@@ -57,6 +53,7 @@ class Carrot:
     Attributes:
         progress: Metres along the path up to the point next to the vehicle.
         length: Of the path, metres.
+        is_last: Whether the carrot is at the end of the path.
     """
 
     def __init__(self, path: Sequence[Vector3], lookahead: float) -> None:
@@ -72,6 +69,7 @@ class Carrot:
         self._lookahead = lookahead
         self.length = self._along[-1]
         self.progress = 0.0
+        self.is_last = False
 
     def advance(self, position: Vector3) -> Vector3:
         """Take a vehicle's position (m), and return where the carrot is."""

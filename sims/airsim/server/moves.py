@@ -1,7 +1,7 @@
 """What vehicles can be told to do, as pure tasks: time and state in, set-points out.
 
-Positions and velocities are of ``map``. The rules are AirSim's; see docs/reference/airsim.md for
-what differs.
+Positions and velocities are of ``map``, angles in radians. The rules are AirSim's; what differs is
+in docs/reference/airsim.md.
 """
 
 from __future__ import annotations
@@ -9,118 +9,111 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from math import atan2, cos, pi, radians, sin
+from math import pi
 
-import msgspec
-
-from events import Land, PositionSetpoint, Vector3, VelocitySetpoint
-from events.rotations import yaw_of
+from events import (
+    AttitudeSetpoint,
+    BodyRateSetpoint,
+    Land,
+    PositionSetpoint,
+    Vector3,
+    VelocitySetpoint,
+)
+from events.rotations import from_rpy, yaw_of
 from sims.airsim.server.carrot import CLOSE, Carrot, braked
 from sims.airsim.server.tasks import RATE, Order, Task
-from sims.airsim.structures import YawMode
-from sims.vehicle import State
+from sims.vehicle import State, VehicleParameters
+
+HOVER_THROTTLE = 9.80665 / (4.0 * 4.18)
+"""Throttle at which AirSim's quadrotor hovers: 1 kg on four rotors of 4.18 N."""
+
+Thrust = Callable[[State], float]
+"""Gives the thrust, 0 to 1 of what all motors can give together."""
 
 _STILL = 0.05
 """Metres per second that count as none."""
+_SETTLING = 5
+"""Updates without progress near the end after which a path has ended."""
+_STUCK = 5 * RATE
+"""Updates without progress after which a path has failed."""
+_GAIN = 1.5
+"""Vertical velocity per metre of error, 1/s."""
+_LIFT_GAIN = 4.0
+"""Vertical acceleration per error in velocity, 1/s."""
 _YAW_GAIN = 3.0
 """Yaw rate per angle of error, 1/s."""
-_HEIGHT_GAIN = 1.5
-"""Vertical velocity per metre of error, 1/s."""
 _FASTEST = 6.0
 """Metres per second at which a height is gone to, as AirSim's controller limits it."""
 
 
-class Heading(msgspec.Struct, frozen=True):
+class Heading:
     """Where to look on the way.
 
-    Attributes:
-        follows: Whether the vehicle looks where it goes (AirSim's ``ForwardOnly``), if the mode is
-            an angle; which is then added.
-        mode: An angle or a rate, in degrees.
+    Args:
+        follows: Whether to look where the vehicle goes (AirSim's ``ForwardOnly``), unless at a
+            rate; the angle is then added.
+        is_rate: Whether the angle is a rate, in radians per second.
+        angle: See `is_rate`.
     """
 
-    follows: bool = False
-    mode: YawMode = YawMode()
+    def __init__(self, follows: bool = False, is_rate: bool = True, angle: float = 0.0) -> None:
+        self._follows, self._is_rate, self._angle = follows, is_rate, angle
 
     def rate(self, state: State, x: float, y: float) -> float:
-        """Return the yaw rate (rad/s) for a vehicle that goes along (x, y) in ``map``."""
-        angle = radians(self.mode.yaw_or_rate)
-        if self.mode.is_rate:
-            return angle
-        if self.follows:
-            if math.hypot(x, y) <= CLOSE:
-                return 0.0
-            angle += atan2(y, x)
-        return _YAW_GAIN * _wrapped(angle - yaw_of(state.orientation))
+        """Return the yaw rate (rad/s) for a vehicle that goes along (x, y)."""
+        if self._is_rate:
+            return self._angle
+        if self._follows and math.hypot(x, y) <= CLOSE:
+            return 0.0
+        course = math.atan2(y, x) if self._follows else 0.0
+        return _YAW_GAIN * wrapped(course + self._angle - yaw_of(state.orientation))
 
 
 def by_velocity(velocity: Vector3, heading: Heading, duration: float) -> Task:
     """Move at a velocity (m/s) for some seconds."""
-
-    def steer(_: float, state: State) -> Order:
-        return _velocity(velocity, heading.rate(state, velocity[0], velocity[1]))
-
-    return Task(steer, duration)
+    x, y, _ = velocity
+    return Task(lambda _, state: _velocity(velocity, heading.rate(state, x, y)), duration)
 
 
 def by_velocity_at(x: float, y: float, height: float, heading: Heading, duration: float) -> Task:
     """Move at a horizontal velocity (m/s), and at a height (z, m), for some seconds."""
 
     def steer(_: float, state: State) -> Order:
-        velocity = (x, y, _to_height(state, height, _FASTEST))
-        return _velocity(velocity, heading.rate(state, x, y))
+        return _velocity((x, y, _to_height(state, height)), heading.rate(state, x, y))
 
     return Task(steer, duration, duration > 0.0)
 
 
 def along_path(
-    path: Sequence[Vector3], velocity: float, lookahead: float, heading: Heading, timeout: float
+    path: Sequence[Vector3], speed: float, lookahead: float, heading: Heading, timeout: float
 ) -> Task:
-    """Fly along a path from its first point, where the vehicle is, to its last.
+    """Fly along a path (m) from its first point, where the vehicle is, to its last.
 
-    It has succeeded at the end of the path when there is no progress any more; it has failed if
-    there is none for a second elsewhere with the carrot at the end, or at the timeout.
+    It has succeeded when there is no progress any more within 0.5 m of the end, and failed if
+    there is none for 5 s elsewhere (where AirSim waits for the timeout), or at the timeout.
     """
-    return Task(_AlongPath(path, velocity, lookahead, heading).steer, timeout, at_limit=False)
+    carrot, least, idle = Carrot(path, lookahead), min(_STILL, 0.1 * speed) / RATE, 0
 
-
-class _AlongPath:
-    def __init__(
-        self, path: Sequence[Vector3], velocity: float, lookahead: float, heading: Heading
-    ) -> None:
-        self._carrot = Carrot(path, lookahead)
-        self._end = path[-1]
-        self._velocity = velocity
-        self._heading = heading
-        self._least = min(_STILL, 0.1 * velocity) / RATE
-        self._idle = 0
-        self._nearest = math.inf
-
-    def steer(self, _: float, state: State) -> Order | bool:
-        carrot = self._carrot
+    def steer(_: float, state: State) -> Order | bool:
+        nonlocal idle
         before = carrot.progress
         target = carrot.advance(state.position)
         x, y, z = (a - b for a, b in zip(target, state.position, strict=True))
-        apart = math.hypot(x, y, z)
-        if carrot.is_last:
-            is_going = carrot.progress - before > self._least
-            self._idle = 0 if is_going else self._idle + 1
-            if apart <= CLOSE or carrot.progress >= carrot.length:
-                if not is_going:
-                    return True
-            elif self._idle >= RATE:
-                return False
+        apart, remaining = math.hypot(x, y, z), carrot.length - carrot.progress
         is_near = carrot.is_last and apart <= CLOSE
-        speed = braked(self._velocity, carrot.length - carrot.progress)
-        share = 0.0 if is_near else speed / apart
-        down = z * share
-        if is_near or abs(z) <= CLOSE:
-            down = _to_height(state, target[2], self._velocity)
-        return _velocity((x * share, y * share, down), self._heading.rate(state, x, y))
+        idle = idle + 1 if carrot.progress - before <= least else 0
+        is_there = is_near or not remaining
+        if idle > (_SETTLING if is_there else _STUCK):
+            return is_there
+        share = 0.0 if is_near else braked(speed, remaining) / apart
+        down = _to_height(state, target[2], speed) if abs(z) <= CLOSE else z * share
+        return _velocity((x * share, y * share, down), heading.rate(state, x, y))
+
+    return Task(steer, timeout, at_limit=False)
 
 
-def landing() -> Callable[[float, State], Order | None]:
-    """Return how to go down at 0.2 m/s until something stops that, and then to stop the motors."""
+def landing(timeout: float) -> Task:
+    """Go down at 0.2 m/s until something stops that for 0.2 s, and then stop the motors."""
     idle = 0
 
     def steer(_: float, state: State) -> Order | None:
@@ -130,46 +123,83 @@ def landing() -> Callable[[float, State], Order | None]:
         idle = idle + 1 if state.velocity[2] <= _STILL else 0
         return Land if idle > 10 else _velocity((0.0, 0.0, 0.2), 0.0)
 
-    return steer
+    return Task(steer, timeout, at_limit=False)
 
 
 def to_yaw(place: Vector3, yaw: float, margin: float, timeout: float) -> Task:
-    """Hold a place (m), and look to a yaw, until it is met to a margin (both radians)."""
+    """Hold a place (m), and turn to a yaw until it is met to a margin."""
 
     def steer(_: float, state: State) -> Order | bool:
-        error = abs(_wrapped(yaw - yaw_of(state.orientation)))
+        error = abs(wrapped(yaw - yaw_of(state.orientation)))
         if error <= margin and abs(state.angular_velocity[2]) <= 0.01:
             return True
-        return functools.partial(PositionSetpoint, position=place, yaw=yaw)
+        return functools.partial(PositionSetpoint, position=place, yaw=wrapped(yaw))
 
     return Task(steer, timeout, at_limit=False)
 
 
 def by_yaw_rate(place: Vector3, yaw: float, rate: float, duration: float) -> Task:
     """Hold a place (m), and turn from a yaw at a rate (rad/s) for some seconds."""
+    turn = functools.partial(PositionSetpoint, position=place, yaw_rate=rate)
+    return Task(
+        lambda elapsed, _: functools.partial(turn, yaw=wrapped(yaw + rate * elapsed)), duration
+    )
 
-    def steer(elapsed: float, _: State) -> Order:
-        return functools.partial(
-            PositionSetpoint, position=place, yaw=_wrapped(yaw + rate * elapsed), yaw_rate=rate
-        )
+
+def by_attitude(
+    roll: float, pitch: float, yaw: float, yaw_rate: float, thrust: Thrust, duration: float
+) -> Task:
+    """Hold an attitude, whose yaw turns on at a rate (rad/s), for some seconds."""
+
+    def steer(elapsed: float, state: State) -> Order:
+        attitude = from_rpy(roll, pitch, yaw + yaw_rate * elapsed)
+        return functools.partial(AttitudeSetpoint, orientation=attitude, thrust=thrust(state))
 
     return Task(steer, duration)
 
 
-def turned(x: float, y: float, yaw: float) -> tuple[float, float]:
-    """Return a horizontal vector of the heading's frame in ``map``."""
-    return x * cos(yaw) - y * sin(yaw), x * sin(yaw) + y * cos(yaw)
+def by_rates(rates: Vector3, thrust: Thrust, duration: float) -> Task:
+    """Turn at body rates (rad/s) for some seconds."""
+    order = functools.partial(BodyRateSetpoint, angular_velocity=rates)
+    return Task(lambda _, state: functools.partial(order, thrust=thrust(state)), duration)
+
+
+def at_height(parameters: VehicleParameters, height: float) -> Thrust:
+    """Return the thrust that brings a vehicle to a height (z, m), and holds it there."""
+
+    def thrust(state: State) -> float:
+        down = _LIFT_GAIN * (_to_height(state, height) - state.velocity[2])
+        _, x, y, _ = state.orientation
+        upright = max(1.0 - 2.0 * (x * x + y * y), 0.3)  # the part of it against the weight
+        share = parameters.hover_thrust * (1.0 - down / parameters.gravity) / upright
+        return min(max(share, 0.0), 1.0)
+
+    return thrust
+
+
+def at_throttle(parameters: VehicleParameters, throttle: float) -> Thrust:
+    """Return the thrust of a throttle of AirSim's quadrotor."""
+    share = share_of(parameters, throttle)
+    return lambda _: share
+
+
+def share_of(parameters: VehicleParameters, throttle: float) -> float:
+    """Return the share of our motors' thrust for a throttle of AirSim's quadrotor.
+
+    It is the same multiple of the weight.
+    """
+    return min(max(throttle, 0.0), 1.0) * parameters.hover_thrust / HOVER_THROTTLE
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle in [-π, π)."""
+    return (angle + pi) % (2.0 * pi) - pi
 
 
 def _velocity(velocity: Vector3, yaw_rate: float) -> Order:
     return functools.partial(VelocitySetpoint, velocity=velocity, yaw_rate=yaw_rate)
 
 
-def _to_height(state: State, height: float, fastest: float) -> float:
+def _to_height(state: State, height: float, fastest: float = _FASTEST) -> float:
     """Return the vertical velocity (m/s, down) that brings a vehicle to a height (z, m)."""
-    return min(max(_HEIGHT_GAIN * (height - state.position[2]), -fastest), fastest)
-
-
-def _wrapped(angle: float) -> float:
-    """Return an angle in [-π, π)."""
-    return (angle + pi) % (2.0 * pi) - pi
+    return min(max(_GAIN * (height - state.position[2]), -fastest), fastest)

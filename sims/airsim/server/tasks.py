@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from events import Arm, Armed, Command, Disarmed, Hover, Land, Setpoint, VehicleEvent
 from runtime.schedule import SECOND
+from sims.airsim.server.methods import RpcError
 from sims.airsim.server.vehicles import ServedMultirotor
 from sims.vehicle import State
 
 if TYPE_CHECKING:
     from sims.airsim.server.node import AirsimServer
+
+Reply = asyncio.Future[bool]
 
 RATE = 50
 """Updates of each task in a simulated second."""
@@ -54,8 +57,24 @@ class Tasks:
         self._server = server
         self._slots: dict[str, _Slot] = {}
 
-    def start(self, vehicle: ServedMultirotor, task: Task) -> asyncio.Future[bool]:
-        """Start a task now, and return its result to come; its first order is the next update's.
+    def commanded(self, name: str) -> ServedMultirotor:
+        """Return a vehicle that clients may command.
+
+        Raises:
+            RpcError: They may not, where AirSim would do nothing, or wait for ever; or there is
+                none of that name.
+        """
+        vehicle = self._server.find_multirotor(name)
+        if not vehicle.api_control:
+            raise RpcError(
+                f"vehicle '{vehicle.name}' is not under API control: call enableApiControl first"
+            )
+        if not vehicle.armed:
+            raise RpcError(f"vehicle '{vehicle.name}' is disarmed: call armDisarm first")
+        return vehicle
+
+    def start(self, vehicle: ServedMultirotor, task: Task) -> Reply:
+        """Start a task now, and return the reply to come; its first order is the next update's.
 
         The older task of the vehicle, if any, is cancelled first. A vehicle whose motors are
         stopped is armed; whether the client may is asked before.
