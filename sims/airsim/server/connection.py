@@ -137,7 +137,8 @@ class Connection:
         async def waiting() -> Any:
             return await result
 
-        task = self._loop.create_task(waiting())
+        # A coroutine itself, since one that a cancelled task has not come to await is a warning.
+        task = self._loop.create_task(result if asyncio.iscoroutine(result) else waiting())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -25,6 +25,15 @@ MOST = 64
 
 LONGEST = 100_000_000
 """Bytes of all images of one call: Cosys-AirSim's client takes no more."""
+
+
+class _Exposure(NamedTuple):
+    """One call's images before they are drawn: the state that they show, and what is known."""
+
+    stamp: int
+    qpos: npt.NDArray[np.float64]
+    wanted: tuple[Wanted, ...]
+    responses: list[ImageResponse]
 
 
 class Images:
@@ -68,24 +77,21 @@ class Images:
 
     @rpc("simGetImage")
     def get_image(
-        self,
-        camera: str,
-        image_type: int,
-        vehicle: str,
-        external: bool | str = False,
+        self, caller: Caller, camera: str, image_type: int, vehicle: str, external: bool | str = ""
     ) -> Awaitable[bytes]:
         """Return an image as PNG; it is empty if images of that type are not drawn."""
+        caller.flavour = "airsim" if isinstance(external, bool) else "cosys"
         self._server.cameras.find(self._server.find_vehicle(vehicle), camera, external)
         requests = [ImageRequest(camera, image_type)]
         if image_type not in ImageType.__members__.values():
-            requests = []
             self._server.log.warning("simGetImage: %s", _not_drawn(image_type))
-        responses = self.take(requests, vehicle)
+            requests = []
+        exposure = self._expose(requests, vehicle, caller.flavour)
 
-        async def taken() -> bytes:
-            return b"".join(each.image_data_uint8 for each in await responses)
+        async def png() -> bytes:
+            return b"".join([each.image_data_uint8 for each in await self._develop(exposure)])
 
-        return taken()
+        return png()
 
     def take(
         self,
@@ -108,6 +114,15 @@ class Images:
         Raises:
             RpcError: There is no such vehicle, camera or type, or it is too much.
         """
+        return self._develop(self._expose(requests, vehicle, flavour, external))
+
+    def _expose(
+        self,
+        requests: Sequence[ImageRequest],
+        vehicle: str,
+        flavour: Flavour,
+        external: bool = False,
+    ) -> _Exposure:
         if len(requests) > MOST:
             raise RpcError(f"expected at most {MOST} images of one call, found {len(requests)}")
         on = self._server.find_vehicle(vehicle)
@@ -144,15 +159,10 @@ class Images:
             responses.append(response)
         if length > LONGEST:
             raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")
-        return self._taken(stamp, qpos, tuple(wanted), responses)
+        return _Exposure(stamp, qpos, tuple(wanted), responses)
 
-    async def _taken(
-        self,
-        stamp: int,
-        qpos: npt.NDArray[np.float64],
-        wanted: tuple[Wanted, ...],
-        responses: list[ImageResponse],
-    ) -> list[ImageResponse]:
+    async def _develop(self, exposure: _Exposure) -> list[ImageResponse]:
+        stamp, qpos, wanted, responses = exposure
         if self._waiting >= MOST:
             raise RpcError(f"expected at most {MOST} calls that wait for images")
         self._waiting += 1
