@@ -9,8 +9,7 @@ _ABSENT = {
     r"sim\w*(Lens|Filmback|Foc|CurrentFieldOfView)\w*": "cameras are ideal or have the lens of the "
     "run's file; simSetCameraFov sets the field of view",
     r"simSwapTextures|simSetObjectMaterial\w*": "a world's textures are those of its file",
-    r"simSet(World|Vehicle)?Light\w*": "a world's lights are those of its file",
-    r"simRunConsoleCommand": "there is no Unreal Engine",
+    r"simCreateVoxelGrid": "a server writes no files for its clients",
     r"moveByManual|moveByRC": "there is no remote control",
     r"setSafety": "there are no safety checks",
     r"setCarControls|getCarState|getCarControls": "there are no cars",

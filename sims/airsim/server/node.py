@@ -17,6 +17,7 @@ from events import Announcement, Command, PoseEstimate, Setpoint, VehicleEvent
 from runtime import NodeConfig, Output, Tick, every, on
 from runtime.node import Node
 from runtime.paths import JsonOrPath, NameOrPath
+from sims.airsim.server.accepted import Accepted
 from sims.airsim.server.cameras import Cameras, ServedCamera
 from sims.airsim.server.collisions import Collisions
 from sims.airsim.server.control import Control
@@ -27,6 +28,7 @@ from sims.airsim.server.listener import Listener
 from sims.airsim.server.methods import Table
 from sims.airsim.server.movables import SpareObject, add_movables
 from sims.airsim.server.objects import Objects
+from sims.airsim.server.scenery import Scenery
 from sims.airsim.server.segmentation import Segmentation
 from sims.airsim.server.sensors import SAMPLES, Sensors
 from sims.airsim.server.session import Session
@@ -132,6 +134,8 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 self.segmentation,
                 self.images,
                 self.sensors,
+                Scenery(self),
+                Accepted(self),
                 self.script_estimates,
                 Flight(self),
             ]
