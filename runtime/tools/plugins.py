@@ -21,11 +21,13 @@ from collections.abc import Callable, Sequence
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from runtime.config.model import Config
 from runtime.errors import CommandError, VisnavError
 from runtime.node import Node
+
+if TYPE_CHECKING:
+    from runtime.config.model import Config
 
 COMMANDS = "visnav.commands"
 NODES = "visnav.nodes"
