@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import selectors
-import sys
 import threading
 import time
 from collections import Counter
@@ -20,6 +19,7 @@ from types import FrameType
 import msgspec
 
 from runtime import code_location, lockstep
+from runtime.frames import frame_of
 
 _LONGEST_PAUSE = 0.05
 """Seconds between two looks at most; a run's end waits for the last of them."""
@@ -84,7 +84,7 @@ class LoopWatchdog:
         pause = min(self._limit / 4, _LONGEST_PAUSE)
         while not self._end.is_set():
             time.sleep(pause)  # an `Event.wait` with a time-out costs five times as much
-            frame = sys._current_frames().get(self._thread_id)
+            frame = frame_of(self._thread_id)
             if frame is None or idle(frame):
                 continue
             del frame
@@ -98,7 +98,7 @@ class LoopWatchdog:
                 return
             if self._signed.wait(self._limit) or self._end.is_set():
                 continue
-            node, line = code_location.of_thread(sys._current_frames().get(self._thread_id))
+            node, line = code_location.of_thread(frame_of(self._thread_id))
             self._signed.wait()
             if not self._end.is_set():
                 self._count(Stall(node, line, time.monotonic() - asked))

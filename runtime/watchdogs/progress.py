@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
-import sys
 import threading
 import time
 from collections import Counter
@@ -21,6 +20,7 @@ from typing import Any
 
 from runtime import code_location
 from runtime.errors import NodeTimeoutError
+from runtime.frames import frame_of
 from runtime.lockstep import LockstepLoop
 from runtime.run_state import RunState
 from runtime.stepping import Stepping
@@ -117,7 +117,7 @@ class ProgressWatchdog:
                     self._loop.call_soon_threadsafe(self._loop.call_soon, explain)
                 except RuntimeError:  # closed
                     return ""
-            frame = sys._current_frames().get(self._thread_id)
+            frame = frame_of(self._thread_id)
             if not known and frame is not None and not idle(frame):
                 seen[code_location.of_thread(frame)] += 1
             del frame
@@ -165,7 +165,7 @@ class ProgressWatchdog:
 
     def _interrupt(self) -> None:
         """Raise an error in whatever blocks the loop, by a signal."""
-        node, line = code_location.of_thread(sys._current_frames().get(self._thread_id))
+        node, line = code_location.of_thread(frame_of(self._thread_id))
         if node == "runtime":  # it is not a node that blocks, or does no more
             return
         error = NodeTimeoutError(node, "expected it to give back the loop, found it blocking it")
