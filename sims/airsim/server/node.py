@@ -28,6 +28,7 @@ from sims.airsim.server.listener import Listener
 from sims.airsim.server.methods import Table
 from sims.airsim.server.movables import SpareObject, add_movables
 from sims.airsim.server.objects import Objects
+from sims.airsim.server.recording import Recording, RecordingConfig
 from sims.airsim.server.scenery import Scenery
 from sims.airsim.server.segmentation import Segmentation
 from sims.airsim.server.sensors import SAMPLES, Sensors
@@ -70,6 +71,7 @@ class AirsimServerConfig(NodeConfig):
         camera_processes: Number of processes that render what clients ask for.
         render_threads: Threads of the software renderer in each of them.
         lidar_frame: Frame of lidars' points, as AirSim's ``DataFrame``.
+        recording: What `startRecording` records.
         sensor_names: Names of vehicles' sensors by those by which scripts call them.
         objects: Objects that clients can bring into the world, and take out again.
         movable: Regular expressions: the geoms and bodies of the world, by their whole names,
@@ -89,6 +91,7 @@ class AirsimServerConfig(NodeConfig):
     camera_processes: Count = 1
     render_threads: Count = 1
     lidar_frame: Literal["VehicleInertialFrame", "SensorLocalFrame"] = "VehicleInertialFrame"
+    recording: RecordingConfig = RecordingConfig()
     sensor_names: dict[str, str] = msgspec.field(default_factory=dict)
     objects: tuple[SpareObject, ...] = ()
     movable: tuple[str, ...] = ()
@@ -119,6 +122,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self.segmentation = Segmentation(self)
         self.images = Images(self)
         self.sensors = Sensors(self)
+        self.recording = Recording(self)
         self.script_estimates = Estimates(self)
         self.time = Time(self)
         self.tasks = Tasks(self)
@@ -136,6 +140,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 self.sensors,
                 Scenery(self),
                 Accepted(self),
+                self.recording,
                 self.script_estimates,
                 Flight(self),
             ]
@@ -162,6 +167,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         assert self._listener is not None  # a run that is only checked has no updates
         self._listener.serve(self.table, self.config.flavour)
         self.log.info("AirSim's clients may connect to %s:%d", self.config.host, self.port)
+        await self.recording.begin()
 
     async def on_shutdown(self) -> None:
         """Close all connections."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from sims.airsim.server.cameras import default_mount
 from sims.airsim.settings.keys import Keys
 
 _DEFAULT_NAMES = ("front_center", "front_right", "front_left", "bottom_center", "back_center")
@@ -13,7 +14,7 @@ _TYPES = range(8)
 Table = dict[str, Any]
 
 
-def cameras(vehicle_name: str, vehicle: Keys, settings: Keys) -> list[Table]:
+def cameras(vehicle_name: str, vehicle: Keys, settings: Keys, free: bool) -> list[Table]:
     """Return the cameras of a vehicle; the server knows where AirSim's default ones are.
 
     Those are among them if ``CameraDefaults`` says how they take images.
@@ -22,6 +23,7 @@ def cameras(vehicle_name: str, vehicle: Keys, settings: Keys) -> list[Table]:
         vehicle_name: Its name.
         vehicle: With its ``Cameras``.
         settings: The whole file with ``CameraDefaults``.
+        free: Whether the vehicle is one of the computer-vision mode.
     """
     defaults = settings.table("CameraDefaults")
     usual = _captures(defaults)
@@ -30,7 +32,10 @@ def cameras(vehicle_name: str, vehicle: Keys, settings: Keys) -> list[Table]:
     }
     for name, keys in vehicle.tables("Cameras"):
         captures = usual | _captures(keys)
-        found[name] = {**keys.mount(), "captures": list(captures.values())}
+        found[name] = {
+            **keys.mount(*default_mount(name, free)),
+            "captures": list(captures.values()),
+        }
         looks = {(each["width"], each["height"], each["fov"]) for each in captures.values()}
         if len(looks) > 1:
             keys.note("CaptureSettings", "the types of image differ in size or field of view")

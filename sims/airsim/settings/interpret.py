@@ -5,6 +5,8 @@ Source of keys and defaults: AirLib's ``common/AirSimSettings.hpp`` in AirSim 1.
 
 from __future__ import annotations
 
+import re
+from pathlib import PurePath
 from typing import Any
 
 from sims.airsim.settings.cameras import cameras
@@ -51,6 +53,8 @@ def interpret(keys: Keys, text: str, world: str) -> Table:
         "host": keys.text("LocalHostIp") or "127.0.0.1",
         "port": keys.whole("ApiServerPort", 41451),
         "settings": text,
+        "sensor_names": {},
+        "cameras": [],
     }
     if "Recording" in keys:
         server["recording"] = _recording(keys.table("Recording"))
@@ -60,6 +64,8 @@ def interpret(keys: Keys, text: str, world: str) -> Table:
         nodes.append({"name": "world", "type": "sims.world:World", "wind": {"velocity": velocity}})
     wind.done()
     keys.done()
+    names = {name: ours for name, ours in server["sensor_names"].items() if name not in {"", ours}}
+    server["sensor_names"] = names
     return {"run": {"name": "airsim", "clock": "lockstep", "speed": speed}, "nodes": nodes}
 
 
@@ -84,12 +90,11 @@ def _vehicles(keys: Keys, mode: str, world: str, server: Table) -> list[Table]:
         camera = _is_camera(vehicle, mode)
         node = {"name": name, **_place(vehicle, camera), **common}
         if not camera:
-            node |= sensors(vehicle, keys)
-        served = cameras(name, vehicle, keys)
+            node |= sensors(vehicle, keys, server)
+        served = cameras(name, vehicle, keys, camera)
         if vehicle.flag("AutoCreate", True):
             nodes.append(node)
-            if served:
-                server.setdefault("cameras", []).extend(served)
+            server["cameras"] += served
             if vehicle.flag("IsFpvVehicle"):
                 server["default_vehicle"] = name
         vehicle.done()
@@ -128,12 +133,16 @@ def _place(vehicle: Keys, camera: bool) -> Table:
 
 
 def _recording(keys: Keys) -> Table:
+    """Return the server's setting; recordings stay in the run's folder."""
+    given = keys.text("Folder") or "recording"
+    folder = re.sub(r"[^\w-]", "_", PurePath(given).name, flags=re.ASCII) or "recording"
+    if folder != given:
+        keys.note("Folder", f'it is "{folder}" in the run\'s folder')
     found: Table = {
         "enabled": keys.flag("Enabled"),
         "on_move": keys.flag("RecordOnMove"),
-        "interval": f"{keys.positive('RecordInterval', 0.05)!r}s",
-        "folder": keys.text("Folder"),
-        "images": [],
+        "interval": keys.positive("RecordInterval", 0.05),
+        "folder": folder,
     }
     for entry in keys.entries("Cameras"):
         image = {
@@ -143,7 +152,7 @@ def _recording(keys: Keys) -> Table:
             "compress": entry.flag("Compress", True),
             "vehicle": entry.text("VehicleName"),
         }
-        found["images"].append(image)
+        found.setdefault("images", []).append(image)
         entry.done()
     keys.done()
     return found

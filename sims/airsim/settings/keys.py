@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
+from events import Vector3
 from runtime.errors import ConfigError, suggest
 
 T = TypeVar("T")
+ZERO = (0.0, 0.0, 0.0)
 
 _LARGEST = 1e300
 
@@ -83,15 +85,21 @@ class Keys:
         """Return the numbers of several keys, given with blanks between."""
         return [self.number(key, default) for key in keys.split()]
 
-    def mount(self) -> dict[str, list[float]]:
-        """Return `position` and `orientation` as our cameras and sensors have them, if given."""
-        places = (("position", "X Y Z"), ("orientation", "Roll Pitch Yaw"))
-        given = ((ours, self.numbers(keys, math.nan)) for ours, keys in places)
-        return {
-            ours: [0.0 if math.isnan(each) else each for each in found]
-            for ours, found in given
-            if not all(map(math.isnan, found))
-        }
+    def mount(self, position: Vector3 = ZERO, orientation: Vector3 = ZERO) -> dict[str, Any]:
+        """Return `position` and `orientation` as our cameras and sensors have them, if given.
+
+        Args:
+            position: What is taken of X, Y, Z that are not given, if one is.
+            orientation: What is taken of Roll, Pitch, Yaw.
+        """
+        found: dict[str, Any] = {}
+        places = (("position", "X Y Z", position), ("orientation", "Roll Pitch Yaw", orientation))
+        for ours, keys, usual in places:
+            given = self.numbers(keys, math.nan)
+            if not all(map(math.isnan, given)):
+                pairs = zip(given, usual, strict=True)
+                found[ours] = [other if math.isnan(each) else each for each, other in pairs]
+        return found
 
     def flag(self, key: str, default: bool = False) -> bool:
         """Return true or false."""

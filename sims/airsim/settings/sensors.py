@@ -6,6 +6,7 @@ Where AirSim's defaults differ from ours, they are AirSim's.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -77,8 +78,8 @@ KINDS = {
 """By AirSim's SensorType."""
 
 
-def sensors(vehicle: Keys, settings: Keys) -> dict[str, Any]:
-    """Return the settings of a multirotor's sensors.
+def sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a multirotor's sensors, and add what the server is to know of them.
 
     One that is listed, even if it is not enabled, replaces the default ones of its type.
 
@@ -86,11 +87,13 @@ def sensors(vehicle: Keys, settings: Keys) -> dict[str, Any]:
         vehicle: With its ``Sensors``.
         settings: The whole file with ``DefaultSensors``, if it replaces the built-in defaults: a
             barometer, an IMU, a satellite receiver and a magnetometer.
+        server: Gets `sensor_names`, where AirSim's are not ours, and `lidar_frame`.
     """
     usual: Iterable[tuple[str, Keys]] = settings.tables("DefaultSensors")
     if "DefaultSensors" not in settings:
         builtin = ({"SensorType": type_, "Enabled": True} for type_ in (1, 2, 3, 4))
         usual = (("", Keys(table, "", [])) for table in builtin)
+        server["sensor_names"]["gps"] = "gnss"
     listed = list(_known(vehicle.tables("Sensors")))
     types = {type_ for _, _, type_ in listed}
     found: dict[str, Any] = {}
@@ -99,9 +102,14 @@ def sensors(vehicle: Keys, settings: Keys) -> dict[str, Any]:
         if "Enabled" not in keys:
             keys.note("", "ignored: a sensor is off unless Enabled is true")
         elif enabled and kind.many:
-            found.setdefault(kind.ours, []).append({"name": name} | _settings(keys, type_))
+            ours = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
+            if type_ == 6 and (frame := keys.text("DataFrame")):
+                server["lidar_frame"] = frame
+            found.setdefault(kind.ours, []).append({"name": ours} | _settings(keys, type_))
+            server["sensor_names"][name] = ours
         elif enabled and kind.ours not in found:
             found[kind.ours] = _settings(keys, type_)
+            server["sensor_names"][name] = kind.ours
         elif enabled:
             keys.note("", f"ignored: a vehicle has one {kind.ours}")
     return {"imu": _imu(Keys({}, "", []))} | found  # it always has one

@@ -8,6 +8,7 @@ import itertools
 import socket
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from events import Event
@@ -72,6 +73,7 @@ def with_script(
     duration: float = 60.0,
     inputs: Iterable[Event] = (),
     seed: int = 0,
+    out: Path | None = None,
     **server: Any,
 ) -> NodeResult:
     """Run nodes and a server, whose time is paused unless said otherwise, until a script ends.
@@ -82,6 +84,7 @@ def with_script(
         duration: Simulated seconds after which the run ends at the latest.
         inputs: Events that are sent to the nodes.
         seed: Of the run.
+        out: Folder for its files.
         server: Settings of the server.
     """
     failed: list[BaseException] = []
@@ -111,6 +114,7 @@ def with_script(
         inputs=inputs,
         duration=duration,
         seed=seed,
+        out=out,
     )
     if failed:
         raise failed[0]

@@ -136,6 +136,61 @@ def test_sensors_are_mapped_with_units() -> None:
     assert (top.channels, top.columns, top.rate, top.max_range) == (32, 400, 5.0, 50.0)
     assert (top.azimuths, top.elevations) == ((270.0, 450.0), (-45.0, 10.0))
     assert top.position == (0.0, 0.0, -0.2)
+    server = node(drone(Sensors=sensors), "airsim")
+    assert server.sensor_names == {
+        "gps": "gnss",
+        "Imu1": "imu",
+        "Gps1": "gnss",
+        "Mag": "magnetometer",
+    }
+
+
+def test_lidars_are_called_by_airsims_names_and_give_points_in_the_frame_asked_for() -> None:
+    lidar = {"SensorType": 6, "Enabled": True, "DataFrame": "SensorLocalFrame"}
+    settings = drone(Sensors={"Lidar 1": lidar})
+    assert node(settings, "Drone1").lidars[0].name == "Lidar_1"
+    server = node(settings, "airsim")
+    assert server.sensor_names == {"gps": "gnss", "Lidar 1": "Lidar_1"}
+    assert server.lidar_frame == "SensorLocalFrame"
+
+
+def test_cameras_keep_airsims_defaults_where_nothing_is_said() -> None:
+    captures = [{"ImageType": 0, "Width": 640}, {"ImageType": 1, "FOV_Degrees": 60}]
+    settings = drone(
+        Cameras={
+            "eye": {"X": 0.5, "Pitch": -10, "CaptureSettings": [{"ImageType": 1}]},
+            "front_left": {"NoiseSettings": [{"Enabled": False}]},
+            "front_right": {"X": 0.5, "CaptureSettings": []},
+        }
+    ) | {"CameraDefaults": {"CaptureSettings": captures}}
+    cameras = {each.name: each for each in node(settings, "airsim", 3).cameras}
+    assert set(cameras) == {
+        "eye",
+        "front_center",
+        "front_right",
+        "front_left",
+        "bottom_center",
+        "back_center",
+    }
+    scene, depth = cameras["eye"].captures
+    assert (scene.width, scene.height, scene.fov) == (640, 144, 90.0)
+    assert (depth.image_type, depth.width, depth.fov) == (1, 256, 90.0)  # replaced as a whole
+    assert cameras["eye"].position == (0.5, 0.0, 0.0)
+    assert cameras["eye"].orientation == (0.0, -10.0, 0.0)
+    assert cameras["front_left"].position is None
+    assert cameras["front_right"].position == (0.5, 0.125, 0.0)
+    assert cameras["front_left"].captures[1].fov == 60.0
+    assert cameras["back_center"].vehicle == "Drone1"
+
+
+def test_recordings_stay_in_the_runs_folder() -> None:
+    images = [{"CameraName": "eye", "ImageType": 1, "PixelsAsFloat": True}]
+    settings = {"Recording": {"RecordInterval": 0.2, "Folder": "/a/../b c", "Cameras": images}}
+    recording = node(settings, "airsim", 1).recording
+    assert (recording.interval, recording.folder) == (0.2, "b_c")
+    assert recording.images[0].camera == "eye"
+    assert recording.images[0].pixels_as_float
+    assert node({"Recording": {}}, "airsim").recording == node({}, "airsim").recording
 
 
 @pytest.mark.parametrize(
@@ -175,6 +230,18 @@ def test_cosys_imus_are_without_noise_unless_asked() -> None:
         (drone(RC={"RemoteControlID": 0}), "Vehicles.Drone1.RC: ignored: clients may always"),
         (drone(Sensors={"G": {"SensorType": 3}}), "Sensors.G: ignored: a sensor is off unless"),
         (drone(Sensors={"G": {"SensorType": 7}}), "Sensors.G.SensorType: ignored: no sensor of"),
+        (
+            drone(Cameras={"c": {"CaptureSettings": [{"Width": 640}]}}),
+            "Cameras.c.CaptureSettings: depth, which is not listed, has 256×144 pixels of 90°",
+        ),
+        (
+            drone(Cameras={"c": {"NoiseSettings": [{}, {"Enabled": True}]}}),
+            "Cameras.c.NoiseSettings[1]: ignored: images on demand are without errors",
+        ),
+        (
+            {"CameraDefaults": {"CaptureSettings": [{"ImageType": -1}]}},
+            "CameraDefaults.CaptureSettings[0].ImageType: ignored: no images of type -1 are taken",
+        ),
         (
             drone(Sensors={n: {"SensorType": 3, "Enabled": True} for n in "GH"}),
             "Vehicles.Drone1.Sensors.H: ignored: a vehicle has one gnss",
@@ -218,6 +285,11 @@ def test_vehicles_at_one_place_are_named() -> None:
             drone(Sensors={"I": {"SensorType": 2, "Enabled": True, "GyroBiasStabilityTau": 0}}),
             "Sensors.I.GyroBiasStabilityTau: expected a number above 0, found 0",
         ),
+        (
+            drone(Cameras={"c": {"CaptureSettings": [{"ProjectionMode": "orthographic"}]}}),
+            "CaptureSettings[0].ProjectionMode: expected \"perspective\", found 'orthographic'",
+        ),
+        (drone(Cameras={"c": {"CaptureSettings": [{"FOV_Degrees": 175}]}}), "fov: expected"),
         ({"OriginGeopoint": {"Latitude": 100}}, "origin"),
     ],
 )
