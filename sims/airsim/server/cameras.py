@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from sims.airsim.server.node import AirsimServer
 
 FieldOfView = Annotated[float, msgspec.Meta(ge=1.0, le=170.0)]
+FARTHEST = 1e6
+"""Metres from its vehicle up to which a client may put a camera."""
+
 _DEFAULTS: tuple[tuple[tuple[str, ...], Vector3, Vector3], ...] = (
     (("front_center", "0", "", "fpv"), (0.46, 0.0, 0.0), (0.0, 0.0, 0.0)),
     (("front_right", "1"), (0.46, 0.125, 0.0), (0.0, 0.0, 0.0)),
@@ -77,40 +80,22 @@ class ServedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     captures: tuple[Capture, ...] = ()
 
 
-class Camera:
+class Camera(msgspec.Struct):
     """One camera as clients know it.
 
-    Args:
+    Attributes:
         body: Number of the body that carries it.
         mount: Where on it.
-        specs: How it takes each type of image that it has settings of its own for.
-        other: How it takes all other types.
+        specs: How it takes images, by their type; those of other types as type -1.
     """
 
-    def __init__(
-        self, body: int, mount: Mount, specs: dict[int, CameraSpec], other: CameraSpec
-    ) -> None:
-        self.mount = mount
-        self._body = body
-        self._specs = specs
-        self._other = other
+    body: int
+    mount: Mount
+    specs: dict[int, CameraSpec]
 
     def eye(self, image_type: int) -> Eye:
         """Return what an image of a type is drawn from."""
-        return Eye(self._body, self.mount, self._specs.get(image_type, self._other))
-
-    def specs(self) -> tuple[CameraSpec, ...]:
-        """Return how it takes images, of whatever type."""
-        return *self._specs.values(), self._other
-
-    def set_fov(self, degrees: float) -> None:
-        """Have all types of image taken with another horizontal field of view."""
-
-        def changed(spec: CameraSpec) -> CameraSpec:
-            return msgspec.structs.replace(spec, fov=degrees, intrinsics=None)
-
-        self._specs = {kind: changed(spec) for kind, spec in self._specs.items()}
-        self._other = changed(self._other)
+        return Eye(self.body, self.mount, self.specs.get(image_type, self.specs[-1]))
 
 
 def default_mount(name: str, free: bool) -> tuple[Vector3, Vector3]:
@@ -159,9 +144,10 @@ class Cameras:
             for names, _, _ in _DEFAULTS:
                 if given := {e.name for e in (*entries, *each.config.cameras)} & set(names):
                     server.log.info("%s: %s are one camera, %s", each.name, names, min(given))
-        cameras = [camera for named in self._named.values() for camera in named.values()]
-        sizes = [View(camera_info(s)).largest() for c in cameras for s in c.specs()]
-        width, height = np.max([(1, 1), *sizes], axis=0)
+        specs = [
+            s for named in self._named.values() for c in named.values() for s in c.specs.values()
+        ]
+        width, height = np.max([(1, 1), *(View(camera_info(s)).largest() for s in specs)], axis=0)
         self.largest = int(width), int(height)
 
     def find(self, vehicle: ServedVehicle, name: str, external: object = False) -> Camera:
@@ -194,28 +180,21 @@ class Cameras:
         on = self._server.find_vehicle(vehicle)
         eye = self.find(on, camera, external).eye(0)
         info = camera_info(eye.spec)
-        tangent = info.width / (2.0 * info.fx)
-        if info.width >= info.height:
-            across, down = 1.0 / tangent, info.width / (info.height * tangent)
-        else:
-            across, down = info.height / (info.width * tangent), 1.0 / tangent
-        rows = (
-            (0.0, across, 0.0, 0.0),
-            (0.0, 0.0, -down, 0.0),
-            (0.0, 0.0, 0.0, 10.0),
-            (-1.0, 0.0, 0.0, 0.0),
-        )
+        tangent, longer = info.width / (2.0 * info.fx), max(info.width, info.height)
+        across, down = (longer / (side * tangent) for side in (info.width, info.height))
+        first, second = (0.0, across, 0.0, 0.0), (0.0, 0.0, -down, 0.0)
+        projection = ProjectionMatrix((first, second, (0.0, 0.0, 0.0, 10.0), (-1.0, 0.0, 0.0, 0.0)))
         _, qpos = self._server.drawn_state()
         fov = eye.spec.fov if eye.spec.intrinsics is None else math.degrees(2 * math.atan(tangent))
-        return CameraInfo(self.pose(on, eye, qpos), fov, ProjectionMatrix(rows))
+        return CameraInfo(self.pose(on, eye, qpos), fov, projection)
 
     @rpc("simSetCameraPose", cosys=3)
     def set_pose(self, camera: str, pose: Pose, vehicle: str, external: bool = False) -> None:
         """Set a camera's pose relative to its vehicle; images of the run's own nodes stay."""
-        position, orientation = msgspec.structs.astuple(pose.position), pose.orientation
-        turn = msgspec.structs.astuple(orientation)
-        if not (all(map(math.isfinite, (*position, *turn))) and any(turn)):
-            raise RpcError(f"expected a pose of finite numbers and a rotation, found {pose}")
+        position = msgspec.structs.astuple(pose.position)
+        turn = msgspec.structs.astuple(pose.orientation)
+        if not (all(abs(each) <= FARTHEST for each in (*position, *turn)) and any(turn)):
+            raise RpcError(f"expected a rotation, and numbers up to {FARTHEST:g}, found {pose}")
         found = self.find(self._server.find_vehicle(vehicle), camera, external)
         found.mount = position, normalize(turn)
 
@@ -224,7 +203,11 @@ class Cameras:
         """Set the horizontal field of view of all of a camera's images, 1 to 170 degrees."""
         if not 1.0 <= degrees <= 170.0:
             raise RpcError(f"expected a field of view of 1 to 170 degrees, found {degrees}")
-        self.find(self._server.find_vehicle(vehicle), camera, external).set_fov(degrees)
+        found = self.find(self._server.find_vehicle(vehicle), camera, external)
+        found.specs = {
+            kind: msgspec.structs.replace(spec, fov=degrees, intrinsics=None)
+            for kind, spec in found.specs.items()
+        }
 
     @rpc("simGetDistortionParams", cosys=2)
     def distortion(
@@ -277,32 +260,33 @@ def cameras_by_name(
 
 def camera_of_file(spec: CameraSpec, body: int) -> Camera:
     """Return a camera of a vehicle's own settings, without lens and errors, for all types."""
-    info = camera_info(spec)
-    given = spec.intrinsics if spec.lens is None else (info.fx, info.fy, info.cx, info.cy)
     plain = CameraSpec(
         name=spec.name,
         width=spec.width,
         height=spec.height,
         fov=spec.fov if spec.lens is None else 90.0,
-        intrinsics=given,
+        intrinsics=spec.intrinsics,
         light=spec.light,
     )
-    return Camera(body, _mount(spec.position, spec.orientation), {}, plain)
+    if spec.lens is not None:
+        info = camera_info(spec)
+        plain = msgspec.structs.replace(plain, intrinsics=(info.fx, info.fy, info.cx, info.cy))
+    return Camera(body, _mount(spec.position, spec.orientation), {-1: plain})
 
 
 def _of_entry(entry: ServedCamera, body: int, free: bool) -> Camera:
     """Return a camera of the server's settings."""
     position, orientation = default_mount(entry.name, free)
-    mount = _mount(
-        position if entry.position is None else entry.position,
-        orientation if entry.orientation is None else entry.orientation,
+    mount = _mount(entry.position or position, entry.orientation or orientation)
+    captures = {-1: Capture()} | {each.image_type: each for each in entry.captures}
+    return Camera(
+        body,
+        mount,
+        {
+            kind: CameraSpec(name="view", width=each.width, height=each.height, fov=each.fov)
+            for kind, each in captures.items()
+        },
     )
-    specs = {each.image_type: _spec(each) for each in entry.captures}
-    return Camera(body, mount, specs, _spec(Capture()))
-
-
-def _spec(capture: Capture) -> CameraSpec:
-    return CameraSpec(name="view", width=capture.width, height=capture.height, fov=capture.fov)
 
 
 def _mount(position: Vector3, degrees: Vector3) -> Mount:

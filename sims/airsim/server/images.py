@@ -28,12 +28,12 @@ LONGEST = 100_000_000
 
 
 class _Exposure(NamedTuple):
-    """One call's images before they are drawn: the state that they show, and what is known."""
+    """The images of one call before they are drawn: the state that they show, and what is known."""
 
     stamp: int
     qpos: npt.NDArray[np.float64]
-    wanted: tuple[Wanted, ...]
-    responses: list[ImageResponse]
+    wanted: list[Wanted]
+    known: list[ImageResponse]
 
 
 class Images:
@@ -127,46 +127,40 @@ class Images:
             raise RpcError(f"expected at most {MOST} images of one call, found {len(requests)}")
         on = self._server.find_vehicle(vehicle)
         stamp, qpos = self._server.drawn_state()
-        wanted, responses, length = [], list[ImageResponse](), 0
+        exposure = _Exposure(stamp, qpos, [], [])
+        length = 0
         for each in requests:
             camera = self._server.cameras.find(on, each.camera_name, external)
             if each.image_type not in ImageType.__members__.values():
                 raise RpcError(_not_drawn(each.image_type))
             eye = camera.eye(each.image_type)
-            form: Form = "rgb" if flavour == "cosys" else "bgr"
-            if each.pixels_as_float:
-                form = "float"
-            elif each.compress:
-                form = "png"
-            wanted.append(Wanted(eye, ImageType(each.image_type), form))
-            length += eye.spec.width * eye.spec.height * (5 if form == "float" else 3)
+            form: Form = "png" if each.compress else "rgb" if flavour == "cosys" else "bgr"
+            form = "float" if each.pixels_as_float else form
+            exposure.wanted.append(Wanted(eye, ImageType(each.image_type), form))
             pose = self._server.cameras.pose(on, eye, qpos)
-            response = ImageResponse(
-                camera_position=pose.position,
-                camera_name=each.camera_name,
-                camera_orientation=pose.orientation,
-                time_stamp=stamp,
-                pixels_as_float=each.pixels_as_float,
-                compress=each.compress,
-                width=eye.spec.width,
-                height=eye.spec.height,
-                image_type=each.image_type,
+            width, height = eye.spec.width, eye.spec.height
+            length += width * height * (5 if form == "float" else 3)
+            answer = {
+                name: getattr(each, name)
+                for name in ("camera_name", "image_type", "pixels_as_float", "compress")
+            }
+            answer |= {"camera_position": pose.position, "camera_orientation": pose.orientation}
+            answer |= {"time_stamp": stamp, "width": width, "height": height}
+            exposure.known.append(
+                CosysImageResponse(**answer, annotation_name=each.annotation_name)
+                if flavour == "cosys"
+                else ImageResponse(**answer)
             )
-            if flavour == "cosys":
-                response = CosysImageResponse(
-                    **msgspec.structs.asdict(response), annotation_name=each.annotation_name
-                )
-            responses.append(response)
         if length > LONGEST:
             raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")
-        return _Exposure(stamp, qpos, tuple(wanted), responses)
+        return exposure
 
     async def _develop(self, exposure: _Exposure) -> list[ImageResponse]:
-        stamp, qpos, wanted, responses = exposure
         if self._waiting >= MOST:
             raise RpcError(f"expected at most {MOST} calls that wait for images")
         self._waiting += 1
         try:
+            stamp, qpos, wanted, known = exposure
             ids = self._server.segmentation.ids()
             await self.start()
             assert self._renderer is not None
@@ -175,14 +169,12 @@ class Images:
             raise RpcError(str(error)) from None
         finally:
             self._waiting -= 1
-        return [_filled(*pair) for pair in zip(responses, images, strict=True)]
-
-
-def _filled(response: ImageResponse, image: npt.NDArray[np.uint8]) -> ImageResponse:
-    """Return a response with its image, which is sent as it is."""
-    if response.pixels_as_float:
-        return msgspec.structs.replace(response, image_data_float=msgspec.Raw(image.data))
-    return msgspec.structs.replace(response, image_data_uint8=image.tobytes())
+        return [
+            msgspec.structs.replace(each, image_data_float=msgspec.Raw(image.data))
+            if each.pixels_as_float
+            else msgspec.structs.replace(each, image_data_uint8=image.tobytes())
+            for each, image in zip(known, images, strict=True)
+        ]
 
 
 def _not_drawn(image_type: int) -> str:

@@ -40,6 +40,7 @@ class Segmentation:
         """Return the ID of each geom as it is drawn, and last that of nothing, shape (n + 1,)."""
         return np.maximum(self._ids, 0).astype(np.uint8)
 
+    @rpc("simGetSegmentationObjectID")
     def id_of(self, name: str) -> int:
         """Return the ID of an object, whatever the case of its name; -1 if there is none."""
         known = {each.lower(): geoms for each, geoms in self._objects.items()}
@@ -56,11 +57,6 @@ class Segmentation:
         for each in found:
             self._set(each, min(max(object_id, HIDDEN), 255))
         return bool(found)
-
-    @rpc("simGetSegmentationObjectID")
-    def get_id(self, name: str) -> int:
-        """Return the ID of an object, whatever the case of its name; -1 if there is none."""
-        return self.id_of(name)
 
     def _set(self, name: str, object_id: int) -> None:
         self._ids[list(self._objects[name])] = object_id
