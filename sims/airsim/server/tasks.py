@@ -111,9 +111,8 @@ class Tasks:
         slot = self._slots.setdefault(vehicle.name, _Slot(vehicle))
         if isinstance(event, Armed):
             vehicle.motors_on = True
-        elif isinstance(event, Disarmed):
-            slot.finish(slot.is_landing)
-            vehicle.motors_on = slot.is_landing = False
+        elif isinstance(event, Disarmed):  # its task ends with the next update, unless rearmed
+            vehicle.motors_on = False
             slot.ordered = None
 
     def update(self, stamp: int) -> None:
@@ -127,6 +126,9 @@ class Tasks:
 
     def _steer(self, slot: _Slot, task: Task, stamp: int) -> None:
         elapsed = (stamp - slot.started) / SECOND
+        if not slot.vehicle.motors_on:
+            slot.finish(slot.is_landing)
+            return
         if elapsed >= task.limit:
             slot.finish(task.at_limit)
             return

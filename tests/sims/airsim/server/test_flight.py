@@ -378,6 +378,24 @@ def test_no_number_that_is_none_reaches_a_vehicle(tiny_world: str) -> None:
     )
 
 
+def test_a_reset_ends_the_task_and_the_vehicle_takes_off_again(tiny_world: str) -> None:
+    def script(caller: Caller) -> None:
+        id_ = caller.send("takeoff", 20, "")
+        caller("simContinueForTime", 2.0)
+        assert place(caller)[2] < -0.5
+        caller("reset")
+        assert caller.join(id_) is False
+        with pytest.raises(RefusedError, match="not under API control"):
+            caller("takeoff", 20, "")
+        caller("enableApiControl", True, "")
+        id_ = caller.send("takeoff", 20, "")
+        caller("simContinueForTime", 6.0)
+        assert caller.join(id_) is True
+        assert place(caller) == pytest.approx((0.0, 0.0, -2.0), abs=0.05)
+
+    fly(tiny_world, script, time="paused")
+
+
 def test_without_api_control_a_move_is_refused_instead_of_hanging(tiny_world: str) -> None:
     def script(caller: Caller) -> None:
         for method, arguments in NUMBERS:
@@ -397,13 +415,13 @@ def test_gains_are_accepted(tiny_world: str) -> None:
 
 def test_equal_scripts_give_equal_flights(tiny_world: str) -> None:
     def waiting(caller: Caller) -> None:
-        caller("takeoff", 20, "")
-        caller("moveToPosition", *to(-3, 2, -2, 3))
-        caller("land", 60, "")
+        caller("takeoff", 1.0, "")
+        caller("moveToPosition", *to(-1, 1, -2, 3))
+        caller("hover", "")
 
     def stepping(caller: Caller) -> None:
         caller.send("takeoff", 20, "")
-        caller("simContinueForTime", 3.0)
+        caller("simContinueForTime", 1.0)
         caller.send("moveByVelocity", 1, 0, 0, 2.0, 0, NO_TURN, "")
         caller("simContinueForTime", 0.503)
         caller.send("hover", "")
