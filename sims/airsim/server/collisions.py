@@ -32,11 +32,11 @@ class Collisions:
         self._apart: dict[str, int] = {}
 
     @rpc("simGetCollisionInfo")
-    def collision_info(self, vehicle_name: str) -> CollisionInfo:
+    def collision_info(self, vehicle: str) -> CollisionInfo:
         """Return a vehicle's last collision, and count it as read: ``has_collided`` is cleared."""
-        vehicle = self._server.find_vehicle(vehicle_name)
-        found = vehicle.collision
-        vehicle.collision = msgspec.structs.replace(found, has_collided=False)
+        served = self._server.find_vehicle(vehicle)
+        found = served.collision
+        served.collision = msgspec.structs.replace(found, has_collided=False)
         return found
 
     def forget(self, vehicle: ServedVehicle) -> None:

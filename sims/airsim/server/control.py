@@ -26,30 +26,30 @@ class Control:
         self._server = server
 
     @rpc("enableApiControl")
-    def enable_api_control(self, is_enabled: bool, vehicle_name: str) -> None:
+    def enable_api_control(self, is_enabled: bool, vehicle: str) -> None:
         """Let clients command a vehicle, or not; a vehicle that counts as armed is armed then."""
-        vehicle = self._server.find_vehicle(vehicle_name)
-        vehicle.api_control = is_enabled
-        if is_enabled and vehicle.armed:
-            self._arm(vehicle)
+        served = self._server.find_vehicle(vehicle)
+        served.api_control = is_enabled
+        if is_enabled and served.armed:
+            self._arm(served)
 
     @rpc("isApiControlEnabled")
-    def is_api_control_enabled(self, vehicle_name: str) -> bool:
+    def is_api_control_enabled(self, vehicle: str) -> bool:
         """Return whether clients may command a vehicle."""
-        return self._server.find_vehicle(vehicle_name).api_control
+        return self._server.find_vehicle(vehicle).api_control
 
     @rpc("armDisarm")
-    def arm_disarm(self, arm: bool, vehicle_name: str) -> bool:
+    def arm_disarm(self, arm: bool, vehicle: str) -> bool:
         """Arm, or stop the motors, in the air too; ``False`` without API control."""
-        vehicle = self._server.find_multirotor(vehicle_name)
-        if not vehicle.api_control:
+        served = self._server.find_multirotor(vehicle)
+        if not served.api_control:
             return False
-        vehicle.armed = arm
+        served.armed = arm
         if arm:
-            self._arm(vehicle)
-        elif vehicle.motors_on:
-            vehicle.motors_on = False
-            self._server.order(Disarm, vehicle)
+            self._arm(served)
+        elif served.motors_on:
+            served.motors_on = False
+            self._server.order(Disarm, served)
         return True
 
     @rpc("reset")
@@ -70,30 +70,30 @@ class Control:
         server.objects.reset()
 
     @rpc("simSetVehiclePose")
-    def set_vehicle_pose(self, pose: Pose, ignore_collision: bool, vehicle_name: str) -> None:  # noqa: ARG002
+    def set_vehicle_pose(self, pose: Pose, ignore_collision: bool, vehicle: str) -> None:  # noqa: ARG002
         """Put a vehicle at rest into a pose, whatever is there; if it flies, it stays there.
 
         Numbers that are NaN keep what they stand for.
         """
-        vehicle = self._server.find_vehicle(vehicle_name)
-        self._put(vehicle, _merged(vehicle, KinematicsState(pose.position, pose.orientation)))
+        served = self._server.find_vehicle(vehicle)
+        self._put(served, _merged(served, KinematicsState(pose.position, pose.orientation)))
 
     @rpc("simSetKinematics")
     def set_kinematics(
         self,
         state: KinematicsState,
         ignore_collision: bool,  # noqa: ARG002
-        vehicle_name: str,
+        vehicle: str,
     ) -> None:
         """Put a vehicle into a pose with velocities; accelerations are left to the physics.
 
         Numbers that are NaN keep what they stand for.
         """
-        vehicle = self._server.find_vehicle(vehicle_name)
-        self._put(vehicle, _merged(vehicle, state))
+        served = self._server.find_vehicle(vehicle)
+        self._put(served, _merged(served, state))
 
     @rpc("simAddVehicle")
-    def add_vehicle(self, vehicle_name: str, vehicle_type: str, pose: Pose, pawn_path: str) -> bool:  # noqa: ARG002
+    def add_vehicle(self, name: str, vehicle_type: str, pose: Pose, pawn_path: str) -> bool:  # noqa: ARG002
         """Return ``False``: the vehicles of a run are those of its file."""
         return False
 

@@ -33,70 +33,70 @@ class VehicleState:
         self._server = server
 
     @rpc("getMultirotorState")
-    def multirotor_state(self, vehicle_name: str) -> MultirotorState:
+    def multirotor_state(self, vehicle: str) -> MultirotorState:
         """Return the true state, with its exact stamp, and the last collision."""
-        vehicle = self._server.find_multirotor(vehicle_name)
-        kinematics = vehicle.kinematics()
+        served = self._server.find_multirotor(vehicle)
+        kinematics = served.kinematics()
         return MultirotorState(
-            vehicle.collision,
+            served.collision,
             kinematics,
-            vehicle.geo_point(vehicle.in_map(kinematics.position)),
-            vehicle.stamp,
-            0 if vehicle.landed() else 1,
+            served.geo_point(served.in_map(kinematics.position)),
+            served.stamp,
+            0 if served.landed() else 1,
         )
 
     @rpc("getComputerVisionState")
-    def computer_vision_state(self, vehicle_name: str) -> ComputerVisionState:
+    def computer_vision_state(self, vehicle: str) -> ComputerVisionState:
         """Return a vehicle's true state, of either kind, with its exact stamp."""
-        vehicle = self._server.find_vehicle(vehicle_name)
-        return ComputerVisionState(vehicle.kinematics(), vehicle.stamp)
+        served = self._server.find_vehicle(vehicle)
+        return ComputerVisionState(served.kinematics(), served.stamp)
 
     @rpc("simGetVehiclePose")
-    def vehicle_pose(self, vehicle_name: str) -> Pose:
+    def vehicle_pose(self, vehicle: str) -> Pose:
         """Return a vehicle's true pose in its local frame."""
-        return self._server.find_vehicle(vehicle_name).pose()
+        return self._server.find_vehicle(vehicle).pose()
 
     @rpc("simGetGroundTruthKinematics")
-    def kinematics(self, vehicle_name: str) -> KinematicsState:
+    def kinematics(self, vehicle: str) -> KinematicsState:
         """Return how a vehicle truly moves; the accelerations are those of the physics."""
-        return self._server.find_vehicle(vehicle_name).kinematics()
+        return self._server.find_vehicle(vehicle).kinematics()
 
     @rpc("simGetGroundTruthEnvironment")
-    def environment(self, vehicle_name: str) -> EnvironmentState:
+    def environment(self, vehicle: str) -> EnvironmentState:
         """Return the standard atmosphere, and the world's gravity, where a vehicle is."""
-        vehicle = self._server.find_vehicle(vehicle_name)
-        position = vehicle.state().position
-        place = vehicle.geo_point(position)
+        served = self._server.find_vehicle(vehicle)
+        position = served.state().position
+        place = served.geo_point(position)
         pressure, temperature = pressure_at(place.altitude), temperature_at(place.altitude)
         return EnvironmentState(
-            vehicle.local(position),
+            served.local(position),
             place,
-            Vector3r(0.0, 0.0, -float(vehicle.world.model.opt.gravity[2])),
+            Vector3r(0.0, 0.0, -float(served.world.model.opt.gravity[2])),
             pressure,
             temperature,
             pressure / (GAS_CONSTANT * temperature),
         )
 
     @rpc("getHomeGeoPoint")
-    def home(self, vehicle_name: str) -> GeoPoint:
+    def home(self, vehicle: str) -> GeoPoint:
         """Return where on the earth a vehicle was at the start."""
-        vehicle = self._server.find_vehicle(vehicle_name)
-        return vehicle.geo_point(vehicle.origin)
+        served = self._server.find_vehicle(vehicle)
+        return served.geo_point(served.origin)
 
     @rpc("getRotorStates")
-    def rotors(self, vehicle_name: str) -> RotorStates:
+    def rotors(self, vehicle: str) -> RotorStates:
         """Return speed, thrust and torque of all rotors: front right, rear left, the other two.
 
         Those are front left and rear right. The physics has no speeds: they are those of which the
         IMU's vibration is made.
         """
-        vehicle = self._server.find_multirotor(vehicle_name)
-        vehicle.state()
-        fastest = 2.0 * pi * vehicle.config.imu.vibration.rotor_speed
+        served = self._server.find_multirotor(vehicle)
+        served.state()
+        fastest = 2.0 * pi * served.config.imu.vibration.rotor_speed
         rotors = tuple(
             RotorParameters(fastest * sqrt(max(x, 0.0)), x * motor.max_thrust, x * motor.max_torque)
             for x, motor in zip(
-                vehicle.physics.thrusts.tolist(), vehicle.physics.parameters.motors, strict=True
+                served.physics.thrusts.tolist(), served.physics.parameters.motors, strict=True
             )
         )
-        return RotorStates(vehicle.stamp, rotors)
+        return RotorStates(served.stamp, rotors)

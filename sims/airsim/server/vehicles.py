@@ -134,6 +134,7 @@ class ServedMultirotor(ServedVehicle):
         assert world.simulation is not None
         self.physics = Physics(world.simulation, name)
         self.motors_on = False
+        self._carried = 0.8 * 4.0 * self.physics.parameters.hover_thrust
 
     @property
     def stamp(self) -> int:
@@ -151,11 +152,11 @@ class ServedMultirotor(ServedVehicle):
 
     def landed(self) -> bool:
         """Return whether it stood in that state: something else carried part of its weight."""
-        parameters, state = self.physics.parameters, self.physics.state()
-        thrust = float(self.physics.thrusts.mean())
+        if sum(self.physics.thrusts.tolist()) >= self._carried:
+            return False
+        state = self.physics.state()
         speeds = (*state.velocity, *state.angular_velocity)
-        slow = max(map(abs, speeds)) < LANDED_SPEED
-        return slow and thrust < 0.8 * parameters.hover_thrust and self.physics.touching()
+        return max(map(abs, speeds)) < LANDED_SPEED and self.physics.touching()
 
 
 class ServedFreeCamera(ServedVehicle):
