@@ -202,6 +202,19 @@ def flood(
     _finish(json, flood=rows)
 
 
+@app.command()
+def airsim(
+    json: Json = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Windows of a second of each case.")] = 10,
+) -> None:
+    """Measure how quickly AirSim's server answers, and how late a 400 Hz tick is meanwhile."""
+    from bench.airsim import measure
+
+    with _status() as say:
+        rows = measure(rounds=rounds, progress=say)
+    _finish(json, airsim=rows)
+
+
 @app.command("all")
 def everything(
     out: Annotated[Path, typer.Option(help="Folder for results.json and plots.")],

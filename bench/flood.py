@@ -19,10 +19,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.flooder import TWIST
-from bench.lateness import BEATS, PROBE, LateRow, figures
+from bench.lateness import BEATS, PROBE, LateRow, figures, lateness
 from nodes.ros2_bridge.keys import data_key
 from nodes.ros_messages.topics import Topic
 from nodes.ros_messages.typestore import TypeStore
@@ -32,8 +31,6 @@ from runtime.execute import execute
 RATE = 10_000.0
 WINDOW = 1.0
 """Seconds."""
-EDGE_NS = 30_000_000
-"""At either end of a window, ticks are left out for so long: what was sent may be under way."""
 
 
 class FloodRow(LateRow, frozen=True, kw_only=True):
@@ -129,8 +126,8 @@ def _settings(port: int, seconds: float) -> dict[str, Any]:
 def _row(
     case: str, windows: list[tuple[int, int, int]], quiet: list[tuple[int, int, int]]
 ) -> FloodRow:
-    lates = [_lateness(window) for window in windows]
-    befores = [_lateness(window) for window in quiet]
+    lates = [lateness(window[0], window[1]) for window in windows]
+    befores = [lateness(window[0], window[1]) for window in quiet]
     ratios = [
         np.percentile(late, [50, 99]) / np.percentile(before, [50, 99])
         for late, before in zip(lates, befores, strict=False)
@@ -144,10 +141,3 @@ def _row(
         ratio_p99=ratio_p99,
         **figures(lates),
     )
-
-
-def _lateness(window: tuple[int, int, int]) -> npt.NDArray[np.float64]:
-    """Return how late the ticks of a window were, nanoseconds."""
-    begin, end, _ = window
-    inside = (beat.late for beat in BEATS if begin + EDGE_NS < beat.at < end - EDGE_NS)
-    return np.array([*inside], np.float64)

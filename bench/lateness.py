@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from events import Takeoff
 from runtime import Node, NodeConfig, Output, Tick, every
@@ -42,6 +43,9 @@ class Beat(NamedTuple):
     late: int
     missed: int
 
+
+EDGE_NS = 30_000_000
+"""At either end of a window, ticks are left out for so long: what was sent may be under way."""
 
 BEATS: list[Beat] = []
 """The ticks of the probe of this process; whoever measures clears it."""
@@ -78,3 +82,9 @@ def figures(runs: Sequence[Any]) -> dict[str, Any]:
         "late_p99_us": float(np.median([np.percentile(run, 99) for run in runs])) / 1e3,
         "late_max_us": float(late.max()),
     }
+
+
+def lateness(begin: int, end: int) -> npt.NDArray[np.float64]:
+    """Return how late the ticks of a window of time (monotonic clock, ns) were, nanoseconds."""
+    inside = (beat.late for beat in BEATS if begin + EDGE_NS < beat.at < end - EDGE_NS)
+    return np.array([*inside], np.float64)

@@ -104,3 +104,6 @@ def _goals(results: Results) -> Iterator[tuple[Any, ...]]:
     for flood in results.flood[1:]:
         what = f"{late}, {flood.messages_per_second:,.0f} messages a second"
         yield what, "quiet", "", f"{flood.ratio_p99:.2f}", "≤ 1.5"
+    for asked in results.airsim[1:]:
+        what = f"{late}, AirSim's client asks for {asked.case}"
+        yield what, "quiet", "", f"{asked.ratio_p99:.2f}", "≤ 1.25"

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from bench import (
+    airsim,
     bridge,
     flood,
     held,
@@ -42,6 +43,7 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
     ros_images: list[ros_images.RosImageRow] = []
     recording: list[recording.RecordingRow] = []
     flood: list[flood.FloodRow] = []
+    airsim: list[airsim.AirsimRow] = []
     missing: dict[str, str]
     versions: dict[str, str]
 
@@ -110,4 +112,5 @@ def beside(*, quick: bool, progress: Callable[..., None] = lambda *_: None) -> d
             seconds=3.0 if quick else 5.0, repeats=1 if quick else 9, progress=progress
         ),
         "flood": flood.measure(windows=4 if quick else 30, progress=progress),
+        "airsim": airsim.measure(rounds=1 if quick else 10, progress=progress),
     }
