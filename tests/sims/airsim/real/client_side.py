@@ -207,6 +207,7 @@ def sensors(port: int) -> Any:
     client = connect(port)
     client.simPause(True)
     client.simContinueForTime(5.0)  # a satellite receiver needs three seconds
+    points = np.array(client.getLidarData().point_cloud).reshape(-1, 3)
     imu = client.getImuData()
     gps = client.getGpsData()
     state = client.getMultirotorState()
@@ -219,6 +220,9 @@ def sensors(port: int) -> Any:
         "latitude": gps.gnss.geo_point.latitude,
         "home": client.getHomeGeoPoint().latitude,
         "state_stamp": state.timestamp,
+        "distance": client.getDistanceSensorData().distance,
+        "points": len(points),
+        "lowest": float(points[:, 2].max()),
         "environment": client.simGetGroundTruthEnvironment().air_pressure,
     }
 

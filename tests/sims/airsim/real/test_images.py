@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.sims.airsim.real.environments import CLIENTS
-from tests.sims.airsim.real.rig import flown
+from tests.sims.airsim.real.rig import SERVER, WORLD, flown
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 BOTH = pytest.mark.parametrize("client", CLIENTS)
@@ -66,3 +66,20 @@ def test_images_are_the_runs_own(client: str, tmp_path: Path) -> None:
     assert found["poses"][0][:3] == pytest.approx([0.46, east, down], abs=1e-4)
     assert found["fov"] == pytest.approx(90.0)
     assert found["png"] > 100
+
+
+@BOTH
+def test_a_camera_is_put_where_a_script_says(client: str, tmp_path: Path) -> None:
+    """In computer-vision mode the images after a pose are taken from it."""
+    camera = "[[nodes]]\nname = 'camera'\ntype = 'sims.computer_vision:FreeCamera'\nworld = {}\n"
+    world = tmp_path / "small.xml"
+    world.write_text(WORLD)
+    free = camera.format(f"'{world}'") + "rate = 20\n"
+    text = f"[run]\nname = 'free'\nspeed = 1.0\nduration = '300s'\n{free}{SERVER}"
+    with flown(tmp_path, text=text.format(settings="")) as rig:
+        found = rig.script(client, "computer_vision", str(tmp_path))
+        rig.end()
+    for each, x in zip(found, (0.0, 1.0, 2.0), strict=True):
+        assert each["pose"] == pytest.approx([x, 0.5, -1.0], abs=1e-4)
+        assert each["image"] == pytest.approx([x, x], abs=1e-4), "of the pose that was set"
+        assert each["depth"] == pytest.approx(8.9 - x, abs=1e-3), "the wall is there"

@@ -18,8 +18,13 @@ def test_a_real_client_connects_and_reads_errors(client: str, tmp_path: Path) ->
         assert rig.script(client, "handshake") == {"ping": True, "vehicles": ["drone"]}
         found = rig.script(client, "errors")
         rig.end()
-    unknown, arity, *_ = found["refused"]
+    unknown, arity, vehicle, sensor, camera, control = found["refused"]
     assert unknown == "rpclib: server could not find function 'simNonsense' with argument count 1."
     assert arity.endswith("with an invalid number of arguments. Expected: 1, got: 0")
+    assert "Vehicle API for 'nobody' is not available" in vehicle
+    assert "No IMU with name nothing exist on vehicle" in sensor
+    assert "nowhere" in camera
+    assert "API control" in control or "enableApiControl" in control
+    assert all("threw an exception" in each for each in (vehicle, sensor, camera, control))
     assert found["alive"]
     assert "takeoff" in rig.said, "what a future's join hides is logged"

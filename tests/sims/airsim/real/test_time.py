@@ -25,7 +25,7 @@ def test_a_script_steps_time(client: str, tmp_path: Path) -> None:
     assert found["later"] == found["where"], "nothing moves while time stands"
 
 
-@pytest.mark.parametrize(("time", "script"), [("paused", "stepped")])
+@pytest.mark.parametrize(("time", "script"), [("paused", "stepped"), ("awaited", "hello")])
 def test_equal_scripts_give_equal_runs(time: str, script: str, tmp_path: Path) -> None:
     digests, replies = set(), []
     for number, client in enumerate([*CLIENTS, "airsim"]):
