@@ -65,6 +65,7 @@ class Collisions:
     def _take(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
         """Keep the deepest of some contacts as a collision."""
         contact = max(contacts, key=lambda each: each.depth)
+        other = self._server.objects.name_of(contact.other)
         vehicle.collision = CollisionInfo(
             True,
             contact.depth,
@@ -72,6 +73,6 @@ class Collisions:
             Vector3r(*contact.normal),
             vehicle.local(contact.position),
             vehicle.local(vehicle.state().position),
-            contact.other,
-            self._server.segmentation.id_of(contact.other),
+            other,
+            self._server.segmentation.id_of(other),
         )

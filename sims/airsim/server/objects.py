@@ -118,13 +118,14 @@ class Objects:
         return Pose(Vector3r(*position), Quaternionr(*rotation))
 
     def name_of(self, touched: str) -> str:
-        """Return the name of an object by that of its body: a spare one has another when it is in.
+        """Return the name of the object that a geom or body is of, by its name in the model.
 
-        Any other name is returned as it is.
+        A spare object that is in the world has another one than its body.
         """
-        body = mujoco.mj_name2id(self._world.model, mujoco.mjtObj.mjOBJ_BODY, touched)
-        if body not in self._spares:
-            return touched
+        model = self._world.model
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, touched)
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, touched)
+        body = int(model.geom_bodyid[geom]) if geom >= 0 else body
         return next((name for name, each in self._bodies.items() if each == body), touched)
 
     @rpc("simListSceneObjects")

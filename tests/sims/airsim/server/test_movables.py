@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from events import Odometry
+from runtime.testing import spec
 from sims.airsim.server.movables import (
     Holder,
     SpareObject,
@@ -20,6 +21,7 @@ from sims.airsim.server.movables import (
     set_free,
     spare_objects,
 )
+from sims.computer_vision import FreeCamera
 from sims.vehicle import Simulation, attach_vehicle
 from sims.worlds import Scene, load_scene
 from tests.sims.airsim.scripts import Caller, RefusedError, drone, with_script
@@ -95,6 +97,18 @@ def test_what_cannot_be_brought_in_is_refused(
             airsim("simSetObjectPose", "a", at(0, 0, math.nan), True)
 
     with_script(script, [drone(world=tiny_world)], **CUBES)
+
+
+@pytest.mark.parametrize("asset", ["Cube", "person"])
+def test_a_vehicle_collides_with_what_is_brought_in(asset: str, tiny_world: str) -> None:
+    def script(airsim: Caller) -> None:
+        airsim("simSpawnObject", "obstacle", asset, at(0.0, 0.0, -1.0), ONE, False, False)
+        airsim("simContinueForTime", 1.5)
+        collision = airsim("simGetCollisionInfo", "")
+        assert collision["object_name"] == "obstacle"
+        assert collision["object_id"] == airsim("simGetSegmentationObjectID", "obstacle") > 0
+
+    with_script(script, [drone(world=tiny_world, height=4.0)], **CUBES)
 
 
 _steps = st.lists(
@@ -206,3 +220,30 @@ def test_what_cannot_move_is_named(expression: str) -> None:
     scene = Scene(mujoco.MjSpec.from_string(WORLD))
     with pytest.raises(ValueError, match=f"movable: expected .* {expression}"):
         add_movables(scene, "airsim", (), (expression,))
+
+
+@pytest.mark.parametrize("kind", ["free camera", "drone"])
+def test_images_show_what_is_moved(kind: str, tiny_world: str) -> None:
+    camera = {"name": "eye", "width": 32, "height": 24, "rate": 1}
+    request = {"camera_name": "eye", "image_type": 1, "pixels_as_float": True, "compress": False}
+
+    def script(airsim: Caller) -> None:
+        def ahead() -> float:
+            (image,) = airsim("simGetImages", [request], "", False)
+            return float(np.array(image["image_data_float"]).reshape(24, 32)[11, 16])
+
+        wall = ahead()
+        airsim("simSetObjectPose", "wall", at(7.0, 0.0, -3.0), True)
+        assert ahead() == pytest.approx(wall + 2.0, abs=0.01)
+        airsim("simSpawnObject", "box", "Cube", at(2.0, 0.0, -0.4), ONE, False, False)
+        assert ahead() == pytest.approx(wall - 2.5, abs=0.01)
+        airsim("simDestroyObject", "box")
+        airsim("reset")
+        assert ahead() == pytest.approx(wall, abs=0.01)
+
+    if kind == "drone":
+        nodes = [drone(world=tiny_world, cameras=[camera])]
+    else:
+        settings = {"world": tiny_world, "cameras": [camera], "rate": 1, "position": (0, 0, -0.5)}
+        nodes = [spec(FreeCamera, "camera", settings)]
+    with_script(script, nodes, **CUBES)
