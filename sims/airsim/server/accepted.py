@@ -1,6 +1,6 @@
 """Methods that are accepted, and of which nothing comes: scripts only need them not to fail.
 
-Most are of AirSim's marks, weather and lights. The log names each that is called, once.
+Most are of AirSim's marks, weather, lights and gains. The log names each that is called, once.
 """
 
 from __future__ import annotations
@@ -22,6 +22,10 @@ _LINES = _POINTS | {"thickness": float} | _SHOWN
 _MARKS = "Accept without effect: marks are not drawn."
 _FOG = "Accept without effect: a world's fog is that of its file."
 _LIGHT = "Return ``False``: a world's lights are those of its file."
+_GAINS = (
+    "Accept without effect: gains are settings of the vehicle's node.",
+    {"kp": list[float], "ki": list[float], "kd": list[float], "vehicle_name": str},
+)
 
 ACCEPTED: dict[str, tuple[str, dict[str, Any]]] = {
     "simEnableWeather": (_FOG, {"is_enabled": bool}),
@@ -61,6 +65,10 @@ ACCEPTED: dict[str, tuple[str, dict[str, Any]]] = {
     "simSetWorldLightVisibility": (_LIGHT, {"name": str, "is_visible": bool}),
     "simSetVehicleLightIntensity": (_LIGHT, {"vehicle": str, "name": str, "intensity": float}),
     "simSetVehicleLightVisibility": (_LIGHT, {"vehicle": str, "name": str, "is_visible": bool}),
+    "setAngleRateControllerGains": _GAINS,
+    "setAngleLevelControllerGains": _GAINS,
+    "setVelocityControllerGains": _GAINS,
+    "setPositionControllerGains": _GAINS,
     "simRunConsoleCommand": ("Return ``False``: there is no Unreal Engine.", {"command": str}),
 }
 """What each does, which begins with what it returns, and its parameters."""

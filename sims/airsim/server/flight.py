@@ -113,23 +113,6 @@ def _by_attitude(name: str, does: str, *, turns: bool = False, spins: bool = Fal
     return move
 
 
-def _gains(name: str) -> Any:
-    """Return a handler that tells once that gains cannot be set."""
-
-    @rpc(name)
-    def ignore(
-        self: Flight,
-        kp: list[float],  # noqa: ARG001
-        ki: list[float],  # noqa: ARG001
-        kd: list[float],  # noqa: ARG001
-        vehicle_name: str,
-    ) -> None:
-        """Have no effect: gains are settings of the vehicle's node."""
-        self.ignore(name, vehicle_name)
-
-    return ignore
-
-
 class Flight:
     """Moves of vehicles.
 
@@ -140,7 +123,6 @@ class Flight:
     def __init__(self, server: AirsimServer) -> None:
         self._server = server
         self.tasks = server.tasks
-        self._told: set[str] = set()
 
     by_velocity = _by_velocity("moveByVelocity", "Move at a velocity north, east, down.")
     by_velocity_z = _by_velocity(
@@ -175,10 +157,6 @@ class Flight:
     by_rates = _by_attitude(
         "moveByAngleRatesThrottle", "Turn at body rates at a throttle; 0.587 hovers.", spins=True
     )
-    rate_gains = _gains("setAngleRateControllerGains")
-    level_gains = _gains("setAngleLevelControllerGains")
-    velocity_gains = _gains("setVelocityControllerGains")
-    position_gains = _gains("setPositionControllerGains")
 
     @rpc("moveByMotorPWMs")
     def by_motors(
@@ -335,13 +313,6 @@ class Flight:
         state = vehicle.state()
         rate, yaw = _bounded(vehicle, radians(yaw_rate)), yaw_of(state.orientation)
         return self.tasks.start(vehicle, moves.by_yaw_rate(state.position, yaw, rate, duration))
-
-    def ignore(self, method: str, vehicle_name: str) -> None:
-        """Log, once, that a method has no effect."""
-        self._server.find_multirotor(vehicle_name)
-        if method not in self._told:
-            self._told.add(method)
-            self._server.log.warning("%s has no effect: see the vehicle's `gains`", method)
 
     def _fly_slowly(self, vehicle: ServedMultirotor, place: Vector3, timeout: float) -> Reply:
         path = [vehicle.state().position, place]

@@ -98,11 +98,6 @@ class Tasks:
         if slot := self._slots.get(vehicle):
             slot.finish(False)
 
-    def busy(self, vehicle: str) -> bool:
-        """Return whether a vehicle has a task."""
-        slot = self._slots.get(vehicle)
-        return slot is not None and slot.task is not None
-
     def note(self, event: VehicleEvent) -> None:
         """Take notice of what happened to a vehicle."""
         vehicle = self._server.vehicles.get(event.source)
