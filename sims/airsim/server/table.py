@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import sims.airsim.server
-from sims.airsim.server.methods import Method, methods_of
+from sims.airsim.server.methods import methods_of
 
 HEADING = "## Methods\n"
 
@@ -29,15 +29,17 @@ class Row(NamedTuple):
     description: str
 
 
-def rows() -> Iterator[Row]:
-    """Yield all methods of all groups in this package, by name."""
-    methods: dict[str, Method] = {}
+def groups() -> Iterator[type]:
+    """Yield the classes in this package that have methods."""
     for module in pkgutil.iter_modules(sims.airsim.server.__path__, "sims.airsim.server."):
-        if module.name == __name__:
-            continue
-        for _, group in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
-            if group.__module__ == module.name:
-                methods |= methods_of(group)
+        if module.name != __name__:
+            found = inspect.getmembers(importlib.import_module(module.name), inspect.isclass)
+            yield from (each for _, each in found if each.__module__ == module.name)
+
+
+def rows() -> Iterator[Row]:
+    """Yield all methods, by name."""
+    methods = {name: method for group in groups() for name, method in methods_of(group).items()}
     for name, method in sorted(methods.items(), key=lambda item: item[0].lower()):
         arguments = (f"{each}: {_type_name(hint)}" for each, hint in method.parameters.items())
         yield Row(name, ", ".join(arguments), method.description)

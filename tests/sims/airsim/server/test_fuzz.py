@@ -1,0 +1,145 @@
+"""Whatever clients send, the server answers the next ping, and the run is what it would be."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import typing
+from typing import Annotated, Any
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from runtime.digest import Digest
+from runtime.testing import NodeResult
+from sims.airsim import wire
+from sims.airsim.server.methods import Method, methods_of
+from sims.airsim.server.table import groups
+from tests.sims.airsim.scripts import Caller, drone, with_script
+
+METHODS: dict[str, Method] = {
+    name: method for group in groups() for name, method in methods_of(group).items()
+}
+OUT_OF_BOUNDS = {"simContinueForTime", "simContinueForFrames", "startRecording", "simPause"}
+"""Methods that let time go on, which may take long, or write files."""
+
+NUMBERS = st.one_of(
+    st.floats(), st.integers(-(2**63), 2**64 - 1), st.floats(-10, 10), st.sampled_from([0, 1, -1])
+)
+NAMES = st.one_of(st.sampled_from(["", "drone", "0", "front_center", "ball", ".*"]), st.text())
+ANYTHING = st.recursive(
+    st.one_of(st.none(), st.booleans(), NUMBERS, NAMES, st.binary(max_size=20)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4),
+        st.dictionaries(st.sampled_from(["x_val", "position", "is_rate", "?"]), inner, max_size=3),
+    ),
+    max_leaves=6,
+)
+
+
+def plausible(hint: Any) -> st.SearchStrategy[Any]:
+    """Return values that a client may send for a parameter of this type, and often not of it."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        return plausible(arguments[0])
+    if origin in {list, tuple}:
+        return st.lists(plausible(arguments[0]), max_size=4)
+    if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        fields = typing.get_type_hints(hint)
+        return st.fixed_dictionaries({}, optional={k: plausible(v) for k, v in fields.items()})
+    return {float: NUMBERS, int: NUMBERS, bool: st.booleans(), str: NAMES}.get(hint, ANYTHING)
+
+
+@st.composite
+def calls(draw: st.DrawFn) -> tuple[str, list[Any]]:
+    """Return a method of the table and arguments of which most fit."""
+    name = draw(st.sampled_from(sorted(METHODS.keys() - OUT_OF_BOUNDS)))
+    hints = METHODS[name].parameters.values()
+    arguments = [draw(plausible(hint) if draw(st.integers(0, 9)) else ANYTHING) for hint in hints]
+    return name, arguments[: len(arguments) - (not draw(st.integers(0, 9)))]
+
+
+@st.composite
+def mutated(draw: st.DrawFn) -> bytes:
+    """Return a valid request of a method that only reads, of which a few bytes are others."""
+    name = draw(st.sampled_from(["ping", "getMultirotorState", "simGetVehiclePose", "nothing"]))
+    data = bytearray(wire.request(draw(st.integers(0, 9)), name, [draw(NAMES)]))
+    for _ in range(draw(st.integers(0, 3))):
+        data[draw(st.integers(0, len(data) - 1))] = draw(st.integers(0, 255))
+    return bytes(data)
+
+
+def quickly(examples: int) -> settings:
+    return settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        phases=[Phase.explicit, Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+def test_random_bytes_leave_the_run_as_it_is(tiny_world: str) -> None:
+    def fly(*, attacked: bool) -> NodeResult:
+        def script(airsim: Caller) -> None:
+            @quickly(100)
+            @given(st.lists(st.one_of(st.binary(max_size=60), mutated()), max_size=6))
+            def attack(pieces: list[bytes]) -> None:
+                address = airsim._socket.getpeername()
+                with socket.create_connection(address) as client, contextlib.suppress(OSError):
+                    for piece in pieces:
+                        client.sendall(piece)
+                    assert airsim("ping") is True
+
+            airsim("simContinueForTime", 0.1)
+            if attacked:
+                attack()
+            airsim("simContinueForTime", 0.1)
+
+        return with_script(script, [drone(world=tiny_world)])
+
+    digests = []
+    for attacked in (False, True):
+        digest = Digest()
+        for event in fly(attacked=attacked).sent:
+            digest(None, event)
+        digests.append(digest.hexdigest())
+    assert digests[0] == digests[1]
+
+
+def _attack_methods(examples: int, world: str, caplog: pytest.LogCaptureFixture) -> None:
+    def script(airsim: Caller) -> None:
+        @quickly(examples)
+        @given(st.lists(calls(), min_size=1, max_size=5))
+        def attack(requests: list[tuple[str, list[Any]]]) -> None:
+            with contextlib.closing(Caller(airsim._socket.getpeername()[1])) as client:
+                for name, arguments in requests:
+                    client.send(name, *arguments)
+                client("ping")
+            assert airsim("ping") is True
+
+        attack()
+        airsim("simContinueForTime", 0.05)
+        for name in ("getMultirotorState", "simGetVehiclePose", "getImuData"):
+            if name in METHODS:
+                airsim(name, *[""] * len(METHODS[name].parameters))
+
+    with caplog.at_level(logging.ERROR, logger="visnav"):
+        with_script(script, [drone(world=world)])
+    bugs = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    assert bugs == []
+
+
+def test_any_arguments_of_any_method_are_answered_or_refused(
+    tiny_world: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    _attack_methods(60, tiny_world, caplog)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_very_many_arguments_are(tiny_world: str, caplog: pytest.LogCaptureFixture) -> None:
+    _attack_methods(1500, tiny_world, caplog)
