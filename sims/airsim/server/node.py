@@ -161,6 +161,12 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         """Announce the estimators that clients will be."""
         return self.script_estimates.announce()
 
+    def check(self) -> Iterable[str]:
+        """Return what is wrong with the vehicles that the settings name."""
+        default = self.config.default_vehicle
+        if default and default not in self.vehicles:
+            yield f'default_vehicle: expected one of {", ".join(self.vehicles)}, found "{default}"'
+
     async def run(self) -> None:
         """Serve those who have connected and will; first, let time stand, if it is to."""
         await self.time.begin()

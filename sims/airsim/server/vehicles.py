@@ -185,12 +185,15 @@ class Vehicles(dict[str, ServedVehicle]):
     Args:
         world: The world that they are in.
         default: Name of the one that an empty name stands for; empty for the first by name.
+
+    Attributes:
+        default: As given.
     """
 
     def __init__(self, world: SharedWorld, default: str) -> None:
         super().__init__()
         self._world = world
-        self._default = default
+        self.default = default
 
     def find(self, name: str) -> ServedVehicle:
         """Return a vehicle of either kind.
@@ -198,18 +201,19 @@ class Vehicles(dict[str, ServedVehicle]):
         Raises:
             RpcError: There is none of that name.
         """
-        found = self.get(name or self._default or min(self, default=""))
+        found = self.get(name or self.default or min(self, default=""))
         if found is None:
             raise _unknown("Vehicle Sim-API", name)
         return found
 
     def find_multirotor(self, name: str) -> ServedMultirotor:
-        """Return a multirotor.
+        """Return a multirotor; an empty name may stand for the first one, by name.
 
         Raises:
             RpcError: There is none of that name.
         """
-        found = self.get(name or self._default or min(self, default=""))
+        flying = (each for each in self if isinstance(self[each], ServedMultirotor))
+        found = self.get(name or self.default or min(flying, default=""))
         if not isinstance(found, ServedMultirotor):
             raise _unknown("Vehicle API", name)
         return found

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from events import Disarmed, Event, Imu, Odometry
 from runtime.config.model import NodeSpec
+from runtime.errors import NodeError
 from runtime.testing import spec
 from sims.computer_vision import FreeCamera
 from tests.sims.airsim.scripts import Caller, RefusedError, drone, with_script
@@ -218,6 +219,24 @@ def test_an_empty_name_is_the_default_vehicle_or_the_first_by_name(tiny_world: s
     with_script(script, nodes)
     with_script(script, nodes, default_vehicle="b")
     assert found == pytest.approx([-7.0, 0.0], abs=1e-3)
+
+
+def test_a_default_vehicle_that_is_not_there_is_refused(tiny_world: str) -> None:
+    with pytest.raises(NodeError, match='default_vehicle: expected one of drone, found "x"'):
+        with_script(lambda _: None, [drone(world=tiny_world)], default_vehicle="x")
+
+
+def test_beside_a_free_camera_an_empty_name_still_flies_the_drone(tiny_world: str) -> None:
+    found: dict[str, Any] = {}
+
+    def script(call: Caller) -> None:
+        call("simSetVehiclePose", pose(5.0, 0.0, 0.0), True, "camera")
+        found["camera"] = call("simGetVehiclePose", "")["position"]["x_val"]
+        found["drone"] = call("getMultirotorState", "")["landed_state"]
+        call("reset")
+
+    with_script(script, [free_camera(tiny_world), drone(world=tiny_world)])
+    assert found == {"camera": 5.0, "drone": 0}
 
 
 POSITIONS = st.tuples(*[st.floats(-1e4, 1e4)] * 2, st.floats(-1e4, 50.0))
