@@ -239,7 +239,7 @@ def test_beside_a_free_camera_an_empty_name_still_flies_the_drone(tiny_world: st
     assert found == {"camera": 5.0, "drone": 0}
 
 
-POSITIONS = st.tuples(*[st.floats(-1e4, 1e4)] * 2, st.floats(-1e4, 50.0))
+POSITIONS = st.tuples(*[st.floats(-9e3, 9e3)] * 2, st.floats(-9e3, 50.0))
 SPEEDS = st.tuples(*[st.floats(-50.0, 50.0)] * 3)
 TURNS = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 0.1)
 
