@@ -75,8 +75,10 @@ class Carrot:
         """Take a vehicle's position (m), and return where the carrot is."""
         self._advance_progress(position)
         ahead = min(self.progress + self._lookahead, self.length)
-        # Round a sharp corner, it may be where the vehicle is already: then it runs on.
-        while ahead < self.length and math.dist(self._at(ahead), position) < CLOSE:
+        # Round a sharp corner, it may be where the vehicle is already: then it runs on, up to 5 m.
+        for _ in range(50):
+            if ahead >= self.length or math.dist(self._at(ahead), position) >= CLOSE:
+                break
             ahead = min(ahead + 0.1, self.length)
         self.is_last = ahead >= self.length
         return self._at(ahead)

@@ -105,7 +105,7 @@ def along_path(
         is_there = is_near or not remaining
         if idle > (_SETTLING if is_there else _STUCK):
             return is_there
-        share = 0.0 if is_near else braked(speed, remaining) / apart
+        share = 0.0 if is_near else braked(speed, remaining) / max(apart, CLOSE)
         down = _to_height(state, target[2], speed) if abs(z) <= CLOSE else z * share
         return _velocity((x * share, y * share, down), heading.rate(state, x, y))
 

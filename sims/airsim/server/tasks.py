@@ -103,16 +103,19 @@ class Tasks:
         vehicle = self._server.vehicles.get(event.source)
         if not isinstance(vehicle, ServedMultirotor):
             return
-        slot = self._slots.setdefault(vehicle.name, _Slot(vehicle))
         if isinstance(event, Armed):
             vehicle.motors_on = True
-        elif isinstance(event, Disarmed):  # its task ends with the next update, unless rearmed
+        elif isinstance(event, Disarmed):  # its task ends with the next update, unless armed again
             vehicle.motors_on = False
-            slot.ordered = None
+            if slot := self._slots.get(vehicle.name):
+                slot.ordered = None
 
     def update(self, stamp: int) -> None:
         """Let all tasks steer."""
         for slot in self._slots.values():
+            if not slot.vehicle.motors_on:
+                slot.finish(slot.is_landing)
+                slot.is_landing = False
             if slot.task is not None:
                 self._steer(slot, slot.task, stamp)
             is_over = slot.ordered is not None and stamp - slot.ordered >= HOVER_AFTER
@@ -121,9 +124,6 @@ class Tasks:
 
     def _steer(self, slot: _Slot, task: Task, stamp: int) -> None:
         elapsed = (stamp - slot.started) / SECOND
-        if not slot.vehicle.motors_on:
-            slot.finish(slot.is_landing)
-            return
         if elapsed >= task.limit:
             slot.finish(task.at_limit)
             return

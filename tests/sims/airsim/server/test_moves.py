@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 from collections.abc import Sequence
 
 import msgspec
@@ -106,6 +107,16 @@ def on_segment(a: Vector3, b: Vector3, point: Vector3) -> float:
     inner = sum((q - p) * (r - p) for p, q, r in zip(a, b, point, strict=True))
     share = min(max(inner / square, 0.0), 1.0) if square else 0.0
     return math.dist(point, [p + share * (q - p) for p, q in zip(a, b, strict=True)])
+
+
+def test_a_knot_of_a_path_takes_little_time_and_never_a_division_by_nothing() -> None:
+    """However many corners lie where the vehicle is."""
+    knot = [(0.1 * (i % 2), 0.05 * (i % 3), 0.0) for i in range(100_000)]
+    task = moves.along_path(knot, 1.0, 0.75, Heading(), math.inf)
+    begin = time.process_time()
+    for count in range(100):
+        assert not isinstance(steered(task, count * STEP, at(knot[count])), bool)
+    assert time.process_time() - begin < 1.0
 
 
 @given(st.floats(0.01, 100.0), st.floats(0.0, 1e4))
