@@ -26,6 +26,10 @@ _SKY = 65504.0
 """Metres from which on a depth is none: the greatest half float, which AirSim sends."""
 
 
+Wanted = tuple[str, str]
+"""A camera, and a kind of image."""
+
+
 class ImageSet(NamedTuple):
     """Images of one instant.
 
@@ -37,17 +41,17 @@ class ImageSet(NamedTuple):
     """
 
     stamp: int
-    images: dict[tuple[str, str], npt.NDArray[Any]]
+    images: dict[Wanted, npt.NDArray[Any]]
     poses: dict[str, Pose]
     resampled: list[str]
 
 
-def decode(responses: Any, wanted: Sequence[tuple[str, str]], bgr: bool) -> ImageSet:
+def decode(responses: Any, wanted: Sequence[Wanted], bgr: bool) -> ImageSet:
     """Make arrays of the responses to a request.
 
     Args:
         responses: The result of ``simGetImages``.
-        wanted: Camera and kind of what was asked for, in this order.
+        wanted: What was asked for, in this order.
         bgr: Whether colours come as blue, green, red (AirSim's) and not as red, green, blue.
 
     Raises:
@@ -87,6 +91,12 @@ def decode(responses: Any, wanted: Sequence[tuple[str, str]], bgr: bool) -> Imag
     return result
 
 
+def requests(wanted: Sequence[Wanted], vehicle: str, cosys: bool) -> tuple[Any, ...]:
+    """Return the arguments of ``simGetImages`` for images of one instant."""
+    asked = [ImageRequest(name, _TYPES[kind], kind == "depth", False) for name, kind in wanted]
+    return (asked, vehicle) if cosys else (asked, vehicle, False)
+
+
 class ImageSource:
     """A connection that only asks for images; made in a process of its own.
 
@@ -94,7 +104,7 @@ class ImageSource:
         address: The server's host and port.
         vehicle: Its name on the server.
         cosys: Whether the server is one of Cosys-AirSim's.
-        wanted: Camera and kind of all that is asked for, in one request: of one instant.
+        wanted: What is asked for, in one request.
         limit: Seconds after which a request is given up, and its connection closed.
     """
 
@@ -103,22 +113,18 @@ class ImageSource:
         address: tuple[str, int],
         vehicle: str,
         cosys: bool,
-        wanted: tuple[tuple[str, str], ...],
+        wanted: Sequence[Wanted],
         limit: float,
     ) -> None:
-        self._address, self._cosys, self._limit = address, cosys, limit
-        self._wanted = wanted
-        requests = [
-            ImageRequest(name, _TYPES[kind], kind == "depth", False) for name, kind in wanted
-        ]
-        self._arguments = (requests, vehicle) if cosys else (requests, vehicle, False)
+        self._address, self._bgr, self._limit = address, not cosys, limit
+        self._wanted, self._arguments = wanted, requests(wanted, vehicle, cosys)
         self._ids = itertools.count()
         self._socket: socket.socket | None = None
 
     def fetch(self) -> ImageSet | str:
         """Return a set of images, or why there is none; the next call connects anew if need be."""
         try:
-            return decode(self._call(), self._wanted, not self._cosys)
+            return decode(self._call(), self._wanted, self._bgr)
         except (OSError, wire.WireFormatError) as error:
             if self._socket is not None:
                 self._socket.close()

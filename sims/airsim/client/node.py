@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import math
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable
 from typing import Any, ClassVar, TypeVar
@@ -13,8 +12,6 @@ from typing import Any, ClassVar, TypeVar
 import msgspec
 
 import events as ev
-from events.frames import OPTICAL_TO_FRD
-from events.rotations import multiply
 from runtime import Node, Output, Worker, on
 from runtime.errors import UncheckableError
 from runtime.schedule import SECOND
@@ -23,7 +20,7 @@ from sims.airsim.client import conversion
 from sims.airsim.client.calls import Calls
 from sims.airsim.client.images import ImageSet, ImageSource
 from sims.airsim.client.orders import Orders
-from sims.airsim.client.remote import KnownCamera, ask
+from sims.airsim.client.remote import FRAME, ask
 from sims.airsim.client.rpc import RpcCallError
 from sims.airsim.client.settings import AirsimClientConfig
 from sims.airsim.structures import CollisionInfo, ImuData, MultirotorState
@@ -31,9 +28,6 @@ from sims.airsim.structures import CollisionInfo, ImuData, MultirotorState
 T = TypeVar("T")
 E = TypeVar("E", bound=ev.Event)
 
-FRAME = "base_link"
-_MASS, _THRUST = 1.0, 4 * 4.18
-"""Kilograms and newtons of AirSim's default quadrotor, for which no method asks."""
 _NEW_CLOCK = 600 * SECOND
 """If the server's clock is further ahead after a loss (ns), or is behind, it is another one."""
 _LAST_WORDS = 2.0
@@ -101,58 +95,27 @@ class AirsimClient(Node[AirsimClientConfig]):
             raise
 
     async def _look(self) -> None:
-        limit = float(self.config.call_timeout)
-        self._remote = remote = await ask(self._state.call, self.config, self.log.warning)
-        wanted = tuple((each.name, kind) for each in remote.cameras for kind in each.images)
-        what = self._where, remote.vehicle, remote.cosys, wanted, limit
-        self._source: Worker[ImageSource] = await self.worker(
-            ImageSource, *what, timeout=2.0 * limit + 10.0
-        )
-        first = await self._source.call_for(0.0, ImageSource.fetch)
-        if isinstance(first, str):
-            raise ValueError(f"cameras: expected images from the server, found: {first}")
-        for camera in first.resampled:
+        """Ask for all that is announced; the first images of a server may take their time."""
+        config = self.config
+        call = functools.partial(self._state.call, limit=float(config.start_timeout))
+        self._remote = remote = await ask(call, config, self.name, self.log.warning)
+        for camera in remote.first.resampled:
             self.log.warning("%s: its depth has another size than its image: resampled", camera)
-        self._sizes = {name: array.shape[:2] for (name, _), array in first.images.items()}
         if remote.clock_speed != 1.0 and not self._lockstep:
             self.log.warning(
                 "expected a ClockSpeed of 1 in real time, found %g", remote.clock_speed
             )
+        limit = float(config.call_timeout)
+        what = self._where, remote.vehicle, remote.cosys, remote.wanted, limit
+        self._source: Worker[ImageSource] = await self.worker(
+            ImageSource, *what, timeout=2.0 * limit + 10.0
+        )
 
     def announce(self) -> Iterable[ev.Announcement]:
         """Announce the vehicle, its IMU and its cameras."""
         if self.checking:
             raise UncheckableError("which cameras there are is known to the server only")
-        config, remote = self.config, self._remote
-        state = conversion.odometry(0, self.name, remote.state, remote.origin)
-        yield ev.VehicleAnnouncement(
-            stamp=0,
-            source=self.name,
-            mass=_MASS,
-            max_thrust=_THRUST,
-            control_rate=config.control_rate,
-            position=state.position,
-            orientation=state.orientation,
-        )
-        yield ev.ImuAnnouncement(
-            stamp=0, source=self.name, rate=config.imu_rate, frame_id=FRAME, **remote.imu
-        )
-        for camera in remote.cameras:
-            height, width = self._sizes[camera.name]
-            yield ev.CameraAnnouncement(
-                stamp=0,
-                source=f"{self.name}/{camera.name}",
-                images=camera.images,
-                # AirSim's users have the centre at W/2, from the image's corner. Here whole
-                # coordinates are those of pixels' centres: the same point is at (W - 1)/2.
-                info=ev.CameraInfo.from_fov(width, height, math.radians(camera.fov)),
-                rate=config.image_rate,
-                latency=0.0,
-                frame_id=self._frame(camera),
-                parent_frame_id=FRAME,
-                position=camera.position,
-                orientation=multiply(camera.orientation, OPTICAL_TO_FRD),
-            )
+        return self._remote.announcements
 
     def check(self) -> Iterable[str]:
         """Return why the server's time cannot be led."""
@@ -168,15 +131,15 @@ class AirsimClient(Node[AirsimClientConfig]):
 
     async def run(self) -> None:
         """Send the cameras' poses on the body, then what the server gives, until the end."""
-        for camera in self._remote.cameras:
+        for camera in self._remote.cameras.values():
             self.transforms.send(
                 ev.TransformStamped(
                     stamp=self.clock.now(),
-                    source=f"{self.name}/{camera.name}",
+                    source=camera.source,
                     frame_id=FRAME,
-                    child_frame_id=self._frame(camera),
+                    child_frame_id=camera.frame_id,
                     translation=camera.position,
-                    rotation=multiply(camera.orientation, OPTICAL_TO_FRD),
+                    rotation=camera.orientation,
                     static=True,
                 )
             )
@@ -287,16 +250,16 @@ class AirsimClient(Node[AirsimClientConfig]):
             ("segmentation", self.segmentation_images, ev.SegmentationImage),
             ("rgb", self.images, ev.Image),
         )
-        for camera in self._remote.cameras:
-            known = found.poses[camera.name], self._remote.origin
-            pose = self._made(camera.name, found.stamp, conversion.camera_pose, *known)
+        for name, camera in self._remote.cameras.items():
+            known = found.poses[name], self._remote.origin
+            pose = self._made(name, found.stamp, conversion.camera_pose, *known)
             if pose is None:
                 continue
             self.camera_poses.send(pose)
-            fields: Any = {"source": pose.source, "frame_id": self._frame(camera)}
+            fields: Any = {"source": pose.source, "frame_id": camera.frame_id}
             for kind, output, event in outputs:
-                data = found.images.get((camera.name, kind))
-                if data is not None and data.shape[:2] == self._sizes[camera.name]:
+                data = found.images.get((name, kind))
+                if data is not None and data.shape[:2] == (camera.info.height, camera.info.width):
                     output.send(event(stamp=pose.stamp, **fields, data=data))
                 elif data is not None:
                     self._report(pose.source, f"its {kind} images have another size now")
@@ -306,9 +269,6 @@ class AirsimClient(Node[AirsimClientConfig]):
         if self._orders is not None and self._pose is not None:
             for event in await self._orders.obey(self.clock.now(), self._pose):
                 self.vehicle_events.send(event(stamp=self.clock.now(), source=self.name))
-
-    def _frame(self, camera: KnownCamera) -> str:
-        return f"{self.name}/{camera.name}_optical"
 
     # What the server says, and when it says nothing any more.
 

@@ -1,4 +1,4 @@
-"""What a server says of its vehicle: where it is, its cameras, the noise of its IMU."""
+"""What a server says of its vehicle, as a simulator would announce it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from events import Quaternion, Vector3
+import events as ev
+from events.frames import OPTICAL_TO_FRD
 from events.rotations import inverse, multiply, normalize, rotate_inverse
 from runtime.errors import ConfigError
 from sims.airsim import settings
-from sims.airsim.client.conversion import pose_of, vector
+from sims.airsim.client.conversion import odometry, pose_of, vector
+from sims.airsim.client.images import ImageSet, Wanted, decode, requests
 from sims.airsim.client.rpc import RpcCallError
 from sims.airsim.client.settings import AirsimClientConfig, RemoteCamera
 from sims.airsim.structures import CameraInfo, MultirotorState, Pose
@@ -20,25 +22,10 @@ from sims.airsim.structures import CameraInfo, MultirotorState, Pose
 Call = Callable[..., Awaitable[Any]]
 """Calls a method of the server with its arguments, and gives the result."""
 
+FRAME = "base_link"
 _KINDS = {0: "rgb", 1: "depth", 5: "segmentation", 7: "segmentation"}
-
-
-class KnownCamera(NamedTuple):
-    """A camera of the server's.
-
-    Attributes:
-        name: Its name there.
-        images: What is asked for.
-        fov: Horizontal field of view, degrees.
-        position: On the body, metres FRD.
-        orientation: From the camera's axes, forward, right, down, to the body's.
-    """
-
-    name: str
-    images: tuple[str, ...]
-    fov: float
-    position: Vector3
-    orientation: Quaternion
+_MASS, _THRUST = 1.0, 4 * 4.18
+"""Kilograms and newtons of AirSim's default quadrotor, for which no method asks."""
 
 
 class Remote(NamedTuple):
@@ -47,24 +34,27 @@ class Remote(NamedTuple):
     Attributes:
         vehicle: Its name there.
         cosys: Whether the server is Cosys-AirSim's.
-        state: Its state at the start.
         origin: Origin of its local frame in ``map``, metres NED.
-        cameras: Those that images are asked of.
-        imu: Noise of its IMU, SI units, named as in `events.ImuAnnouncement`.
         clock_speed: Simulated seconds per real second.
+        wanted: What is asked for at each request for images.
+        first: The images of the first one.
+        announcements: The vehicle, its IMU, and then its cameras by their names.
     """
 
     vehicle: str
     cosys: bool
-    state: MultirotorState
-    origin: Vector3
-    cameras: tuple[KnownCamera, ...]
-    imu: dict[str, Any]
+    origin: ev.Vector3
     clock_speed: float
+    wanted: tuple[Wanted, ...]
+    first: ImageSet
+    announcements: tuple[ev.Announcement, ...]
+    cameras: dict[str, ev.CameraAnnouncement]
 
 
-async def ask(call: Call, config: AirsimClientConfig, log: Callable[[str], None]) -> Remote:
-    """Ask a server for all that is to be announced.
+async def ask(
+    call: Call, config: AirsimClientConfig, name: str, log: Callable[[str], None]
+) -> Remote:
+    """Ask a server for all that a node of a name is to announce.
 
     Raises:
         RpcCallError: The server refused a call.
@@ -86,19 +76,58 @@ async def ask(call: Call, config: AirsimClientConfig, log: Callable[[str], None]
         if each["vehicle"] == vehicle
     }
     state = msgspec.convert(await call("getMultirotorState", vehicle), MultirotorState)
-    body = Pose(state.kinematics_estimated.position, state.kinematics_estimated.orientation)
-    cameras = [
-        await _camera(call, each, vehicle, cosys, captured.get(each.name, {}), body)
-        for each in config.cameras or _cameras(captured)
-    ]
+    kinematics = state.kinematics_estimated
+    body = pose_of(Pose(kinematics.position, kinematics.orientation))
+    origin = await _origin(call, own, vehicle, cosys, body[0])
+    place = odometry(0, name, state, origin)
+    announced = ev.VehicleAnnouncement(
+        stamp=0,
+        source=name,
+        mass=_MASS,
+        max_thrust=_THRUST,
+        control_rate=config.control_rate,
+        position=place.position,
+        orientation=place.orientation,
+    )
+    imu = ev.ImuAnnouncement(
+        stamp=0, source=name, rate=config.imu_rate, frame_id=FRAME, **_noise(own)
+    )
+    wished = config.cameras or _cameras(captured)
+    wanted = tuple((each.name, kind) for each in wished for kind in each.images)
+    taken = await call("simGetImages", *requests(wanted, vehicle, cosys))
+    first = decode(taken, wanted, not cosys)
+    cameras = {}
+    for each in wished:
+        found = await call("simGetCameraInfo", each.name, vehicle, *(() if cosys else (False,)))
+        info = msgspec.convert(found, CameraInfo)
+        height, width = first.images[each.name, each.images[0]].shape[:2]
+        # By the settings: AirSim reports another one.
+        fov = math.radians(captured.get(each.name, {}).get(0, {}).get("fov", info.fov))
+        (x, y, z), turn = pose_of(info.pose)
+        apart = x - body[0][0], y - body[0][1], z - body[0][2]
+        cameras[each.name] = ev.CameraAnnouncement(
+            stamp=0,
+            source=f"{name}/{each.name}",
+            images=each.images,
+            # AirSim's users have the centre at W/2, from the image's corner. Here whole
+            # coordinates are those of pixels' centres: the same point is at (W - 1)/2.
+            info=ev.CameraInfo.from_fov(width, height, fov),
+            rate=config.image_rate,
+            latency=0.0,
+            frame_id=f"{name}/{each.name}_optical",
+            parent_frame_id=FRAME,
+            position=rotate_inverse(body[1], apart),
+            orientation=normalize(multiply(multiply(inverse(body[1]), turn), OPTICAL_TO_FRD)),
+        )
     return Remote(
-        vehicle=vehicle,
-        cosys=cosys,
-        state=state,
-        origin=await _origin(call, own, vehicle, cosys, vector(body.position)),
-        cameras=tuple(cameras),
-        imu=_noise(own),
-        clock_speed=said["run"]["speed"],
+        vehicle,
+        cosys,
+        origin,
+        said["run"]["speed"],
+        wanted,
+        first,
+        (announced, imu, *cameras.values()),
+        cameras,
     )
 
 
@@ -129,26 +158,9 @@ def _cameras(captured: dict[str, dict[int, Any]]) -> list[RemoteCamera]:
     return cameras or [RemoteCamera(name="0")]
 
 
-async def _camera(
-    call: Call, wanted: RemoteCamera, vehicle: str, cosys: bool, captures: Any, body: Pose
-) -> KnownCamera:
-    """Return a camera: its field of view by the settings, since AirSim reports another one."""
-    found = await call("simGetCameraInfo", wanted.name, vehicle, *(() if cosys else (False,)))
-    info = msgspec.convert(found, CameraInfo)
-    (here, turned), (place, turn) = pose_of(body), pose_of(info.pose)
-    apart = (place[0] - here[0], place[1] - here[1], place[2] - here[2])
-    return KnownCamera(
-        wanted.name,
-        wanted.images,
-        captures.get(0, {}).get("fov", info.fov),
-        rotate_inverse(turned, apart),
-        normalize(multiply(inverse(turned), turn)),
-    )
-
-
 async def _origin(
-    call: Call, own: dict[str, Any], vehicle: str, cosys: bool, local: Vector3
-) -> Vector3:
+    call: Call, own: dict[str, Any], vehicle: str, cosys: bool, local: ev.Vector3
+) -> ev.Vector3:
     """Return where a vehicle's local frame is: by where its pawn is, or else by the settings."""
     try:
         found = await call("simGetObjectPose", vehicle, *((True,) if cosys else ()))

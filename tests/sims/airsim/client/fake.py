@@ -1,10 +1,16 @@
-"""A small server whose answers a test scripts, on a loop of its own in a thread."""
+"""A small server whose answers a test scripts, on a loop of its own in a thread.
+
+As a program (``python -m tests.sims.airsim.client.fake WIDTH HEIGHT``) it prints its port, and its
+images take 80 ms each, as those of an Unreal Engine do.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -42,6 +48,7 @@ class FakeServer:
         methods: By name; a test puts others in.
         calls: All calls in order, with their arguments.
         time: Nanoseconds of its clock.
+        late: Seconds that images take.
         port: Where it listens.
     """
 
@@ -72,6 +79,7 @@ class FakeServer:
         self.time = START
         self.velocity = Vector3r()
         self.size = 8, 4
+        self.late = 0.0
         self._writers: set[asyncio.StreamWriter] = set()
         self.port = 0
 
@@ -167,4 +175,37 @@ class FakeServer:
             return
         except ValueError as error:
             answer = wire.reply(request.id, str(error), None)
-        writer.write(answer)
+        if request.method == "simGetImages" and self.late:
+            asyncio.get_running_loop().call_later(self.late, writer.write, answer)
+        else:
+            writer.write(answer)
+
+
+def main() -> None:
+    """Serve in real time, with images that take 80 ms, until standard input ends."""
+    server = FakeServer()
+    server.size = int(sys.argv[1]), int(sys.argv[2])
+    server.late = 0.08
+    state, sample, images = (
+        server.methods[name] for name in ("getMultirotorState", "getImuData", "simGetImages")
+    )
+
+    def now(method: Callable[..., Any]) -> Callable[..., Any]:
+        def answer(*arguments: Any) -> Any:
+            server.time = time.time_ns()
+            return method(*arguments)
+
+        return answer
+
+    server.methods |= {
+        "getMultirotorState": now(state),
+        "getImuData": now(sample),
+        "simGetImages": now(images),
+    }
+    with server.serving():
+        print(server.port, flush=True)
+        sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main()
