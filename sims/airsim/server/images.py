@@ -46,11 +46,7 @@ class Images:
         self._waiting = 0
 
     async def start(self) -> None:
-        """Start what renders, unless that is done.
-
-        Raises:
-            GraphicsError: This machine cannot render.
-        """
+        """Start what renders, unless that is done."""
         async with self._starting:
             if self._renderer is None:
                 server = self._server

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,9 +58,6 @@ class Renderer:
         size: Width and height of the largest drawing, pixels.
         threads: Threads of the software renderer, if this is the process's first GL context.
         dynamics: What moves in the world by itself.
-
-    Raises:
-        GraphicsError: There is no GL; the message names what to install.
     """
 
     def __init__(
@@ -74,7 +71,7 @@ class Renderer:
         keep_memory()
         self._model: Any = model_from_bytes(model_bytes)
         self._camera = int(self._model.camera(camera).id)
-        self._stage = Stage(self._model, *size, threads, dynamics)
+        self._make = partial(Stage, self._model, *size, threads, dynamics)
 
     def take(
         self, stamp: int, qpos: Floats, ids: npt.NDArray[np.uint8], wanted: Sequence[Wanted]
@@ -88,6 +85,9 @@ class Renderer:
             qpos: The state, shape (nq,).
             ids: Segmentation ID of each object number, and last of nothing, shape (ngeom + 1,).
             wanted: The images.
+
+        Raises:
+            GraphicsError: There is no GL; the message names what to install.
         """
         self._stage.enter()
         images: dict[int, npt.NDArray[np.uint8]] = {}
@@ -101,7 +101,12 @@ class Renderer:
 
     def close(self) -> None:
         """Give the GL context back."""
-        self._stage.close()
+        if "_stage" in self.__dict__:
+            self._stage.close()
+
+    @cached_property
+    def _stage(self) -> Stage:
+        return self._make()  # by the first images: without GL, all else is served
 
     def _see(
         self,

@@ -246,3 +246,15 @@ def test_a_client_may_leave_and_the_next_one_is_served(tiny_world: str) -> None:
         assert len(images(call, request("eye", 0))) == 1
 
     with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
+
+
+def test_without_gl_all_else_is_served(tiny_world: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")  # in the worker
+
+    def script(call: Caller) -> None:
+        for _ in range(2):
+            with pytest.raises(RefusedError, match="cannot render: expected a working EGL"):
+                images(call, request("eye", 0))
+        assert call("ping") is True
+
+    with_script(script, [drone(world=tiny_world)], cameras=CAMERAS)
