@@ -6,6 +6,7 @@ the plane that touches the ellipsoid's parallel surface at the origin.
 
 from __future__ import annotations
 
+import functools
 from math import atan2, cos, degrees, hypot, radians, sin, sqrt
 
 from events.base import Vector3
@@ -51,10 +52,11 @@ def from_ecef(point: Vector3) -> Geodetic:
 
 def to_geodetic(position: Vector3, origin: Geodetic) -> Geodetic:
     """Return where a position in ``map`` (metres NED) is, for an origin of ``map``."""
-    axes, start = _axes(origin), to_ecef(origin)
+    (north, east, down), start = _frame(origin)
+    n, e, d = position
     x, y, z = (
-        start[i] + sum(part * axis[i] for part, axis in zip(position, axes, strict=True))
-        for i in range(3)
+        begin + (n * along + e * across + d * below)
+        for begin, along, across, below in zip(start, north, east, down, strict=True)
     )
     return from_ecef((x, y, z))
 
@@ -64,6 +66,12 @@ def from_geodetic(place: Geodetic, origin: Geodetic) -> Vector3:
     apart = [a - b for a, b in zip(to_ecef(place), to_ecef(origin), strict=True)]
     x, y, z = (sum(a * b for a, b in zip(axis, apart, strict=True)) for axis in _axes(origin))
     return (x, y, z)
+
+
+@functools.lru_cache(maxsize=16)
+def _frame(origin: Geodetic) -> tuple[tuple[Vector3, Vector3, Vector3], Vector3]:
+    """Return the axes at an origin, and its own place."""
+    return _axes(origin), to_ecef(origin)
 
 
 def _axes(origin: Geodetic) -> tuple[Vector3, Vector3, Vector3]:

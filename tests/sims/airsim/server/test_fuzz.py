@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import socket
 import typing
 from typing import Annotated, Any
@@ -29,7 +30,9 @@ OUT_OF_BOUNDS = {"simContinueForTime", "simContinueForFrames", "startRecording",
 NUMBERS = st.one_of(
     st.floats(), st.integers(-(2**63), 2**64 - 1), st.floats(-10, 10), st.sampled_from([0, 1, -1])
 )
-NAMES = st.one_of(st.sampled_from(["", "drone", "0", "front_center", "ball", ".*"]), st.text())
+NAMES = st.one_of(
+    st.sampled_from(["", "drone"]), st.sampled_from(["0", "front_center", "ball", ".*"]), st.text()
+)
 ANYTHING = st.recursive(
     st.one_of(st.none(), st.booleans(), NUMBERS, NAMES, st.binary(max_size=20)),
     lambda inner: st.one_of(
@@ -115,17 +118,16 @@ def _attack_methods(examples: int, world: str, caplog: pytest.LogCaptureFixture)
         @quickly(examples)
         @given(st.lists(calls(), min_size=1, max_size=5))
         def attack(requests: list[tuple[str, list[Any]]]) -> None:
+            airsim("enableApiControl", True, "")
             with contextlib.closing(Caller(airsim._socket.getpeername()[1])) as client:
                 for name, arguments in requests:
                     client.send(name, *arguments)
                 client("ping")
-            assert airsim("ping") is True
+            airsim("simContinueForTime", 0.03)  # for tasks to steer
+            position = airsim("simGetVehiclePose", "drone")["position"]
+            assert all(map(math.isfinite, position.values())), requests
 
         attack()
-        airsim("simContinueForTime", 0.05)
-        for name in ("getMultirotorState", "simGetVehiclePose", "getImuData"):
-            if name in METHODS:
-                airsim(name, *[""] * len(METHODS[name].parameters))
 
     with caplog.at_level(logging.ERROR, logger="visnav"):
         with_script(script, [drone(world=world)])
