@@ -3,47 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
-from events import (
-    Announcement,
-    BarometerAnnouncement,
-    Event,
-    FluidPressure,
-    Imu,
-    ImuAnnouncement,
-    LidarAnnouncement,
-    LidarScan,
-    MagneticField,
-    MagnetometerAnnouncement,
-    NavSatAnnouncement,
-    NavSatFix,
-    Quaternion,
-    Range,
-    RangeAnnouncement,
-    Vector3,
-)
+from events import Announcement, Event, announcements, sensors
 from events.rotations import multiply, rotate
-from sims.airsim import wire
+from sims.airsim import structures, wire
 from sims.airsim.server.methods import Caller, RpcError, rpc
 from sims.airsim.server.vehicles import ServedMultirotor
-from sims.airsim.structures import (
-    BarometerData,
-    CosysLidarData,
-    DistanceSensorData,
-    GeoPoint,
-    GnssReport,
-    GpsData,
-    ImuData,
-    LidarData,
-    MagnetometerData,
-    Pose,
-    Quaternionr,
-    Vector3r,
-)
+from sims.airsim.structures import GeoPoint, Pose, Quaternionr, Vector3r
 from sims.sensors.barometer import altitude_at
 from sims.vehicle import TIMESTEP_NS
 
@@ -56,25 +26,11 @@ GAUSS = 1e-4
 MOST_UNCERTAIN_2D = 4.0
 """Metres of horizontal uncertainty up to which AirSim's receiver has a fix in the plane."""
 
-SAMPLES = (Imu, FluidPressure, MagneticField, NavSatFix, Range, LidarScan)
-"""Events that are samples of sensors."""
-
-Sensor = (
-    ImuAnnouncement
-    | BarometerAnnouncement
-    | MagnetometerAnnouncement
-    | NavSatAnnouncement
-    | RangeAnnouncement
-    | LidarAnnouncement
+SAMPLES = (
+    *(sensors.Imu, sensors.FluidPressure, sensors.MagneticField),
+    *(sensors.NavSatFix, sensors.Range, sensors.LidarScan),
 )
-A = TypeVar("A", bound=Sensor)
-
-
-class _Newest(NamedTuple):
-    """A sensor's newest sample, and the vehicle's orientation at its time."""
-
-    sample: Any
-    orientation: Quaternion
+"""Events that are samples of sensors."""
 
 
 class Sensors:
@@ -85,119 +41,128 @@ class Sensors:
 
     def __init__(self, server: AirsimServer) -> None:
         self._server = server
-        self._announced: dict[str, Sensor] = {}
-        self._newest: dict[str, _Newest] = {}
+        self._announced: dict[str, Announcement] = {}
+        self._newest: dict[str, Any] = {}
+        self._orientations: dict[str, Quaternionr] = {}
 
     def announced(self, announcement: Announcement) -> None:
         """Take note of a vehicle's sensor."""
         vehicle = self._server.vehicles.get(announcement.source.partition("/")[0])
-        if not isinstance(vehicle, ServedMultirotor) or not isinstance(announcement, Sensor):
-            return
-        self._announced[announcement.source] = announcement
-        if isinstance(announcement, LidarAnnouncement):  # a turn, and one until the next is there
-            self._server.world.remember(2.1 / announcement.rate + announcement.latency)
+        if isinstance(vehicle, ServedMultirotor):
+            self._announced[announcement.source] = announcement
+            if isinstance(announcement, announcements.LidarAnnouncement):
+                # A turn, and one until the next is there.
+                self._server.world.remember(2.1 / announcement.rate + announcement.latency)
 
     def note(self, sample: Event) -> None:
-        """Take note of a sample."""
+        """Take note of a sample, and with an IMU's of the true orientation at its stamp."""
         if sample.source in self._announced:
-            vehicle = self._server.find_multirotor(sample.source.partition("/")[0])
-            self._newest[sample.source] = _Newest(sample, vehicle.physics.state().orientation)
+            self._newest[sample.source] = sample
+            if isinstance(sample, sensors.Imu):
+                vehicle = self._server.find_multirotor(sample.source.partition("/")[0])
+                turn = Quaternionr(*vehicle.physics.state().orientation)
+                self._orientations[sample.source] = turn
 
     @rpc("getImuData")
-    def imu(self, name: str, vehicle: str = "") -> ImuData:
+    def imu(self, name: str, vehicle: str = "") -> structures.ImuData:
         """Return the newest sample of an IMU, with the true orientation at its stamp."""
-        sensor = self._find(ImuAnnouncement, "IMU", name, vehicle)
-        if (newest := self._newest.get(sensor.source)) is None:
-            return ImuData(
-                orientation=Quaternionr(*self._server.find_multirotor(vehicle).state().orientation)
-            )
-        sample = newest.sample
-        return ImuData(
-            time_stamp=sample.stamp,
-            orientation=Quaternionr(*newest.orientation),
-            angular_velocity=Vector3r(*sample.angular_velocity),
-            linear_acceleration=Vector3r(*sample.linear_acceleration),
+        sensor, sample = self._read(announcements.ImuAnnouncement, "IMU", name, vehicle)
+        if sample is None:
+            turn = self._server.find_multirotor(vehicle).state().orientation
+            return structures.ImuData(orientation=Quaternionr(*turn))
+        return structures.ImuData(
+            sample.stamp,
+            self._orientations[sensor.source],
+            Vector3r(*sample.angular_velocity),
+            Vector3r(*sample.linear_acceleration),
         )
 
     @rpc("getBarometerData")
-    def barometer(self, name: str, vehicle: str = "") -> BarometerData:
+    def barometer(self, name: str, vehicle: str = "") -> structures.BarometerData:
         """Return the newest pressure of a barometer, and the altitude at QNH 1013.25 hPa."""
-        sensor = self._find(BarometerAnnouncement, "barometer", name, vehicle)
-        if (newest := self._newest.get(sensor.source)) is None:
-            return BarometerData()
-        pressure = newest.sample.fluid_pressure
-        return BarometerData(newest.sample.stamp, altitude_at(pressure), pressure)
+        kind = announcements.BarometerAnnouncement
+        _, sample = self._read(kind, "barometer", name, vehicle)
+        if sample is None:
+            return structures.BarometerData()
+        pressure = sample.fluid_pressure
+        return structures.BarometerData(sample.stamp, altitude_at(pressure), pressure)
 
     @rpc("getMagnetometerData")
-    def magnetometer(self, name: str, vehicle: str = "") -> MagnetometerData:
+    def magnetometer(self, name: str, vehicle: str = "") -> structures.MagnetometerData:
         """Return the newest field of a magnetometer, Gauss; the covariance is empty."""
-        sensor = self._find(MagnetometerAnnouncement, "magnetometer", name, vehicle)
-        if (newest := self._newest.get(sensor.source)) is None:
-            return MagnetometerData()
-        x, y, z = newest.sample.magnetic_field
-        return MagnetometerData(newest.sample.stamp, Vector3r(x / GAUSS, y / GAUSS, z / GAUSS))
+        kind = announcements.MagnetometerAnnouncement
+        _, sample = self._read(kind, "magnetometer", name, vehicle)
+        if sample is None:
+            return structures.MagnetometerData()
+        field = Vector3r(*(component / GAUSS for component in sample.magnetic_field))
+        return structures.MagnetometerData(sample.stamp, field)
 
     @rpc("getGpsData")
-    def gps(self, name: str, vehicle: str = "") -> GpsData:
+    def gps(self, name: str, vehicle: str = "") -> structures.GpsData:
         """Return the newest fix of a satellite receiver; `eph` and `epv` are standard deviations.
 
         Its name is ``gps``, as AirSim calls it by default, or ``gnss``.
         """
         name = "gnss" if name == "gps" else name
-        sensor = self._find(NavSatAnnouncement, "gps", name, vehicle)
-        if (newest := self._newest.get(sensor.source)) is None:
-            return GpsData()
-        fix = newest.sample
+        _, fix = self._read(announcements.NavSatAnnouncement, "gps", name, vehicle)
+        if fix is None:
+            return structures.GpsData()
         covariance = fix.position_covariance or (0.0,) * 9
         eph, epv = math.sqrt(covariance[0]), math.sqrt(covariance[8])
-        report = GnssReport(
-            geo_point=GeoPoint(fix.latitude, fix.longitude, fix.altitude),
-            eph=eph,
-            epv=epv,
-            velocity=Vector3r(*fix.velocity),
-            fix_type=3 if fix.status >= 0 else 2 if eph <= MOST_UNCERTAIN_2D else 0,
-            time_utc=fix.stamp // 1000,
-        )
-        return GpsData(fix.stamp, report, is_valid=True)
+        fix_type = 3 if fix.status >= 0 else 2 if eph <= MOST_UNCERTAIN_2D else 0
+        place = GeoPoint(fix.latitude, fix.longitude, fix.altitude)
+        velocity = Vector3r(*fix.velocity)
+        report = structures.GnssReport(place, eph, epv, velocity, fix_type, fix.stamp // 1000)
+        return structures.GpsData(fix.stamp, report, is_valid=True)
 
     @rpc("getDistanceSensorData")
-    def distance(self, name: str, vehicle: str = "") -> DistanceSensorData:
+    def distance(self, name: str, vehicle: str = "") -> structures.DistanceSensorData:
         """Return the newest range of a range finder; its limits if nothing or too much is near."""
-        sensor = self._find(RangeAnnouncement, "distance sensor", name, vehicle)
-        pose = Pose(Vector3r(*sensor.position), Quaternionr(*sensor.orientation))
+        kind = announcements.RangeAnnouncement
+        sensor, sample = self._read(kind, "distance sensor", name, vehicle)
         low, high = sensor.min_range, sensor.max_range
-        if (newest := self._newest.get(sensor.source)) is None:
-            return DistanceSensorData(0, 0.0, low, high, pose)
-        found = min(max(newest.sample.range, low), high)
-        return DistanceSensorData(newest.sample.stamp, found, low, high, pose)
+        found = 0.0 if sample is None else min(max(sample.range, low), high)
+        return structures.DistanceSensorData(
+            0 if sample is None else sample.stamp,
+            found,
+            low,
+            high,
+            Pose(Vector3r(*sensor.position), Quaternionr(*sensor.orientation)),
+        )
 
     @rpc("getLidarData")
-    def lidar(self, caller: Caller, name: str, vehicle: str = "") -> LidarData | CosysLidarData:
+    def lidar(
+        self, caller: Caller, name: str, vehicle: str = ""
+    ) -> structures.LidarData | structures.CosysLidarData:
         """Return the newest whole turn of a lidar, channel by channel, freed of the motion's skew.
 
         Each ray is placed by where the sensor was at its own time. The stamp and the pose are of
         the first ray. `segmentation` is -1, and Cosys' `groundtruth` is empty text, for all points.
         """
-        sensor = self._find(LidarAnnouncement, "lidar", name, vehicle)
-        newest = self._newest.get(sensor.source)
-        if newest is None:
-            return CosysLidarData() if caller.flavour == "cosys" else LidarData()
-        scan = newest.sample
+        sensor, scan = self._read(announcements.LidarAnnouncement, "lidar", name, vehicle)
+        is_cosys = caller.flavour == "cosys"
+        if scan is None:
+            return structures.CosysLidarData() if is_cosys else structures.LidarData()
         served = self._server.find_multirotor(vehicle)
         places, turns = _poses(served.physics, sensor, scan)
         places -= served.origin
-        points = _at_their_times(scan, places, turns)
+        steps = scan.times.astype(np.float64) / (TIMESTEP_NS * 1e-9)
+        # As `sims.sensors.scanner` takes them: the place of the nearest millisecond.
+        points = scan.points.astype(np.float64)
+        if len(points):
+            between = Slerp(np.arange(len(places)), turns)(np.minimum(steps, len(places) - 1))
+            points = places[np.rint(steps).astype(np.intp)] + between.apply(points)
         if self._server.config.lidar_frame == "SensorLocalFrame":
             points = turns[0].inv().apply(points - places[0])
         cloud = wire.float_array(points[np.argsort(scan.rings, kind="stable")])
         turn = turns[0].as_quat(scalar_first=True).tolist()
         pose = Pose(Vector3r(*places[0].tolist()), Quaternionr(*turn))
-        if caller.flavour == "cosys":
-            return CosysLidarData(scan.stamp, cloud, pose, ("",) * len(points))
-        return LidarData(scan.stamp, cloud, pose, (-1,) * len(points))
+        if is_cosys:
+            return structures.CosysLidarData(scan.stamp, cloud, pose, ("",) * len(points))
+        return structures.LidarData(scan.stamp, cloud, pose, (-1,) * len(points))
 
-    def _find(self, kind: type[A], called: str, name: str, vehicle: str) -> A:
-        """Return a sensor; of an empty name the first of its kind.
+    def _read(self, kind: type, called: str, name: str, vehicle: str) -> tuple[Any, Any]:
+        """Return a sensor's announcement and newest sample; of an empty name the first's.
 
         Raises:
             RpcError: There is none.
@@ -207,39 +172,15 @@ class Sensors:
         for source, sensor in self._announced.items():
             own = source.removeprefix(prefix) if source.startswith(prefix) else ""
             if isinstance(sensor, kind) and own and name in ("", own):
-                return sensor
+                return sensor, self._newest.get(source)
         raise RpcError(f"No {called} with name {name} exist on vehicle")
 
 
-def _poses(physics: Any, sensor: Any, scan: LidarScan) -> tuple[Any, Any]:
+def _poses(physics: Any, sensor: Any, scan: Any) -> tuple[Any, Rotation]:
     """Return the sensor's pose at each millisecond of a scan: metres in ``map``, shape (n, 3)."""
-    stamps = range(scan.stamp, scan.end + TIMESTEP_NS, TIMESTEP_NS)
-    history = physics.simulation.history
-    places: list[Vector3] = []
-    turns: list[Quaternion] = []
-    for stamp in stamps:
-        state = physics.state_in(*history.at(stamp))
-        lever = rotate(state.orientation, sensor.position)
-        x, y, z = (a + b for a, b in zip(state.position, lever, strict=True))
-        places.append((x, y, z))
+    places, turns = [], []
+    for stamp in range(scan.stamp, scan.end + 2 * TIMESTEP_NS, TIMESTEP_NS):
+        state = physics.state_in(*physics.simulation.history.at(min(stamp, physics.time_ns)))
+        places.append(np.add(state.position, rotate(state.orientation, sensor.position)))
         turns.append(multiply(state.orientation, sensor.orientation))
     return np.array(places), Rotation.from_quat(turns, scalar_first=True)
-
-
-def _at_their_times(scan: LidarScan, places: Any, turns: Any) -> Any:
-    """Return a scan's points, each placed by the sensor's pose at its own time, shape (n, 3).
-
-    As `sims.sensors.scanner` takes them: the place of the nearest millisecond, and the rotation
-    between two.
-    """
-    steps = scan.times.astype(np.float64) / (TIMESTEP_NS * 1e-9)
-    last = len(places) - 1
-    whole = np.minimum(steps.astype(np.intp), last)
-    quaternions = turns.as_quat()
-    before, after = quaternions[whole], quaternions[np.minimum(whole + 1, last)]
-    after = after * np.where((before * after).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
-    between = before + (steps - whole)[:, None] * (after - before)
-    nearest = np.minimum(np.rint(steps).astype(np.intp), last)
-    if not len(steps):
-        return np.empty((0, 3))
-    return places[nearest] + Rotation.from_quat(between).apply(scan.points)
