@@ -9,7 +9,7 @@ it was put into.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import msgspec
 import mujoco
@@ -40,9 +40,21 @@ _TYPES = {
     "Cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "Cone": mujoco.mjtGeom.mjGEOM_MESH,
 }
+_LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 _COPIED = (
     *("conaffinity", "condim", "contype", "density", "friction", "gap", "group", "margin", "mass"),
-    *("material", "meshname", "priority", "rgba", "size", "solimp", "solmix", "solref", "type"),
+    *(
+        "material",
+        "meshname",
+        "name",
+        "priority",
+        "rgba",
+        "size",
+        "solimp",
+        "solmix",
+        "solref",
+        "type",
+    ),
 )
 
 
@@ -65,27 +77,10 @@ class SpareObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     colour: tuple[Share, Share, Share] | None = None
 
 
-class Movable(NamedTuple):
-    """A body that scripts may move.
-
-    Attributes:
-        body: Name of the body in the model.
-        asset: What a spare object is; empty for what belongs to the world.
-        scale: Of a spare object.
-    """
-
-    body: str
-    asset: str = ""
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-def spare_objects(node: str, specs: tuple[SpareObject, ...]) -> list[Movable]:
-    """Return the spare objects of a server's settings, as bodies of the model."""
-    each = [spec for spec in specs for _ in range(spec.count)]
-    return [
-        Movable(f"{node}/{spec.asset}_{number}", spec.asset, spec.scale)
-        for number, spec in enumerate(each)
-    ]
+def spare_objects(node: str, specs: tuple[SpareObject, ...]) -> dict[str, SpareObject]:
+    """Return the spare objects of a server's settings, by the names of their bodies."""
+    each = (spec for spec in specs for _ in range(spec.count))
+    return {f"{node}/{spec.asset}_{number}": spec for number, spec in enumerate(each)}
 
 
 def add_movables(
@@ -102,10 +97,10 @@ def add_movables(
     # What MuJoCo takes from the mean of all bodies is to be as without these.
     for name in ("meanmass", "meansize", "extent", "center"):
         setattr(scene.spec.stat, name, getattr(world.stat, name))
-    each = [spec for spec in specs for _ in range(spec.count)]
-    for number, (spec, spare) in enumerate(zip(each, spare_objects(node, specs), strict=True)):
-        _add_spare(scene, spare.body, spec, (0.0, 0.0, AWAY + 100.0 * number))
-    held = [spare.body for spare in spare_objects(node, specs)]
+    held = []
+    for number, (name, spec) in enumerate(spare_objects(node, specs).items()):
+        _add_spare(scene, name, spec, (0.0, 0.0, AWAY + 100.0 * number))
+        held.append(name)
     for expression in movable:
         held += _free(scene.spec, world, expression)
     for geom in (geom for name in held for geom in scene.spec.body(name).geoms):
@@ -113,16 +108,11 @@ def add_movables(
             geom.contype, geom.conaffinity = MOVABLE, 0
 
 
-def movable_bodies(model: Any) -> list[tuple[int, str]]:
-    """Return number and name of each body with a free joint, but vehicles."""
-    roots = np.flatnonzero((model.body_parentid == 0) & (model.body_jntnum == 1)).tolist()
-    named = [(body, model.body(body).name) for body in roots]
-    free = mujoco.mjtJoint.mjJNT_FREE
-    return [
-        (body, name)
-        for body, name in named
-        if model.jnt_type[model.body_jntadr[body]] == free and not name.endswith("/base_link")
-    ]
+def movable_bodies(model: Any) -> dict[str, int]:
+    """Return name and number of each body with a free joint, but vehicles."""
+    joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    named = {model.body(int(body)).name: int(body) for body in model.jnt_bodyid[joints]}
+    return {name: body for name, body in named.items() if not name.endswith("/base_link")}
 
 
 def have_met(model: Any) -> None:
@@ -226,15 +216,11 @@ def _free(spec: Any, world: Any, expression: str) -> list[str]:
         body.explicitinertial, body.mass, body.inertia = True, 100.0, [10.0, 10.0, 10.0]
         for part in parts:
             options = {key: getattr(part, key) for key in _COPIED}
-            there, way = _pose(world, part.name)
-            pos, quat, back, away = np.zeros(3), np.zeros(4), np.zeros(4), np.zeros(3)
-            mujoco.mju_negPose(away, back, place, turn)
-            mujoco.mju_mulPose(pos, quat, away, back, there, way)
-            part_name = part.name
+            options["pos"], options["quat"] = _relative(place, turn, *_pose(world, part.name))
             if part.type != mujoco.mjtGeom.mjGEOM_MESH:
-                options["size"] = world.geom(part_name).size  # of a capsule between two points
+                options["size"] = world.geom(part.name).size  # of a capsule between two points
             spec.delete(part)
-            body.add_geom(name=part_name, pos=pos, quat=quat, **options)
+            body.add_geom(**options)
     names = whole_matches(expression, still)
     for name in names:
         still[name].add_joint(type=mujoco.mjtJoint.mjJNT_FREE, armature=HELD)
@@ -249,13 +235,25 @@ def _free(spec: Any, world: Any, expression: str) -> list[str]:
 def _pose(world: Any, geom: str) -> tuple[Any, Any]:
     """Return the pose of a geom of the world itself as its file has it: that of a mesh is moved."""
     number = world.geom(geom).id
-    place, turn = world.geom_pos[number].copy(), world.geom_quat[number].copy()
+    place, turn = world.geom_pos[number], world.geom_quat[number]
+    if world.geom_type[number] != mujoco.mjtGeom.mjGEOM_MESH:
+        return place, turn
     mesh = world.geom_dataid[number]
-    if world.geom_type[number] == mujoco.mjtGeom.mjGEOM_MESH:
-        away, back = np.zeros(3), np.zeros(4)
-        mujoco.mju_negPose(away, back, world.mesh_pos[mesh], world.mesh_quat[mesh])
-        mujoco.mju_mulPose(place, turn, place.copy(), turn.copy(), away, back)
-    return place, turn
+    back = _relative(world.mesh_pos[mesh], world.mesh_quat[mesh], np.zeros(3), _LEVEL)
+    return _product(place, turn, *back)
+
+
+def _relative(place: Any, turn: Any, other_place: Any, other_turn: Any) -> tuple[Any, Any]:
+    """Return a pose in the frame of another."""
+    position, rotation = np.zeros(3), np.zeros(4)
+    mujoco.mju_negPose(position, rotation, place, turn)
+    return _product(position, rotation, other_place, other_turn)
+
+
+def _product(place: Any, turn: Any, other_place: Any, other_turn: Any) -> tuple[Any, Any]:
+    position, rotation = np.zeros(3), np.zeros(4)
+    mujoco.mju_mulPose(position, rotation, place, turn, other_place, other_turn)
+    return position, rotation
 
 
 def _held(spec: Any, name: str, **options: Any) -> Any:

@@ -40,6 +40,8 @@ FARTHEST = 1e4
 LONGEST_NAME = 100
 """Characters of the name of an object that is brought in."""
 
+_BODY = mujoco.mjtObj.mjOBJ_BODY
+
 UNKNOWN = Pose(Vector3r(NAN, NAN, NAN), Quaternionr(NAN, NAN, NAN, NAN))
 """Pose of an object that is not there."""
 
@@ -59,20 +61,16 @@ class Objects:
         self._still: Any = None
         model, config = self._world.model, server.config
         spares = spare_objects(server.name, config.objects)
-        self._spares = {model.body(each.body).id: each for each in spares}
-        whole = geoms_by_object(model)
+        self._spares = {model.body(name).id: spec for name, spec in spares.items()}
         self.geoms = {
             name: geoms
-            for name, geoms in whole.items()
+            for name, geoms in geoms_by_object(model).items()
             if model.geom_bodyid[geoms[0]] not in self._spares
         }
-        self._bodies = {name: body for body, name in movable_bodies(model) if name in self.geoms}
-        self._bodies = {k: v for k, v in self._bodies.items() if k not in server.vehicles}
-        self._held = {
-            body
-            for body in (*self._bodies.values(), *self._spares)
-            if model.dof_armature[model.body_dofadr[body]] == HELD or body in self._spares
-        }
+        bodies = movable_bodies(model)
+        self._bodies = {name: body for name, body in bodies.items() if name in self.geoms}
+        armature = {body: model.dof_armature[model.body_dofadr[body]] for body in bodies.values()}
+        self._held = {body for body in armature if armature[body] == HELD or body in self._spares}
         self._at_start = dict(self._bodies), dict(self.geoms), model.qpos0.copy()
         if self._held and self._world.simulation is not None:
             have_met(model)
@@ -106,14 +104,14 @@ class Objects:
         if name not in self.geoms:
             return UNKNOWN
         model, data = self._world.model, self.data()
-        own = self._bodies.get(name, -1)
-        number = next((each for each in (own, *_bodies_called(model, name)) if each >= 0), -1)
-        if number >= 0:
-            place, turn = data.xpos[number], data.xquat[number]
+        bodies = (mujoco.mj_name2id(model, _BODY, each) for each in (name, f"{name}/base_link"))
+        body = self._bodies.get(name, max(bodies))
+        if body >= 0:
+            place, turn = data.xpos[body], data.xquat[body]
         else:
-            number = model.geom(name).id
-            place, turn = data.geom_xpos[number], np.zeros(4)
-            mujoco.mju_mat2Quat(turn, data.geom_xmat[number])
+            geom = model.geom(name).id
+            place, turn = data.geom_xpos[geom], np.zeros(4)
+            mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
         position, rotation = flip_yz(tuple(place.tolist())), flip_yz_rotation(tuple(turn.tolist()))
         return Pose(Vector3r(*position), Quaternionr(*rotation))
 
@@ -124,7 +122,7 @@ class Objects:
         """
         model = self._world.model
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, touched)
-        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, touched)
+        body = mujoco.mj_name2id(model, _BODY, touched)
         body = int(model.geom_bodyid[geom]) if geom >= 0 else body
         return next((name for name, each in self._bodies.items() if each == body), touched)
 
@@ -174,24 +172,17 @@ class Objects:
         if len(name) > LONGEST_NAME:
             raise RpcError(f"name: expected up to {LONGEST_NAME} characters, found {len(name)}")
         qpos = _qpos(pose)
-        used = set(self._bodies.values())
-        free = {
-            body: spare
-            for body, spare in self._spares.items()
-            if spare.asset == asset and body not in used
-        }
         if asset not in self.assets():
             raise RpcError(f"asset: expected one of {self.assets()}, found {asset!r:.80}")
-        if not free:
+        used = set(self._bodies.values())
+        free = [body for body, spare in self._spares.items() if spare.asset == asset]
+        if not (free := [body for body in free if body not in used]):
             raise RpcError(f"all objects {asset} are in the world: the settings can have more")
         wanted = scale.x_val, scale.y_val, scale.z_val
-        body = next((body for body, spare in free.items() if spare.scale == wanted), min(free))
-        if free[body].scale != wanted:
+        body = next((each for each in free if self._spares[each].scale == wanted), free[0])
+        if (found := self._spares[body].scale) != wanted:
             self._server.log.warning(
-                "simSpawnObject: %s has the scale %s of the settings, not %s",
-                name,
-                free[body].scale,
-                wanted,
+                "simSpawnObject: %s has the scale %s of the settings, not %s", name, found, wanted
             )
         name = name or asset
         numbered = (f"{name}{number}" for number in itertools.count(1))
@@ -255,12 +246,6 @@ class Objects:
         simulation.data.qpos[begin : begin + 7] = qpos
         simulation.data.qvel[dof : dof + 6] = 0.0
         simulation.changed()
-
-
-def _bodies_called(model: Any, name: str) -> tuple[int, ...]:
-    """Return the numbers of the bodies of an object, or of a vehicle, of a name; -1 for none."""
-    names = (name, f"{name}/base_link")
-    return tuple(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, each) for each in names)
 
 
 def _qpos(pose: Pose) -> Any:

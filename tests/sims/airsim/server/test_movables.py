@@ -182,8 +182,8 @@ def test_a_world_is_drawn_as_before_but_for_what_is_brought_in() -> None:
             assert np.allclose(old_value, new_value, atol=1e-12)
         for field in ("geom_size", "geom_rgba", "geom_type", "geom_matid", "geom_aabb"):
             assert np.allclose(getattr(before, field)[old], getattr(after, field)[new])
-    for spare in spare_objects("airsim", spares):
-        assert states[1].body(spare.body).xpos[2] >= 1e5
+    for name in spare_objects("airsim", spares):
+        assert states[1].body(name).xpos[2] >= 1e5
     cone = after.geom(int(after.body("airsim/Cone_3").geomadr[0]))
     turn = states[1].geom_xmat[cone.id].reshape(3, 3)
     middle = states[1].geom_xpos[cone.id] + turn @ after.geom_aabb[cone.id][:3]
