@@ -23,6 +23,12 @@ if TYPE_CHECKING:
 MOST = 64
 """Images of one call, and calls that wait for their images at a time."""
 
+ABANDONED = 8
+"""Calls of clients that have left which may still be with the renderer; it is full with more."""
+
+TIMEOUT = 600.0
+"""Real seconds after which the renderer is taken to hang; the longest call takes some 30."""
+
 LONGEST = 100_000_000
 """Bytes of all images of one call: Cosys-AirSim's client takes no more."""
 
@@ -43,6 +49,7 @@ class Images:
         self._server = server
         self._renderer: Worker[Renderer] | None = None
         self._starting = asyncio.Lock()
+        self._idle = asyncio.Semaphore(server.config.camera_processes)
         self._waiting = 0
 
     async def start(self) -> None:
@@ -58,6 +65,7 @@ class Images:
                     server.config.render_threads,
                     server.world.dynamics,
                     processes=server.config.camera_processes,
+                    timeout=TIMEOUT,
                 )
 
     @rpc("simGetImages", cosys=2)
@@ -152,7 +160,8 @@ class Images:
         return exposure
 
     async def _develop(self, exposure: _Exposure) -> list[ImageResponse]:
-        if self._waiting >= MOST:
+        abandoned = 0 if self._renderer is None else self._renderer.outstanding()
+        if self._waiting >= MOST or abandoned > ABANDONED + self._server.config.camera_processes:
             raise RpcError(f"expected at most {MOST} calls that wait for images")
         self._waiting += 1
         try:
@@ -160,7 +169,9 @@ class Images:
             ids = self._server.segmentation.ids()
             await self.start()
             assert self._renderer is not None
-            images = await self._renderer.call_untimed(Renderer.take, stamp, qpos, ids, wanted)
+            async with self._idle:
+                take = self._renderer.call_untimed(Renderer.take, stamp, qpos, ids, wanted)
+                images = await take
         except GraphicsError as error:
             raise RpcError(str(error)) from None
         finally:
