@@ -67,18 +67,26 @@ def load(
     Raises:
         ConfigError: Something in it is wrong.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: expected a readable file, found: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: expected UTF-8 text, found {error.reason}") from None
-    table = (read or _read_toml)(text, str(path))
+    table = (read or _read_toml)(text_of(path), str(path))
     folder = path.resolve().parent
     find_modules_in(folder)
     for change in overrides:
         override(table, change)
     return parse(table, path.name, folder)
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        ConfigError: It cannot be read, or is no text.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: expected a readable file, found: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: expected UTF-8 text, found {error.reason}") from None
 
 
 def _read_toml(text: str, path: str) -> dict[str, Any]:

@@ -21,11 +21,11 @@ def import_(
     """
     import tomli_w
 
+    from runtime.config.reading import text_of
     from sims.airsim.settings import read
 
     warnings: list[str] = []
-    text = settings.read_text(encoding="utf-8-sig")
-    table = read(text, settings.name, warnings.append, world)
+    table = read(text_of(settings), settings.name, warnings.append, world)
     for line in warnings:
         print(f"warning: {line}", file=sys.stderr)
     print(f"# Made from AirSim's {settings.name} by `python -m runtime import`.")

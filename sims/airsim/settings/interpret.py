@@ -66,6 +66,8 @@ def interpret(keys: Keys, text: str, world: str) -> Table:
     keys.done()
     names = {name: ours for name, ours in server["sensor_names"].items() if name not in {"", ours}}
     server["sensor_names"] = names
+    for empty in [key for key, value in server.items() if value in ({}, [])]:
+        del server[empty]
     return {"run": {"name": "airsim", "clock": "lockstep", "speed": speed}, "nodes": nodes}
 
 

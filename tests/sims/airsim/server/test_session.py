@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
 
 from tests.sims.airsim.scripts import Caller, RefusedError, drone, with_script
@@ -48,3 +51,31 @@ def test_what_cannot_be_served_is_refused(
         assert airsim("ping")
 
     with_script(script, [drone(world=tiny_world)])
+
+
+def test_settings_are_handed_out_as_given_or_say_what_runs(tiny_world: str, tmp_path: Path) -> None:
+    camera = {"name": "eye", "width": 320, "height": 200, "fov": 60.0}
+
+    def described(airsim: Caller) -> None:
+        found = json.loads(airsim("getSettingsString"))
+        assert found["SimMode"] == "Multirotor"
+        vehicle = found["Vehicles"]["drone"]
+        assert (vehicle["VehicleType"], vehicle["X"]) == ("SimpleFlight", 2.0)
+        scene = vehicle["Cameras"]["eye"]["CaptureSettings"][0]
+        assert (scene["ImageType"], scene["Width"]) == (0, 320)
+        assert scene["FOV_Degrees"] == pytest.approx(60.0)
+
+    def given(airsim: Caller) -> None:
+        assert airsim("getSettingsString") == ' {"a": 1.5}'
+
+    def missing(airsim: Caller) -> None:
+        with pytest.raises(RefusedError, match="settings: expected a readable file"):
+            airsim("getSettingsString")
+
+    path = tmp_path / "settings.json"
+    path.write_text(' {"a": 1.5}')
+    vehicle = drone(world=tiny_world, position=(2.0, 0.0), cameras=[camera])
+    with_script(described, [vehicle])
+    with_script(given, [drone(world=tiny_world)], settings=' {"a": 1.5}')
+    with_script(given, [drone(world=tiny_world)], settings=str(path))
+    with_script(missing, [drone(world=tiny_world)], settings=str(tmp_path / "other.json"))
