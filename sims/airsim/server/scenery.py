@@ -17,6 +17,9 @@ from sims.airsim.structures import GeoPoint, Vector3r
 if TYPE_CHECKING:
     from sims.airsim.server.node import AirsimServer
 
+FARTHEST_PLACE = 1e9
+"""Degrees, and metres above the sea."""
+
 STRONGEST_WIND = 100.0
 """Metres per second, beyond which the physics would not be those of air any more."""
 
@@ -102,6 +105,6 @@ class Scenery:
 
     def _in_map(self, point: GeoPoint) -> Vector3:
         place = point.latitude, point.longitude, point.altitude
-        if not all(map(math.isfinite, place)):
-            raise ValueError(f"place: expected finite numbers, found {place}")
+        if not all(abs(number) <= FARTHEST_PLACE for number in place):
+            raise ValueError(f"place: expected up to {FARTHEST_PLACE:g}, found {place}")
         return from_geodetic(place, self._server.find_vehicle("").config.origin)

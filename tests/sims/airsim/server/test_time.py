@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import random
+import socket
+import threading
 import time
 from collections.abc import Awaitable
 from typing import Any
@@ -14,6 +17,7 @@ import pytest
 from runtime.node import Node
 from runtime.schedule import SECOND, Once
 from runtime.testing import spec
+from sims.airsim import wire
 from sims.airsim.client.rpc import RpcCallError, RpcClient
 from sims.airsim.server import AirsimServer
 from sims.airsim.server.methods import Table, rpc
@@ -174,3 +178,25 @@ def test_a_client_cannot_pause_a_run_in_real_time(tiny_world: str) -> None:
     assert supervise(nodes, clock="real", duration=20.0).error is None
     assert all("the run is in real time, which cannot be stopped" in text for text in refused)
     assert len(refused) == 2
+
+
+def test_clients_that_flood_the_server_do_not_stop_time(tiny_world: str) -> None:
+    count = 1000
+
+    def script(airsim: Caller) -> None:
+        address = airsim._socket.getpeername()
+        flood = b"".join(wire.request(n, "ping", ()) for n in range(count))
+        answer = b"".join(wire.reply(n, None, True) for n in range(count))
+        begin = airsim("now")
+        with contextlib.ExitStack() as stack:
+            clients = [stack.enter_context(socket.create_connection(address)) for _ in range(4)]
+            for client in clients:
+                threading.Thread(target=client.sendall, args=(flood,)).start()
+            for client in clients:
+                received = b""
+                while len(received) < len(answer):
+                    received += client.recv(1 << 16)
+                assert received == answer
+        assert airsim("now") > begin + 0.1
+
+    with_script(script, [drone(world=tiny_world)], time="running", duration=1e6)
