@@ -54,7 +54,7 @@ class Control:
 
     @rpc("reset")
     def reset(self) -> None:
-        """Bring all vehicles and objects back to the start, without API control; time goes on."""
+        """Bring all vehicles, objects and the wind back to the start; time goes on."""
         server = self._server
         for vehicle in server.vehicles.values():
             server.tasks.cancel(vehicle.name)
@@ -68,6 +68,7 @@ class Control:
             vehicle.release()
             server.collisions.forget(vehicle)
         server.objects.reset()
+        server.scenery.reset()
 
     @rpc("simSetVehiclePose")
     def set_vehicle_pose(self, pose: Pose, ignore_collision: bool, vehicle: str) -> None:  # noqa: ARG002

@@ -122,6 +122,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self.segmentation = Segmentation(self)
         self.images = Images(self)
         self.sensors = Sensors(self)
+        self.scenery = Scenery(self)
         self.recording = Recording(self)
         self.script_estimates = Estimates(self)
         self.time = Time(self)
@@ -138,7 +139,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
                 self.segmentation,
                 self.images,
                 self.sensors,
-                Scenery(self),
+                self.scenery,
                 Accepted(self),
                 self.recording,
                 self.script_estimates,

@@ -33,6 +33,7 @@ class Scenery:
     def __init__(self, server: AirsimServer) -> None:
         self._server = server
         self._messages = 0
+        self._wind_before: Vector3 | None = None
 
     @rpc("simSetWind")
     def set_wind(self, velocity: Vector3r) -> None:
@@ -40,10 +41,21 @@ class Scenery:
         wind = velocity.x_val, velocity.y_val, velocity.z_val
         if not math.hypot(*wind) <= STRONGEST_WIND:
             raise ValueError(f"wind: expected up to {STRONGEST_WIND:g} m/s, found {wind}")
-        simulation = self._server.world.simulation
-        if simulation is not None:
-            simulation.advance_to(self._server.clock.now())
-        self._server.world.set_wind(wind)
+        self._blow(wind)
+
+    def reset(self) -> None:
+        """Let the wind blow as before clients changed it."""
+        if self._wind_before is not None:
+            self._blow(self._wind_before)
+            self._wind_before = None
+
+    def _blow(self, wind: Vector3) -> None:
+        world = self._server.world
+        if world.simulation is not None:
+            world.simulation.advance_to(self._server.clock.now())
+        if self._wind_before is None:
+            self._wind_before = world.air.velocity if world.air is not None else (0.0, 0.0, 0.0)
+        world.set_wind(wind)
 
     @rpc("simTestLineOfSightToPoint")
     def sees_point(self, point: GeoPoint, vehicle: str = "") -> bool:

@@ -125,16 +125,25 @@ class ServedMultirotor(ServedVehicle):
     """A multirotor.
 
     Attributes:
-        physics: Its view of the world's physics.
         motors_on: Whether its autopilot is armed.
     """
 
     def __init__(self, name: str, world: SharedWorld, config: Any, now: Callable[[], int]) -> None:
         super().__init__(name, world, config, now)
-        assert world.simulation is not None
-        self.physics = Physics(world.simulation, name)
+        self._physics = self._look()
         self.motors_on = False
         self._carried = 0.8 * 4.0 * self.physics.parameters.hover_thrust
+
+    def _look(self) -> Physics:
+        assert self.world.simulation is not None
+        return Physics(self.world.simulation, self.name)
+
+    @property
+    def physics(self) -> Physics:
+        """Its view of the world's physics, of which there is another after one has diverged."""
+        if self._physics.simulation is not self.world.simulation:
+            self._physics = self._look()
+        return self._physics
 
     @property
     def stamp(self) -> int:

@@ -162,6 +162,27 @@ def test_reset_resets_every_vehicle_and_its_sensors(tiny_world: str) -> None:
     assert [e.source for e in sent if isinstance(e, Disarmed)] == ["b"]
 
 
+def test_reset_calms_the_wind_of_a_client(tiny_world: str) -> None:
+    norths: list[float] = []
+
+    def script(call: Caller) -> None:
+        for _ in range(2):
+            call("simSetVehiclePose", pose(0.0, 0.0, -30.0), True, "")
+            call("simContinueForTime", 0.5)
+            norths.append(call("simGetVehiclePose", "")["position"]["x_val"])
+            call("simSetWind", vector(30.0, 0.0, 0.0))
+            call("simSetWind", vector(40.0, 0.0, 0.0))
+            call("simSetVehiclePose", pose(0.0, 0.0, -30.0), True, "")
+            call("simContinueForTime", 0.5)
+            norths.append(call("simGetVehiclePose", "")["position"]["x_val"])
+            call("reset")
+
+    with_script(script, [drone(world=tiny_world)])
+    # For one more step of the physics the old wind blows on.
+    assert max(map(abs, norths[::2])) < 0.02
+    assert min(norths[1::2]) > 1.0
+
+
 def test_a_free_camera_is_where_it_is_put_at_once(tiny_world: str) -> None:
     found: dict[str, Any] = {}
 
