@@ -21,7 +21,7 @@ from sims.vehicle import Simulation
 from sims.worlds import Scene
 from sims.worlds.bodies import COLOURS, SIZES, Kind, add_shape
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+Factor = Annotated[float, msgspec.Meta(ge=0.01, le=1000)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Basic = Literal["Cube", "Sphere", "Cylinder", "Cone"]
 
@@ -72,7 +72,7 @@ class SpareObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """
 
     asset: Basic | Kind
-    scale: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    scale: tuple[Factor, Factor, Factor] = (1.0, 1.0, 1.0)
     count: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
     colour: tuple[Share, Share, Share] | None = None
 
