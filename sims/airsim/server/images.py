@@ -33,11 +33,15 @@ LONGEST = 100_000_000
 """Bytes of all images of one call: Cosys-AirSim's client takes no more."""
 
 
+_RESPONSES = {"airsim": ImageResponse, "cosys": CosysImageResponse}
+
+
 class _Exposure(NamedTuple):
     """The images of one call before they are drawn: the state that they show, and what is known."""
 
     stamp: int
     qpos: npt.NDArray[np.float64]
+    ids: npt.NDArray[np.uint8]
     wanted: list[Wanted]
     known: list[ImageResponse]
 
@@ -51,6 +55,7 @@ class Images:
         self._starting = asyncio.Lock()
         self._idle = asyncio.Semaphore(server.config.camera_processes)
         self._waiting = 0
+        self._told = False
 
     async def start(self) -> None:
         """Start what renders, unless that is done."""
@@ -88,8 +93,9 @@ class Images:
         self._server.cameras.find(self._server.find_vehicle(vehicle), camera, external)
         requests = [ImageRequest(camera, image_type)]
         if image_type not in ImageType.__members__.values():
-            self._server.log.warning("simGetImage: %s", _not_drawn(image_type))
-            requests = []
+            if not self._told:
+                self._server.log.warning("simGetImage: %s", _not_drawn(image_type))
+            self._told, requests = True, []
         exposure = self._expose(requests, vehicle, caller.flavour)
 
         async def png() -> bytes:
@@ -131,7 +137,7 @@ class Images:
             raise RpcError(f"expected at most {MOST} images of one call, found {len(requests)}")
         on = self._server.find_vehicle(vehicle)
         stamp, qpos = self._server.drawn_state()
-        exposure = _Exposure(stamp, qpos, [], [])
+        exposure = _Exposure(stamp, qpos, self._server.segmentation.ids(), [], [])
         length = 0
         for each in requests:
             camera = self._server.cameras.find(on, each.camera_name, external)
@@ -144,17 +150,16 @@ class Images:
             pose = self._server.cameras.pose(on, eye, qpos)
             width, height = eye.spec.width, eye.spec.height
             length += width * height * (5 if form == "float" else 3)
-            answer = {
-                name: getattr(each, name)
-                for name in ("camera_name", "image_type", "pixels_as_float", "compress")
+            known = msgspec.structs.asdict(each) | {
+                "camera_position": pose.position,
+                "camera_orientation": pose.orientation,
+                "time_stamp": stamp,
+                "width": width,
+                "height": height,
             }
-            answer |= {"camera_position": pose.position, "camera_orientation": pose.orientation}
-            answer |= {"time_stamp": stamp, "width": width, "height": height}
-            exposure.known.append(
-                CosysImageResponse(**answer, annotation_name=each.annotation_name)
-                if flavour == "cosys"
-                else ImageResponse(**answer)
-            )
+            if flavour == "airsim":
+                del known["annotation_name"]
+            exposure.known.append(_RESPONSES[flavour](**known))
         if length > LONGEST:
             raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")
         return exposure
@@ -165,13 +170,10 @@ class Images:
             raise RpcError(f"expected at most {MOST} calls that wait for images")
         self._waiting += 1
         try:
-            stamp, qpos, wanted, known = exposure
-            ids = self._server.segmentation.ids()
             await self.start()
             assert self._renderer is not None
             async with self._idle:
-                take = self._renderer.call_untimed(Renderer.take, stamp, qpos, ids, wanted)
-                images = await take
+                images = await self._renderer.call_untimed(Renderer.take, *exposure[:4])
         except GraphicsError as error:
             raise RpcError(str(error)) from None
         finally:
@@ -180,7 +182,7 @@ class Images:
             msgspec.structs.replace(each, image_data_float=msgspec.Raw(image.data))
             if each.pixels_as_float
             else msgspec.structs.replace(each, image_data_uint8=image.tobytes())
-            for each, image in zip(known, images, strict=True)
+            for each, image in zip(exposure.known, images, strict=True)
         ]
 
 

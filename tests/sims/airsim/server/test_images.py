@@ -163,7 +163,9 @@ def test_segmentation_ids_are_set_and_told(tiny_world: str) -> None:
 
         assert call("simGetSegmentationObjectID", "WALL") == initial_id("wall")
         assert call("simGetSegmentationObjectID", "nothing") == -1
+        before = call.send("simGetImages", [request("eye", 7)], "", False)
         assert call("simSetSegmentationObjectID", "wall", 7, False) is True
+        assert initial_id("wall") in pixels(call.join(before)[0])
         assert call("simSetSegmentationObjectID", "WALL", 8, False) is False
         found["plain"] = seen()
         assert call("simSetSegmentationObjectID", "W.*", 300, True) is True
