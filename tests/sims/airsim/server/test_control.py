@@ -162,6 +162,28 @@ def test_reset_resets_every_vehicle_and_its_sensors(tiny_world: str) -> None:
     assert [e.source for e in sent if isinstance(e, Disarmed)] == ["b"]
 
 
+@pytest.mark.parametrize("between", ["armDisarm", "reset"])
+def test_a_script_flies_at_the_instant_at_which_another_one_has_disarmed(
+    between: str, tiny_world: str
+) -> None:
+    found: list[Any] = []
+
+    def script(call: Caller) -> None:
+        for _ in range(2):
+            call("enableApiControl", True, "")
+            call("armDisarm", True, "")
+            found.append(call("takeoff", 20.0, ""))
+            found.append(call("simGetVehiclePose", "")["position"]["z_val"])
+            call("simSetVehiclePose", pose(0.0, 0.0, 0.0), True, "")
+            call("armDisarm", False, "")
+            if between == "reset":
+                call("reset")
+
+    with_script(script, [drone(world=tiny_world)], time="awaited")
+    assert found[::2] == [True, True]
+    assert found[1::2] == pytest.approx([-2.0, -2.0], abs=0.5)
+
+
 def test_reset_calms_the_wind_of_a_client(tiny_world: str) -> None:
     norths: list[float] = []
 
