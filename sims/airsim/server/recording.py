@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 HEADER = "VehicleName TimeStamp POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile".replace(" ", "\t")
 
+LEAST_INTERVAL = 1e-3
+"""Seconds: the step of physics."""
+
 STILL = 1e-3
 """What position, in metres, and quaternion of a vehicle that stands may have changed by."""
 
@@ -68,8 +71,8 @@ class RecordingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     images: tuple[RecordedImage, ...] = (RecordedImage(),)
 
     def __post_init__(self) -> None:
-        if not self.interval:
-            raise ValueError("interval: expected a time above 0, found 0")
+        if self.interval < LEAST_INTERVAL:
+            raise ValueError(f"interval: expected at least 1 ms, found {self.interval:g} s")
 
 
 class Recording:
@@ -84,22 +87,25 @@ class Recording:
 
     async def begin(self) -> None:
         """Start recording with the run, if the settings say so."""
-        if self._config.enabled:
-            try:
-                await self.start()
-            except RpcError as error:
-                self._server.log.error("%s", error)
+        try:
+            if self._config.enabled and (started := self.start()):
+                await started
+        except RpcError as error:
+            self._server.log.error("%s", error)
 
     @rpc("startRecording")
-    async def start(self) -> None:
+    def start(self) -> Awaitable[None] | None:
         """Record the settings' images and true poses into a folder in the run's folder."""
-        server = self._server
-        if self._folder is not None:
-            return
-        if server.out is None:
+        out = self._server.out
+        if out is None:
             raise RpcError("expected a run with a folder of results, found one without")
-        base = self._folder = server.out / self._config.folder
-        self._failed = ""
+        if self._folder is not None:
+            return None
+        self._folder, self._failed = out / self._config.folder, ""
+        return self._started(self._folder)
+
+    async def _started(self, base: Path) -> None:
+        server = self._server
         try:
             await server.images.start()
             folder = await server.offload(_make_folder, base)
@@ -165,7 +171,7 @@ class Recording:
 def _make_folder(base: Path) -> Path:
     """Make a folder named by the date, with an empty table, and return it."""
     date = time.strftime("%Y-%m-%d-%H-%M-%S")
-    names = (date, *(f"{date}-{number}" for number in range(2, 100)))
+    names = (date, *(f"{date}-{number}" for number in range(2, 1000)))
     folder = next(base / name for name in names if not (base / name).exists())
     (folder / "images").mkdir(parents=True)
     (folder / "airsim_rec.txt").write_text(f"{HEADER}\n", encoding="utf-8")

@@ -7,75 +7,38 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any
 
 from sims.airsim.settings.keys import Keys
 
 GRAVITY = 9.80665
-_RATES = {"UpdateFrequency": ("rate", 1.0)}
-_TIMES = {"UpdateLatency": "latency", "StartupDelay": "startup_delay"}
 
+_OURS = dict(
+    enumerate(["barometer", "imu", "gnss", "magnetometer", "range_finders", "lidars"], start=1)
+)
+"""Names of our settings by AirSim's SensorType."""
 
-class Kind(NamedTuple):
-    """A sensor that both have.
-
-    Attributes:
-        ours: Name of our setting.
-        base: What differs from our defaults.
-        numbers: Key to our name and the factor to our unit.
-        many: Whether a vehicle may have several, which have names.
-    """
-
-    ours: str
-    base: Mapping[str, Any] = {}
-    numbers: Mapping[str, tuple[str, float]] = {}
-    many: bool = False
-
-
-KINDS = {
-    1: Kind(
-        "barometer",
-        {"model": "airsim"},
-        {
-            "PressureFactorSigma": ("drift", 1.0),
-            "PressureFactorTau": ("drift_time", 1.0),
-            "UncorrelatedNoiseSigma": ("noise", 1.0),
-        }
-        | _RATES,
-    ),
-    2: Kind("imu"),
-    3: Kind(
-        "gnss",
-        {},
-        {
-            "EphInitial": ("eph_initial", 1.0),
-            "EphFinal": ("eph_final", 1.0),
-            "EphMin3d": ("eph_min_3d", 1.0),
-            "EphTimeConstant": ("eph_time_constant", 1.0),
-            "EPH_TimeConstant": ("eph_time_constant", 1.0),
-        }
-        | _RATES,
-    ),
-    4: Kind(
-        "magnetometer",
-        {"model": "airsim"},
-        {
-            "NoiseSigma": ("noise", 1e-4),
-            "NoiseBias": ("bias", 1e-4),
-            "ScaleFactor": ("scale_factor", 1.0),
-        }
-        | _RATES,
-    ),
-    5: Kind(
-        "range_finders",
-        {"noise": 0.2},
-        {"MinDistance": ("min_range", 1.0), "MaxDistance": ("max_range", 1.0)} | _RATES,
-        many=True,
-    ),
-    6: Kind("lidars", {}, {"Range": ("max_range", 1.0)}, many=True),
+_BASE: dict[int, dict[str, Any]] = {
+    1: {"model": "airsim"},
+    4: {"model": "airsim"},
+    5: {"noise": 0.2},
 }
-"""By AirSim's SensorType."""
+"""What differs from our defaults."""
+
+_NUMBERS = {
+    1: {"PressureFactorSigma": "drift", "PressureFactorTau": "drift_time"}
+    | {"UncorrelatedNoiseSigma": "noise"},
+    3: {"EphInitial": "eph_initial", "EphFinal": "eph_final", "EphMin3d": "eph_min_3d"}
+    | {"EphTimeConstant": "eph_time_constant", "EPH_TimeConstant": "eph_time_constant"},
+    4: {"NoiseSigma": "noise", "NoiseBias": "bias", "ScaleFactor": "scale_factor"},
+    5: {"MinDistance": "min_range", "MaxDistance": "max_range"},
+    6: {"Range": "max_range"},
+}
+"""Keys and our names of numbers; UpdateFrequency and times are all sensors'."""
+
+_UNITS = {"NoiseSigma": 1e-4, "NoiseBias": 1e-4}
+"""Gauss in tesla."""
 
 
 def sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str, Any]:
@@ -98,39 +61,39 @@ def sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str, 
     types = {type_ for _, _, type_ in listed}
     found: dict[str, Any] = {}
     for name, keys, type_ in [*listed, *(each for each in _known(usual) if each[2] not in types)]:
-        kind, enabled = KINDS[type_], keys.flag("Enabled")
+        setting, enabled = _OURS[type_], keys.flag("Enabled")
         if "Enabled" not in keys:
             keys.note("", "ignored: a sensor is off unless Enabled is true")
-        elif enabled and kind.many:
+        elif enabled and type_ >= 5:
             ours = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
             if type_ == 6 and (frame := keys.text("DataFrame")):
                 server["lidar_frame"] = frame
-            found.setdefault(kind.ours, []).append({"name": ours} | _settings(keys, type_))
+            found.setdefault(setting, []).append({"name": ours} | _settings(keys, type_))
             server["sensor_names"][name] = ours
-        elif enabled and kind.ours not in found:
-            found[kind.ours] = _settings(keys, type_)
-            server["sensor_names"][name] = kind.ours
+        elif enabled and setting not in found:
+            found[setting] = _settings(keys, type_)
+            server["sensor_names"][name] = setting
         elif enabled:
-            keys.note("", f"ignored: a vehicle has one {kind.ours}")
+            keys.note("", f"ignored: a vehicle has one {setting}")
     return {"imu": _imu(Keys({}, "", []))} | found  # it always has one
 
 
 def _known(listed: Iterable[tuple[str, Keys]]) -> Iterable[tuple[str, Keys, int]]:
     for name, keys in listed:
-        if (type_ := keys.whole("SensorType", 0)) in KINDS:
+        if (type_ := keys.whole("SensorType", 0)) in _OURS:
             yield name, keys, type_
         else:
             keys.note("SensorType", f"ignored: no sensor of type {type_} is simulated")
 
 
 def _settings(keys: Keys, type_: int) -> dict[str, Any]:
-    kind = KINDS[type_]
-    found = dict(kind.base) | keys.mount()
-    for key, (ours, factor) in kind.numbers.items():
+    found: dict[str, Any] = {**_BASE.get(type_, {}), **keys.mount()}
+    common = {"UpdateFrequency": "rate"} if type_ not in {2, 6} else {}
+    for key, ours in (_NUMBERS.get(type_, {}) | common).items():
         if (value := keys.number(key, None)) is not None:
-            found[ours] = value * factor
-    for key, ours in _TIMES.items():
-        if (value := keys.number(key, None)) is not None:
+            found[ours] = value * _UNITS.get(key, 1.0)
+    for key, ours in (("UpdateLatency", "latency"), ("StartupDelay", "startup_delay")):
+        if type_ != 2 and (value := keys.number(key, None)) is not None:
             found[ours] = f"{value!r}s"
     if type_ == 2:
         found |= _imu(keys)
