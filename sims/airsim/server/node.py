@@ -58,8 +58,9 @@ class AirsimServerConfig(NodeConfig):
         flavour: Whose clients call: ``airsim`` (1.8.1, and Colosseum's) or ``cosys``
             (Cosys-AirSim 3.5). They differ in the colours' order, among others.
         time: ``running``: time runs, at the run's `speed`. ``paused``: it stands from the start,
-            and a script steps it. ``awaited``: it runs only while a client waits for a vehicle.
-            With the last two, a script whose only waiting is for replies gives equal runs.
+            and a script steps it. ``awaited``: it runs only while a vehicle does what a client
+            has told it to. With the last two, a script whose only waiting is for replies gives
+            equal runs; with ``awaited``, if it waits for each task before it asks for anything.
         default_vehicle: Name of the vehicle that an empty name stands for; empty for the first by
             name.
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.

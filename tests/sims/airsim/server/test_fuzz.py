@@ -18,7 +18,7 @@ from runtime.digest import Digest
 from runtime.testing import NodeResult
 from sims.airsim import wire
 from sims.airsim.server.methods import Method, methods_of
-from sims.airsim.server.table import groups
+from tests.sims.airsim.methods_table import groups
 from tests.sims.airsim.scripts import Caller, drone, with_script
 
 METHODS: dict[str, Method] = {

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from sims.airsim.server import AirsimServer
 from sims.airsim.server.absent import reason_of_absence
-from sims.airsim.server.table import HEADING, rewritten, rows
+from tests.sims.airsim.methods_table import HEADING, PAGE, rewritten, rows
 from tests.sims.airsim.scripts import Caller, drone, with_script
-
-PAGE = Path("docs/reference/airsim.md")
 
 
 def test_the_page_has_all_methods_as_they_are() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    assert page == rewritten(page), f"run python -m sims.airsim.server.table {PAGE}"
+    assert page == rewritten(page), "run python -m tests.sims.airsim.methods_table"
 
 
 def test_the_table_has_what_a_run_serves(tiny_world: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
-"""The methods as a table for the documentation: ``python -m sims.airsim.server.table PAGE``.
+"""The methods as a table for the documentation: ``python -m tests.sims.airsim.methods_table``.
 
-It stands below the heading `HEADING` of the page, in Markdown, to the page's end.
+It stands below the heading `HEADING` of the page `PAGE`, in Markdown, to the page's end.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-import sys
 import types
 import typing
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from typing import Annotated, Any, NamedTuple
 import sims.airsim.server
 from sims.airsim.server.methods import methods_of
 
+PAGE = Path("docs/reference/airsim.md")
 HEADING = "## Methods\n"
 
 
@@ -32,9 +32,8 @@ class Row(NamedTuple):
 def groups() -> Iterator[type]:
     """Yield the classes in this package that have methods."""
     for module in pkgutil.iter_modules(sims.airsim.server.__path__, "sims.airsim.server."):
-        if module.name != __name__:
-            found = inspect.getmembers(importlib.import_module(module.name), inspect.isclass)
-            yield from (each for _, each in found if each.__module__ == module.name)
+        found = inspect.getmembers(importlib.import_module(module.name), inspect.isclass)
+        yield from (each for _, each in found if each.__module__ == module.name)
 
 
 def rows() -> Iterator[Row]:
@@ -78,5 +77,4 @@ def _type_name(hint: Any) -> str:
 
 
 if __name__ == "__main__":
-    path = Path(sys.argv[1])
-    path.write_text(rewritten(path.read_text(encoding="utf-8")), encoding="utf-8")
+    PAGE.write_text(rewritten(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
