@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sims.airsim.server.regex import whole_matches
 from sims.cameras.stage import LOOK
@@ -40,7 +41,6 @@ _TYPES = {
     "Cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "Cone": mujoco.mjtGeom.mjGEOM_MESH,
 }
-_LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 _COPIED = (
     *("conaffinity", "condim", "contype", "density", "friction", "gap", "group", "margin", "mass"),
     *(
@@ -211,12 +211,12 @@ def _free(spec: Any, world: Any, expression: str) -> list[str]:
         parts = [geoms[each] for each in (name, name + LOOK) if each in geoms]
         if any(part.type == mujoco.mjtGeom.mjGEOM_PLANE for part in parts):
             raise ValueError(f"movable: expected what can be moved, found {name}, a plane")
-        place, turn = _pose(world, name)
-        body = _held(spec, name, pos=place, quat=turn)
+        pose = _pose(world, name)
+        body = _held(spec, name, **_options(pose))
         body.explicitinertial, body.mass, body.inertia = True, 100.0, [10.0, 10.0, 10.0]
         for part in parts:
             options = {key: getattr(part, key) for key in _COPIED}
-            options["pos"], options["quat"] = _relative(place, turn, *_pose(world, part.name))
+            options |= _options(np.linalg.inv(pose) @ _pose(world, part.name))
             if part.type != mujoco.mjtGeom.mjGEOM_MESH:
                 options["size"] = world.geom(part.name).size  # of a capsule between two points
             spec.delete(part)
@@ -232,28 +232,26 @@ def _free(spec: Any, world: Any, expression: str) -> list[str]:
     return found + names
 
 
-def _pose(world: Any, geom: str) -> tuple[Any, Any]:
-    """Return the pose of a geom of the world itself as its file has it: that of a mesh is moved."""
+def _pose(world: Any, geom: str) -> Any:
+    """Return the pose of a geom of the world itself as its file has it, shape (4, 4)."""
     number = world.geom(geom).id
-    place, turn = world.geom_pos[number], world.geom_quat[number]
+    pose = _matrix(world.geom_pos[number], world.geom_quat[number])
     if world.geom_type[number] != mujoco.mjtGeom.mjGEOM_MESH:
-        return place, turn
-    mesh = world.geom_dataid[number]
-    back = _relative(world.mesh_pos[mesh], world.mesh_quat[mesh], np.zeros(3), _LEVEL)
-    return _product(place, turn, *back)
+        return pose
+    mesh = world.geom_dataid[number]  # MuJoCo has moved it to its centre of mass
+    return pose @ np.linalg.inv(_matrix(world.mesh_pos[mesh], world.mesh_quat[mesh]))
 
 
-def _relative(place: Any, turn: Any, other_place: Any, other_turn: Any) -> tuple[Any, Any]:
-    """Return a pose in the frame of another."""
-    position, rotation = np.zeros(3), np.zeros(4)
-    mujoco.mju_negPose(position, rotation, place, turn)
-    return _product(position, rotation, other_place, other_turn)
+def _matrix(place: Any, turn: Any) -> Any:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(turn, scalar_first=True).as_matrix()
+    matrix[:3, 3] = place
+    return matrix
 
 
-def _product(place: Any, turn: Any, other_place: Any, other_turn: Any) -> tuple[Any, Any]:
-    position, rotation = np.zeros(3), np.zeros(4)
-    mujoco.mju_mulPose(position, rotation, place, turn, other_place, other_turn)
-    return position, rotation
+def _options(pose: Any) -> dict[str, Any]:
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+    return {"pos": pose[:3, 3], "quat": turn}
 
 
 def _held(spec: Any, name: str, **options: Any) -> Any:
