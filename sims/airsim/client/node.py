@@ -28,8 +28,8 @@ from sims.airsim.structures import CollisionInfo, ImuData, MultirotorState
 T = TypeVar("T")
 E = TypeVar("E", bound=ev.Event)
 
-_NEW_CLOCK = 600 * SECOND
-"""If the server's clock is further ahead after a loss (ns), or is behind, it is another one."""
+_NEW_CLOCK = 60 * SECOND
+"""If the server's clock is further off (ns), or behind after a loss, it is another one."""
 _LAST_WORDS = 2.0
 """Real seconds that a server has for each of the last calls."""
 
@@ -84,7 +84,7 @@ class AirsimClient(Node[AirsimClientConfig]):
     async def on_startup(self) -> None:
         """Connect, ask what is there, and take a first set of images."""
         if self.checking:
-            return
+            raise UncheckableError("which cameras there are is known to the server only")
         try:
             await self._connect()
             await self._look()
@@ -113,8 +113,6 @@ class AirsimClient(Node[AirsimClientConfig]):
 
     def announce(self) -> Iterable[ev.Announcement]:
         """Announce the vehicle, its IMU and its cameras."""
-        if self.checking:
-            raise UncheckableError("which cameras there are is known to the server only")
         return self._remote.announcements
 
     def check(self) -> Iterable[str]:
@@ -122,10 +120,6 @@ class AirsimClient(Node[AirsimClientConfig]):
         peers = (each.config for each in self.siblings(AirsimClient))
         if self._lockstep and [(p.host, p.port) for p in peers].count(self._where) > 1:
             yield "port: expected one AirsimClient for each server in lockstep, found several"
-
-    async def on_ready(self) -> None:
-        """Take the vehicle over, and let the server's time stand in lockstep."""
-        await self._begin()
 
     # In the run.
 
@@ -145,6 +139,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             )
         if self._lockstep:
             await self._lead()
+        await self._relate()  # now that our clock runs, too
         self.start(self._repeat(self.config.image_rate, self._take_images))
         self.start(self._repeat(self.config.control_rate, self._obey))
         await self._repeat(self.config.imu_rate, self._read)
@@ -200,8 +195,8 @@ class AirsimClient(Node[AirsimClientConfig]):
         vehicle, origin = self._remote.vehicle, self._remote.origin
         state = await self._ask("getMultirotorState", MultirotorState, vehicle)
         sample = await self._ask("getImuData", ImuData, "", vehicle)
-        if state is not None and self._lockstep:
-            await self._reach(state.timestamp - self._shift)
+        if state is not None:
+            await self._follow(state.timestamp - self._shift - self.clock.now())
         if sample is not None:
             before = self._newest.get("imu")
             if event := self._made("imu", sample.time_stamp, conversion.imu, sample):
@@ -217,16 +212,20 @@ class AirsimClient(Node[AirsimClientConfig]):
                 self._pose = found
                 self.odometry.send(found)
 
-    async def _reach(self, stamp: int) -> None:
-        """Wait in simulated time for the instant that the server has reached."""
-        if (ahead := stamp - self.clock.now()) and self.deterministic:
+    async def _follow(self, ahead: int) -> None:
+        """In lockstep, wait for the instant that the server has reached, so far ahead (ns)."""
+        if not -_NEW_CLOCK < ahead < _NEW_CLOCK:
+            raise ConnectionResetError(f"the server's clock leaps by {ahead / SECOND:.3g} s")
+        if not self._lockstep:
+            return
+        if ahead and self.deterministic:
             self.deterministic = False  # type: ignore[misc]
             self.log.warning(
                 "the server's time is %+.3f ms from where it was to step to: the run follows it, "
                 "and is not the same each time",
                 ahead / 1e6,
             )
-        await self.clock.sleep_until(stamp)
+        await self.clock.sleep_until(self.clock.now() + ahead)
 
     async def _take_images(self) -> None:
         """Send a set of images, and a new contact."""
@@ -314,7 +313,7 @@ class AirsimClient(Node[AirsimClientConfig]):
                     self._report("a connection is lost", str(error))
                     await self._connect()
                     with contextlib.suppress(OSError):
-                        await self._begin()
+                        await self.on_ready()
                         return
                     before = self._connected
 
@@ -333,17 +332,14 @@ class AirsimClient(Node[AirsimClientConfig]):
             )
         self._connected += 1
 
-    async def _begin(self) -> None:
+    async def on_ready(self) -> None:
         """Let the server's time stand in lockstep, relate it to ours, and take the vehicle over."""
         config, call, vehicle = self.config, self._state.call, self._remote.vehicle
         if self._lockstep:
             paused = await call("simIsPaused") is True
             self._was_paused = paused if self._connected == 1 else self._was_paused
             await call("simPause", True)
-        found = msgspec.convert(await call("getMultirotorState", vehicle), MultirotorState)
-        ahead = found.timestamp - self._shift - self._newest.get("state", 0)
-        if self._connected == 1 or not 0 <= ahead < _NEW_CLOCK:
-            self._shift = found.timestamp - self.clock.now()
+        found = await self._relate()
         if not config.takeover:
             return
         await self._commands.call("enableApiControl", True, vehicle)
@@ -358,6 +354,16 @@ class AirsimClient(Node[AirsimClientConfig]):
             1.0 / config.control_rate,
             functools.partial(self._report, "refused by the server"),
         )
+
+    async def _relate(self) -> MultirotorState:
+        """Relate the server's clock to ours, so that no stamp is in the future."""
+        before = self.clock.now()
+        found = await self._state.call("getMultirotorState", self._remote.vehicle)
+        state = msgspec.convert(found, MultirotorState)
+        ahead = state.timestamp - self._shift - self._newest.get("state", 0)
+        if not self._newest or not 0 <= ahead < _NEW_CLOCK:
+            self._shift = state.timestamp - before
+        return state
 
     # After the run.
 

@@ -24,7 +24,7 @@ from runtime.errors import FatalError, VisnavError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from sims.airsim.client import AirsimClient
 from sims.airsim.structures import ImuData, MultirotorState, Vector3r
-from tests.sims.airsim.client.fake import FakeServer, HangUp, NoReply
+from tests.sims.airsim.client.fake import START, FakeServer, HangUp, NoReply
 
 NAN = float("nan")
 
@@ -159,6 +159,7 @@ def test_a_repeated_sample_is_dropped_and_a_gap_survived(server: FakeServer) -> 
         ("simGetImages", lambda *_: []),
         ("simGetImages", lambda *_: [{"width": 9, "height": 9}] * 2),
         ("simGetCollisionInfo", lambda *_: {"has_collided": True, "normal": {"x_val": NAN}}),
+        ("simGetImages", lambda *_: [{"width": 1, "height": 1, "image_data_uint8": b"123"}, {}]),
         ("getMultirotorState", lambda *_: 7),
     ],
 )
@@ -244,7 +245,7 @@ def test_a_hung_request_for_images_costs_one_set_of_them(
 
 def test_a_server_that_starts_anew_has_another_clock(server: FakeServer) -> None:
     def state(name: str) -> MultirotorState:
-        if server.time == 30_000_000 + 1_700_000_000 * 10**9:
+        if server.time == START + 30_000_000:
             server.time = 5
             raise HangUp
         return server.state(name)
@@ -254,6 +255,22 @@ def test_a_server_that_starts_anew_has_another_clock(server: FakeServer) -> None
     stamps = [e.stamp for e in found.of(Odometry)]
     assert stamps == sorted(set(stamps))
     assert stamps[-1] >= 90_000_000
+
+
+def test_a_clock_that_leaps_moves_no_stamps(server: FakeServer) -> None:
+    def state(name: str) -> MultirotorState:
+        if server.time == START + 30_000_000:
+            server.time += 10**18
+        return server.state(name)
+
+    server.methods["getMultirotorState"] = state
+    found = fly(server, 0.1, imu_rate=100, on_loss="reconnect")
+    stamps = [e.stamp for e in found.of(Odometry)]
+    assert stamps == sorted(set(stamps))
+    assert 90_000_000 <= stamps[-1] <= 100_000_000
+    server.time = START
+    with pytest.raises(FatalError, match="clock leaps by 1e\\+09 s"):
+        fly(server)
 
 
 def test_two_clients_cannot_lead_one_server(server: FakeServer) -> None:
