@@ -23,7 +23,7 @@ OPEN_REQUESTS = 256
 LONGEST_QUEUE = 64 << 20
 """Bytes of replies that a client may leave unread; with more, its connection is closed."""
 
-SMALL, LARGE = 256, 1 << 18
+SMALL, LARGE = 256, 2048
 """Bytes that are read in one turn of the loop: some requests, or a part of a long one."""
 
 
