@@ -11,9 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from runtime.testing import spec
 from sims.airsim.server.image_types import palette
 from sims.airsim.server.images import LONGEST, MOST
 from sims.airsim.server.segmentation import initial_id
+from sims.computer_vision import FreeCamera
 from tests.sims.airsim.scripts import Caller, RefusedError, drone, with_script
 
 CAMERAS = [
@@ -151,6 +153,23 @@ def test_vehicles_see_each_other_and_fly_on_unchanged(tiny_world: str) -> None:
 
     without = with_script(lambda call: script(call, takes_images=False), two, cameras=CAMERAS)
     assert flown.sent == without.sent
+
+
+def test_a_free_camera_shows_at_once_where_it_has_been_put(tiny_world: str) -> None:
+    found: list[Any] = []
+
+    def script(call: Caller) -> None:
+        for north in (0.0, 1.5, -2.0):
+            position = {"x_val": north, "y_val": 0.0, "z_val": 0.0}
+            call("simSetVehiclePose", {"position": position, "orientation": {}}, True, "")
+            found.extend(images(call, request("eye", 1, floats=True)))
+            assert call("simGetVehiclePose", "")["position"] == position
+
+    settings = {"world": tiny_world, "camera_processes": 1, "cameras": [{"name": "any"}]}
+    with_script(script, [spec(FreeCamera, "free", settings)], cameras=CAMERAS)
+    for response, north in zip(found, (0.0, 1.5, -2.0), strict=True):
+        assert response["camera_position"]["x_val"] == pytest.approx(north)
+        assert pixels(response)[10, 16] == pytest.approx(AHEAD - north, abs=1e-4)
 
 
 def test_segmentation_ids_are_set_and_told(tiny_world: str) -> None:
