@@ -8,6 +8,7 @@ The function's result is printed as JSON in the last line. No import of this pro
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import sys
 import threading
@@ -200,6 +201,64 @@ def errors(port: int) -> Any:
     future.join()
     attempt(future.get)
     return {"refused": refused, "alive": client.ping()}
+
+
+def every_method(port: int) -> Any:
+    """Call each method of the client once, if it is known with what; return all errors."""
+    client = connect(port)
+    client.takeoffAsync().join()
+    place, here = airsim.GeoPoint(), airsim.Vector3r(0.5, 0, -2)
+    pose = airsim.Pose(here, airsim.Quaternionr(0, 0, 0, 1))
+    given: dict[str, Any] = {
+        "requests": [airsim.ImageRequest("0", 0)],
+        "path": [here],
+        "poses": [pose],
+        "pose": pose,
+        "state": client.simGetGroundTruthKinematics(),
+        "color_rgba": [1.0, 0.0, 0.0, 1.0],
+        "distortion_params": {"K1": 0.0},
+        "param_name": "K1",
+        "z": -2,
+        "fov_degrees": 80,
+        "is_name_regex": False,
+    }
+    of_kinds: list[tuple[Any, str]] = [
+        (0.0, "y vy vz roll pitch roll_rate pitch_rate yaw_rate value val scale"),
+        (0, "image_type param"),
+        (0.5, "x vx yaw throttle front_right_pwm rear_left_pwm front_left_pwm rear_right_pwm"),
+        (1, "duration velocity object_id seconds frames radius_cm"),
+        (True, "enable is_enabled status ignore_collision ignore_collison"),
+        ("crate", "object_name mesh_name asset_name message command level_name name_regex"),
+        ("0", "camera_name"),
+        (47.6414, "latitude"),
+        (-122.14, "longitude"),
+        (124, "altitude"),
+        (here, "wind scale_vector scale_vec"),
+        ([here], "points points_start points_end positions"),
+        (["a"], "strings names tf_names"),
+        (place, "geo_point point point1 point2"),
+    ]
+    given |= {name: value for value, names in of_kinds for name in names.split()}
+    called, errors = [], {}
+    for name, method in sorted(inspect.getmembers(client, inspect.ismethod)):
+        needed = [
+            each
+            for each, parameter in inspect.signature(method).parameters.items()
+            if parameter.default is inspect.Parameter.empty
+        ]
+        if name.startswith("_") or name == "reset" or not set(needed) <= given.keys():
+            continue
+        called.append(name)
+        try:
+            result: Any = method(*[given[each] for each in needed])
+            if name.endswith("Async"):
+                result.get()
+        except Exception as error:  # as in `errors`
+            text = error.args[0] if error.args else ""
+            errors[name] = text.decode() if isinstance(text, bytes) else repr(error)
+        if client.simIsPause():
+            client.simPause(False)
+    return {"called": called, "errors": errors}
 
 
 def sensors(port: int) -> Any:

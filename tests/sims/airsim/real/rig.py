@@ -64,6 +64,23 @@ latency = 0
 position = [0.46, 0.0, 0.0]
 """
 
+SENSORS = """
+[nodes.barometer]
+drift = 0.0
+
+[nodes.magnetometer]
+
+[nodes.gnss]
+
+[[nodes.range_finders]]
+name = "distance"
+
+[[nodes.lidars]]
+name = "lidar"
+channels = 16
+columns = 128
+"""
+
 
 class Rig:
     """A run that goes on, which scripts of a client may fly.

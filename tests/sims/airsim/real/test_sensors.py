@@ -8,26 +8,9 @@ import numpy as np
 import pytest
 
 from tests.sims.airsim.real.environments import CLIENTS
-from tests.sims.airsim.real.rig import flown
+from tests.sims.airsim.real.rig import SENSORS, flown
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
-
-SENSORS = """
-[nodes.barometer]
-drift = 0.0
-
-[nodes.magnetometer]
-
-[nodes.gnss]
-
-[[nodes.range_finders]]
-name = "distance"
-
-[[nodes.lidars]]
-name = "lidar"
-channels = 16
-columns = 128
-"""
 
 
 @pytest.mark.parametrize("client", CLIENTS)
