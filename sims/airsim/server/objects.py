@@ -59,6 +59,7 @@ class Objects:
         self._server = server
         self._world = server.world
         self._still: Any = None
+        self._warned: set[str] = set()
         model, config = self._world.model, server.config
         spares = spare_objects(server.name, config.objects)
         self._spares = {model.body(name).id: spec for name, spec in spares.items()}
@@ -141,11 +142,7 @@ class Objects:
         """Put an object somewhere at once; ``False`` of one that the settings do not let move."""
         qpos = _qpos(pose)
         if name not in self._bodies:
-            self._server.log.warning(
-                "simSetObjectPose: %s cannot be moved: `movable` of the server's settings names "
-                "what of the world can",
-                name,
-            )
+            self._warn("simSetObjectPose", f"{name!r:.80} is not in `movable` of the settings")
             return False
         self._put(self._bodies[name], qpos, keep=True)
         return True
@@ -181,9 +178,7 @@ class Objects:
         wanted = scale.x_val, scale.y_val, scale.z_val
         body = next((each for each in free if self._spares[each].scale == wanted), free[0])
         if (found := self._spares[body].scale) != wanted:
-            self._server.log.warning(
-                "simSpawnObject: %s has the scale %s of the settings, not %s", name, found, wanted
-            )
+            self._warn("simSpawnObject", f"the scale is {found} of the settings, not {wanted}")
         name = name or asset
         numbered = (f"{name}{number}" for number in itertools.count(1))
         if name in self.geoms:
@@ -220,6 +215,12 @@ class Objects:
     def set_scale(self, name: str, scale: Vector3r) -> bool:
         """Return whether an object has this scale: it cannot be changed."""
         return name in self.geoms and self.scale(name) == scale
+
+    def _warn(self, method: str, text: str) -> None:
+        """Log what a method does not do as asked, when it first happens."""
+        if method not in self._warned:
+            self._warned.add(method)
+            self._server.log.warning("%s: %s", method, text)
 
     def _home(self, body: int) -> Any:
         begin = self._world.model.jnt_qposadr[self._world.model.body_jntadr[body]]
