@@ -32,16 +32,17 @@ def cameras(vehicle_name: str, vehicle: Keys, settings: Keys, free: bool) -> lis
     }
     for name, keys in vehicle.tables("Cameras"):
         captures = usual | _captures(keys)
-        found[name] = {
-            **keys.mount(*default_mount(name, free)),
-            "captures": list(captures.values()),
-        }
+        place = dict(zip(("position", "orientation"), default_mount(name, free), strict=True))
+        mount = defaults.mount(**place)
+        mount |= keys.mount(**(place | mount))
+        found[name] = {**mount, "captures": list(captures.values())}
         looks = {(each["width"], each["height"], each["fov"]) for each in captures.values()}
         if len(looks) > 1:
             keys.note("CaptureSettings", "the types of image differ in size or field of view")
         elif 0 in captures and not {1, 2, 3} & set(captures):
             keys.note("CaptureSettings", "depth, which is not listed, has 256×144 pixels of 90°")
         keys.done()
+    defaults.mount()  # known, even if no camera asks for it
     defaults.done()
     return [{"name": name, "vehicle": vehicle_name, **each} for name, each in found.items()]
 
@@ -62,4 +63,6 @@ def _captures(keys: Keys) -> dict[int, Table]:
     for entry in keys.entries("NoiseSettings"):
         if entry.flag("Enabled"):
             entry.note("", "ignored: images on demand are without errors")
+    if keys.table("Gimbal").number("Stabilization", 0.0):
+        keys.note("Gimbal", "ignored: cameras turn with their vehicle")
     return {type_: each for type_, each in found.items() if type_ in _TYPES}

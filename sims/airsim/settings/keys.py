@@ -19,10 +19,12 @@ IGNORED = {
     for reason, keys in {
         "it changes only what Unreal shows": "ViewMode, TimeOfDay, SubWindows, CameraDirector, "
         "PawnPaths, PawnPath, RecordUIVisible, EngineSound, SpeedUnitFactor, SpeedUnitLabel, "
-        "LogMessagesVisible, Default Environment, DrawDebugPoints, EnableTrace, UnrealEngine",
+        "LogMessagesVisible, Default Environment, DrawDebugPoints, EnableTrace, UnrealEngine, "
+        "SeeDocsAt",
         "images are of one instant, in perspective, without errors": "MotionBlurAmount, "
         "TargetGamma, AutoExposureSpeed, AutoExposureBias, AutoExposureMaxBrightness, "
-        "AutoExposureMinBrightness, OrthoWidth, Gimbal",
+        "AutoExposureMinBrightness, OrthoWidth, DepthOfFieldFstop, DepthOfFieldFocalDistance, "
+        "DepthOfFieldFocalRegion, PublishToRos",
         "time is simulated in steps of 1 ms": "ClockType",
         "vehicles fly by MuJoCo's physics, and bodies are solid": "PhysicsEngineName, "
         "EnableCollisions, EnableCollisionPassthrogh, EnableCollisionPassthrough",
@@ -35,6 +37,12 @@ IGNORED = {
     for key in keys.split(", ")
 }
 """Why known keys have no effect."""
+
+_HOLDS = {
+    "DefaultVehicleState": "Armed",
+    **dict.fromkeys(("EnableRpc", "RpcEnabled", "AllowAPIAlways", "EnableCollisions"), True),
+}
+"""Values of these that hold here; so do 0, false and an empty text of all."""
 
 
 class Keys:
@@ -129,9 +137,10 @@ class Keys:
             yield inner.table(name)
 
     def done(self) -> None:
-        """Note each key that nobody asked for."""
-        for key in self._table:
-            if key not in self._asked:
+        """Note each key that nobody asked for, unless it asks for what is so anyway."""
+        for key, value in self._table.items():
+            so_anyway = key in IGNORED and (not value or value != value or value == _HOLDS.get(key))
+            if key not in self._asked and not so_anyway:
                 unknown = f"no such setting is known{suggest(key, self._asked)}"
                 self.note(key, f"ignored: {IGNORED.get(key, unknown)}")
 

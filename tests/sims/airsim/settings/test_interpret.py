@@ -181,6 +181,11 @@ def test_cameras_keep_airsims_defaults_where_nothing_is_said() -> None:
     assert cameras["front_right"].position == (0.5, 0.125, 0.0)
     assert cameras["front_left"].captures[1].fov == 60.0
     assert cameras["back_center"].vehicle == "Drone1"
+    settings["CameraDefaults"] = {"Y": 0.2, "Yaw": 5}
+    cameras = {each.name: each for each in node(settings, "airsim").cameras}
+    assert cameras["eye"].position == (0.5, 0.2, 0.0)
+    assert cameras["eye"].orientation == (0.0, -10.0, 5.0)
+    assert cameras["front_left"].position == (0.46, 0.2, 0.0)
 
 
 def test_recordings_stay_in_the_runs_folder() -> None:
@@ -227,6 +232,10 @@ def test_cosys_imus_are_without_noise_unless_asked() -> None:
         ({"ViewMode": "NoDisplay"}, "ViewMode: ignored: it changes only what Unreal shows"),
         ({"ClokSpeed": 2}, "ClokSpeed: ignored: no such setting is known (did you mean 'Clock"),
         ({"ClockSpeed": 1.5}, "ClockSpeed: AirSim takes 1.5 as 1; here it is 1.5"),
+        (
+            drone(Cameras={"c": {"Gimbal": {"Stabilization": 1}}}),
+            "Cameras.c.Gimbal: ignored: cameras turn with their vehicle",
+        ),
         (drone(RC={"RemoteControlID": 0}), "Vehicles.Drone1.RC: ignored: clients may always"),
         (drone(Sensors={"G": {"SensorType": 3}}), "Sensors.G: ignored: a sensor is off unless"),
         (drone(Sensors={"G": {"SensorType": 7}}), "Sensors.G.SensorType: ignored: no sensor of"),
@@ -255,6 +264,19 @@ def test_what_is_not_honoured_is_named_once_with_its_path(settings: Any, note: s
     (found,) = table_of(settings, 1)[1]
     assert note in found
     assert found.startswith("settings.json: ")
+
+
+def test_what_asks_for_what_is_so_anyway_is_not_named() -> None:
+    gimbal = {"Stabilization": 0, "Pitch": float("nan")}
+    settings = drone(
+        DefaultVehicleState="Armed",
+        EnableCollisions=True,
+        EnableCollisionPassthrogh=False,
+        AllowAPIAlways=True,
+        PawnPath="",
+        X=float("nan"),
+    ) | {"ClockType": "", "RpcEnabled": True, "CameraDefaults": {"Gimbal": gimbal, "X": None}}
+    assert not [note for note in table_of(settings, None)[1] if "NaN" not in note]
 
 
 def test_vehicles_at_one_place_are_named() -> None:
