@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from runtime.errors import CommandError
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.real_clock import RealClock
-from runtime.schedule import Ticker
+from runtime.schedule import Once, Ticker
 from runtime.stepping import Stepping
 from runtime.testing import run_in_lockstep
 
@@ -161,6 +161,27 @@ def test_all_that_is_due_when_time_comes_to_stand_is_done_and_nothing_after() ->
     assert [each for each in run_in_lockstep(main()) if each.endswith(" at 10")] == [
         f"{word} at 10" for word in words
     ]
+
+
+def test_whoever_waits_until_time_stands_finds_all_that_is_due_done() -> None:
+    async def main() -> None:
+        loop, clock = running_loop()
+        stepping = Stepping(clock)
+        assert await stepping.stands() == 0  # at once: it is not to stand
+        await clock.sleep(0.01)
+        done: list[str] = []
+        for name in "abc":  # due at the instant at which time is paused
+            loop.schedule.add(20 * MS, Once(lambda name=name: done.append(name)))  # type: ignore[misc]
+        loop.schedule.add(20 * MS + 1, Once(lambda: done.append("later")))
+        await clock.sleep_until(20 * MS)
+        stepping.pause()
+        await stepping.stands()
+        assert (done, loop.now, stepping.state) == (["a", "b", "c"], 20 * MS, "paused")
+        stepping.resume()
+        await clock.sleep(0.001)
+        assert done == ["a", "b", "c", "later"]
+
+    run_in_lockstep(main())
 
 
 def test_a_step_goes_exactly_as_far_although_nothing_is_due_there_or_ever() -> None:
