@@ -207,7 +207,7 @@ class Flight:
 
     @rpc("hover")
     def hover(self, vehicle_name: str) -> Reply:
-        """Stop, and hold the place; replies at once."""
+        """Stop, and hold the place; replies within 0.2 s."""
         vehicle = self.tasks.commanded(vehicle_name)
         return self._fly_slowly(vehicle, vehicle.state().position, math.inf)
 
@@ -265,7 +265,7 @@ class Flight:
         adaptive: Number,
         vehicle_name: str,
     ) -> Reply:
-        """Fly straight to a place on the earth, degrees and metres above the sea."""
+        """Fly straight to a place on the earth, degrees, and metres above the ellipsoid."""
         vehicle = self.tasks.commanded(vehicle_name)
         place = from_geodetic((latitude, longitude, altitude), vehicle.config.origin)
         if math.dist(place, vehicle.origin) > 1e6:
