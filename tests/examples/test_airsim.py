@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,20 @@ from tests.sims.airsim.real.rig import Rig
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-def beside(example: str, out: Path) -> tuple[str, Any]:
-    """Run an example and its script; return what the script prints, and the run's summary."""
+def beside(example: str, out: Path, text: str = "") -> tuple[str, Any]:
+    """Run an example and its script; return what the script prints, and the run's summary.
+
+    Args:
+        example: Name of the script.
+        out: Folder for the results.
+        text: A script in place of the example's; PORT in it becomes the server's port.
+    """
     settings = ["--set", "airsim.port=0", "--quiet", "--log", "info", "--out", str(out)]
     name = example.removesuffix("_hello")
     with start(["run", f"examples/{name}.toml", *settings], ROOT) as process:
         rig = Rig(out, process)
-        script = [str(python_of("cosysairsim")), f"examples/{example}.py", str(rig.port)]
+        given = ["-c", text.replace("PORT", str(rig.port))] if text else [f"examples/{example}.py"]
+        script = [str(python_of("cosysairsim")), *given, str(rig.port)]
         done = subprocess.run(
             script, cwd=ROOT, capture_output=True, text=True, timeout=400, check=False
         )
@@ -29,7 +37,16 @@ def beside(example: str, out: Path) -> tuple[str, Any]:
         return done.stdout, rig.end(interrupt=name == "airsim")
 
 
-def test_the_five_lines_fly(tmp_path: Path) -> None:
+def test_the_lines_of_the_readme_fly(tmp_path: Path) -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"^```python\n(import cosysairsim.*?)^```", readme, re.M | re.S)
+    lines = lines.replace("MultirotorClient()", "MultirotorClient(port=PORT)")
+    lines += "print(png[:4], len(depth.image_data_float))"
+    printed, _ = beside("airsim_hello", tmp_path, lines)
+    assert printed.splitlines()[-1] == "b'\\x89PNG' 36864"
+
+
+def test_the_first_script_flies(tmp_path: Path) -> None:
     printed, summary = beside("airsim_hello", tmp_path)
     assert "m up: 256x144 pixels" in printed
     assert summary["outputs"]["airsim.setpoints"] > 50
