@@ -57,9 +57,7 @@ class ServedVehicle(ABC):
         self.config = config
         self.world = world
         self._now = now
-        self.api_control = False
-        self.armed = True
-        self.collision = CollisionInfo()
+        self.release()
 
     def release(self) -> None:
         """Be as at the start for clients: not under control, armed, without a collision."""
@@ -194,15 +192,12 @@ class Vehicles(dict[str, ServedVehicle]):
     Args:
         world: The world that they are in.
         default: Name of the one that an empty name stands for; empty for the first by name.
-
-    Attributes:
-        default: As given.
     """
 
     def __init__(self, world: SharedWorld, default: str) -> None:
         super().__init__()
         self._world = world
-        self.default = default
+        self._default = default
 
     def find(self, name: str) -> ServedVehicle:
         """Return a vehicle of either kind.
@@ -210,7 +205,7 @@ class Vehicles(dict[str, ServedVehicle]):
         Raises:
             RpcError: There is none of that name.
         """
-        found = self.get(name or self.default or min(self, default=""))
+        found = self.get(name or self._default or min(self, default=""))
         if found is None:
             raise _unknown("Vehicle Sim-API", name)
         return found
@@ -222,7 +217,7 @@ class Vehicles(dict[str, ServedVehicle]):
             RpcError: There is none of that name.
         """
         flying = (each for each in self if isinstance(self[each], ServedMultirotor))
-        found = self.get(name or self.default or min(flying, default=""))
+        found = self.get(name or self._default or min(flying, default=""))
         if not isinstance(found, ServedMultirotor):
             raise _unknown("Vehicle API", name)
         return found
