@@ -178,7 +178,7 @@ class AirsimClient(Node[AirsimClientConfig]):
                 await self._obey()
 
         while True:
-            await self.clock.sleep_until(self._newest.get("state", 0) + period if step else 0)
+            await self.clock.sleep_until(self.clock.now() + period if step else 0)
             await self._guarded(work)
             step += 1
 

@@ -166,3 +166,20 @@ def test_a_flight_goes_on_after_a_lost_connection(tmp_path: Path, tiny_world: st
     log = (tmp_path / "cut" / "client" / "log.txt").read_text()
     assert "a connection is lost" in log
     assert "a set of images is lost" in log
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_the_example_flies_and_is_judged(tmp_path: Path) -> None:
+    run, port = [sys.executable, "-m", "runtime", "run"], free_port()
+    server = [*run, "examples/airsim.toml", "--set", "airsim.time=paused", "--out", f"{tmp_path}/s"]
+    command = [*run, "examples/airsim_client.toml", "--out", f"{tmp_path}/c"]
+    with subprocess.Popen([*server, "--set", f"airsim.port={port}"], cwd=ROOT) as process:
+        try:
+            change = ["--set", f"drone.port={port}"]
+            subprocess.run([*command, *change], cwd=ROOT, check=True, timeout=300)
+        finally:
+            process.terminate()
+    found = json.loads((tmp_path / "c" / "summary.json").read_text())
+    assert found["verdict"]["estimators"]["odometry"]["ate_percent"] < 1.0
+    assert (tmp_path / "c" / "report.html").is_file()
