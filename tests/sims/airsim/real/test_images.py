@@ -20,7 +20,7 @@ SKY = 65504.0
 
 @BOTH
 def test_images_are_the_runs_own(client: str, tmp_path: Path) -> None:
-    with flown(tmp_path, nodes=KEEP) as rig:
+    with flown(tmp_path, nodes=KEEP, settings='time = "paused"') as rig:
         found = rig.script(client, "images", str(tmp_path))
         rig.end()
 
