@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench import flood, ros_images
+from bench import flood, lateness, ros_images
 from bench.lateness import Beat
 
 
@@ -27,7 +27,7 @@ def test_each_flooded_window_is_compared_with_the_quiet_one_before_it(
     for window, late in enumerate([100, 120, 5000, 6000, 100, 130]):
         ticks += [(window * second + n * 2_500_000, late * 1000) for n in range(400)]
         ticks.append((window * second + 1_000_000, 10**9))
-    monkeypatch.setattr(flood, "BEATS", [Beat(at, at, late, 0) for at, late in ticks])
+    monkeypatch.setattr(lateness, "BEATS", [Beat(at, at, late, 0) for at, late in ticks])
     windows = [(w * second, (w + 1) * second, 10_000 * (w % 2)) for w in range(6)]
     row = flood._row("flood", windows[1::2], windows[0::2])
     assert (row.late_p50_us, row.late_p99_us, row.late_max_us) == (130.0, 130.0, 6000.0)

@@ -36,7 +36,7 @@ def settings_file(folder: Path, settings: Any) -> Path:
 
 
 def test_what_import_prints_is_toml_that_says_where_it_is_from(tmp_path: Path) -> None:
-    settings_file(tmp_path, '{"ViewMode": "", // none\n "a\\nb = [": 1, "Wind": {"X": 1}}')
+    settings_file(tmp_path, '{"ViewMode": "Fpv", // none\n "a\\nb = [": 1, "Wind": {"X": 1}}')
     done = runtime(tmp_path, "import", "settings.json", "--world", "yard")
     assert done.returncode == 0, done.stderr
     assert "warning: settings.json: a comment in line 1: AirSim itself" in done.stderr
