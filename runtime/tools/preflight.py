@@ -120,6 +120,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
             cut_short.add(runner.spec.name)
             if isinstance(error.__cause__, UncheckableError):
                 uncertain = True
+                warnings.append(f"{runner.spec.name}: {error.__cause__}: not all can be checked")
             elif not isinstance(error.__cause__, _NoWorkerError):
                 errors.append(str(error))
         elif phase == "announce":

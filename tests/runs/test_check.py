@@ -157,7 +157,7 @@ def test_a_recording_is_looked_for_beside_the_file(tmp_path: Path) -> None:
     ids=lambda path: path.stem,
 )
 def test_our_own_files_are_right(path: Path) -> None:
-    """Those that need a recording, or a vocabulary, say so and nothing else."""
+    """Those that need a recording, a vocabulary or a server say so and nothing else."""
     code, lines = check(path)
     if code:
         assert path.stem in {"replay", "orb_slam3", "euroc", "tum", "kitti", "svo", "kiss_icp"}
@@ -165,4 +165,7 @@ def test_our_own_files_are_right(path: Path) -> None:
         assert "expected a recording" in lines[0] or "expected a vocabulary" in lines[0]
     else:
         assert lines[-1].endswith(": right")
-        assert len(lines) == 1, lines
+        warnings = [line for line in lines if line.startswith("warning: ")]
+        if path.stem == "airsim_client":
+            assert "is known to the server only: not all can be checked" in warnings[0]
+        assert len(lines) == 1 or (path.stem == "airsim_client" and len(warnings) == 3), lines
