@@ -14,13 +14,6 @@ import msgspec
 NAN = float("nan")
 
 
-class Vector2r(msgspec.Struct, frozen=True):
-    """Two numbers."""
-
-    x_val: float = 0.0
-    y_val: float = 0.0
-
-
 class Vector3r(msgspec.Struct, frozen=True):
     """Three numbers."""
 
