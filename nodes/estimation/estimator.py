@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from typing_extensions import TypeVar
@@ -111,9 +112,9 @@ class Estimator(Node[C], ABC):
     are in the announced camera's own image. Rows keep the read-out time of a rolling shutter only
     nearly.
 
-    **Frame and alignment.** The `frame_id` of the estimates, chosen once with the first pose, says
-    what is known about their origin, and so how `nodes.evaluation` aligns them with the ground
-    truth before it compares:
+    **Frame and alignment.** The `frame_id` of the estimates, chosen with the first pose of each
+    map, says what is known about their origin, and so how `nodes.evaluation` aligns them with the
+    ground truth before it compares:
 
     - ``map``: the origin is that of the ground truth. No alignment.
     - ``odom``, ``odom_1``, ``odom_2``, …: the origin is the body at the first image. The first pose
@@ -132,8 +133,10 @@ class Estimator(Node[C], ABC):
       stamp;
     - the estimates are in metres: the estimator is not scale-free.
 
-    Otherwise it is ``odom``, whose origin is the body at that image, and after a restart
-    ``odom_1``, ``odom_2``, … A restarted node sends `TrackingLost`, then `TrackingRegained`.
+    Otherwise it is ``odom``, whose origin is the body at that image. After a restart, and with each
+    further map of the tracker (`TrackingResult.map`), it is ``odom_1``, ``odom_2``, …, and
+    `TrackingLost`, then `TrackingRegained` are sent. The origin of a further map is as near to the
+    one before as the tracker guesses.
     """
 
     needs: frozenset[str] = frozenset()
@@ -166,7 +169,8 @@ class Estimator(Node[C], ABC):
     _vehicles: tuple[VehicleAnnouncement, ...] = ()
     _choice: SensorChoice | None = None
     _rectification: Rectification | None = None
-    _mount: Mount | None = None
+    _mounts: Mapping[int, Mount] = MappingProxyType({})
+    _frame = ""
     _given: Mapping[str, str] = MappingProxyType({})
     _lost = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
@@ -322,24 +326,30 @@ class Estimator(Node[C], ABC):
                 the first image that is published with a pose.
         """
         stamp = self.exposed_at(image)
-        if self.restarts and self._mount is None and not self._lost:
-            self._lost = True
-            reason = f"restarted: poses are in {self._odom()} from here on"
-            self.tracking_events.send(TrackingLost(stamp=stamp, source=self.name, reason=reason))
+        if self.restarts and not self._mounts:
+            self._lose(stamp, f"restarted: poses are in {self._odom()} from here on")
         self._send_features(image, result)
-        if result.lost and not self._lost:
-            self.log.warning("lost: %s", result.reason or "no reason given")
-            self.tracking_events.send(
-                TrackingLost(stamp=stamp, source=self.name, reason=result.reason)
-            )
-        elif self._lost and not result.lost:
+        if result.lost:
+            self._lose(stamp, result.reason)
+            return
+        mount = self._mount_of(result.map, stamp if origin is None else origin)
+        if mount.frame_id != self._frame and self._frame:
+            reason = f"another map: poses are in {mount.frame_id} from here on"
+            if self._lost:
+                self.log.warning("%s", reason)
+            self._lose(stamp, reason)
+        self._frame = mount.frame_id
+        if self._lost:
+            self._lost = False
             self.log.info("regained %s", result.reason)
             self.tracking_events.send(TrackingRegained(stamp=stamp, source=self.name))
-        self._lost = result.lost
-        if not result.lost:
-            if self._mount is None:
-                self._mount = self._mounting(stamp if origin is None else origin)
-            self.estimates.send(self._mount.estimate(stamp, self.name, result))
+        self.estimates.send(mount.estimate(stamp, self.name, result))
+
+    def _lose(self, stamp: int, reason: str) -> None:
+        if not self._lost:
+            self._lost = True
+            self.log.warning("lost: %s", reason or "no reason given")
+            self.tracking_events.send(TrackingLost(stamp=stamp, source=self.name, reason=reason))
 
     def _send_features(self, image: Frame, result: TrackingResult) -> None:
         points = result.points
@@ -356,18 +366,28 @@ class Estimator(Node[C], ABC):
         )
 
     def publish_trajectory(
-        self, stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float64]
+        self, stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float64], number: int = 0
     ) -> None:
         """Send the trajectory as the tracker sees it now, after loop closures; see `on_end`.
+
+        Without a pose that was published in that map, none is sent.
 
         Args:
             stamps: When the images were exposed (`exposed_at`), ns, strictly rising, shape (n,).
             poses: The optical camera as in `TrackingResult`, shape (n, 4, 4).
+            number: Of the map that they are in.
         """
-        if self._mount is not None and len(stamps):
-            self.trajectories.send(
-                self._mount.trajectory(self.clock.now(), self.name, stamps, poses)
-            )
+        if (mount := self._mounts.get(number)) is not None and len(stamps):
+            self.trajectories.send(mount.trajectory(self.clock.now(), self.name, stamps, poses))
+
+    def _mount_of(self, number: int, origin: int) -> Mount:
+        """Return the mount for poses in a map; that of the first is for poses from `origin` on."""
+        if (mount := self._mounts.get(number)) is None:
+            first = next(iter(self._mounts.values()), None)
+            mount = first and msgspec.structs.replace(first, frame_id=self._odom())
+            mount = mount or self._mounting(origin)
+            self._mounts = {**self._mounts, number: mount}
+        return mount
 
     def _mounting(self, origin: int) -> Mount:
         """Return the mount for a tracker whose poses start at an image of this stamp."""
@@ -399,4 +419,5 @@ class Estimator(Node[C], ABC):
 
     def _odom(self) -> str:
         """Return the frame of estimates whose origin is unknown."""
-        return f"odom_{self.restarts}" if self.restarts else "odom"
+        before = self.restarts + len(self._mounts)
+        return f"odom_{before}" if before else "odom"

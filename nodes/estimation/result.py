@@ -22,6 +22,9 @@ class TrackingResult(msgspec.Struct, frozen=True, eq=False):
         covariance: Of the pose's error (x, y, z, roll, pitch, yaw) in the optical camera at the
             first image, m², m rad and rad², shape (6, 6): a shift of the camera and a rotation
             about it, both along that frame's axes; `None` if the tracker does not know it.
+        map: Number of the map that the pose is in. A tracker that begins a new map at a pose, or
+            with a unit of length, that it only guesses counts it up; one that finds an earlier map
+            again says that one's number. Poses of each map are sent in a frame of their own.
     """
 
     pose: npt.NDArray[np.float64]
@@ -31,3 +34,4 @@ class TrackingResult(msgspec.Struct, frozen=True, eq=False):
     inliers: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
     velocity: npt.NDArray[np.float64] | None = None
     covariance: npt.NDArray[np.float64] | None = None
+    map: int = 0

@@ -68,6 +68,7 @@ class MonocularTracker:
         self._before: tuple[Grey, Floats, Floats] | None = None  # image, landmarks, their pixels
         self._known: deque[Keyframe] = deque(maxlen=_STORED)
         self._lost_since: int | None = None
+        self._maps = 0  # begun at a guessed pose, with a guessed unit
 
     def track(self, stamp: int, image: npt.NDArray[np.uint8]) -> TrackingResult | None:
         """Return the pose of the next image; `None` before there is a map.
@@ -101,6 +102,7 @@ class MonocularTracker:
             reason=reason,
             points=pixels[known].astype(np.float32),
             inliers=agree[known],
+            map=self._maps,
         )
         shift = np.linalg.norm(pixels - tracks.pixels[rows], axis=1)
         far = float(np.median(shift[agree])) > self._settings.keyframe_shift
@@ -127,6 +129,7 @@ class MonocularTracker:
         unit, reason = 1.0, ""
         if self._map is not None:
             unit, reason = self._map.depth, "by a new map: its unit of length is a guess"
+            self._maps += 1
         start = inverse(self._pose)
         self._map = LocalMap.first(found, grey, start, unit, self._matrix, self._settings)
         self._lost_since = self._initialization = None
@@ -138,6 +141,7 @@ class MonocularTracker:
             reason=reason,
             points=found.pixels[1].astype(np.float32),
             inliers=np.ones(count, np.bool_),
+            map=self._maps,
         )
 
     def _continue_from(self, world: LocalMap) -> None:

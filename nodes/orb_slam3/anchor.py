@@ -43,11 +43,17 @@ class Anchor:
         self._from_world = np.eye(4)
         self._last = np.eye(4)
         self._doubted = False
+        self._map = 0.0  # stamp of its first key frame
 
     @property
     def maps(self) -> int:
         """How many maps there have been."""
         return len(self._first)
+
+    @property
+    def map(self) -> int:
+        """Number of the map that poses are placed by; 0 before there is one."""
+        return list(self._first).index(self._map) if self._first else 0
 
     def world_may_have_changed(self, first: KeyFrame, pose: Floats) -> None:
         """Take note of the first key frame of the map in which the camera is now.
@@ -66,16 +72,16 @@ class Anchor:
         old_fits = self._jump(self._from_world, pose) < self._jump(from_world, pose)
         self._doubted = known and old_fits and not self._doubted
         if not self._doubted:
-            self._from_world = from_world
+            self._from_world, self._map = from_world, first.stamp
 
     def _jump(self, from_world: Floats, pose: Floats) -> float:
         """Return how far a pose would be from the last one."""
         return float(np.linalg.norm((from_world @ pose)[:3, 3] - self._last[:3, 3]))
 
-    def first(self, stamp: float) -> Floats | None:
-        """Return the first key frame of a map in our frame, by its stamp; `None` if unknown."""
-        known = (pose for at, pose in self._first.items() if abs(at - stamp) < 1e-4)
-        return next(known, None)
+    def first(self, stamp: float) -> tuple[int, Floats] | None:
+        """Return a map's number and its first key frame in our frame, by that one's stamp."""
+        known = enumerate(self._first.items())
+        return next(((n, pose) for n, (at, pose) in known if abs(at - stamp) < 1e-4), None)
 
     def place(self, pose: Floats) -> Floats:
         """Return a pose in the frame of the very first key frame; remembered as the last one."""

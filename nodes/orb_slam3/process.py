@@ -142,14 +142,14 @@ class OrbSlam3Process:
         self._left_alone = time.process_time()
         return found
 
-    def trajectory(self) -> tuple[npt.NDArray[np.int64], Floats]:
+    def trajectory(self) -> tuple[npt.NDArray[np.int64], Floats, int]:
         """End ORB-SLAM3's threads, and return the poses as it sees them after all corrections.
 
         They are those of the images that were tracked in its largest map.
 
         Returns:
-            Stamps of images as given to `track`, strictly rising, shape (n,), and the optical
-            camera in the frame of `track`'s poses, shape (n, 4, 4).
+            Stamps of images as given to `track`, strictly rising, shape (n,), the optical camera in
+            the frame of `track`'s poses, shape (n, 4, 4), and the number of that map.
         """
         _wait_for_other_threads(self._left_alone + _LAST)
         self._slam.shutdown()
@@ -160,16 +160,17 @@ class OrbSlam3Process:
         rows, key_frames = (np.loadtxt(file, ndmin=2) for file in files)
         first = self._anchor.first(key_frames[0, 0] * 1e-9) if len(key_frames) else None
         if first is None or not len(rows):
-            return np.empty(0, np.int64), np.empty((0, 4, 4))
+            return np.empty(0, np.int64), np.empty((0, 4, 4)), 0
+        number, first_pose = first
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3, 3] = rows[:, 1:4]
         poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
         on_imu = self._settings.camera_on_imu  # with an IMU, poses are those of its frame
-        poses = first @ np.linalg.inv(on_imu) @ poses @ on_imu
+        poses = first_pose @ np.linalg.inv(on_imu) @ poses @ on_imu
         sent = np.array(self._stamps)
         at = np.abs(sent - np.round(rows[:, :1])).argmin(1)
         at, row = np.unique(at, return_index=True)
-        return sent[at], poses[row]
+        return sent[at], poses[row], number
 
     def close(self) -> None:
         """End ORB-SLAM3's threads."""
@@ -212,6 +213,7 @@ class OrbSlam3Process:
             matches=int(result.num_tracked_points) if valid else 0,
             first_keyframe=self._first_keyframe,
             maps=self._anchor.maps,
+            map=self._anchor.map,
         )
 
     def _update_map(self, pose: Floats) -> None:

@@ -67,6 +67,7 @@ class SvoProcess:
         self._last = np.eye(4)
         self._known_at = -1
         self._reason = ""
+        self._maps = 0  # put where the camera was last known to be
 
     def track(self, stamp: int, image: npt.NDArray[np.uint8]) -> TrackingResult | None:
         """Return the pose of the next image; `None` while there has been no map yet.
@@ -90,7 +91,7 @@ class SvoProcess:
             if np.isfinite(pose).all():
                 self._last, self._known_at = pose, stamp
                 reason, self._reason = self._reason, ""
-                return TrackingResult(pose=pose, reason=reason)
+                return TrackingResult(pose=pose, reason=reason, map=self._maps)
         if self._known_at < 0:
             return None
         relocalizing = self._svo.stage() == self._stages.RELOCALIZING
@@ -98,6 +99,7 @@ class SvoProcess:
             self._svo.reset()
             self._svo.start()
             self._world = self._last
+            self._maps += 1
             self._reason = "a new map, put where the camera was last known to be"
         reason = "too few landmarks; looking for the nearest key frame"
         return TrackingResult(

@@ -62,6 +62,7 @@ class DenseTracker:
         self._before: Any = None
         self._age = 0
         self._lost_since: int | None = None
+        self._maps = 0  # begun at a guessed pose
 
     def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> TrackingResult:
         """Return the pose of the next image; see `Tracker.track`."""
@@ -88,7 +89,9 @@ class DenseTracker:
                 return lost
             self._make_keyframe(frame)
             self._lost_since = None
-            return TrackingResult(self._pose, reason="by a new map, started at the last pose")
+            self._maps += 1
+            reason = "by a new map, started at the last pose"
+            return TrackingResult(self._pose, reason=reason, map=self._maps)
         reason = "against a key frame" if self._lost_since is not None else ""
         self._lost_since = None
         self._pose = pose
@@ -96,7 +99,7 @@ class DenseTracker:
         self._age += 1
         if self._age >= self._settings.keyframe_interval:
             self._make_keyframe(frame)
-        return TrackingResult(pose, reason=reason)
+        return TrackingResult(pose, reason=reason, map=self._maps)
 
     def _make_keyframe(self, frame: Any) -> None:
         """Make this the key frame."""

@@ -109,6 +109,7 @@ class FeatureTracker:
         self._pose = np.eye(4)  # world (the first camera) to camera
         self._lost_since: int | None = None
         self._count = 0  # images so far
+        self._maps = 0  # begun at a guessed pose
         self._searched = 0  # key frames, since tracking was lost
         self._near_until = 0
         self._near: Rows | None = None  # landmarks that are or may soon be in view
@@ -167,6 +168,7 @@ class FeatureTracker:
             reason="against a key frame" if lost else "",
             points=points.astype(np.float32),
             inliers=inliers,
+            map=self._maps,
         )
 
     def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
@@ -370,6 +372,7 @@ class FeatureTracker:
                 least = self._settings.min_inliers
                 few = f"{count} corners with depth, of {least} needed for a map, and too few edges"
                 return self._lost(stamp, few)
+        self._maps += bool(self._keyframes) and not self._is_carried
         self._clear_map()
         self._lost_since = None
         self._motion.placed(stamp, self._pose)
@@ -381,7 +384,13 @@ class FeatureTracker:
             reason=reason,
             points=pixels.astype(np.float32),
             inliers=np.ones(count, np.bool_),
+            map=self._maps,
         )
+
+    @property
+    def _is_carried(self) -> bool:
+        """Whether the pose is known without the map, so that a new one goes on in its frame."""
+        return False
 
     def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
         """Return that tracking is lost; after a while, start a new map.

@@ -31,6 +31,7 @@ from events import (
 )
 from events.poses import pose_matrix, pose_tuples
 from nodes.estimation import Estimator, RgbdFrame, StereoInertialFrame, TrackingResult
+from nodes.evaluation.record import EstimatorRecord
 from runtime import Bundle
 from runtime.errors import NodeError, RefusedError
 from runtime.testing import NodeResult, run_nodes, spec
@@ -196,6 +197,35 @@ def test_after_a_restart_it_is_in_a_frame_of_its_own_and_says_so() -> None:
         *[(3000, TrackingLost), (3000, TrackingRegained)],
     ]
     assert result.of(TrackingLost)[0].reason == "restarted: poses are in odom_1 from here on"
+
+
+class Mapping(Scripted):
+    """Begins another map at a guessed pose with each brighter image."""
+
+    async def run(self) -> None:
+        async for image, _ in self.frames:
+            number = int(image.data.max()) - 9
+            self.publish(image, TrackingResult(np.eye(4), map=number))
+
+    async def on_end(self) -> None:
+        self.publish_trajectory(np.array([1, 2]), np.tile(np.eye(4), (2, 1, 1)), 2)
+
+
+def test_each_map_at_a_guessed_pose_has_a_frame_of_its_own_and_counts_as_a_restart() -> None:
+    shown = [(1, 9), (2, 9), (3, 11), (4, 9), (5, 11), (6, 12)]
+    frames = [event for stamp, grey in shown for event in rgbd(stamp, grey=grey)]
+    seen = camera("drone/front", "rgb", "depth")
+    result = run_nodes([spec(Mapping, "est")], inputs=[vehicle(), seen, *frames], duration=1.0)
+    estimates = result.of(PoseEstimate)
+    expected = ["map", "map", "odom_1", "map", "odom_1", "odom_2"]
+    assert [each.frame_id for each in estimates] == expected
+    changes = [3, 4, 5, 6]
+    assert [each.stamp for each in result.of(TrackingLost)] == changes
+    assert [each.stamp for each in result.of(TrackingRegained)] == changes
+    record = EstimatorRecord()
+    assert [record.add(each, None) for each in estimates] == [f == "map" for f in expected]
+    assert record.restarts == 3
+    assert [each.frame_id for each in result.of(TrajectoryEstimate)] == ["odom_1"]
 
 
 def test_another_vehicles_place_is_not_taken_for_its_own() -> None:

@@ -217,6 +217,7 @@ def test_a_new_map_waits_for_the_timeout_says_so_and_goes_on_from_the_last_pose(
     new = next(i for i, each in enumerate(said) if not each.lost)
     assert new * FRAME > 0.15e9
     assert "new map" in said[new].reason
+    assert (before.map, {each.map for each in said[new:]}) == (0, {1})
     assert NO_MAP not in said
     assert not any(each.lost or each.reason for each in said[new + 1 :])
     relative = [np.linalg.inv(before.pose) @ each.pose for each in said[new:]]

@@ -69,10 +69,11 @@ def test_a_new_map_begins_where_the_camera_was_last_and_falls_into_place_when_me
     anchor.world_may_have_changed(KeyFrame(7.0, np.eye(4)), np.eye(4))
     np.testing.assert_allclose(anchor.place(np.eye(4)), pose(2.0, 0.3), atol=1e-12)
     np.testing.assert_allclose(anchor.place(pose(0.5)), pose(2.0, 0.3) @ pose(0.5), atol=1e-12)
-    assert anchor.maps == 2
+    assert (anchor.maps, anchor.map) == (2, 1)
     # Merged: the world is the first map's again, and its pose there is the truth.
     anchor.world_may_have_changed(KeyFrame(0.0, np.eye(4)), pose(3.1))
     np.testing.assert_allclose(anchor.place(pose(3.1)), pose(3.1), atol=1e-12)
+    assert anchor.map == 0
     assert anchor.maps == 2
 
 

@@ -11,7 +11,7 @@ import pytest
 from events import CameraInfo
 from nodes.estimation import TrackingResult
 from nodes.odometry.images import Floats
-from nodes.visual_odometry.dense import DenseTracker
+from nodes.visual_odometry.dense import DenseSettings, DenseTracker
 from nodes.visual_odometry.features import FeatureTracker
 from nodes.visual_odometry.node import Tracker
 from nodes.visual_odometry.settings import FeatureSettings
@@ -140,10 +140,17 @@ def test_features_begin_a_new_map_if_nothing_is_known_and_say_so() -> None:
     said = follow(tracker, [far] * 6, 21)
     assert [each.lost for each in said][-1] is False
     assert any("new map" in each.reason for each in said)
+    assert said[-1].map == 1
     x, y, z = said[-1].pose[:3, 3]
     assert abs(y) < 0.01
     assert abs(z) < 0.01
     assert 0.2 < x < 0.5  # the pose goes on as it moved, and ever more slowly
+
+
+def test_a_dense_map_at_a_guessed_pose_has_a_number_of_its_own() -> None:
+    tracker = DenseTracker(INFO, DenseSettings(reset_timeout=0.0))
+    assert follow(tracker, RIGHT)[-1].map == 0
+    assert follow(tracker, [pose(x=-6.0, y=6.0, yaw=60.0)], 20)[-1].map == 1
 
 
 def test_features_tell_what_they_followed() -> None:
