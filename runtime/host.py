@@ -8,6 +8,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+import msgspec
 from typing_extensions import TypeVar
 
 from runtime.clock import Clock
@@ -37,6 +38,30 @@ class Sibling(NamedTuple):
     here: bool
 
 
+class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
+    """How a run ended.
+
+    Attributes:
+        stamp: When its end was asked for, on the run's clock (ns).
+        reason: Why, in words.
+        by: Who ended it: a node's name, ``user`` (Ctrl-C, a signal, a key, a closed window), or ""
+            where its `duration` was over.
+        error: Message of the error that ended it, which `by` caused; "" if none did.
+        planned: Whether this was the end of the plan: of `duration`, or of what a node that flies
+            or replays carries out, without an error; or a person's wish where there is no plan.
+        duration: Seconds that the run was to take; `None` if the file does not say.
+        restarts: How often each node of this process was brought up anew.
+    """
+
+    stamp: int
+    reason: str
+    by: str
+    error: str = ""
+    planned: bool
+    duration: float | None = None
+    restarts: dict[str, int]
+
+
 class Host(Protocol):
     """What a run does for its nodes; see the methods of `Node` that call these, with themselves.
 
@@ -44,6 +69,7 @@ class Host(Protocol):
         siblings: All nodes of the run, in file order.
         shared: What nodes of this process share, by name.
         stepping: Pauses and steps simulated time.
+        run_end: How the run ended; `None` before.
     """
 
     seed: int
@@ -72,8 +98,11 @@ class Host(Protocol):
         """Run a function of a node in a thread."""
 
     @property
-    def stop(self) -> Callable[[str], None]:
-        """Ends the run in order, for a reason."""
+    def run_end(self) -> RunEnd | None:
+        """How the run ended, if it did."""
+
+    def stop(self, node: Any, reason: str) -> None:
+        """End the run in order, for a reason of a node's."""
 
     def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:
         """Put a verdict into the summary."""

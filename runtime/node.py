@@ -17,6 +17,7 @@ from typing import (
     Any,
     ClassVar,
     Generic,
+    Literal,
     ParamSpec,
     dataclass_transform,
     get_args,
@@ -31,7 +32,7 @@ from runtime.bundles import Matcher
 from runtime.clock import Clock
 from runtime.declarations import Declared, read_declarations
 from runtime.hold import Hold, HoldConfig
-from runtime.host import Host, Sibling
+from runtime.host import Host, RunEnd, Sibling
 from runtime.json_values import plain
 from runtime.logs import NodeLogger
 from runtime.schedule import SECOND, Tick, Ticker
@@ -100,6 +101,10 @@ class Node(Generic[C]):
     flies: ClassVar[bool] = False
     """Whether it is a part of the flight itself (a simulator, a pilot), which a sweep records once
     for all runs with equal ones if nothing else has an influence on it."""
+    ends_run: ClassVar[Literal["", "plan", "hand"]] = ""
+    """What is over when it ends the run: the ``plan`` that it carries out (of a pilot, of a replay:
+    also of all that fly), or what a person wants by whose ``hand`` it acts (a window, keys). Of any
+    other node, the run ends early."""
     files: ClassVar[tuple[str, ...]] = ()
     """What it writes into the run's folder, besides what settings of type `OutputPath` name."""
     declared: ClassVar[Declared]
@@ -275,7 +280,12 @@ class Node(Generic[C]):
 
     def stop(self, reason: str) -> None:
         """End the run in order, as Ctrl-C would."""
-        self._host.stop(reason)
+        self._host.stop(self, reason)
+
+    @property
+    def run_end(self) -> RunEnd | None:
+        """How the run ended, for `on_end` and `on_shutdown`; `None` while it goes on."""
+        return self._host.run_end
 
     def conclude(
         self, subject: str, figures: Mapping[str, Any], *, passed: bool | None = True

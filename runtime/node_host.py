@@ -17,7 +17,7 @@ from typing_extensions import TypeVar
 from runtime.answers import Answers
 from runtime.config.model import Config
 from runtime.hold import Hold, HoldConfig
-from runtime.host import Sibling
+from runtime.host import RunEnd, Sibling
 from runtime.instruments import Instruments
 from runtime.node import Node
 from runtime.node_runner import Create, NodeRunner
@@ -43,7 +43,7 @@ class NodeHost:
         instruments: What looks on.
         parameters: Changes settings of nodes.
         create: Makes a task that the run owns.
-        stop: Ends the run, for a reason.
+        stop: Ends the run, for a reason of a node.
         fault: Called with the node and what it raised.
     """
 
@@ -56,7 +56,7 @@ class NodeHost:
         instruments: Instruments,
         parameters: ParameterServer,
         create: Create,
-        stop: Callable[[str], None],
+        stop: Callable[[str, str], None],
         fault: Callable[[str, BaseException], None],
     ) -> None:
         self.state = state
@@ -68,7 +68,7 @@ class NodeHost:
         self.stepping = Stepping(state.clock, over=lambda: bool(state.reason))
         self.instruments = instruments
         self.parameters = parameters
-        self.stop = stop
+        self._stop = stop
         self._create = create
         self._fault = fault
         self._executor = concurrent.futures.ThreadPoolExecutor(
@@ -93,6 +93,15 @@ class NodeHost:
             self._start(node, node.run()).add_done_callback(lambda _: self._has_run(node))
 
     # What nodes ask for.
+
+    @property
+    def run_end(self) -> RunEnd | None:
+        """How the run ended, if it did."""
+        return self.state.end
+
+    def stop(self, node: Node[Any], reason: str) -> None:
+        """End the run in order."""
+        self._stop(node.name, reason)
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as part of a node."""

@@ -12,6 +12,7 @@ from events import Announcement
 from runtime.answers import Answers
 from runtime.clock import Clock
 from runtime.config.model import Config
+from runtime.host import RunEnd
 from runtime.links import Link
 from runtime.node import Node
 from runtime.node_runner import NodeRunner
@@ -39,6 +40,7 @@ class RunState:
         stopped: When the end of the run was asked for, on `time.monotonic`; `None` before.
         stopped_at: The same on the run's clock (ns).
         reason: Why the run ends; "" before.
+        end: How the run ended; `None` before.
         error: The first that went wrong, if anything did.
         interruption: An exception that is to be raised in a node that blocks the loop.
         announcements: What the nodes announced.
@@ -62,6 +64,7 @@ class RunState:
     stopped: float | None = None
     stopped_at: int | None = None
     reason: str = ""
+    end: RunEnd | None = None
     error: Exception | None = None
     interruption: Exception | None = None
     announcements: list[Announcement] = field(default_factory=list)

@@ -68,6 +68,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         clock: ``lockstep`` or ``real``.
         seed: Of the run's random numbers.
         reason: What ended it.
+        ended_by: Who did: a node's name, ``user``, or "" for its duration; see `RunEnd`.
         error: What went wrong, or `None`.
         wall_seconds: Real seconds, from the first update to when the end was asked for.
         sim_seconds: The same time on the run's clock: what was sent, was sent in it.
@@ -95,6 +96,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     clock: str
     seed: int
     reason: str
+    ended_by: str
     error: str | None
     sim_seconds: float
     wall_seconds: float
@@ -177,6 +179,7 @@ def summarise(
         clock=state.clock.kind,
         seed=state.config.run.seed,
         reason=state.reason,
+        ended_by=state.end.by if state.end is not None else "",
         error=None if state.error is None else str(state.error),
         sim_seconds=(state.clock.now() if state.stopped_at is None else state.stopped_at) / SECOND,
         wall_seconds=round(ended - (state.first_update or ended), 6),

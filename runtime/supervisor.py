@@ -29,6 +29,7 @@ from runtime import code_location, graph
 from runtime.clock import Clock
 from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
+from runtime.host import RunEnd
 from runtime.instruments import Instruments
 from runtime.node import Node
 from runtime.node_host import NodeHost
@@ -92,7 +93,13 @@ class Supervisor:
         self.instruments = Instruments(runners, self._reconnect)
         self.parameters = ParameterServer(self.state, self.fault)
         self._host = NodeHost(
-            self.state, out, self.instruments, self.parameters, self._own, self.stop, self.fault
+            self.state,
+            out,
+            self.instruments,
+            self.parameters,
+            self._own,
+            lambda node, reason: self.stop(reason, by=node),
+            self.fault,
         )
         self.stepping = self._host.stepping
         self._taps = tuple(taps)
@@ -127,28 +134,61 @@ class Supervisor:
 
     # What others ask of a run.
 
-    def stop(self, reason: str, error: Exception | None = None, *, from_peer: bool = False) -> None:
+    def stop(
+        self,
+        reason: str,
+        error: Exception | None = None,
+        *,
+        by: str = "user",
+        from_peer: bool = False,
+    ) -> None:
         """End the run in order; the first reason counts.
 
         Args:
             reason: For the summary.
             error: What went wrong, if anything did.
+            by: Who ends it, as in `RunEnd`.
             from_peer: Whether another process reported it, and need not be notified.
         """
         if self._ended.is_set():
             return
         state = self.state
-        reason = state.stop_requested or reason
+        if state.stop_requested:
+            reason, by = state.stop_requested, "user"
+        by = "user" if error is None and self._ends_run(by) == "hand" else by
         if self.peers is not None:
-            self.peers.stopping(reason, error, from_peer=from_peer)
+            self.peers.stopping(reason, error, by=by, from_peer=from_peer)
         state.reason = reason
         state.error = error
         state.stopped, state.stopped_at = time.monotonic(), state.clock.now()
+        state.end = RunEnd(
+            stamp=state.stopped_at,
+            reason=reason,
+            by=by,
+            error="" if error is None else str(error),
+            planned=error is None and self._is_planned(by),
+            duration=state.config.run.duration or None,
+            restarts={name: max(each.starts - 1, 0) for name, each in state.runners.items()},
+        )
         if error is not None or state.stop_requested:
             state.clock.hurry()
         self._ended.set()
         if self._startup is not None and not self._startup.done():
             self._startup.cancel()
+
+    def _is_planned(self, by: str) -> bool:
+        """Tell whether the run's plan is over if `by` ends it without an error."""
+        if by != "user":
+            return not by or self._ends_run(by) == "plan"
+        config = self.state.config  # no simulator alone has a plan
+        return not config.run.duration and all(n.node.ends_run != "plan" for n in config.nodes)
+
+    def _ends_run(self, name: str) -> str:
+        """Return what is over if a node ends the run; see `Node.ends_run`."""
+        nodes = {spec.name: spec.node for spec in self.state.config.nodes}
+        if name not in nodes:
+            return ""
+        return nodes[name].ends_run or ("plan" if nodes[name].flies else "")
 
     def escaped(self, error: BaseException) -> None:
         """Deal with an exception that came out of the loop: some task or callback let it."""
@@ -159,7 +199,7 @@ class Supervisor:
         wrapped = wrap("runtime", error)
         log_error(wrapped, last=not self._ended.is_set())
         self.state.note_error(wrapped)
-        self.stop(f"failed at {place}", wrapped)
+        self.stop(f"failed at {place}", wrapped, by="runtime")
 
     def fault(self, name: str, error: BaseException) -> None:
         """Deal with an exception in a node as its `on_error` says."""
@@ -176,7 +216,7 @@ class Supervisor:
         if self._ended.is_set():
             self.state.note_error(wrapped)
         elif fatal:
-            self.stop(f"{name} failed", wrapped)
+            self.stop(f"{name} failed", wrapped, by=name)
         else:
             self.restart(name)
 
@@ -224,7 +264,9 @@ class Supervisor:
 
     def _receive_end(self, event: Event) -> None:
         reason = getattr(event, "reason", "") or type(event).__name__
-        self.stop(f"{event.source}: {reason}")
+        names = [spec.name for spec in self.state.config.nodes]
+        by = next((n for n in names if f"{event.source}/".startswith(f"{n}/")), event.source)
+        self.stop(f"{event.source}: {reason}", by=by)
 
     # Starting.
 
@@ -234,14 +276,14 @@ class Supervisor:
             announced = await self._start_nodes()
         except PeerError as error:
             log.error("%s", error, extra={"reported": True})
-            self.stop("the processes of the run did not come together", error)
+            self.stop("the processes of the run did not come together", error, by="runtime")
             return
         except asyncio.CancelledError:  # the run is to end
             raise
         except BaseException as error:
             failed = wrap("runtime", error)
             log_error(failed, last=True)
-            self.stop("start-up failed", failed)
+            self.stop("start-up failed", failed, by=failed.node)
             return
         for announcement in announced:
             for tap in self._taps:
@@ -253,7 +295,7 @@ class Supervisor:
             state.clock.start()
         if state.config.run.duration:
             end = state.clock.now() + round(state.config.run.duration * SECOND)
-            state.clock.schedule.add(end, Once(lambda: self.stop("duration")))
+            state.clock.schedule.add(end, Once(lambda: self.stop("duration", by="")))
         for index, spec in enumerate(state.config.nodes):
             if spec.name in state.runners:
                 state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
@@ -322,7 +364,7 @@ class Supervisor:
             except NodeError as error:
                 if isinstance(code_location.leaf(error.__cause__ or error), FatalError):
                     log_error(error, last=True)
-                    self.stop(f"{name} failed", error)
+                    self.stop(f"{name} failed", error, by=name)
                     return
                 log_error(error, last=False)
                 await asyncio.shield(self._own(self._shut_down(runner), name))

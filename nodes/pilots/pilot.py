@@ -102,6 +102,7 @@ class Pilot(Node[C], ABC):
     """
 
     flies = True
+    ends_run = "plan"
     commands = Output(Command)
     shutdowns = Output(Shutdown)
 

@@ -133,6 +133,7 @@ class Teleop(Node[TeleopConfig]):
     Keys are not marked as handled, so recorders and other nodes hear them too.
     """
 
+    ends_run = "hand"
     setpoints = Output(VelocitySetpoint)
     commands = Output(Command)
     shutdowns = Output(Shutdown)

@@ -79,6 +79,8 @@ class Replay(Node[ReplayConfig]):
     and ``replay.position=12s`` do what `pause` and `seek` do; these are for the loop's thread.
     """
 
+    ends_run = "plan"
+
     events = Output(Event)
 
     def __init__(self) -> None:

@@ -55,6 +55,7 @@ class ImageWindow(Node[ImageWindowConfig]):
     was pressed.
     """
 
+    ends_run = "hand"
     images = Input(Image, keep="latest")
     key_presses = Output(KeyPressed)
     key_releases = Output(KeyReleased)

@@ -163,12 +163,14 @@ class Stop(Message, frozen=True):
         error: What went wrong, if anything did.
         serial: Its place among the ordered messages.
         apart: Whether I take no part in the turns: my first update was not yet, or I give up.
+        by: Who ends it, as in `RunEnd`.
     """
 
     reason: str
     error: str | None = None
     serial: int = AT_ONCE
     apart: bool = False
+    by: str = ""
 
 
 class NodeEnded(Message, frozen=True):

@@ -51,7 +51,14 @@ log = logging.getLogger("visnav.runtime")
 class Run(Protocol):
     """What the other processes can bring about here."""
 
-    def stop(self, reason: str, error: Exception | None = None, *, from_peer: bool = False) -> None:
+    def stop(
+        self,
+        reason: str,
+        error: Exception | None = None,
+        *,
+        by: str = "user",
+        from_peer: bool = False,
+    ) -> None:
         """End the run; `from_peer` if another process reported it."""
 
     def connect(self) -> None:
@@ -163,14 +170,14 @@ class Peers:
             Subscriptions(subscriptions(each for each in listeners if each.node != "run"))
         )
 
-    def stopping(self, reason: str, error: Exception | None, *, from_peer: bool) -> None:
+    def stopping(self, reason: str, error: Exception | None, *, by: str, from_peer: bool) -> None:
         """Notify the others that the run ends, and why; also where the reason is `from_peer`.
 
         They may receive it from us first.
         """
         self._ends = True
         text = None if error is None else str(error)
-        stop = Stop(reason, text, apart=not self._begun)
+        stop = Stop(reason, text, apart=not self._begun, by=by)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
         self._membership.waiting.absent.clear()
         if not self._begun:  # also its senders: they need not wait for our turn
@@ -285,7 +292,7 @@ class Peers:
         if "stop" in rules:
             log.error("%s", gone, extra={"reported": True})
             self._gather()
-            self._run.stop(f"{name_of(member.nodes)} lost", gone)
+            self._run.stop(f"{name_of(member.nodes)} lost", gone, by=min(lost))
         elif "restart" in rules:
             log.error("%s: waiting for its return", gone)
             self._membership.settle(lost=member.nodes)
@@ -324,7 +331,7 @@ class Peers:
                     member = self._membership.numbered(number)
                     where = name_of(member.nodes) if member else "?"
                     failed = PeerError(f"at {where}: {message.error}") if message.error else None
-                    self._run.stop(message.reason, failed, from_peer=True)
+                    self._run.stop(message.reason, failed, by=message.by, from_peer=True)
                 case NodeEnded():
                     self.shutdown.ended_nodes.add(message.node)
         except WireError as error:

@@ -174,6 +174,7 @@ class _DryHost:
         self.clock = clock
         self.siblings = siblings(config, {spec.name for spec in config.nodes})
         self.shared: dict[str, Any] = {}
+        self.run_end = None
         self.stepping = Stepping(clock)
         self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
@@ -198,7 +199,7 @@ class _DryHost:
     def hold(self, node: Node[Any], name: str, config: HoldConfig, latency: float) -> Hold[Any]:  # noqa: ARG002
         return Hold(name, self.clock, config, latency)
 
-    def stop(self, reason: str) -> None:
+    def stop(self, node: Node[Any], reason: str) -> None:
         pass
 
     def note_environment(self, name: str, value: str) -> None:

@@ -56,6 +56,7 @@ class NoHost:
         self.checking = False
         self.siblings: tuple[Sibling, ...] = ()
         self.shared: dict[str, Any] = {}
+        self.run_end = None
         self.stepping = Stepping(self.clock)
 
     def start(self, node: Node[Any], coro: Coroutine[Any, Any, None]) -> None:
@@ -77,7 +78,7 @@ class NoHost:
     ) -> concurrent.futures.Future[Any]:
         raise NotImplementedError
 
-    def stop(self, reason: str) -> None:
+    def stop(self, node: Node[Any], reason: str) -> None:
         raise NotImplementedError
 
     def conclude(self, subject: str, figures: Mapping[str, Any], passed: bool | None) -> None:

@@ -169,7 +169,8 @@ class _Recorder(Instrument):
         return occasion
 
     def _hook(self) -> None:
-        host, loop = self._supervisor._host, asyncio.get_running_loop()
+        loop = asyncio.get_running_loop()
+        host: Any = self._supervisor._host
         assert isinstance(loop, LockstepLoop)
         schedule: Any = loop.schedule
         stop, add, hold, call_at = host.stop, schedule.add, loop.hold, loop.call_at
@@ -179,9 +180,9 @@ class _Recorder(Instrument):
             self._turn += 1
             run_once()
 
-        def stopped(reason: str) -> None:
+        def stopped(node: Any, reason: str) -> None:
             self._act("stop", text=reason)
-            stop(reason)
+            stop(node, reason)
 
         def added(due: int, entry: Any) -> None:
             if isinstance(entry, Ticker):

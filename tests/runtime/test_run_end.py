@@ -1,0 +1,118 @@
+"""How a run ended, as its nodes read it in their last phases: when, why, by whom, as planned?"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from events import Shutdown, WindowClosed
+from runtime import Node, Output
+from runtime.config.model import NodeSpec
+from runtime.host import RunEnd
+from runtime.node import NodeConfig
+from runtime.testing import spec
+from tests.runtime.samples_runs import supervise
+
+
+class HowConfig(NodeConfig):
+    how: str = "stop"
+
+
+class Ends(Node[HowConfig]):
+    """Ends the run after 0.2 s, somehow."""
+
+    shutdowns = Output(Shutdown)
+    closures = Output(WindowClosed)
+
+    async def run(self) -> None:
+        await self.clock.sleep(0.2)
+        match self.config.how:
+            case "stop":
+                self.stop("enough")
+            case "shutdown":
+                self.shutdowns.send(Shutdown(stamp=0, source=self.name, reason="enough"))
+            case "below":
+                self.shutdowns.send(Shutdown(stamp=0, source=f"{self.name}/x", reason="enough"))
+            case "raise":
+                raise ValueError("too much")
+            case "fatal":
+                self.log.fatal("too much")
+            case "close":
+                self.closures.send(WindowClosed(stamp=0, source=self.name))
+
+
+class Pilot(Ends):
+    flies = True
+
+
+class Replayer(Ends):
+    ends_run = "plan"
+
+
+class Window(Ends):
+    ends_run = "hand"
+
+
+class Reader(Node):
+    """Keeps how the run ended."""
+
+    found: list[Any]
+
+    async def on_startup(self) -> None:
+        Reader.found = [self.run_end]
+
+    async def on_end(self) -> None:
+        Reader.found.append(self.run_end)
+
+    async def on_shutdown(self) -> None:
+        Reader.found.append(self.run_end)
+
+
+def ended(*nodes: NodeSpec, **run: Any) -> RunEnd:
+    """Run nodes after a reader, and return how the reader says that the run ended."""
+    supervise([spec(Reader, "reader"), *nodes], **run)
+    before, end, again = Reader.found
+    assert before is None
+    assert end is again
+    assert isinstance(end, RunEnd)
+    return end
+
+
+@pytest.mark.parametrize(
+    ("node", "how", "expected"),
+    [
+        (Ends, "nothing", ("", "duration", "", True)),
+        (Ends, "stop", ("x", "enough", "", False)),
+        (Ends, "shutdown", ("x", "x: enough", "", False)),
+        (Ends, "below", ("x", "x/x: enough", "", False)),
+        (Ends, "raise", ("x", "x failed", "x: ValueError: too much", False)),
+        (Ends, "fatal", ("x", "x failed", "x: too much", False)),
+        (Ends, "close", ("x", "x: WindowClosed", "", False)),
+        (Pilot, "shutdown", ("x", "x: enough", "", True)),
+        (Pilot, "raise", ("x", "x failed", "x: ValueError: too much", False)),
+        (Replayer, "stop", ("x", "enough", "", True)),
+        (Window, "close", ("user", "x: WindowClosed", "", False)),
+        (Window, "raise", ("x", "x failed", "x: ValueError: too much", False)),
+    ],
+)
+def test_a_run_says_who_ended_it_and_whether_that_was_the_plan(
+    node: type[Ends], how: str, expected: tuple[str, str, str, bool]
+) -> None:
+    end = ended(spec(node, "x", {"how": how}), spec(Ends, "x_too", {"how": "nothing"}))
+    assert (end.by, end.reason, end.error, end.planned) == expected
+    assert end.stamp == (1_000_000_000 if not end.by else 200_000_000)
+    assert end.duration == 1.0
+
+
+@pytest.mark.parametrize(("others", "planned"), [([], True), ([Replayer], False)])
+def test_a_person_may_end_what_has_no_plan(others: list[type[Ends]], planned: bool) -> None:
+    nodes = [spec(node, f"other{i}", {"how": "nothing"}) for i, node in enumerate(others)]
+    end = ended(spec(Window, "x", {"how": "close"}), *nodes, duration=0.0)
+    assert (end.by, end.planned) == ("user", planned)
+
+
+def test_a_run_counts_how_often_a_node_was_brought_up_anew() -> None:
+    end = ended(spec(Ends, "x", {"how": "raise"}, on_error="restart"), duration=1.5)
+    assert end.restarts == {"reader": 0, "x": 1}
+    assert (end.by, end.planned) == ("", True)
