@@ -387,6 +387,7 @@ class Estimator(Node[C], ABC):
             mount = first and msgspec.structs.replace(first, frame_id=self._odom())
             mount = mount or self._mounting(origin)
             self._mounts = {**self._mounts, number: mount}
+            self._frame_numbers().append(self._frame_number())
         return mount
 
     def _mounting(self, origin: int) -> Mount:
@@ -419,5 +420,12 @@ class Estimator(Node[C], ABC):
 
     def _odom(self) -> str:
         """Return the frame of estimates whose origin is unknown."""
-        before = self.restarts + len(self._mounts)
-        return f"odom_{before}" if before else "odom"
+        number = self._frame_number()
+        return f"odom_{number}" if number else "odom"
+
+    def _frame_number(self) -> int:
+        """Return a number that no frame has had, of this node or of those before a restart."""
+        return max([self.restarts, *(number + 1 for number in self._frame_numbers())])
+
+    def _frame_numbers(self) -> list[int]:
+        return self.share(f"frames of {self.name}", list[int])

@@ -121,7 +121,7 @@ class TwoFrames(Good):
     def say(self, image: Any, result: TrackingResult) -> None:
         self.publish(image, result)
         if image.stamp == 1_000_000_000:
-            self._mount = None
+            self._mounts = {}
 
 
 class Talks(Good):
@@ -130,8 +130,8 @@ class Talks(Good):
     def say(self, image: Any, result: TrackingResult) -> None:
         self.publish(image, result)
         if result.lost:
-            assert self._mount is not None
-            self.estimates.send(self._mount.estimate(image.stamp, self.name, result))
+            mount = self._mount_of(result.map, image.stamp)
+            self.estimates.send(mount.estimate(image.stamp, self.name, result))
 
 
 class LostTwice(Good):

@@ -228,6 +228,22 @@ def test_each_map_at_a_guessed_pose_has_a_frame_of_its_own_and_counts_as_a_resta
     assert [each.frame_id for each in result.of(TrajectoryEstimate)] == ["odom_1"]
 
 
+def test_a_frame_of_before_a_restart_is_no_frame_of_another_map() -> None:
+    class Crashes(Mapping):
+        def publish(self, image: Any, result: TrackingResult, origin: int | None = None) -> None:
+            super().publish(image, result, origin)
+            if image.stamp == 2:
+                raise RuntimeError("dazzled")
+
+    frames = [e for at, grey in [(1, 9), (2, 11), (900 * MS, 9)] for e in rgbd(at, grey=grey)]
+    result = run_nodes(
+        [spec(Crashes, "est", on_error="restart")],
+        inputs=[vehicle(), camera("drone/front", "rgb", "depth"), *frames],
+        duration=1.0,
+    )
+    assert [each.frame_id for each in result.of(PoseEstimate)] == ["map", "odom_1", "odom_2"]
+
+
 def test_another_vehicles_place_is_not_taken_for_its_own() -> None:
     seen = camera("other/front", "rgb", "depth")
     result = track(vehicle("drone"), seen, *rgbd(1, "other/front"))

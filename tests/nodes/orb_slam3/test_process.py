@@ -67,7 +67,7 @@ class Flight:
                 right = view.right if mode == "stereo" else None
                 said = await slam.call(OrbSlam3Process.track, view.stamp, view.rgb, depth, right)
                 self.tracked.append(said)
-            self.stamps, self.final = await slam.call(OrbSlam3Process.trajectory)
+            self.stamps, self.final, _ = await slam.call(OrbSlam3Process.trajectory)
         finally:
             await asyncio.to_thread(slam.close)
             clock.close()
