@@ -7,8 +7,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
-from events import Announcement, Event, Odometry, VehicleAnnouncement
+from events import Announcement, Event, Odometry, TrajectoryEstimate, VehicleAnnouncement
 from nodes.replay.ahead import ReadAhead
 from nodes.replay.choice import Choice
 from nodes.replay.reader import Reader, ReplayError
@@ -61,6 +63,64 @@ def open_reader(config: ReplayConfig, name: str) -> Reader:
     return RosBag(path, config.topics, vehicle)
 
 
+class Timeline:
+    """Where the times of a recording lie on the run's clock, by the stretches that were played."""
+
+    def __init__(self) -> None:
+        self._stretches: list[tuple[int, int, bool]] = []
+        """Begin (recording), begin (run), and whether it goes on from the one before."""
+        self.shift = 0
+        """The run's clock less the recording's time now (ns)."""
+
+    def go_on(self, position: int, now: int, *, pause: bool = False) -> None:
+        """Note that from now on (ns of the run) the recording is played from this position."""
+        self._stretches.append((position, now, pause))
+        self.shift = now - position
+
+    def moved(self, event: Event) -> Event | None:
+        """Return an event on the run's clock; `None` if it was true before the run.
+
+        A stamp of before a pause stays where it was then; of a trajectory those poses are left out
+        that were not played.
+        """
+        if not self.shift and len(self._stretches) < 2:
+            return event
+        stamp = self._stamp(event.stamp)
+        if stamp < 0:
+            return None
+        if isinstance(event, TrajectoryEstimate):
+            known, stamps = self._stamps(event.stamps)
+            return msgspec.structs.replace(
+                event,
+                stamp=stamp,
+                stamps=stamps[known],
+                positions=event.positions[known],
+                orientations=event.orientations[known],
+            )
+        return msgspec.structs.replace(event, stamp=stamp)
+
+    def _stamp(self, time: int) -> int:
+        shift = 0
+        for position, now, pause in reversed(self._stretches):
+            shift = now - position
+            if time >= position or not pause:
+                break
+        return time + shift
+
+    def _stamps(
+        self, times: npt.NDArray[np.int64]
+    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+        """Return which times were played, and when they last were."""
+        known, found = np.zeros(times.shape, np.bool_), times.copy()
+        first = last = np.iinfo(np.int64).max  # of what was played later: on recording and run
+        for position, now, _ in reversed(self._stretches):
+            here = (times >= position) & (times < min(first, last - now + position))
+            found[here] += now - position
+            known |= here
+            first, last = min(first, position), now
+        return known, found
+
+
 _SLICE = SECOND // 10
 """In real time, how long a sleep may keep `seek` waiting (ns)."""
 
@@ -87,8 +147,7 @@ class Replay(Node[ReplayConfig]):
         self._reader: Reader | None = None
         self._ahead: ReadAhead | None = None
         self._announcements: list[Announcement] = []
-        self._shift = 0
-        """The run's clock less the recording's time (ns)."""
+        self._timeline = Timeline()
         self._paused_at: int | None = None
         self._resumed = asyncio.Event()
         self._target: int | None = None
@@ -119,8 +178,9 @@ class Replay(Node[ReplayConfig]):
         assert self._reader is not None
         begin = round(self.config.start * SECOND)
         end = round(self.config.end * SECOND) or None
-        position, self._shift = begin, self.clock.now() - begin
+        position = begin
         while True:
+            self._timeline.go_on(position, self.clock.now())
             last = await self._play(position, end)
             if last is None and not self.sent and self._target is None:
                 self.log.fatal("%s", self._nothing())
@@ -138,7 +198,6 @@ class Replay(Node[ReplayConfig]):
                 position = begin
             else:
                 break
-            self._shift = self.clock.now() - position
         self._log_trouble()
         if named := ", ".join(sorted(self._choice.unmatched)):
             self.log.warning("only, skip: nothing in the recording is of %s", named)
@@ -167,7 +226,8 @@ class Replay(Node[ReplayConfig]):
     def resume(self) -> None:
         """Go on where `pause` came."""
         if self._paused_at is not None:
-            self._shift += self.clock.now() - self._paused_at
+            position = self._paused_at - self._timeline.shift
+            self._timeline.go_on(position, self.clock.now(), pause=True)
             self._paused_at = None
             self._resumed.set()
 
@@ -181,7 +241,7 @@ class Replay(Node[ReplayConfig]):
         if self._target is not None:
             return self._target / SECOND
         now = self.clock.now() if self._paused_at is None else self._paused_at
-        return (now - self._shift) / SECOND
+        return (now - self._timeline.shift) / SECOND
 
     async def _play(self, start: int, end: int | None) -> int | None:
         """Send the events from one time to another; return the last time, if there was any."""
@@ -189,21 +249,18 @@ class Replay(Node[ReplayConfig]):
         await self._close_ahead()
         events = self._reader.events(start, end, self._choice)
         self._ahead = ahead = ReadAhead(events, self.config.memory)
-        send, now = self.events.send, self.clock.now
+        send, now, timeline = self.events.send, self.clock.now, self._timeline
         last = None
         try:
             while (batch := await self.offload(ahead.take)) is not None:
                 for last, event in batch:
-                    if last + self._shift > now() or self._paused_at is not None:
+                    if last + timeline.shift > now() or self._paused_at is not None:
                         await self._sleep_until(last)
                     if self._target is not None:
                         return last
-                    if shift := self._shift:
-                        event = msgspec.structs.replace(event, stamp=event.stamp + shift)
-                        if event.stamp < 0:  # of before the start
-                            continue
-                    self.sent += 1
-                    send(event)
+                    if (moved := timeline.moved(event)) is not None:
+                        self.sent += 1
+                        send(moved)
         except ReplayError as error:
             self.log.fatal("%s", error)
         return last
@@ -215,7 +272,7 @@ class Replay(Node[ReplayConfig]):
             if self._paused_at is not None:
                 await self._resumed.wait()
                 continue
-            now, due = self.clock.now(), time + self._shift
+            now, due = self.clock.now(), time + self._timeline.shift
             if due <= now:
                 return
             await self.clock.sleep_until(min(due, now + _SLICE) if real else due)

@@ -6,10 +6,21 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from events import Announcement, Event, Image, Imu, Odometry, VehicleAnnouncement
+from events import (
+    Announcement,
+    Event,
+    Image,
+    Imu,
+    Odometry,
+    TrackingLost,
+    TrajectoryEstimate,
+    VehicleAnnouncement,
+)
 from nodes.replay import Replay
+from nodes.replay.node import Timeline
 from runtime import Node, on
 from runtime.errors import ConfigError, FatalError
 from runtime.testing import NodeResult, run_nodes, spec
@@ -101,6 +112,39 @@ def test_a_choice_narrows_it(path: Path) -> None:
     """The camera's images alone; announcements stay."""
     result = replay(path, only=["Image"])
     assert len(result.of(Image)) == sets.FRAMES == len(result.sent) - len(result.of(Announcement))
+
+
+@pytest.mark.parametrize(
+    ("played", "stamps"),
+    [
+        ([(0, 0)], {10: 10, 30: 30, 50: 50, 80: 80}),
+        ([(30, 0)], {30: 0, 50: 20, 80: 50}),  # a start: what was before it is not in this run
+        ([(0, 0), (40, 140, True)], {10: 10, 30: 30, 50: 150, 80: 180}),  # a pause
+        ([(0, 0), (0, 90)], {10: 100, 30: 120, 50: 140, 80: 170}),  # a loop
+        ([(0, 0), (70, 20)], {10: 10, 80: 30}),  # ahead
+        ([(0, 0), (40, 60)], {10: 10, 30: 30, 50: 70, 80: 100}),  # back
+    ],
+)
+def test_each_pose_of_a_trajectory_is_when_it_was_played(
+    played: list[tuple[int, ...]], stamps: dict[int, int]
+) -> None:
+    timeline, recorded = Timeline(), [10, 30, 50, 80]
+    for position, now, *pause in played:
+        timeline.go_on(position, now, pause=bool(pause))
+    sent = TrajectoryEstimate(
+        stamp=80,
+        source="slam",
+        stamps=np.array(recorded),
+        positions=np.array([(float(t), 0.0, 0.0) for t in recorded]),
+        orientations=np.array([(1.0, 0.0, 0.0, 0.0)] * 4),
+    )
+    found = timeline.moved(sent)
+    assert isinstance(found, TrajectoryEstimate)
+    assert dict(zip(found.positions[:, 0].tolist(), found.stamps.tolist(), strict=True)) == stamps
+    for recorded_at in stamps if len(played) < 2 or played[1][2:] else ():  # and single events
+        event = timeline.moved(TrackingLost(stamp=recorded_at, source="slam"))
+        assert event is not None
+        assert event.stamp == stamps[recorded_at]
 
 
 class Pausing(Witness):
