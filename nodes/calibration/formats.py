@@ -2,9 +2,11 @@
 
 Each file is a template beside this module, ``<format>.<file>.jinja``, and reads like the file.
 
-Every file speaks of the IMU's frame, in which the exported IMU data is, and of optical frames
-(x right, y down, z forward); pixel centres have whole coordinates in all of them. A rig without an
-IMU has the body's frame (FRD) in its place. Noise is that of ``ImuAnnouncement``, continuous
+Every file speaks of the IMU's frame and of optical frames (x right, y down, z forward); pixel
+centres have whole coordinates in all of them. A rig without an IMU has the body's frame in its
+place. The IMU's axes are those of the measurements that the file is for: of a file that names
+topics those of ROS (forward, left, up), else ours, as exported data, the link and libraries have
+them (forward, right, down). Noise is that of ``ImuAnnouncement``, continuous
 densities as Kalibr's, or what a template says beside it. What a format has no word for is refused
 if the projection depends on it, and otherwise said in a comment.
 
@@ -23,9 +25,12 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement
+from events.frames import axes_of
 from events.poses import inverse, pose_matrix, pose_tuples
 from nodes.dataset.recording import real, templates
 from nodes.dataset.rig import Rig
+from nodes.ros_messages.publications import TopicKind, publication
+from nodes.ros_messages.settings import PublishingConfig
 
 DEPTH_FACTOR = 5000.0
 """Steps of an exported depth image per metre, as TUM's."""
@@ -44,6 +49,7 @@ class Format(msgspec.Struct, frozen=True):
         pair_only: Whether it is for one camera or one stereo pair.
         needs_imu: Whether there is none of it without an IMU.
         camera_file: A file of each camera, with ``{}`` for its number; empty for none.
+        topics: Whether its files name the topics of ROS.
     """
 
     files: tuple[str, ...]
@@ -51,16 +57,18 @@ class Format(msgspec.Struct, frozen=True):
     pair_only: bool = False
     needs_imu: bool = False
     camera_file: str = ""
+    topics: bool = False
 
 
 FORMATS = {
-    "kalibr": Format(("camchain-imucam.yaml", "imu.yaml"), 4),
+    "kalibr": Format(("camchain-imucam.yaml", "imu.yaml"), 4, topics=True),
     "openvins": Format(
         ("estimator_config.yaml", "kalibr_imu_chain.yaml", "kalibr_imucam_chain.yaml"),
         4,
         needs_imu=True,
+        topics=True,
     ),
-    "vins": Format(("vins.yaml",), 4, pair_only=True, camera_file="cam{}.yaml"),
+    "vins": Format(("vins.yaml",), 4, pair_only=True, camera_file="cam{}.yaml", topics=True),
     "basalt": Format(("calibration.json",), 8),
     "orbslam3": Format(("orbslam3.yaml",), 5, pair_only=True),
     "vslamlab": Format(("calibration.yaml",), 5),
@@ -68,12 +76,14 @@ FORMATS = {
 """The formats of calibrations, by the names that ``export`` knows."""
 
 
-def write_files(rig: Rig, name: str) -> dict[str, str]:
+def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
     """Return the files of a format, by name, with their texts.
 
     Args:
         rig: Sensors of one body.
         name: One of `FORMATS`.
+        topics: Whether who reads them listens to the topics that they name; else our own
+            measurements come in another way.
 
     Raises:
         ValueError: The format has no word for something that the projection depends on.
@@ -82,11 +92,17 @@ def write_files(rig: Rig, name: str) -> dict[str, str]:
     if form.needs_imu and rig.imu is None:
         raise ValueError(f"{name}: expected an IMU on {rig.body}, found none")
     chosen = pair(rig) if form.pair_only else rig.cameras
-    cameras = [_camera(rig, each, name) for each in chosen]
+    ros = form.topics and topics
+    cameras = [_camera(rig, each, name, ros=ros) for each in chosen]
     for what in ("fisheye",) if name == "orbslam3" else ("time_offset",) * (name != "kalibr"):
         if len({camera[what] for camera in cameras}) > 1:
             raise ValueError(f"{name} has one {what} for all cameras, found several")
-    common = variables(rig, cameras)
+    common = variables(rig, cameras) | {
+        "axes": "x forward, y left, z up, as on ROS's topics"
+        if ros
+        else "x forward, y right, z down, as in exported data; on ROS's topics y left, z up",
+        "imu_topic": _topic("imu", rig.imu.source) if ros and rig.imu else "",
+    }
     environment = templates(Path(__file__).parent)
     found = {
         file: environment.get_template(f"{name}.{file}.jinja").render(common)
@@ -99,15 +115,20 @@ def write_files(rig: Rig, name: str) -> dict[str, str]:
     return found
 
 
-def variables(rig: Rig, cameras: list[dict[str, Any]] | None = None) -> dict[str, Any]:
+def variables(
+    rig: Rig, cameras: list[dict[str, Any]] | None = None, *, topics: bool = False
+) -> dict[str, Any]:
     """Return what every template may use: cameras, imu, stereo, gravity and depth_factor.
 
     Args:
         rig: Sensors of one body.
         cameras: In a format's words; if not given, all of the rig, with up to eight coefficients.
+        topics: Whether the IMU's axes are those on the topics of ROS.
     """
+    if cameras is None:
+        cameras = [_camera(rig, each, "", ros=topics) for each in rig.cameras]
     return {
-        "cameras": [_camera(rig, each, "") for each in rig.cameras] if cameras is None else cameras,
+        "cameras": cameras,
         "imu": rig.imu,
         "stereo": len(pair(rig)) == 2,
         "gravity": GRAVITY,
@@ -115,9 +136,9 @@ def variables(rig: Rig, cameras: list[dict[str, Any]] | None = None) -> dict[str
     }
 
 
-def _camera(rig: Rig, camera: CameraAnnouncement, name: str) -> dict[str, Any]:
+def _camera(rig: Rig, camera: CameraAnnouncement, name: str, *, ros: bool) -> dict[str, Any]:
     """Return what templates ask of a camera, besides what is announced."""
-    info, in_imu = camera.info, camera_in_imu(rig, camera)
+    info, in_imu = camera.info, imu_axes(rig, ros=ros) @ camera_in_imu(rig, camera)
     fisheye = info.distortion_model == "equidistant"
     k = _coefficients(camera, name)
     names = (
@@ -140,6 +161,7 @@ def _camera(rig: Rig, camera: CameraAnnouncement, name: str) -> dict[str, Any]:
         "middle": {"fx": info.fx, "fy": info.fy, "cx": info.cx, "cy": info.cy},
         "in_imu": in_imu,
         "from_imu": inverse(in_imu),
+        "topic": _topic("image", camera.source),
         "pose": {"px": x, "py": y, "pz": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw},
         "eyes": [
             number
@@ -189,6 +211,18 @@ def camera_in_imu(rig: Rig, camera: CameraAnnouncement) -> Floats:
     if rig.imu is None:
         return in_body
     return inverse(pose_matrix(rig.imu.position, rig.imu.orientation)) @ in_body
+
+
+def imu_axes(rig: Rig, *, ros: bool) -> Floats:
+    """Return the IMU's frame (or the body's) in itself as it is on topics of ROS, shape (4, 4)."""
+    frame = rig.cameras[0].parent_frame_id if rig.imu is None else rig.imu.frame_id
+    turned = ros and axes_of(frame) == "body"
+    return np.diag([1.0, -1.0, -1.0, 1.0]) if turned else np.eye(4)
+
+
+def _topic(kind: TopicKind, source: str) -> str:
+    found = publication(kind, source, PublishingConfig())
+    return "" if found is None else found.topic
 
 
 def pair(rig: Rig) -> tuple[CameraAnnouncement, ...]:

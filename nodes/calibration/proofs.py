@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from events import CameraAnnouncement, Imu, ImuAnnouncement
 from events.poses import pose_matrix
 from nodes.calibration.collector import Floats, Motion, _Collector
-from nodes.calibration.formats import FORMATS, GRAVITY, write_files
+from nodes.calibration.formats import FORMATS, GRAVITY, imu_axes, write_files
 from nodes.calibration.readers import read
 from nodes.calibration.room import NEAREST, hits, spheres
 from nodes.dataset.rig import Rig
@@ -246,6 +246,7 @@ def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator)
     """Return by how much a format's files in a folder project differently than announced."""
     worst = 0.0
     body = np.eye(4) if rig.imu is None else pose_matrix(rig.imu.position, rig.imu.orientation)
+    axes = imu_axes(rig, ros=FORMATS[name].topics)
     for camera, found in zip(rig.cameras, read(name, folder), strict=False):
         if rig.imu is None and name == "orbslam3":
             continue  # whose file has no transform without an IMU
@@ -253,7 +254,7 @@ def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator)
         rays = camera.info.unproject(generator.uniform((0, 0), size, (400, 2)))
         rays = rays[np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.05)]
         rays *= generator.uniform(1.0, 20.0, (len(rays), 1))
-        pose = np.linalg.inv(body) @ pose_matrix(camera.position, camera.orientation)
+        pose = axes @ np.linalg.inv(body) @ pose_matrix(camera.position, camera.orientation)
         pixels = found.project(rays @ pose[:3, :3].T + pose[:3, 3])
         off = float(np.abs(pixels - camera.info.project(rays)).max(initial=0.0))
         worst = max(worst, off if np.isfinite(off) else float("inf"))

@@ -348,7 +348,7 @@ class Process(Estimator[ProcessConfig]):
             "cameras": [],
             "imu": None,
             "stereo": False,
-            **(variables(rig) if rig else {}),
+            **(variables(rig, topics=self.config.feed == "ros2") if rig else {}),
             **own,
         }
 

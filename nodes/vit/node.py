@@ -106,7 +106,7 @@ class Vit(Estimator[VitConfig]):
         files: dict[str, str] | None = None if config.calibration == "interface" else {}
         if config.calibration not in {"interface", "config"}:
             try:
-                files = write_files(rig, config.calibration)
+                files = write_files(rig, config.calibration, topics=False)
             except ValueError as error:
                 self.log.fatal("calibration: %s", error)
         self._hold = self.hold(self.name, config.hold, config.latency)

@@ -57,6 +57,7 @@ class VitTracker:
         self._world = np.eye(4)  # the library's, in the optical camera at its first pose
         self._pose = np.eye(4)
         self._anew = True
+        self._maps = 0  # put where the camera was last known to be
         with contextlib.ExitStack() as opened:
             folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="vit_"))
             file = _write(config, files or {}, Path(folder))
@@ -109,7 +110,9 @@ class VitTracker:
         """Return where the camera is; after a pose that is none the library begins anew there."""
         numbers = np.array([*data.position, *data.orientation, *data.velocity], np.float64)
         if not np.isfinite(numbers).all() or not numbers[3:7].any():
-            self._anew = self._library.reset() or self._anew
+            if self._library.reset():
+                self._maps += not self._anew
+                self._anew = True
             return TrackingResult(self._pose, True, "the library's pose is not finite")
         in_world = np.eye(4)
         in_world[:3, :3] = Rotation.from_quat(numbers[3:7]).as_matrix()
@@ -118,7 +121,9 @@ class VitTracker:
         if self._anew:
             self._world, self._anew = self._pose @ inverse(in_world), False
         self._pose = self._world @ in_world
-        return TrackingResult(self._pose, velocity=self._world[:3, :3] @ numbers[7:])
+        return TrackingResult(
+            self._pose, velocity=self._world[:3, :3] @ numbers[7:], map=self._maps
+        )
 
 
 def _write(config: str, files: dict[str, str], folder: Path) -> Path | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from events import CameraInfo
+from events.frames import convert_vector
 from events.poses import pose_matrix
 from events.rotations import from_rpy
 from nodes.calibration.formats import FORMATS, write_files
@@ -40,7 +42,13 @@ def exported(rig: Rig, form: str, folder: Path) -> list[ReadCamera]:
     return read(form, folder)
 
 
-def difference(rig: Rig, found: list[ReadCamera]) -> float:
+def imu_axes(form: str, points: Any) -> Any:
+    """Return points as the IMU has them whose measurements a format is for."""
+    on_topics = form in {"kalibr", "openvins", "vins"}
+    return np.array([convert_vector("body", tuple(p)) for p in points]) if on_topics else points
+
+
+def difference(rig: Rig, form: str, found: list[ReadCamera]) -> float:
     """Return by how many pixels the same points of the IMU's frame fall elsewhere, at most."""
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (300, 3)) + np.array([0, 0, 2])
     worst = 0.0
@@ -48,7 +56,7 @@ def difference(rig: Rig, found: list[ReadCamera]) -> float:
         pose = pose_matrix(announced.position, announced.orientation)
         pixels = announced.info.project(points)
         assert np.isfinite(pixels).all()
-        off = each.project(points @ pose[:3, :3].T + pose[:3, 3]) - pixels
+        off = each.project(imu_axes(form, points @ pose[:3, :3].T + pose[:3, 3])) - pixels
         worst = max(worst, float(np.abs(off).max()))
     return worst
 
@@ -68,7 +76,7 @@ def test_a_stereo_pair_projects_the_same_or_is_refused(
             write_files(rig, form)
         return
     found = exported(rig, form, tmp_path)
-    assert difference(rig, found) < 1e-6
+    assert difference(rig, form, found) < 1e-6
     assert {each.time_offset for each in found} <= {-0.005, None}
 
 
@@ -100,17 +108,19 @@ def test_any_radtan_camera_projects_the_same(
     rays = np.random.default_rng(2).uniform(-0.25, 0.25, (100, 3)) + np.array([0, 0, 2])
     pose = pose_matrix(place, rig.cameras[0].orientation)
     moved = rays @ pose[:3, :3].T + pose[:3, 3]
-    np.testing.assert_allclose(found[0].project(moved), info.project(rays), atol=1e-6)
+    np.testing.assert_allclose(
+        found[0].project(imu_axes(form, moved)), info.project(rays), atol=1e-6
+    )
 
 
 def test_a_transposed_transform_is_found(tmp_path: Path) -> None:
     rig = Rig("drone", (camera(),), IMU)
-    assert difference(rig, exported(rig, "basalt", tmp_path)) < 1e-6
+    assert difference(rig, "basalt", exported(rig, "basalt", tmp_path)) < 1e-6
     path = tmp_path / "calibration.json"
     text = path.read_text()
     turned = re.sub(r'"q([xyz])": (-?)', lambda m: f'"q{m[1]}": {"" if m[2] else "-"}', text)
     path.write_text(turned)
-    assert difference(rig, read("basalt", tmp_path)) > 100.0
+    assert difference(rig, "basalt", read("basalt", tmp_path)) > 100.0
 
 
 def test_the_noise_is_in_each_programs_unit(tmp_path: Path) -> None:
@@ -152,7 +162,7 @@ def test_without_an_imu_the_body_stands_in_its_place(tmp_path: Path) -> None:
         files = write_files(rig, form)
         assert "imu.yaml" not in files
         if form != "orbslam3":  # which has no transform without an IMU
-            assert difference(rig, exported(rig, form, tmp_path / form)) < 1e-6
+            assert difference(rig, form, exported(rig, form, tmp_path / form)) < 1e-6
     with pytest.raises(ValueError, match="openvins: expected an IMU on cv, found none"):
         write_files(rig, "openvins")
 
@@ -180,8 +190,31 @@ def test_an_imu_that_is_turned_and_moved_is_what_transforms_speak_of(tmp_path: P
     in_body = points @ seen[:3, :3].T + seen[:3, 3]
     in_imu = (in_body - pose[:3, 3]) @ pose[:3, :3]
     for form in FORMATS:
-        found = exported(rig, form, tmp_path / form)[0].project(in_imu)
+        found = exported(rig, form, tmp_path / form)[0].project(imu_axes(form, in_imu))
         np.testing.assert_allclose(found, rig.cameras[0].info.project(points), atol=1e-6)
+
+
+def test_a_library_that_gets_our_measurements_gets_files_for_them() -> None:
+    ours = write_files(stereo(), "openvins", topics=False)
+    assert 'rostopic: ""' in ours["kalibr_imu_chain.yaml"]
+    assert "z down" in ours["kalibr_imucam_chain.yaml"]
+    turned = write_files(stereo(), "openvins")
+    assert 'rostopic: "/drone/imu"' in turned["kalibr_imu_chain.yaml"]
+    assert "z up, as on ROS's topics" in turned["kalibr_imucam_chain.yaml"]
+
+
+@pytest.mark.parametrize("example", ["stereo_inertial", "figure_eight"])
+def test_openvins_initializes_at_the_rest_of_our_examples(example: str) -> None:
+    settings = write_files(stereo(), "openvins")["estimator_config.yaml"]
+    says = dict(re.findall(r"^(\w+): (\S+)$", settings, re.M))
+    assert says["try_zupt"] == says["zupt_only_at_beginning"] == "true"
+    at_rest = 3**0.5 * IMU.accelerometer_noise_density * IMU.rate**0.5
+    assert 3 * at_rest < float(says["init_imu_thresh"]) < 0.62  # of a gentle take-off
+    path = Path(__file__).parents[3] / "examples" / f"{example}.toml"
+    nodes = {each["name"]: each for each in tomllib.loads(path.read_text())["nodes"]}
+    rests = float(nodes["pilot"]["start_delay"].removesuffix("s"))
+    assert rests >= float(says["init_window_time"]) + 0.5
+    assert nodes["drone"]["imu"]["vibration"]["amplitude"] > 1.0
 
 
 def test_an_imu_on_another_body_is_refused() -> None:
