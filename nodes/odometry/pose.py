@@ -21,6 +21,8 @@ _HUBER = 2.0
 """Standard deviations beyond which a residual counts linearly."""
 _STEPS = 8
 _SMALL = 1e-7
+_DAMPING = 1e-9
+"""Share of its own information by which each motion is held back."""
 
 
 class Observations(msgspec.Struct, frozen=True, eq=False):
@@ -106,7 +108,9 @@ def solve_pose(
         np.abs(residuals[2], out=errors[1])
         weights = _huber(errors) * ahead
         weighted = (by * weights[[0, 0, 1]]).reshape(6, -1)
-        normal = weighted @ by.reshape(6, -1).T + 1e-9 * np.eye(6)
+        normal = weighted @ by.reshape(6, -1).T
+        # In units of its own, as what landmarks in one column leave open is lost in rounding else.
+        normal += np.diag(_DAMPING * np.diag(normal) + _DAMPING)
         gradient = weighted @ residuals.reshape(-1)
         if information is not None:
             normal += information

@@ -2,6 +2,10 @@
 
 F. Steinbrücker, J. Sturm and D. Cremers, "Real-time visual odometry from dense RGB-D images",
 ICCV Workshops 2011, with the point-to-plane distances of depth beside the differences of colour.
+
+This is an example of a method from a library. The library does not tell how sure it is of a motion,
+so where little is to be seen (a plain wall, a corridor) poses are wrong by percents of the way and
+are not said to be lost.
 """
 
 from __future__ import annotations

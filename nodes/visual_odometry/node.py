@@ -44,7 +44,7 @@ class VisualOdometryConfig(EstimatorConfig):
 
     Attributes:
         method: ``features``: corners, followed by optical flow, and their depth; ``dense``: every
-            pixel, by OpenCV's ``cv2.Odometry``.
+            pixel, by OpenCV's ``cv2.Odometry``, as an example: it does not know when it is wrong.
         features: Settings of the method ``features``.
         dense: Settings of the method ``dense``.
     """
@@ -63,7 +63,8 @@ class VisualOdometry(Estimator[VisualOdometryConfig]):
     frames = Bundle(RgbdFrame, keep="latest")
 
     def __init__(self) -> None:
-        self.method = f"RGB-D odometry ({self.config.method})"
+        example = ", an example" if self.config.method == "dense" else ""
+        self.method = f"RGB-D odometry ({self.config.method}{example})"
 
     async def on_ready(self) -> None:
         """Start the tracker, in a process of its own."""

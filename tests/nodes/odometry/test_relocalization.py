@@ -7,7 +7,7 @@ import pytest
 
 from nodes.monocular_odometry.keyframes import new_corners
 from nodes.odometry.images import Floats
-from nodes.odometry.pose import rays
+from nodes.odometry.pose import Observations, rays, solve_pose
 from nodes.odometry.relocalization import (
     DescribedPoints,
     describe,
@@ -52,3 +52,17 @@ def test_corners_at_the_edge_are_not_described() -> None:
     described = describe(image, edge, np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
     assert described.points.tolist() == [[2.0, 0.0, 0.0]]
     assert describe(image, edge[:1], np.ones((1, 3))).points.shape == (0, 3)
+
+
+def test_landmarks_in_one_column_of_pixels_leave_open_what_they_do_not_tell() -> None:
+    for seed in range(300):
+        random = np.random.default_rng(seed)
+        count, depth = int(random.integers(15, 40)), float(random.uniform(3, 30))
+        pixels = np.stack([np.full(count, random.integers(400)), 10.0 + 7 * np.arange(count)], 1)
+        if seed % 2:
+            pixels[:] = pixels[0]
+        matrix = INFO.matrix()
+        landmarks = depth * rays(pixels, matrix)
+        seen = Observations.without_depth(landmarks, pixels)
+        found = solve_pose(seen, np.eye(4), matrix, 0.3, 0.001)
+        assert np.allclose(found.pose, np.eye(4), atol=1e-6)
