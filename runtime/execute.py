@@ -69,11 +69,13 @@ def execute(
             be written after a run has been.
     """
     handlers = list(handlers or [])
-    if out is not None:
-        results.prepare(out, config)
-        handlers.append(file_handler(out / "log.txt"))
-    run = _Run(config, out, log_events, watch, only, stand_ins)
-    with logging_to(handlers, config.run.log, run.now):
+    with contextlib.ExitStack() as stack:
+        folder = None if out is None else stack.enter_context(results.Folder(out))
+        if out is not None:
+            results.write_config(out, config)
+            handlers.append(file_handler(out / "log.txt"))
+        run = _Run(config, out, folder, log_events, watch, only, stand_ins)
+        stack.enter_context(logging_to(handlers, config.run.log, run.now))
         summary = event_loop.run_to_end(run.loop, run.main(), run.escaped)
         if out is not None:
             run.conclude(out, summary)
@@ -118,6 +120,7 @@ class _Run:
         self,
         config: Config,
         out: Path | None,
+        folder: results.Folder | None,
         log_events: bool,
         watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
         only: Collection[str],
@@ -127,6 +130,7 @@ class _Run:
         self._clock: Clock | None = None
         self._config = config
         self._out = out
+        self._folder = folder
         self._watch = watch or contextlib.nullcontext
         self._only = only
         self._stand_ins = stand_ins
@@ -148,6 +152,8 @@ class _Run:
         self.supervisor = supervisor = Supervisor(
             self._config, clock, self._taps, self._out, self._only, self._stand_ins
         )
+        if self._folder is not None:
+            supervisor.state.before_first_update = self._folder.flown
         # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
         level = logging.DEBUG if run.clock == "lockstep" else logging.WARNING
         watchdog = LoopWatchdog(loop, run.stall, functools.partial(_report_stall, level))

@@ -267,8 +267,10 @@ class NodeRunner:
         return wrong
 
     def _too_late(self, what: str, limit: float, place: str) -> NodeTimeoutError:
+        setting = "startup_limit" if what in {"on_startup", "on_ready"} else "shutdown_limit"
         late = NodeTimeoutError(
-            self.spec.name, f"expected {what} to end within {limit:.3g} s, found it still running"
+            self.spec.name,
+            f"expected {what} to end within {limit:.3g} s (run.{setting}), found it still running",
         )
         late.place = place
         return late

@@ -1,16 +1,24 @@
 """A run's folder: whose it is, and files in it that are written as a whole or not at all.
 
-A folder that the runtime has made has a marker in it, and only such a folder is ever cleared.
-Not here: what nodes write.
+A folder that the runtime has made has a marker in it, and only such a folder is ever moved or
+removed. The marker says which process uses it, and when its first update was; that process holds
+a lock on it. Not here: what nodes write.
 """
 
 from __future__ import annotations
 
 import contextlib
+import datetime as dt
+import errno
+import fcntl
+import logging
 import os
+import re
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import msgspec
@@ -20,43 +28,116 @@ from runtime.config.model import Config, to_builtins
 from runtime.errors import ResultsError
 from runtime.summary import Summary
 
+log = logging.getLogger("visnav.runtime")
+
 MARKER = ".visnav-run"
-_MARK = "A run made this folder; the next one that is given it removes what this one has left.\n"
+_MARK = "A run made this folder; the next one that is given it moves it to NAME.1.\n"
 _SUMMARY_OF_OURS = {"clock", "seed", "reason", "digest", "sim_seconds", "announcements"}
 
 
-def prepare(out: Path, config: Config) -> None:
-    """Make a run's folder, or clear it of what an earlier run has left; recordings stay.
+class Folder:
+    """The folder of one run, which no other run may use meanwhile.
+
+    An earlier run that is in it is put aside. With the first update it becomes ``NAME.1``, in the
+    place of what was kept there before; if there is none, it comes back, and the start that failed
+    goes to ``NAME.failed``.
+
+    Args:
+        out: Of the run; made if missing.
 
     Raises:
-        ResultsError: It holds what no run has made, or it cannot be written.
+        ResultsError: Another run uses it, it holds what no run has made, or it cannot be written.
     """
-    with _readable(out):
-        claim(out)
-        for name in ("summary.json", "report.html"):
-            (out / name).unlink(missing_ok=True)
-        for name in ("evaluation", "trajectories", "frames", "plots", "answers"):
-            shutil.rmtree(out / name, ignore_errors=True)
-        write(out / "config.toml", tomli_w.dumps(to_builtins(config)).encode())
+
+    def __init__(self, out: Path) -> None:
+        with _readable(out):
+            if out.is_symlink() or out.name in {"", ".."}:
+                out = Path(os.path.realpath(out))
+            self._out, self._flown = out, False
+            self._aside = out.parent / f".{out.name}.earlier"
+            self._kept, self._failed = (out.parent / f"{out.name}.{end}" for end in ("1", "failed"))
+            out.mkdir(parents=True, exist_ok=True)
+            with _locked(out.parent):
+                self._marker = _mark(out)
+                try:
+                    self._take()
+                except BaseException:
+                    os.close(self._marker)
+                    raise
+
+    def __enter__(self) -> Folder:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with _readable(self._out), _locked(self._out.parent):
+            if not self._flown and self._aside.exists():
+                self._give_back()
+                print(
+                    f"warning: {self._out} is as it was: the start that failed is in "
+                    f"{self._failed}",
+                    file=sys.stderr,
+                )
+            os.close(self._marker)
+
+    def flown(self) -> None:
+        """Note the first update: from here on the earlier run is ``NAME.1``.
+
+        Raises:
+            ResultsError: It cannot be moved there.
+        """
+        with _readable(self._out), _locked(self._out.parent):
+            if self._aside.exists():
+                _move(self._aside, self._kept)
+                log.info("the earlier run in %s is now %s", self._out, self._kept)
+            now = dt.datetime.now(dt.UTC).isoformat(timespec="seconds")
+            os.write(self._marker, f"first update: {now}\n".encode())
+            self._flown = True
+
+    def _take(self) -> None:
+        """Put aside what is there, and write into the marker who is here now."""
+        if self._aside.exists():  # a start was killed
+            self._give_back()
+        for place in (self._kept, self._failed):
+            _check(place)
+        marked = _read(self._marker)
+        started = "process: " in marked
+        if "first update: " in marked or (not started and _has_summary_of_ours(self._out)):
+            self._move_away(self._aside)
+        elif started:
+            self._move_away(self._failed)
+        os.write(self._marker, f"process: {os.getpid()}\n".encode())
+
+    def _give_back(self) -> None:
+        """Put the earlier run where it was, and what is there now to ``NAME.failed``."""
+        if self._out.exists():
+            _move(self._out, self._failed)
+        self._aside.rename(self._out)
+        self._mark_anew()
+
+    def _move_away(self, place: Path) -> None:
+        _move(self._out, place)
+        self._mark_anew()
+
+    def _mark_anew(self) -> None:
+        before, self._marker = self._marker, _mark(self._out)
+        os.close(before)
 
 
-def keep_earlier(out: Path) -> Path | None:
-    """Move the folder of an earlier run to ``NAME.1``, in the place of what was kept there before.
-
-    Returns:
-        Where it is now; `None` if there is no folder that a run has made.
+def clear(out: Path) -> None:
+    """Make an empty folder for a run that is to be given it, in the place of an earlier one.
 
     Raises:
-        ResultsError: It cannot be moved, or ``NAME.1`` is not a run's.
+        ResultsError: A run uses it, or no run has made it.
+        OSError: It cannot be made.
     """
-    if not (out / MARKER).is_file():
-        return None
-    kept = out.with_name(f"{out.name}.1")
-    with _readable(out):
-        claim(kept)
-        shutil.rmtree(kept)
-        out.rename(kept)
-    return kept
+    os.close(_mark(out))
+    shutil.rmtree(out)
+    claim(out)
 
 
 def claim(out: Path) -> None:
@@ -67,16 +148,69 @@ def claim(out: Path) -> None:
         OSError: It cannot be made.
     """
     out.mkdir(parents=True, exist_ok=True)
+    _check(out)
     marker = out / MARKER
-    if marker.is_file():
+    if not marker.is_file():
+        marker.write_text(_MARK, encoding="utf-8")
+
+
+def _check(out: Path) -> None:
+    """Refuse a folder with something in it if no run has made it."""
+    if not out.exists() or (out / MARKER).is_file() or _has_summary_of_ours(out):
         return
     found = next(iter(sorted(each.name for each in out.iterdir())), None)
-    if found is not None and not _of_an_earlier_version(out):
+    if found is not None:
         raise ResultsError(
             f"{out}: expected a new or empty folder, or one that a run has made (with a "
             f"{MARKER} in it), found {found!r}: name another with --out, or remove it"
         )
-    marker.write_text(_MARK, encoding="utf-8")
+
+
+def _mark(out: Path) -> int:
+    """Claim a folder, and return its marker, open and locked.
+
+    Raises:
+        ResultsError: A run uses it.
+    """
+    claim(out)
+    marker = os.open(out / MARKER, os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        numbers = re.findall(r"process: (\d+)", _read(marker))
+        os.close(marker)
+        raise ResultsError(
+            f"{out}: expected a folder that no other run uses, found that of process "
+            f"{numbers[-1] if numbers else '?'}, which still runs: name another with --out, or "
+            "end that one first"
+        ) from None
+    except OSError:  # a file system without locks
+        pass
+    return marker
+
+
+def _read(marker: int) -> str:
+    return os.pread(marker, 1000, 0).decode(errors="replace")
+
+
+def _move(source: Path, place: Path) -> None:
+    """Move a run's folder into the place of another."""
+    _check(place)
+    if place.exists():
+        shutil.rmtree(place)
+    source.rename(place)
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Let others that move runs in a folder wait."""
+    number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(number, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(number)
 
 
 def write(path: Path, content: bytes) -> None:
@@ -85,17 +219,48 @@ def write(path: Path, content: bytes) -> None:
     Raises:
         OSError: It cannot be written; what was there before is as it was.
     """
+    with replacing(path) as new, new.open("wb") as file:
+        file.write(content)
+        file.flush()
+        if new != path:
+            os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give the place of a new file, which then takes the place of `path`.
+
+    Only a file is ever replaced. A link stays, and so does a device, which is written to itself.
+
+    Raises:
+        OSError: What is there can be neither replaced nor written to, or the block raises it; then
+            `path` is as it was.
+    """
+    if path.is_symlink():
+        path = Path(os.path.realpath(path))
+    if path.is_char_device():
+        yield path
+        return
+    if path.exists() and not path.is_file():
+        raise FileExistsError(errno.EEXIST, "expected a file there, found none", str(path))
     new = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with new.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+        yield new
         new.replace(path)
     except BaseException:
         with contextlib.suppress(OSError):
             new.unlink(missing_ok=True)
         raise
+
+
+def write_config(out: Path, config: Config) -> None:
+    """Write all settings of a run as ``config.toml``.
+
+    Raises:
+        ResultsError: It cannot be written.
+    """
+    with _readable(out):
+        write(out / "config.toml", tomli_w.dumps(to_builtins(config)).encode())
 
 
 def write_summary(out: Path, summary: Summary) -> None:
@@ -111,8 +276,8 @@ def write_summary(out: Path, summary: Summary) -> None:
         write(out / "summary.json", encoded + b"\n")
 
 
-def _of_an_earlier_version(out: Path) -> bool:
-    """Tell whether a folder without a marker has a summary that only a run can have written."""
+def _has_summary_of_ours(out: Path) -> bool:
+    """Tell whether a folder has a summary that only a run can have written."""
     try:
         found = msgspec.json.decode((out / "summary.json").read_bytes())
     except (OSError, ValueError, RecursionError):

@@ -51,6 +51,7 @@ class RunState:
         environment: What nodes found of the machine on which figures depend.
         costs: What workers cost, by ``node.Factory``.
         outside: What became of the frames for systems outside the process, by their names.
+        before_first_update: What is called once all nodes have started.
         after_run: What is called with the run's folder at the very end.
     """
 
@@ -75,6 +76,7 @@ class RunState:
     environment: dict[str, str] = field(default_factory=dict)
     costs: dict[str, Costs] = field(default_factory=dict)
     outside: dict[str, Answers] = field(default_factory=dict)
+    before_first_update: Callable[[], None] = lambda: None
     after_run: list[Callable[[Path], Any]] = field(default_factory=list)
 
     def note_error(self, error: Exception) -> None:

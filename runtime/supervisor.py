@@ -274,6 +274,7 @@ class Supervisor:
         state = self.state
         try:
             announced = await self._start_nodes()
+            state.before_first_update()
         except PeerError as error:
             log.error("%s", error, extra={"reported": True})
             self.stop("the processes of the run did not come together", error, by="runtime")

@@ -7,9 +7,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import threading
+import time
 from collections.abc import AsyncIterator, Iterable
+from pathlib import Path
 from typing import Any
+
+LOOK_EVERY = 1.0
+"""Real seconds between two looks at how busy the machine is."""
 
 
 @contextlib.asynccontextmanager
@@ -47,15 +53,59 @@ async def real_time_limit(seconds: float) -> AsyncIterator[None]:
             raise TimeoutError from None
 
 
+class Starvation:
+    """Real seconds in which a process, or one that it has started, waited for a processor.
+
+    On a busy machine that is most of the time, and no fault of whoever has a limit. It is 0 where
+    the kernel does not tell. It counts from the first look.
+
+    Args:
+        process: Its number; this one, if not given.
+    """
+
+    def __init__(self, process: int | None = None) -> None:
+        self._process = os.getpid() if process is None else process
+        self._waits: dict[str, int] | None = None
+        self._at = 0.0
+        self._seconds = 0.0
+
+    def look(self) -> float:
+        """Return the seconds; between two looks, those of the thread that waited longest."""
+        now, waits, before = time.monotonic(), waits_of(self._process), self._waits
+        if before is not None:
+            longest = max((wait - before.get(key, 0) for key, wait in waits.items()), default=0)
+            self._seconds += min(longest / 1e9, now - self._at)
+        self._at, self._waits = now, waits
+        return self._seconds
+
+
+def waits_of(process: int) -> dict[str, int]:
+    """Return how long each thread of a process and of its children has waited to run (ns)."""
+    found, processes = {}, [process]
+    for number in processes:
+        for thread in Path(f"/proc/{number}/task").glob("*"):
+            with contextlib.suppress(OSError, IndexError):  # it has ended, or the kernel is another
+                found[thread.name] = int((thread / "schedstat").read_bytes().split()[1])
+                processes += map(int, (thread / "children").read_bytes().split())
+    return found
+
+
 async def ended(tasks: Iterable[asyncio.Task[Any]], seconds: float) -> list[asyncio.Task[Any]]:
-    """Wait for so many real seconds at most until all tasks have ended.
+    """Wait until all tasks have ended, for so many real seconds at most without `Starvation`.
 
     Returns:
         Those that have not.
     """
     tasks = [task for task in tasks if not task.done()]
-    if tasks:
+    begin, starvation, left = time.monotonic(), Starvation(), seconds
+    while tasks:
         with contextlib.suppress(TimeoutError):
-            async with real_time_limit(seconds):
+            async with real_time_limit(min(left, LOOK_EVERY)):
                 await asyncio.wait(tasks)
-    return [task for task in tasks if not task.done()]
+        tasks = [task for task in tasks if not task.done()]
+        left = seconds - (time.monotonic() - begin)
+        if tasks and seconds > LOOK_EVERY:
+            left += starvation.look()
+        if left <= 0:
+            break
+    return tasks

@@ -29,6 +29,7 @@ from nodes.dataset.recording import ImageFile, Recording, in_colour
 from nodes.dataset.rig import Rig, choose
 from nodes.trajectory.table import EPOCH, epoch_of
 from nodes.viewing.encoding import depth_in_steps
+from runtime.results import claim
 
 
 def export_calibration(
@@ -62,11 +63,13 @@ def export_calibration(
     rig = choose(announcements(run), camera)
     files = write_files(rig, form)
     folder = out or run / "export" / form
+    recording = run / "recording.mcap"
+    if form == "vslamlab" and recording.is_file():
+        claim(folder)  # images that an earlier export has left there are removed
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         (folder / name).write_text(text, encoding="utf-8", newline="\n")
     written = [folder / name for name in files]
-    recording = run / "recording.mcap"
     if form != "vslamlab" or not recording.is_file():
         return written
     from nodes.replay.recorded import Recorded  # which wants what reads MCAP

@@ -118,8 +118,19 @@ def write(
     """
     if (out / "config.toml").exists():
         raise ResultsError(f"{out}: expected no run's folder: name another with --out")
-    results.keep_earlier(out)
-    results.claim(out)
+    with results.Folder(out) as folder:
+        page = _write(out, truth, judgements, verdict, notes)
+        folder.flown()
+    return page
+
+
+def _write(
+    out: Path,
+    truth: Source,
+    judgements: dict[str, Judgement],
+    verdict: Verdict,
+    notes: Sequence[str],
+) -> Path:
     write_results(out, {}, judgements, msgspec.to_builtins(verdict))
     write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
     for name, judgement in judgements.items():

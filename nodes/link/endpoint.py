@@ -204,7 +204,8 @@ class Endpoint:
         if closed:
             return
         if self._listener is not None:
-            self._path.unlink(missing_ok=True)
+            if self._path.is_socket():
+                self._path.unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # wakes the thread that accepts
                 self._listener.shutdown(socket.SHUT_RDWR)
             self._listener.close()

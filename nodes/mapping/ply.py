@@ -12,6 +12,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from runtime.results import replacing
+
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 )
@@ -91,11 +93,9 @@ def write_ply(
         ]
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}")
-    with unfinished.open("wb") as file:
+    with replacing(path) as new, new.open("wb") as file:
         file.write(header.encode("ascii"))
         file.write(rows.tobytes())
-    unfinished.replace(path)
 
 
 def read_ply(path: Path, most: int) -> Cloud:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from nodes.orb_slam3.vocabulary import TreeShape, Vocabulary
+from runtime.results import replacing
 
 _SCORING, _WEIGHTING = 0, 0
 """L1 norm and tf-idf, which ORB-SLAM3 expects (DBoW2's ScoringType and WeightingType)."""
@@ -55,10 +56,9 @@ def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
         for row, weight in zip(numbers[1:].tolist(), vocabulary.weights[1:].tolist(), strict=True)
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    # No newline at the end: DBoW2 would read a node from the empty line after it.
-    part.write_text("\n".join([header, *lines]), encoding="ascii")
-    part.replace(path)
+    with replacing(path) as new:
+        # No newline at the end: DBoW2 would read a node from the empty line after it.
+        new.write_text("\n".join([header, *lines]), encoding="ascii")
 
 
 def check_vocabulary(path: Path) -> tuple[int, int]:

@@ -62,8 +62,9 @@ def missing_message(absent: Sequence[str], seconds: float, meet: str) -> str:
     """Return the message for a process that waits in vain."""
     only = ",".join(absent)
     return (
-        f"expected all nodes to be there within {seconds:g} s, found none of {', '.join(absent)} "
-        f"that knows our secret (network.secret) at {meet}: start them with --only {only}"
+        f"expected all nodes to be there within {seconds:g} s (network.wait), found none of "
+        f"{', '.join(absent)} that knows our secret (network.secret) at {meet}: "
+        f"start them with --only {only}"
     )
 
 

@@ -108,6 +108,7 @@ class Membership:
         self._loop = asyncio.get_running_loop()
         self._handshakes: Handshakes | None = None
         self.ended: Stop | None = None
+        self._unfit: list[str] = []
         self._numbers: dict[tuple[str, ...], int] = {}
         self._numbered: dict[int, Member] = {}
         self.waiting = Waiting(self.present, float(config.run.startup_limit))
@@ -134,7 +135,7 @@ class Membership:
                 await self.waiting.until(lambda: not self._missing())
         except TimeoutError:
             text = missing_message(self._missing(), float(network.wait), network.meet)
-            raise PeerError(text) from None
+            raise PeerError("; ".join([text, *self._unfit])) from None
         return self.number()
 
     def number(self) -> int:
@@ -287,6 +288,7 @@ class Membership:
         except PeerError as error:
             if self.hello.began < member.hello.began:  # the newcomer gives up
                 log.warning("left alone: %s", error)
+                self._unfit = [str(error)]
             else:
                 self.misfit(error)
             return

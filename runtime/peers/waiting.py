@@ -125,10 +125,11 @@ class Waiting:
         slow = "; ".join(f"{name_of(m.nodes)} ({m.place})" for m in self._present() if whom(m))
         gone = "; ".join(_loss(member) for _, member in sorted(self.absent.items()))
         if late and gone:
-            text = f"{gone}: expected its return within {self._startup_limit:g} s, found none"
-            raise PeerError(text) from None
+            within = f"{self._startup_limit:g} s (run.startup_limit)"
+            raise PeerError(f"{gone}: expected its return within {within}, found none") from None
         if late:
-            raise PeerError(f"expected a word within {limit:g} s of {slow}, found none") from None
+            within = f"{limit:g} s (of run.startup_limit for each node)"
+            raise PeerError(f"expected a word within {within} of {slow}, found none") from None
         log.info("still waiting for %s", "; ".join(filter(None, [gone, slow])))
 
 

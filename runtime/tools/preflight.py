@@ -240,6 +240,8 @@ def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:
             posixpath.normpath(file) for file in (*spec.node.files, *written(spec.config))
         )
         for file in files:
+            if file.startswith(("/", "..")):
+                yield f"{spec.name}: expected a file in the run's folder, found {file}"
             if file in writers:
                 yield (
                     f"{spec.name}: expected files of its own in the run's folder, found {file}, "

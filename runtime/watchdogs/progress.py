@@ -24,6 +24,7 @@ from runtime.frames import frame_of
 from runtime.lockstep import LockstepLoop
 from runtime.run_state import RunState
 from runtime.stepping import Stepping
+from runtime.time_limits import Starvation
 from runtime.watchdogs.loop import idle
 
 log = logging.getLogger("visnav.runtime")
@@ -64,11 +65,13 @@ class ProgressWatchdog:
 
     def _watch(self) -> None:
         mark: Any = None
+        starvation = Starvation()
         since, due, interrupted = 0.0, 0.0, 0.0
         while not self._end.wait(min(self._limit / 8, _LONGEST_PAUSE)):
             found, now = self._mark(), time.monotonic()
             if found != mark:
                 mark, since, due, interrupted = found, now, self._limit, now
+                starvation = Starvation()
             if now - since < due / 2:
                 continue
             seen: Counter[tuple[str, str]] = Counter()
@@ -84,9 +87,9 @@ class ProgressWatchdog:
             if (
                 self._main
                 and answer is None
-                and time.monotonic() - interrupted > self._blocking_limit()
+                and time.monotonic() - interrupted - starvation.look() > self._blocking_limit()
             ):
-                interrupted = time.monotonic()
+                interrupted, starvation = time.monotonic(), Starvation()
                 self._interrupt()
 
     def _mark(self) -> tuple[Any, ...]:
@@ -168,7 +171,10 @@ class ProgressWatchdog:
         node, line = code_location.of_thread(frame_of(self._thread_id))
         if node == "runtime":  # it is not a node that blocks, or does no more
             return
-        error = NodeTimeoutError(node, "expected it to give back the loop, found it blocking it")
+        setting = "startup_limit" if self._state.first_update is None else "shutdown_limit"
+        error = NodeTimeoutError(
+            node, f"expected it to give back the loop (run.{setting}), found it blocking it"
+        )
         error.place = line
         self._state.interruption = error
         signal.pthread_kill(self._thread_id, signal.SIGUSR2)

@@ -3,7 +3,8 @@
 Started by `runtime.workers.worker` as ``python -m runtime.workers.child SOCKET IN OUT LIMIT``:
 inherited file descriptors, and the seconds that a call may take. The process ends with the run,
 however the run ends: in order if it waits for calls; after `_GRACE` if it is in one, and if that
-call does not even let go of Python's lock, once its limit is over.
+call does not even let go of Python's lock, once its limit is over (ten times as long as the run
+itself would wait for it on an idle machine).
 """
 
 from __future__ import annotations

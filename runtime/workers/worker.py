@@ -30,6 +30,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 from runtime.clock import Clock
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.schedule import SECOND
+from runtime.time_limits import Starvation
 from runtime.workers.costs import Costs
 from runtime.workers.output import Output, how_it_ended
 from runtime.workers.shared_memory import SharedPipe, anonymous_file
@@ -43,6 +44,9 @@ Called = Callable[[str, str, concurrent.futures.Future[Any]], None]
 
 _GRACE = 2.0
 """Seconds a process gets to end by itself once its connection is closed."""
+
+_MOST_STARVED = 10
+"""How many times longer a call may take on a busy machine once the run has gone."""
 
 _LOOK = 0.25
 """Seconds after which a thread that receives nothing from a process looks whether there is one."""
@@ -234,6 +238,8 @@ class _Process:
         self._timeout = timeout
         self._died = died
         self._costs = costs
+        self._awaited: concurrent.futures.Future[Any] | None = None
+        self._starvation = Starvation()
         self._looked = -math.inf  # at its memory, on `time.monotonic`
         self._calls: collections.deque[tuple[float, concurrent.futures.Future[Any]]] = (
             collections.deque()
@@ -254,7 +260,7 @@ class _Process:
         command = [sys.executable, "-m", "runtime.workers.child", *map(str, numbers)]
         try:
             self._child = subprocess.Popen(  # noqa: S603  # our own module
-                [*command, str(limit + _GRACE)],
+                [*command, str(_MOST_STARVED * limit + _GRACE)],
                 pass_fds=numbers,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
@@ -344,13 +350,17 @@ class _Process:
 
     def _check_limit(self) -> None:
         with self._lock:
-            late = bool(self._calls) and time.monotonic() > self._calls[0][0]
-        if late:
+            due, work = self._calls[0] if self._calls else (math.inf, None)
+        if work is not self._awaited:
+            self._awaited, self._starvation = work, Starvation(self._child.pid)
+        if due < math.inf and time.monotonic() > due + self._starvation.look():
             raise self._hung()
 
     def _hung(self) -> WorkerTimeoutError:
         self._child.kill()
-        return WorkerTimeoutError(self._story(f"no answer in {self._timeout:g} s"))
+        return WorkerTimeoutError(
+            self._story(f"no answer in {self._timeout:g} s (timeout of self.worker)")
+        )
 
     def _fail(self, error: WorkerError) -> None:
         expected = self._closing

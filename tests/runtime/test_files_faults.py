@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
+import shutil
+import stat
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from nodes.mapping.ply import write_ply
+from nodes.orb_slam3.vocabulary import Vocabulary
+from nodes.orb_slam3.vocabulary_file import write_vocabulary
 from runtime.config.model import Config, RunConfig
-from runtime.errors import ResultsError
+from runtime.errors import NodeError, ResultsError, VisnavError
 from runtime.execute import execute
-from runtime.results import MARKER, claim, write
+from runtime.node import Node
+from runtime.results import MARKER, Folder, claim, clear, write
 from runtime.testing import spec
+from runtime.tools.tracing.record import tracing
 from runtime.units import Duration
 from tests.runtime.samples import Speaker
 from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, summary
@@ -23,9 +33,102 @@ from tests.runtime.tools.samples_cli import ROOT, command_here, config_file, sum
 pytestmark = pytest.mark.timeout(180)
 
 
-def fly(out: Path) -> None:
+class Refuser(Node):
+    """Fails in start-up, of which it leaves a trace."""
+
+    async def on_ready(self) -> None:
+        assert self.out is not None
+        (self.out / "half").touch()
+        raise ValueError("not today")
+
+
+class Rival(Node):
+    """Begins a run in the folder of its own, once that goes on."""
+
+    async def run(self) -> None:
+        assert self.out is not None
+        with pytest.raises(ResultsError, match=f"no other run uses.*of process {os.getpid()}, "):
+            Folder(self.out)
+
+
+def fly(out: Path, seed: int = 0, cls: type[Node[Any]] = Speaker) -> None:
+    run = RunConfig(duration=Duration(0.1), seed=seed)
+    execute(Config(run=run, nodes=(spec(cls, "node"),)), out)
+
+
+def write_ply_here(path: Path, _: bytes) -> None:
+    write_ply(path, np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), "map")
+
+
+def write_vocabulary_here(path: Path, _: bytes) -> None:
+    words = np.zeros((2, 32), np.uint8)
+    ones = np.ones(2, int)
+    tree = Vocabulary(
+        branching=10, depth=1, parents=ones, leaves=ones, descriptors=words, weights=np.ones(2)
+    )
+    write_vocabulary(tree, path)
+
+
+def trace_here(path: Path, _: bytes) -> None:
     run = RunConfig(duration=Duration(0.1))
-    execute(Config(run=run, nodes=(spec(Speaker, "speaker"),)), out)
+    config = Config(run=run, nodes=(spec(Speaker, "node"),))
+    execute(config, watch=lambda supervisor: tracing(supervisor, path, "x"))
+
+
+def flights(folder: Path) -> dict[str, int]:
+    """Return the seeds of the runs in a folder."""
+    return {each.name: summary(each)["seed"] for each in sorted(folder.iterdir())}
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_a_start_that_fails_takes_nothing_away(link: bool, tmp_path: Path) -> None:
+    real = tmp_path / "real"
+    out = real / "out"
+    if link:
+        out.mkdir(parents=True)
+        out = tmp_path / "link"
+        out.symlink_to(real / "out")
+    fly(out, 1)
+    fly(out, 2)
+    assert flights(real) == {"out": 2, "out.1": 1}
+    for seed in (3, 4):
+        with pytest.raises(NodeError, match="not today"):
+            fly(out, seed, Refuser)
+        assert flights(real) == {"out": 2, "out.1": 1, "out.failed": seed}
+        assert (real / "out.failed" / "half").exists()
+    fly(out, 5)
+    assert flights(real) == {"out": 5, "out.1": 2, "out.failed": 4}
+
+
+def test_a_start_that_was_killed_takes_nothing_away(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    fly(out, 1)
+    killed = Folder(out)
+    (out / "half").touch()
+    os.close(killed._marker)  # as the kernel does
+    fly(out, 2)
+    assert [each.name for each in (tmp_path / "out.failed").iterdir()] == [MARKER, "half"]
+    shutil.rmtree(tmp_path / "out.failed")
+    assert flights(tmp_path) == {"out": 2, "out.1": 1}
+
+
+def test_two_runs_never_share_a_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    fly(out, 1, Rival)
+    fly(out, 2, Rival)
+    assert flights(tmp_path) == {"out": 2, "out.1": 1}
+    with Folder(out), pytest.raises(ResultsError, match="no other run uses"):
+        clear(out)
+    clear(out)
+    assert [each.name for each in out.iterdir()] == [MARKER]
+
+
+def test_a_first_start_that_fails_is_where_one_looks_for_it(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for seed in (1, 2):
+        with pytest.raises(NodeError, match="not today"):
+            fly(out, seed, Refuser)
+    assert flights(tmp_path) == {"out": 2, "out.failed": 1}
 
 
 def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
@@ -40,23 +143,15 @@ def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path: Path) 
     assert sorted(each.name for each in tmp_path.iterdir()) == ["config.toml", "plots"]
 
 
-def test_a_folder_of_a_run_is_used_again_and_cleared(tmp_path: Path) -> None:
+def test_a_folder_of_a_run_of_an_earlier_version_is_known_by_its_summary(tmp_path: Path) -> None:
     out = tmp_path / "out"
     fly(out)
-    assert (out / MARKER).is_file()
-    (out / "plots").mkdir()
+    (out / MARKER).unlink()
     fly(out)
-    assert not (out / "plots").exists()
-
-
-def test_a_folder_of_a_run_of_an_earlier_version_is_known_by_its_summary(tmp_path: Path) -> None:
-    fly(tmp_path)
-    (tmp_path / MARKER).unlink()
-    fly(tmp_path)
-    (tmp_path / MARKER).unlink()
-    (tmp_path / "summary.json").write_text('{"name": "mine"}', encoding="utf-8")
+    (out / MARKER).unlink()
+    (out / "summary.json").write_text('{"name": "mine"}', encoding="utf-8")
     with pytest.raises(ResultsError, match="expected a new or empty folder"):
-        fly(tmp_path)
+        fly(out)
 
 
 def test_a_file_is_written_as_a_whole_or_not_at_all(
@@ -73,6 +168,47 @@ def test_a_file_is_written_as_a_whole_or_not_at_all(
         write(file, b"new and longer")
     assert [each.name for each in tmp_path.iterdir()] == ["summary.json"]
     assert file.read_bytes() == b"old"
+
+
+DEVICE = os.makedev(1, 7)
+"""That of /dev/full, which cannot be written to."""
+
+
+@pytest.mark.parametrize("write", [write, write_ply_here, trace_here, write_vocabulary_here])
+@pytest.mark.parametrize("kind", ["device", "link to a device", "fifo", "folder"])
+def test_what_is_no_file_is_never_removed_nor_replaced(
+    kind: str, write: Callable[[Path, bytes], object], tmp_path: Path
+) -> None:
+    path = real = tmp_path / "out"
+    if kind == "link to a device":
+        real = tmp_path / "device"
+        path.symlink_to(real)
+    if "device" in kind:
+        try:
+            os.mknod(real, 0o666 | stat.S_IFCHR, DEVICE)
+        except PermissionError:
+            pytest.skip("only root makes devices")
+    elif kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.mkdir()
+    before = path.lstat(), real.lstat()
+    with contextlib.suppress(OSError, VisnavError):
+        write(path, b"new")
+    after = path.lstat(), real.lstat()
+    assert [(s.st_ino, s.st_rdev, s.st_mode) for s in before] == [
+        (s.st_ino, s.st_rdev, s.st_mode) for s in after
+    ]
+    assert sorted(tmp_path.iterdir()) == sorted({path, real})
+
+
+@pytest.mark.parametrize("write", [write, write_ply_here, trace_here, write_vocabulary_here])
+def test_a_link_to_a_file_stays_one(write: Callable[[Path, bytes], object], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to("file")
+    write(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file").stat().st_size > 0
 
 
 def test_claiming_twice_is_no_mistake(tmp_path: Path) -> None:

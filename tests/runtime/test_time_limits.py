@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import os
 import threading
 import time
+from collections.abc import AsyncIterator
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from runtime import time_limits
 from runtime.time_limits import real_time_limit
 from tests.runtime.loops import Run, turns
 
@@ -107,6 +113,54 @@ def test_a_cancellation_at_the_moment_of_the_limit_is_not_swallowed(run: Run) ->
     cancelled, cancelling = run(main())
     assert cancelled
     assert cancelling == 1
+
+
+@pytest.mark.parametrize(("starved", "seconds"), [(0.0, 60), (0.9, 591), (1.0, None)])
+def test_what_a_busy_machine_takes_is_no_part_of_a_limit(
+    starved: float, seconds: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread that waits for a processor for nine of ten seconds has nine times as many more."""
+    now = 0.0
+
+    @contextlib.asynccontextmanager
+    async def passes(seconds: float) -> AsyncIterator[None]:
+        nonlocal now
+        now += seconds
+        if now > 1000:
+            task.set_result(None)
+        raise TimeoutError
+        yield
+
+    monkeypatch.setattr(time_limits, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(time_limits, "real_time_limit", passes)
+    monkeypatch.setattr(time_limits, "waits_of", lambda _: {"1": now * starved * 1e9, "2": 0})
+    loop = asyncio.new_event_loop()
+    task: Any = loop.create_future()
+    late = loop.run_until_complete(time_limits.ended([task], 60.0))
+    loop.close()
+    assert late == ([] if seconds is None else [task])
+    assert now == pytest.approx(seconds or 1001)
+
+
+def test_starvation_is_that_of_the_thread_that_waits_longest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now: tuple[float, dict[str, float]] = 0, {"a": 7e9}
+    monkeypatch.setattr(time_limits, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(time_limits, "waits_of", lambda _: now[1])
+    starvation = time_limits.Starvation()
+    assert starvation.look() == 0
+    now = 10, {"a": 9e9, "b": 3e9}
+    assert starvation.look() == 3
+    now = 11, {"b": 99e9}
+    assert starvation.look() == 4
+    now = 12, {}
+    assert starvation.look() == 4
+
+
+def test_the_kernel_says_how_long_threads_wait() -> None:
+    assert min(time_limits.waits_of(os.getpid()).values(), default=0) >= 0
+    assert time_limits.waits_of(-1) == {}
 
 
 def test_a_limit_within_a_limit_expires_alone(run: Run) -> None:

@@ -84,17 +84,21 @@ def run(
     """Run the nodes of a file until they, its duration or Ctrl-C end the run.
 
     Results go to runs/<name> (with --only, to runs/<name>-<first node>): summary.json, log.txt,
-    the resolved config.toml, and whatever the nodes write. The results of an earlier run of that
-    name are kept as runs/<name>.1; those that were there before are removed.
+    the resolved config.toml, and whatever the nodes write. With the first update, an earlier run
+    in that folder becomes runs/<name>.1, in the place of what was kept there; a start that fails
+    leaves it where it is.
 
     Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
     immediate); with 1 if a threshold of the run was not met; with 2 if something failed.
     """
     from runtime.execute import execute
-    from runtime.results import keep_earlier
     from runtime.tools.cli.observers import Observers
     from runtime.tools.plugins import load_configuration
 
+    if "VISNAV_LIFELINE" in os.environ:
+        from runtime.tools.sweep.process import end_with_the_sweep
+
+        end_with_the_sweep()
     changes = list(overrides or [])
     if log is not None and log is not Log.events:
         changes.append(f"run.log={log.value}")
@@ -103,8 +107,6 @@ def run(
     look_at(settings, nodes_here)
     name = "-".join([settings.run.name, *nodes_here[:1]])
     folder = out or Path("runs") / name
-    if out is None and (kept := keep_earlier(folder)) and not quiet:
-        print(f"the earlier run in {folder} is now {kept}", file=sys.stderr)
     stand_ins = {}
     if flight:
         from runtime.tools.flights.cache import recorded

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import socket
@@ -70,8 +69,8 @@ def _answers(path: Path) -> bool:
         try:
             probe.connect(str(path))
         except (ConnectionRefusedError, FileNotFoundError):
-            with contextlib.suppress(OSError):
-                path.unlink()
+            if path.is_socket():  # of a file, a connection is refused as well
+                path.unlink(missing_ok=True)
             return False
         except OSError:
             return False

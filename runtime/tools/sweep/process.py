@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from typing import Any
 import msgspec
 
 from runtime.digest import combined
-from runtime.results import claim
+from runtime.results import clear
 from runtime.tools.sweep.plan import Job
 from runtime.tools.sweep.rows import Row, failed
 
@@ -28,6 +27,9 @@ _STOPPED = {"Ctrl-C", "SIGTERM", "SIGHUP"}
 """Reasons for a run's end that are no end of its own; see `runtime.execute`."""
 
 _LONGEST_ERROR = 300
+
+LIFELINE = "VISNAV_LIFELINE"
+"""Environment variable of a run: number of a pipe at whose other end its sweep is."""
 
 
 class RunVerdict(msgspec.Struct, frozen=True):
@@ -73,9 +75,7 @@ class Children:
     def run(self, job: Job) -> Row:
         """Run a job and wait for its end."""
         out = Path(job.out)
-        if out.exists():
-            shutil.rmtree(out)
-        claim(out)
+        clear(out)
         settings = out / "config.toml"
         settings.write_text(job.text, encoding="utf-8")
         command = [sys.executable, "-m", "runtime", "run", str(settings)]
@@ -83,13 +83,19 @@ class Children:
             command += ["--flight", "record" if job.record else "use"]
         paths = [os.environ.get("PYTHONPATH", ""), job.folder]
         begin = time.monotonic()
-        with (out / "output.txt").open("wb") as output:
+        lifeline, ours = os.pipe()  # whose other end the kernel closes, however we end
+        with (out / "output.txt").open("wb") as output, os.fdopen(lifeline), os.fdopen(ours, "w"):
             with self._lock:
                 if self.ending:
                     return failed(job, "not started")
                 child = subprocess.Popen(  # noqa: S603
                     [*command, "--out", str(out), "--quiet"],
-                    env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+                    env={
+                        **os.environ,
+                        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+                        LIFELINE: str(lifeline),
+                    },
+                    pass_fds=(lifeline,),
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=subprocess.STDOUT,
@@ -100,7 +106,7 @@ class Children:
             try:
                 code = child.wait(job.limit)
             except subprocess.TimeoutExpired:
-                _kill(child)
+                kill_tree(child.pid)
                 row = failed(job, f"timed out after {job.limit:g} s")
                 row["exit_code"] = child.wait()
                 row["wall_seconds"] = round(time.monotonic() - begin, 6)
@@ -121,26 +127,63 @@ class Children:
                 if not self.ending:
                     child.send_signal(signal.SIGINT)
                 elif child.poll() is None:
-                    _kill(child)  # a second SIGINT may fall together with the first
+                    kill_tree(child.pid)  # a second SIGINT may fall together with the first
             self.ending = True
 
     def usage(self) -> tuple[int, float]:
         """Return how many processes the runs have, and their own memory (GB)."""
-        sessions = {str(child.pid) for child in [*self._running]}
+        sessions = {child.pid for child in [*self._running]}
         count, pages = 0, 0
-        for folder in Path("/proc").glob("[0-9]*") if sessions else ():
-            with contextlib.suppress(OSError, IndexError):  # it may just have ended
-                fields = (folder / "stat").read_text().rpartition(")")[2].split()
-                if fields[3] in sessions:
-                    _, resident, shared, *_ = (folder / "statm").read_text().split()
+        for number, (_, session) in _processes().items() if sessions else ():
+            with contextlib.suppress(OSError):  # it may just have ended
+                if session in sessions:
+                    statm = Path(f"/proc/{number}/statm").read_text(encoding="ascii")
+                    _, resident, shared, *_ = statm.split()
                     count, pages = count + 1, pages + int(resident) - int(shared)
         return count, pages * os.sysconf("SC_PAGE_SIZE") / 1e9
 
 
-def _kill(child: subprocess.Popen[bytes]) -> None:
-    """End a run and its workers, which are in its group, at once."""
+def end_with_the_sweep() -> None:
+    """In a run of a sweep: end at once, with all that was started, when the sweep is gone."""
+    lifeline = os.environ.pop(LIFELINE, None)
+    if lifeline is None:
+        return
+    os.set_inheritable(int(lifeline), False)
+
+    def watch() -> None:
+        os.read(int(lifeline), 1)
+        kill_tree(os.getpid())
+
+    threading.Thread(target=watch, name="sweep", daemon=True).start()
+
+
+def kill_tree(run: int) -> None:
+    """Kill a run, which leads a session, and all that it has started, whatever group that is in."""
     with contextlib.suppress(ProcessLookupError):
-        os.killpg(child.pid, signal.SIGKILL)
+        if run != os.getpid():
+            os.kill(run, signal.SIGSTOP)  # or it might start more
+        for _ in range(2):  # again, for what these have started meanwhile
+            found, tree = _processes(), {run}
+            while more := {
+                number
+                for number, (parent, session) in found.items()
+                if (parent in tree or session == run) and number not in tree
+            }:
+                tree |= more
+            for number in tree - {run}:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(number, signal.SIGKILL)
+        os.kill(run, signal.SIGKILL)
+
+
+def _processes() -> dict[int, tuple[int, int]]:
+    """Return the parent and the session of all processes, by number."""
+    found = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it may just have ended
+            _, parent, _, session, *_ = stat.read_bytes().rpartition(b")")[2].split()
+            found[int(stat.parent.name)] = int(parent), int(session)
+    return found
 
 
 def read_results(job: Job, code: int, wall_seconds: float) -> Row:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import logging
+import os
+import tempfile
 import threading
 import time
 from collections import deque
@@ -149,8 +151,14 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
     """
     if not path.name or path.is_dir():
         raise ConfigError(f"{path}: expected the name of a file for a trace, found a folder")
+    if path.exists() and not (path.is_file() or path.is_char_device()):
+        raise ConfigError(f"{path}: expected the name of a file for a trace, found none")
     try:
-        spool = Spool(path.with_name(path.name + ".part"))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = tempfile.gettempdir() if path.is_char_device() else path.parent
+        number, part = tempfile.mkstemp(".part", f"{path.name}.", folder)
+        os.close(number)
+        spool = Spool(Path(part))
     except OSError as error:
         raise ConfigError(
             f"{path}: expected a place for a trace, found: {error.strerror}"
@@ -173,4 +181,3 @@ def _write(spool: Spool, path: Path, supervisor: Supervisor, name: str) -> None:
         write_trace(spool, path, name=name, clock=supervisor.state.clock.kind, nodes=order)
     except OSError as error:  # a full disk: the run's other results must not go with the trace
         log.error("%s: the trace could not be written: %s", path, error)
-        path.unlink(missing_ok=True)

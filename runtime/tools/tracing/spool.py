@@ -71,7 +71,6 @@ class Spool:
     """
 
     def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.beside: deque[tuple[Any, ...]] = deque()
         self.rate: ClockRate | None = None

@@ -14,6 +14,7 @@ from typing import IO, Any
 
 import msgspec
 
+from runtime.results import replacing
 from runtime.tools.tracing.causes import Causes, SentEvent
 from runtime.tools.tracing.spool import ClockRate, Spool
 
@@ -45,7 +46,7 @@ def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Itera
         nodes: Names, in the order in which they are to be shown.
     """
     about = {"run": name, "clock": clock, "made by": MADE_BY}
-    with _open(path) as file:
+    with replacing(path) as new, _open(new, compress=path.name.endswith(".gz")) as file:
         file.write(b'{"displayTimeUnit":"ms","otherData":' + msgspec.json.encode(about))
         file.write(b',"traceEvents":[\n')
         separator = b""
@@ -55,8 +56,8 @@ def write_trace(spool: Spool, path: Path, *, name: str, clock: str, nodes: Itera
         file.write(b"\n]}\n")
 
 
-def _open(path: Path) -> IO[bytes]:
-    if path.name.endswith(".gz"):
+def _open(path: Path, *, compress: bool) -> IO[bytes]:
+    if compress:
         return gzip.open(path, "wb", compresslevel=4)  # type: ignore[return-value]
     return path.open("wb")
 

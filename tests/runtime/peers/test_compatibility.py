@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from runtime.errors import PeerError
@@ -65,6 +66,18 @@ def test_another_file_is_refused_and_the_right_one_still_welcome() -> None:
     assert "found nodes[1].takes = 0.005 there, 0.5 here" in str(refused.error)
     Process(right, "one").ended()
     assert first.ended().outputs["one.answers"] > 0
+
+
+def test_both_are_told_in_what_their_files_differ(caplog: pytest.LogCaptureFixture) -> None:
+    first, second = (
+        settings(*TWO, wait=3.0),
+        settings(*TWO[:1], ("one", "Answerer", {"takes": 0.5})),
+    )
+    second = msgspec.structs.replace(second, network=first.network)
+    waiting = Process(first, "asker").up()
+    assert "takes = 0.005 there, 0.5 here" in str(Process(second, "one").done().error)
+    assert "takes = 0.5 there, 0.005 here" in str(waiting.done().error)
+    assert "left alone: expected the process" in caplog.text
 
 
 def test_how_each_process_gets_there_and_what_it_logs_may_differ() -> None:

@@ -252,7 +252,8 @@ def test_a_signal_to_one_process_ends_all_soon(
         assert others == 2
         assert f"{who}: their process is gone" in trial.said(other)
         if phase == "start-up":
-            assert "expected its return within 4 s, found none" in trial.said(other)
+            text = "expected its return within 4 s (run.startup_limit), found none"
+            assert text in trial.said(other)
     if how in {"INT", "TERM"}:
         assert code == others == 0
 

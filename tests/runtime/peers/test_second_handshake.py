@@ -143,7 +143,8 @@ def test_who_does_not_come_back_is_named_after_the_limit(once: Any, clock: str, 
     for process in processes.values():
         assert isinstance(process.done(15).error, PeerError)
         assert re.search(
-            rf"{who}: their process is gone \(.*\): expected its return within 0.5 s, found none",
+            rf"{who}: their process is gone \(.*\): expected its return within 0.5 s "
+            r"\(run.startup_limit\), found none",
             str(process.error),
         )
 

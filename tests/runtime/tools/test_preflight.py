@@ -229,6 +229,10 @@ def test_no_two_nodes_of_a_process_write_one_file(tmp_path: Path) -> None:
     own = Config(run=RunConfig(), nodes=(spec(Writing, "w", {"plot": "./log.txt"}),))
     (told,) = preflight.of_file(own).errors
     assert told.endswith("found log.txt, which the run itself writes, too")
+    for path in ("/dev/null", "../plot.png"):
+        away = Config(run=RunConfig(), nodes=(spec(Writing, "w", {"plot": path}),))
+        (told,) = preflight.of_file(away).errors
+        assert told == f"w: expected a file in the run's folder, found {path}"
 
 
 def test_an_input_without_a_sender_is_odd() -> None:

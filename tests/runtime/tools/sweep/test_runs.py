@@ -6,6 +6,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,7 +17,7 @@ import pytest
 
 from runtime.tools.flights.cache import kept
 from runtime.tools.sweep import Children, make_plan, sweep, write_tables
-from runtime.tools.sweep.process import last_error, read_results
+from runtime.tools.sweep.process import kill_tree, last_error, read_results
 from tests.runtime.tools.flights.samples import flight_file
 from tests.runtime.tools.samples_cli import summary
 from tests.runtime.tools.sweep.samples import Judge, judge_file, plan_in, started
@@ -140,6 +142,57 @@ def test_a_second_signal_ends_runs_at_once(tmp_path: Path, number: signal.Signal
         process.communicate(timeout=60)
     assert process.returncode == 130
     assert (tmp_path / "out" / "rows.jsonl").read_text() == ""
+
+
+def gone(number: int) -> bool:
+    """Tell whether a process has ended, within a minute; it is the kernel that one waits for."""
+    until = time.monotonic() + 60
+    while time.monotonic() < until:
+        try:
+            if Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        time.sleep(0.01)
+    return False
+
+
+ELSEWHERE = "subprocess.Popen(['sleep', '1000'], start_new_session=True).pid"
+"""What a run may start, and a signal to its group does not reach."""
+
+
+def test_a_run_is_killed_with_all_that_it_has_started() -> None:
+    code = f"import os, subprocess\nprint({ELSEWHERE}, flush=True)\nos.read(0, 1)"
+    with subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    ) as run:
+        assert run.stdout is not None
+        started_by_it = int(run.stdout.readline())
+        kill_tree(run.pid)
+        assert run.wait() == -signal.SIGKILL
+    assert gone(started_by_it)
+
+
+@pytest.mark.slow
+def test_a_sweep_that_is_killed_leaves_nothing_running(tmp_path: Path) -> None:
+    sign = tmp_path / "sign"
+    os.mkfifo(sign)
+    (tmp_path / "own.py").write_text(
+        "import os, subprocess\nfrom pathlib import Path\nfrom runtime import Node\n\n\n"
+        f"class Own(Node):\n    async def run(self):\n        mine = {ELSEWHERE}\n"
+        f"        Path({str(sign)!r}).write_text(f'{{os.getpid()}} {{mine}}')\n"
+        "        await self.clock.sleep(1e6)\n",
+        encoding="utf-8",
+    )
+    config = judge_file(tmp_path, type_="own:Own", run="clock = 'real'")
+    with started([config, "--out", "out"], tmp_path) as process:
+        numbers = [int(each) for each in sign.read_text().split()]
+        process.kill()
+        process.wait()
+        assert all(gone(number) for number in numbers)
 
 
 @pytest.mark.slow
