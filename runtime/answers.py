@@ -20,6 +20,7 @@ from typing_extensions import Buffer
 
 from runtime.digest import combined
 from runtime.errors import ConfigError
+from runtime.paths import source_file
 from runtime.schedule import SECOND
 from runtime.workers.costs import Costs
 
@@ -150,7 +151,7 @@ class Answers:
             OSError: It cannot be written.
         """
         (folder / FOLDER).mkdir(exist_ok=True)
-        file = folder / FOLDER / f"{name.replace('/', '_')}.csv"
+        file = folder / FOLDER / f"{source_file(name)}.csv"
         with file.open("w", newline="", encoding="utf-8") as out:
             rows = csv.writer(out)
             rows.writerow(COLUMNS)

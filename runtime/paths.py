@@ -1,4 +1,4 @@
-"""Settings that name files, and the private folder of a user.
+"""Settings that name files, names of files of a source, and the private folder of a user.
 
 A setting names what the file reads, or what its nodes write into the run's folder::
 
@@ -16,6 +16,7 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
+import urllib.parse
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -127,6 +128,30 @@ def _walk(value: Any, type_: Any, change: Callable[[Kind, str], str]) -> Any:
     if len(inner) == 1:  # or None
         return _walk(value, inner[0], change)
     return value
+
+
+_RESERVED = {"truth", "plan"}
+"""Names of a run's files that are no source's."""
+
+
+def source_file(source: str) -> str:
+    """Return the name of a source's files, without a suffix; no two sources have the same.
+
+    ``/`` becomes ``+``. All but ASCII's letters and digits, ``-`` and ``_`` becomes ``~`` and two
+    hexadecimal digits for each byte, and so does the first letter of a name that other files have.
+    There is no dot in it: what follows one says which file of the source it is.
+    """
+    quoted = urllib.parse.quote(source, safe="/", errors="surrogatepass")
+    if source in _RESERVED:
+        quoted = f"%{ord(source[0]):02X}{source[1:]}"
+    quoted = quoted.replace("~", "%7E").replace(".", "%2E")
+    return quoted.replace("/", "+").replace("%", "~")
+
+
+def source_of(name: str) -> str:
+    """Return the source that a name of `source_file` is of."""
+    quoted = name.replace("~", "%").replace("+", "/")
+    return urllib.parse.unquote(quoted, errors="surrogatepass")
 
 
 def user_folder() -> Path:

@@ -11,6 +11,7 @@ import numpy as np
 from nodes.calibration.selftest import TITLES, Result
 from nodes.report import style
 from nodes.report.page import embedded
+from runtime.paths import source_file
 
 
 def write_page(path: Path, name: str, results: Sequence[Result]) -> None:
@@ -50,7 +51,7 @@ def _plots(result: Result) -> Iterator[style.Plot]:
         axes.invert_yaxis()
         axes.set(aspect="equal", xlabel="column", ylabel="row")
         yield style.Plot(
-            f"points_{source.replace('/', '_')}",
+            f"points_{source_file(source)}",
             figure,
             f"{source}: points beside their pixels",
             f"Each arrow is one sphere in one image; the longest is {longest:.3f} px. Without "

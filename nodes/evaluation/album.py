@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from events import Image, TrackedFeatures
-from nodes.evaluation.results import file_name
+from runtime.paths import source_file
 from runtime.schedule import SECOND
 
 _WAITING = 30
@@ -67,7 +67,7 @@ class Album:
                     continue  # kept before its estimator began
                 folder.mkdir(exist_ok=True)
                 drawn = draw_features(image, features)
-                path = folder / f"{file_name(name)}_{image.stamp:015d}.jpg"
+                path = folder / f"{source_file(name)}_{image.stamp:015d}.jpg"
                 cv2.imwrite(str(path), drawn, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 

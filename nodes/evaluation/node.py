@@ -31,7 +31,7 @@ from nodes.evaluation.flight import Flight, collision_rows
 from nodes.evaluation.judging import Judgement, judge
 from nodes.evaluation.live import LiveErrors
 from nodes.evaluation.record import EstimatorRecord
-from nodes.evaluation.results import FRAMES, file_name, write_results
+from nodes.evaluation.results import FRAMES, write_results
 from nodes.evaluation.verdict import Thresholds, conclude
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row
@@ -39,6 +39,7 @@ from nodes.trajectory.growing import GrowingFile
 from nodes.vehicles import Vehicles
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
+from runtime.paths import source_file
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -142,7 +143,7 @@ class Evaluation(Node[EvaluationConfig]):
         record = self._records.setdefault(name, EstimatorRecord())
         if not record.add(event, now):
             return
-        self._append(name, event)
+        self._append(source_file(name), event)
         self._score(event, "latency", (now - event.stamp) / 1e9, "s")
         truth = self._flight_of(name).recent.at(event.stamp)
         if truth is None or record.scale_free:
@@ -285,7 +286,7 @@ class Evaluation(Node[EvaluationConfig]):
     def _named(self, what: str, vehicle: str) -> str:
         """Return the name of a file: ``truth`` of the first vehicle, ``truth.<name>`` of others."""
         first = next(iter(self._vehicles.names), vehicle)
-        return what if vehicle == first else f"{what}.{vehicle}"
+        return what if vehicle == first else f"{what}.{source_file(vehicle)}"
 
     def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
         """Add a pose to a file: should the run be killed, what was sent until then is there."""
@@ -295,9 +296,10 @@ class Evaluation(Node[EvaluationConfig]):
         if file is None:
             folder = self.out / "trajectories"
             folder.mkdir(exist_ok=True)
-            path = folder / f"{file_name(name)}.tum"
+            path = folder / f"{name}.tum"
             true = isinstance(event, Odometry)
-            frame = "map (NED)" if true else f"{event.frame_id}, as it was sent"
+            frame = event.frame_id.encode("unicode_escape").decode("ascii")  # in one line
+            frame = "map (NED)" if true else f"{frame}, as it was sent"
             head = f"# {FRAMES.format(frame)}\n"
             file = self._files[name] = GrowingFile(self, path, head)
         file.add(tum_row(event.stamp, event.position, event.orientation))

@@ -1,7 +1,7 @@
 """What an evaluation leaves in a run's folder, for people, for plots and for other tools.
 
 trajectories/truth.tum              the true poses; it grows with the run
-trajectories/<estimator>.tum        the estimates as they were sent; likewise
+trajectories/<estimator>.tum        the estimates as they were sent; likewise (of ``a/b``: a+b.tum)
 trajectories/plan.tum               where the pilot meant to be
 trajectories/truth.<vehicle>.tum    both of the second vehicle, the third, …
 trajectories/collisions.csv         what the vehicles hit, when and where
@@ -26,6 +26,7 @@ import numpy as np
 from nodes.evaluation.judging import Errors, Judgement
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
+from runtime.paths import source_file
 
 _MOST_TICKS = 100_000
 
@@ -46,7 +47,7 @@ def write_results(
         if plan is not None:
             write_tum(trajectories / f"{file}.tum", plan, FRAMES.format("map (NED)"))
     for source, judgement in judgements.items():
-        name = file_name(source)
+        name = source_file(source)
         if judgement.aligned is not None:
             comment = FRAMES.format("map (NED), aligned")
             write_tum(evaluation / f"{name}.aligned.tum", judgement.aligned, comment)
@@ -63,11 +64,6 @@ def write_results(
             _write_errors(evaluation / f"{name}.ticks.csv", "pose_ns", thin)
     text = msgspec.json.format(msgspec.json.encode(verdict), indent=2)
     (evaluation / "verdict.json").write_bytes(text + b"\n")
-
-
-def file_name(source: str) -> str:
-    """Return the name of an estimator's files: its source, without what divides folders."""
-    return source.replace("/", "_")
 
 
 def read_errors(path: Path) -> Errors:

@@ -18,7 +18,7 @@ from nodes.evaluation.alignment import How
 from nodes.evaluation.judging import Judgement, judge
 from nodes.evaluation.node import EvaluationConfig
 from nodes.evaluation.record import EstimatorRecord
-from nodes.evaluation.results import FRAMES, file_name, write_results
+from nodes.evaluation.results import FRAMES, write_results
 from nodes.evaluation.verdict import conclude
 from nodes.judge.sources import Axes, Source
 from nodes.report.contents import Facts, Verdict
@@ -28,6 +28,7 @@ from nodes.trajectory.formats import write_tum
 from runtime import Duration, results
 from runtime.environment import command_line, commit, environment
 from runtime.errors import ResultsError
+from runtime.paths import source_file
 from runtime.schedule import SECOND
 
 
@@ -135,7 +136,7 @@ def _write(
     write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
     for name, judgement in judgements.items():
         assert judgement.estimate is not None
-        path = out / "trajectories" / f"{file_name(name)}.tum"
+        path = out / "trajectories" / f"{source_file(name)}.tum"
         write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
     facts = Facts(
         name=out.name,

@@ -79,6 +79,7 @@ def write_ply(
     rows = np.empty(len(points), _VERTEX)
     rows["x"], rows["y"], rows["z"] = points.T
     rows["red"], rows["green"], rows["blue"] = colours.T
+    named = frame_id.encode("unicode_escape").decode("ascii")  # in one line
     axes = ", x north, y east, z down" if frame_id == "map" else ""
     names = {"float32": "float", "uint8": "uchar"}
     properties = (f"property {names[_VERTEX[n].name]} {n}" for n in _VERTEX.names or ())
@@ -86,7 +87,7 @@ def write_ply(
         [
             "ply",
             "format binary_little_endian 1.0",
-            f"comment frame {frame_id}: metres{axes}",
+            f"comment frame {named}: metres{axes}",
             f"element vertex {len(rows)}",
             *properties,
             "end_header\n",

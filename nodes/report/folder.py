@@ -18,11 +18,12 @@ import numpy.typing as npt
 from nodes.evaluation.coverage import Interval, seconds
 from nodes.evaluation.judging import Errors, judge
 from nodes.evaluation.record import EstimatorRecord
-from nodes.evaluation.results import file_name, read_errors
+from nodes.evaluation.results import read_errors
 from nodes.report.contents import Estimator, Facts, Run, Verdict
 from nodes.report.poses import gaps, read_poses
 from nodes.report.style import COLORS
 from nodes.trajectory import Trajectory
+from runtime.paths import source_file, source_of
 
 T = TypeVar("T")
 
@@ -99,7 +100,9 @@ class _Reader:
     def _by_vehicle(self, what: str, first: str) -> dict[str, Trajectory]:
         """Read the file of the first vehicle, and those of all others: ``<what>.<vehicle>.tum``."""
         paths = sorted((self.folder / "trajectories").glob(f"{what}.*tum"))
-        names = {p.stem.partition(".")[2] or first: f"trajectories/{p.name}" for p in paths}
+        names = {
+            source_of(p.stem.partition(".")[2]) or first: f"trajectories/{p.name}" for p in paths
+        }
         found = {vehicle: self._try(name, read_poses) for vehicle, name in names.items()}
         order = sorted(found.items(), key=lambda item: item[0] != first)
         return {vehicle: poses for vehicle, poses in order if poses is not None}
@@ -112,10 +115,10 @@ class _Reader:
         self, verdict: Verdict | None, truths: dict[str, Trajectory]
     ) -> list[Estimator]:
         figures = {} if verdict is None else verdict.estimators
-        files = {file_name(name): name for name in figures}
+        files = {source_file(name): name for name in figures}
         there = {p.stem for p in (self.folder / "trajectories").glob("*.tum")}
         sent = {name for name in there if name.partition(".")[0] not in _NO_ESTIMATES}
-        files |= {file: file for file in sorted(sent - set(files))}
+        files |= {file: source_of(file) for file in sorted(sent - set(files))}
         if not files:
             self.missing.append("no estimator has sent anything, and none was judged")
         return [

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from nodes.report.contents import Run
 from nodes.report.style import DPI, WIDTH, Plot, label, sheet
+from runtime.paths import source_file, source_of
 
 _COLUMNS = 4
 _MOST = 12
@@ -24,13 +25,13 @@ _CAPTION = 26
 
 def draw_frames(run: Run) -> list[Plot]:
     """Draw one sheet for each estimator that left images, and each camera that nobody tracks."""
-    names = {e.name.replace("/", "_"): e.name for e in run.estimators}
+    names = {source_file(e.name): e.name for e in run.estimators}
     plots = []
     for file, paths in run.frames.items():
         step = -(-len(paths) // _MOST)
         figure = _sheet(run, paths[::step])
         if figure is not None:
-            title, caption = f"Images of {file}", "Sample images of the camera."
+            title, caption = f"Images of {source_of(file)}", "Sample images of the camera."
             if (name := names.get(file)) is not None:
                 title = f"Images and features of {name}"
                 caption = (

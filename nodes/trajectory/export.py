@@ -23,6 +23,7 @@ from events.poses import pose_matrix
 from nodes.trajectory.formats import read_tum, write_euroc, write_kitti, write_tum
 from nodes.trajectory.table import EPOCH, epoch_of
 from nodes.trajectory.trajectory import Trajectory, associate
+from runtime.paths import source_file
 
 FORMATS = ("tum", "euroc", "kitti")
 
@@ -184,8 +185,8 @@ def _truth_of(run: Path, estimate: str) -> str:
     if not path.is_file():
         return TRUTH
     found = msgspec.json.decode(path.read_bytes(), type=_Verdict).estimators
-    vehicles = {name.replace("/", "_"): each.get("vehicle", "") for name, each in found.items()}
-    return f"{TRUTH}.{vehicles.get(estimate, '')}"
+    vehicles = {source_file(name): each.get("vehicle", "") for name, each in found.items()}
+    return f"{TRUTH}.{source_file(vehicles.get(estimate, ''))}"
 
 
 class _Verdict(msgspec.Struct):

@@ -10,6 +10,7 @@ from typing import IO
 from events import Event
 from nodes.trajectory.table import EPOCH, epoch_of
 from nodes.viewing.measurements import MEASURED, fields_of, numbers
+from runtime.paths import source_file
 
 
 def export_measurements(run: Path, out: Path | None = None, epoch: int | str = EPOCH) -> list[Path]:
@@ -43,7 +44,7 @@ def export_measurements(run: Path, out: Path | None = None, epoch: int | str = E
         for path in recordings:
             for event in _measurements(path):
                 kind = next(known for known in MEASURED if isinstance(event, known))
-                name = f"{event.source.replace('/', '_')}.{kind.__name__}.csv"
+                name = f"{source_file(event.source)}.{kind.__name__}.csv"
                 file = files.get(folder / name)
                 if file is None:
                     opened = (folder / name).open("w", encoding="utf-8", newline="\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,16 @@ from hypothesis import strategies as st
 from runtime import Changeable, Node, NodeConfig
 from runtime.config.model import to_builtins
 from runtime.config.reading import load
-from runtime.paths import InputPath, NameOrPath, OutputPath, file_names, resolve, written
+from runtime.paths import (
+    InputPath,
+    NameOrPath,
+    OutputPath,
+    file_names,
+    resolve,
+    source_file,
+    source_of,
+    written,
+)
 
 
 class Part(msgspec.Struct):
@@ -151,3 +161,18 @@ def test_whatever_stands_there_is_for_the_check_of_types_to_refuse(table: Any) -
     """Resolving changes texts only, and what is absolute stays as it is."""
     once = resolve(table, ReadingConfig, Path("/folder"))
     assert repr(resolve(once, ReadingConfig, Path("/elsewhere"))) == repr(once)
+
+
+@given(st.lists(st.text() | st.text("a/b_.~+%tTé\n"), unique=True))
+def test_each_source_has_files_of_its_own_and_is_known_by_them(sources: list[str]) -> None:
+    names = [source_file(source) for source in [*sources, "truth", "plan"]]
+    assert [source_of(name) for name in names] == [*sources, "truth", "plan"]
+    assert len(set(names)) == len({*sources, "truth", "plan"})
+    assert not {"truth", "plan"} & {*names}
+    assert all(re.fullmatch(r"[\w+~-]*", name, re.ASCII) for name in names)
+
+
+def test_usual_names_stay_as_they_are() -> None:
+    assert [source_file(each) for each in ("orb-slam_3", "drone/slam", "a_b", "v1.2")] == [
+        *("orb-slam_3", "drone+slam", "a_b", "v1~2E2")
+    ]

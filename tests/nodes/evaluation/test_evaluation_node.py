@@ -29,6 +29,7 @@ from nodes.evaluation import Evaluation
 from nodes.evaluation.results import read_errors
 from nodes.trajectory.formats import read_tum
 from runtime.errors import NodeError
+from runtime.paths import source_file
 from runtime.testing import run_node
 from tests.nodes.evaluation.flights import (
     MS,
@@ -189,6 +190,24 @@ def test_files_hold_what_was_said(tmp_path: Path) -> None:
     np.testing.assert_allclose(errors.position, 0.3, atol=1e-8)
     ticks = read_errors(tmp_path / "evaluation" / "est.ticks.csv")
     assert len(ticks.stamps) == 4001
+
+
+def test_each_estimator_has_files_of_its_own_whatever_it_and_its_frame_are_called(
+    tmp_path: Path,
+) -> None:
+    sources = ["truth", "plan", "a/b", "a_b", "a.lost", "é"]
+    sent: list[Event] = [
+        estimate(stamp, error=(float(n), 0.0, 0.0), source=source, frame_id="odom\n1 2 é")
+        for stamp in FRAMES[:9]
+        for n, source in enumerate(sources)
+    ]
+    judged(tmp_path, announced(), truth(1), sent)
+    for n, source in enumerate(sources):
+        said = read_tum(tmp_path / "trajectories" / f"{source_file(source)}.tum")
+        assert said.positions[0, 0] - place(0)[0] == pytest.approx(n)
+        assert (tmp_path / "evaluation" / f"{source_file(source)}.lost.csv").is_file()
+    assert len(read_tum(tmp_path / "trajectories" / "truth.tum")) > 100
+    assert len([*(tmp_path / "evaluation").glob("*.aligned.tum")]) == len(sources)
 
 
 def test_of_many_images_a_few_are_kept_with_their_features(tmp_path: Path) -> None:

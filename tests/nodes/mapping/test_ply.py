@@ -25,6 +25,12 @@ def test_a_cloud_comes_back(tmp_path: Path) -> None:
     assert [each.name for each in path.parent.iterdir()] == ["a.ply"]
 
 
+def test_the_name_of_a_frame_stays_in_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, POINTS, COLOURS, "odom\nélement")
+    assert read_ply(path, 10).total == 3
+
+
 def test_the_bytes_are_those_of_the_format(tmp_path: Path) -> None:
     """A header in ASCII, with the frame in a comment, then 15 bytes a point, little-endian."""
     path = tmp_path / "a.ply"

@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from events import PoseEstimate
 from nodes.evaluation.judging import Judgement, judge
 from nodes.evaluation.record import EstimatorRecord
-from nodes.evaluation.results import file_name, write_results
+from nodes.evaluation.results import write_results
 from nodes.evaluation.verdict import Thresholds
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
+from runtime.paths import source_file
 
 SECOND = 1_000_000_000
 
@@ -102,7 +103,7 @@ def evaluated(
     write_tum(out / "trajectories" / "truth.tum", truth)
     for name, judgement in judgements.items():
         if judgement.estimate is not None:
-            write_tum(out / "trajectories" / f"{file_name(name)}.tum", judgement.estimate)
+            write_tum(out / "trajectories" / f"{source_file(name)}.tum", judgement.estimate)
     write_results(out, {"plan": plan}, judgements, verdict)
     return verdict
 

@@ -51,7 +51,7 @@ def test_each_sensor_has_a_file_of_its_measurements(tmp_path: Path) -> None:
     record(tmp_path / "recording.mcap", events)
     written = export_measurements(tmp_path, epoch=1000)
     assert [path.name for path in written] == [
-        "drone_barometer.FluidPressure.csv",
+        "drone+barometer.FluidPressure.csv",
         "drone_down.Range.csv",
         "drone_gnss.NavSatFix.csv",
     ]
