@@ -133,15 +133,17 @@ def latency(config: Config, announced: Announced) -> Iterator[Finding]:
 
 
 def zero_noise(config: Config, announced: Announced) -> Iterator[Finding]:
-    """Without noise an estimator is better than it will ever be."""
+    """Without noise an estimator is better than it will ever be; of a recording none is known."""
     if not any("thresholds" in spec.config.__struct_fields__ for spec in config.nodes):
         return  # nobody is judged
     if any(isinstance(each, EstimatorAnnouncement) for each in announced):
         for camera in cameras(announced):
-            if not camera.noise and not camera.undistorted and {"rgb", "grey"} & {*camera.images}:
+            seen = not camera.undistorted and {"rgb", "grey"} & {*camera.images}
+            if not camera.noise and seen and not _recorded(config, camera.source):
                 yield Finding(camera.source, "its images have no noise", "noise = 2.0 is usual")
     for _, imu in inertial_pairs(config, announced):
-        if not imu.gyroscope_noise_density or not imu.accelerometer_noise_density:
+        densities = imu.gyroscope_noise_density, imu.accelerometer_noise_density
+        if not all(densities) and not _recorded(config, imu.source):
             found = "a noise density of it is 0"
             yield Finding(imu.source, found, "take the densities of a data sheet")
 
@@ -223,6 +225,15 @@ def inertial_pairs(
 def body_of(source: str) -> str:
     """Return the source of the body that carries a sensor: ``drone`` for ``drone/front``."""
     return source.rpartition("/")[0] or source
+
+
+def _recorded(config: Config, source: str) -> bool:
+    """Return whether a sensor is in a file's recording, and of no other node of the file."""
+    from nodes.replay import Replay
+
+    replays = {spec.name for spec in config.nodes if issubclass(spec.node, Replay)}
+    others = {spec.name for spec in config.nodes} - replays
+    return bool(replays) and source.partition("/")[0] not in others
 
 
 def _reads_imu(spec: NodeSpec) -> bool:

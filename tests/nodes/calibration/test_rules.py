@@ -128,6 +128,18 @@ def test_nothing_is_said_of_a_sound_rig() -> None:
     assert lint(ON_A_LIDAR, [lidar()]) == []
 
 
+def test_of_a_recording_no_noise_is_known() -> None:
+    config = file()
+    replay = {"name": "drone", "type": "nodes.replay:Replay", "file": "flight.mcap"}
+    recorded = msgspec.structs.replace(
+        config, nodes=(*config.nodes, *parse({"nodes": [replay]}, "test").nodes)
+    )
+    silent = msgspec.structs.replace(IMU, gyroscope_noise_density=0.0)
+    announced = [square(noise=0.0), silent, ESTIMATES]
+    assert len(lint(config, announced)) == 2
+    assert lint(recorded, announced) == []
+
+
 def test_what_a_file_accepts_is_left_out_and_a_wrong_name_is_said() -> None:
     announced = [square(rate=40.0), IMU, ESTIMATES]
     assert lint(file(accept=["imu-rate:drone/left"]), announced) == []
