@@ -302,7 +302,8 @@ def wrap(name: str, error: BaseException) -> NodeError:
         wrapped = NodeError(name, str(found).removeprefix(f"{name}: "))
     else:
         wrapped = NodeError(name, _described(found))
-        wrapped.place = code_location.of_error(found)[1] if found.__traceback__ else ""
+        there = getattr(found, "place_in_worker", "")
+        wrapped.place = there or (code_location.of_error(found)[1] if found.__traceback__ else "")
     wrapped.__cause__ = error
     return wrapped
 

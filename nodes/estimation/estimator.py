@@ -7,7 +7,7 @@ Poses are computed in the subclasses (`nodes.visual_odometry` and others), and j
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -39,9 +39,15 @@ from events import (
 from events.camera_info import COEFFICIENTS
 from nodes.estimation.mount import Mount
 from nodes.estimation.rectification import ALIGNED, Rectification, misalignment
-from nodes.estimation.result import TrackingResult
+from nodes.estimation.result import (
+    TrackingResult,
+    check_result,
+    check_shape,
+    check_transform,
+)
 from nodes.estimation.rig import SensorChoice
 from runtime import Bundle, Node, NodeConfig, Output, on
+from runtime.errors import DeclarationError, NodeError, suggest
 from runtime.node import matchers
 from runtime.units import Latency
 
@@ -67,15 +73,21 @@ class EstimatorConfig(NodeConfig):
             rows of both eyes are not aligned, are turned into those of pinhole cameras first. If
             not, they are refused. Cameras whose images need it come after others.
         latency: Time on the run's clock from the arrival of an image to its estimate.
+        not_finite: What a pose is that is not finite (NaN): an ``error`` that ends the run, or
+            ``lost``.
     """
 
     origin: Literal["announced", "start"] = "announced"
     rectify: bool = True
     latency: Latency = Latency(0.015)  # immutable
+    not_finite: Literal["error", "lost"] = "error"
 
 
 Frame = Image | DepthImage | LidarScan
 """What a pose is estimated for."""
+
+_KINDS = ("rgb", "grey", "depth", "segmentation", "lidar")
+"""What an estimator may need."""
 
 F = TypeVar("F", bound=tuple[Any, ...])
 C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
@@ -174,6 +186,20 @@ class Estimator(Node[C], ABC):
     _given: Mapping[str, str] = MappingProxyType({})
     _lost = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        needs: Any = cls.needs
+        if isinstance(needs, property):
+            return
+        for need in needs if isinstance(needs, Set) else [needs]:
+            if need not in _KINDS or needs is need:
+                known = ", ".join(_KINDS)
+                raise DeclarationError(
+                    f"{cls.__name__}.needs: expected a set of {known}, found {need!r}"
+                    + ("" if needs is need else suggest(str(need), _KINDS))
+                )
+        cls.needs = frozenset(needs)
 
     def read(self, frame: type[tuple[Any, ...]]) -> None:
         """Read sets of this type as ``frames``, for a class whose settings say what it reads.
@@ -324,8 +350,12 @@ class Estimator(Node[C], ABC):
             result: What the tracker found in it.
             origin: When the image was exposed at which the tracker's poses start (ns); if `None`,
                 the first image that is published with a pose.
+
+        Raises:
+            NodeError: It is no such result.
         """
         stamp = self.exposed_at(image)
+        result = self._checked(stamp, result)
         if self.restarts and not self._mounts:
             self._lose(stamp, f"restarted: poses are in {self._odom()} from here on")
         self._send_features(image, result)
@@ -344,6 +374,19 @@ class Estimator(Node[C], ABC):
             self.log.info("regained %s", result.reason)
             self.tracking_events.send(TrackingRegained(stamp=stamp, source=self.name))
         self.estimates.send(mount.estimate(stamp, self.name, result))
+
+    def _checked(self, stamp: int, result: TrackingResult) -> TrackingResult:
+        which = f"pose at {stamp / 1e9:.3f} s"
+        try:
+            wrong = check_result(result)
+        except ValueError as error:
+            raise NodeError(self.name, f"{which}: {error}") from None
+        if not wrong:
+            return result
+        if self.config.not_finite == "error":
+            cure = 'not_finite = "lost" counts it as lost'
+            raise NodeError(self.name, f"{which}: {wrong} ({cure})")
+        return msgspec.structs.replace(result, lost=True, reason=wrong)
 
     def _lose(self, stamp: int, reason: str) -> None:
         if not self._lost:
@@ -377,6 +420,15 @@ class Estimator(Node[C], ABC):
             poses: The optical camera as in `TrackingResult`, shape (n, 4, 4).
             number: Of the map that they are in.
         """
+        try:
+            check_shape("poses", poses, (len(stamps), 4, 4))
+            for pose, stamp in zip(poses, stamps.tolist(), strict=True):
+                which = f"pose at {stamp / 1e9:.3f} s"
+                if not np.isfinite(pose).all():
+                    raise ValueError(f"{which}: expected finite numbers, found others")
+                check_transform(which, pose)
+        except ValueError as error:
+            raise NodeError(self.name, f"final trajectory: {error}") from None
         if (mount := self._mounts.get(number)) is not None and len(stamps):
             self.trajectories.send(mount.trajectory(self.clock.now(), self.name, stamps, poses))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import numpy as np
 import numpy.typing as npt
@@ -35,3 +37,59 @@ class TrackingResult(msgspec.Struct, frozen=True, eq=False):
     velocity: npt.NDArray[np.float64] | None = None
     covariance: npt.NDArray[np.float64] | None = None
     map: int = 0
+
+
+_NOT_RIGID = 1e-2
+"""By how much a rotation's columns may miss length 1 and right angles."""
+
+
+def check_result(result: Any) -> str:
+    """Return which numbers of a tracker's result are not finite, and which these are, if any.
+
+    Raises:
+        ValueError: It is no such result; the message says what was expected and found.
+    """
+    if not isinstance(result, TrackingResult):
+        raise ValueError(f"expected a TrackingResult, found {_kind(result)}")
+    if result.lost:
+        return ""
+    given = {"pose": (result.pose, (4, 4))}
+    given |= {"velocity": (result.velocity, (3,))} if result.velocity is not None else {}
+    given |= {"covariance": (result.covariance, (6, 6))} if result.covariance is not None else {}
+    for name, (array, shape) in given.items():
+        check_shape(name, array, shape)
+    for name, (array, _) in given.items():
+        if not np.isfinite(array).all():
+            return f"{name}: expected finite numbers, found {array[~np.isfinite(array)][0]}"
+    check_transform("pose", result.pose)
+    return ""
+
+
+def check_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
+    """Raise `ValueError` if something is no array of real numbers of a shape."""
+    numbers = isinstance(array, np.ndarray) and array.dtype.kind in "fiu"
+    if not numbers or array.shape != shape:
+        raise ValueError(
+            f"{name}: expected a numpy array of numbers of shape {shape}, found {_kind(array)}"
+        )
+
+
+def check_transform(name: str, pose: npt.NDArray[Any]) -> None:
+    """Raise `ValueError` if a matrix of finite numbers, shape (4, 4), is no rigid transform."""
+    turn = pose[:3, :3]
+    off = np.abs(turn.T @ turn - np.eye(3)).max()
+    if off > _NOT_RIGID or np.linalg.det(turn) < 0:
+        lengths = ", ".join(f"{length:.3g}" for length in np.linalg.norm(turn, axis=0))
+        raise ValueError(
+            f"{name}[:3, :3]: expected a rotation (columns of length 1 at right angles, "
+            f"determinant 1), found columns of length {lengths}, determinant "
+            f"{np.linalg.det(turn):.3g}"
+        )
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > _NOT_RIGID:
+        raise ValueError(f"{name}[3]: expected 0, 0, 0, 1, found {pose[3].tolist()}")
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"shape {value.shape} of {value.dtype}"
+    return "None" if value is None else f"a {type(value).__name__}"

@@ -201,8 +201,13 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
     except DeclarationError as error:
         frames = traceback.extract_tb(error.__traceback__)
         here = str(Path(__file__).parents[1])
-        last = [frame for frame in frames if not frame.filename.startswith(here)][-1]
-        place = f"{last.filename}, line {last.lineno}"
+        own = [
+            frame
+            for frame in frames
+            if not frame.filename.startswith((here, "<frozen"))
+            and frame.name != "__init_subclass__"
+        ]
+        place = f"{own[-1].filename}, line {own[-1].lineno}"
         raise ConfigError(f"{where}: {module_name}: {error} ({place})") from error
     except VisnavError:
         raise
@@ -212,6 +217,9 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
         raise ConfigError(
             f"{where}: {module_name} cannot be imported: {type(error).__name__}: {error}{place}"
         ) from error
+    found = vars(module).get(class_name)
+    if isinstance(found, type) and issubclass(found, Node) and (lacks := abstract(found)):
+        raise ConfigError(f"{where}: {type_}: expected {lacks} in it, found none")
     known = {
         name: value
         for name, value in vars(module).items()
@@ -223,6 +231,13 @@ def find_node(type_: str, where: str) -> type[Node[Any]]:
             + suggest(class_name, known)
         )
     return known[class_name]
+
+
+def abstract(cls: type[Node[Any]]) -> str:
+    """Return what a class leaves to those that are derived from it, as their code has it."""
+    names = sorted(getattr(cls, "__abstractmethods__", ()))
+    waits = {name for name in names if inspect.iscoroutinefunction(getattr(cls, name))}
+    return ", ".join(f"`{'async ' * (name in waits)}def {name}`" for name in names)
 
 
 def is_base(cls: type[Node[Any]]) -> bool:

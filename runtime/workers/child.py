@@ -14,12 +14,16 @@ import select
 import signal
 import socket
 import sys
+import sysconfig
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
 from runtime.workers.shared_memory import SharedPipe
+
+_LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
+"""Folders of code that is not a worker's own."""
 
 _GRACE = 5.0
 """Seconds in which a call may end, and the object close, once the run has gone."""
@@ -105,11 +109,19 @@ def _portable(error: Exception) -> Exception:
     import pickle
     import traceback
 
-    error.add_note("in the worker:\n" + "".join(traceback.format_exception(error)))
+    note = "in the worker:\n" + "".join(traceback.format_exception(error))
+    error.add_note(note)
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
+    own = [f for f in frames if not f.filename.startswith(_LIBRARIES)] or frames
+    place = f"{own[-1].filename}:{own[-1].lineno} in {own[-1].name}" if own else ""
+    vars(error)["place_in_worker"] = place
     try:
         pickle.loads(pickle.dumps(error))  # noqa: S301  # made a line above
     except Exception:
-        return RuntimeError(f"{type(error).__name__}: {error}")
+        found = RuntimeError(f"{type(error).__name__}: {error}")
+        found.add_note(note)
+        vars(found)["place_in_worker"] = place
+        return found
     return error
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -33,7 +35,8 @@ from events.poses import pose_matrix, pose_tuples
 from nodes.estimation import Estimator, RgbdFrame, StereoInertialFrame, TrackingResult
 from nodes.evaluation.record import EstimatorRecord
 from runtime import Bundle
-from runtime.errors import NodeError, RefusedError
+from runtime.config.reading import find_node
+from runtime.errors import ConfigError, NodeError, RefusedError
 from runtime.testing import NodeResult, run_nodes, spec
 
 LOOKING_AHEAD = (0.5, 0.5, 0.5, 0.5)
@@ -242,6 +245,103 @@ def test_a_frame_of_before_a_restart_is_no_frame_of_another_map() -> None:
         duration=1.0,
     )
     assert [each.frame_id for each in result.of(PoseEstimate)] == ["map", "odom_1", "odom_2"]
+
+
+def pose(change: tuple[Any, Any] | None = None, factor: float = 1.0) -> Any:
+    found = np.eye(4)
+    found[:3, :3] *= factor
+    if change is not None:
+        found[change[0]] = change[1]
+    return found
+
+
+class Giving(Scripted):
+    """Gives good poses, but for one at 2 ms."""
+
+    bad: Any = None
+
+    async def run(self) -> None:
+        async for image, _ in self.frames:
+            good = TrackingResult(np.eye(4))
+            self.publish(image, self.bad if image.stamp == 2 * MS else good)
+
+
+def giving(bad: Any, **config: Any) -> NodeResult:
+    node = type("Bad", (Giving,), {"bad": bad})
+    frames = [event for stamp in (1, 2, 3) for event in rgbd(stamp * MS)]
+    given = [camera("drone/front", "rgb", "depth"), *frames]
+    return run_nodes([spec(node, "est", config)], inputs=given, duration=1.0)
+
+
+NOT_FINITE = TrackingResult(pose(((0, 3), math.nan)))
+
+
+@pytest.mark.parametrize(
+    ("bad", "says"),
+    [
+        (None, "expected a TrackingResult, found None"),
+        (np.eye(4), "expected a TrackingResult, found shape (4, 4) of float64"),
+        (TrackingResult(None), "pose: * of shape (4, 4), found None"),  # type: ignore[arg-type]
+        (TrackingResult(np.eye(4).tolist()), "pose: * of shape (4, 4), found a list"),
+        (TrackingResult(np.eye(3)), "pose: * shape (4, 4), found shape (3, 3) of float64"),
+        (TrackingResult(np.eye(4, dtype=object)), "pose: * found shape (4, 4) of object"),
+        (NOT_FINITE, "pose: expected finite numbers, found nan (not_finite = *lost*)"),
+        (TrackingResult(pose(factor=2.0)), "pose[:3, :3]: expected a rotation * length 2, 2, 2, *"),
+        (TrackingResult(pose(factor=-1.0)), "pose[:3, :3]: * determinant -1"),
+        (TrackingResult(pose((3, 1.0))), "pose[3]: expected 0, 0, 0, 1, found *"),
+        (TrackingResult(pose(), velocity=np.eye(3)), "velocity: * (3,), found shape (3, 3) *"),
+        (TrackingResult(pose(), covariance=np.eye(3)), "covariance: * (6, 6), found shape (3, 3)*"),
+    ],
+)
+def test_what_is_no_pose_is_refused_in_a_line_that_says_which(bad: Any, says: str) -> None:
+    with pytest.raises(NodeError) as caught:
+        giving(bad)
+    pattern = re.escape(f"est: pose at 0.002 s: {says}").replace(r"\*", ".*")
+    assert re.fullmatch(pattern, str(caught.value)), str(caught.value)
+
+
+def test_a_pose_that_is_not_finite_may_count_as_lost() -> None:
+    result = giving(NOT_FINITE, not_finite="lost")
+    assert [each.stamp // MS for each in result.of(PoseEstimate)] == [1, 3]
+    (lost,) = result.of(TrackingLost)
+    assert (lost.stamp, lost.reason) == (2 * MS, "pose: expected finite numbers, found nan")
+
+
+def test_a_final_trajectory_that_is_none_is_refused() -> None:
+    class Ends(Giving):
+        async def on_end(self) -> None:
+            self.publish_trajectory(np.array([1, 2 * MS]), np.stack([np.eye(4), pose(factor=2.0)]))
+
+    with pytest.raises(NodeError, match=r"est: final trajectory: pose at 0.002 s\[:3, :3\]: exp"):
+        run_nodes(
+            [spec(Ends, "est")],
+            inputs=[camera("drone/front", "rgb", "depth"), *rgbd(1)],
+            duration=1.0,
+        )
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ("needs = {'grey'}", "{name}:B: expected `async def run` in it, found none"),
+        ("def run(self): pass", "{name}: B.run: expected `async def run`, found `def run` ({line}"),
+        ("needs = {'gray'}", "{name}: B.needs: expected a set of rgb, grey, depth, segmentation, "
+         "lidar, found 'gray' (did you mean 'grey'?) ({line}"),
+        ("needs = 'grey'", "{name}: B.needs: expected a set of rgb, grey, depth, segmentation, "
+         "lidar, found 'grey' ({line}"),
+    ],
+)  # fmt: skip
+def test_a_class_that_is_no_estimator_is_a_line_with_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str, says: str
+) -> None:
+    name = f"wrong_{abs(hash(body))}"
+    text = f"from nodes.estimation import Estimator\n\n\nclass B(Estimator):\n    {body}\n"
+    (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError) as caught:
+        find_node(f"{name}:B", "c.toml: nodes[0] (b)")
+    line = f"{tmp_path / name}.py, line 4)"
+    assert str(caught.value) == f"c.toml: nodes[0] (b): {says.format(name=name, line=line)}"
 
 
 def test_another_vehicles_place_is_not_taken_for_its_own() -> None:

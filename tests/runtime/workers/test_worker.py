@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import re
 import signal
 import threading
 import time
@@ -17,6 +18,7 @@ import pytest
 from runtime import Worker, task_factory
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.node_runner import with_place, wrap
 from runtime.real_clock import RealClock
 from runtime.testing import run_in_lockstep
 from tests.runtime.samples_workers import Plant, plain
@@ -81,8 +83,12 @@ async def test_an_exception_of_the_object_comes_back_with_the_workers_traceback(
             await plant.call(Plant.fail)
         assert "in the worker:" in caught.value.__notes__[0]
         assert "samples_workers.py" in caught.value.__notes__[0]
-        with pytest.raises(RuntimeError, match="UnpicklableError: 1 and 2"):
-            await plant.call(Plant.fail_oddly)
+        for method in (Plant.fail, Plant.fail_oddly):
+            with pytest.raises((LookupError, RuntimeError)) as caught:
+                await plant.call(method)
+            place = with_place(wrap("vo", caught.value))
+            assert re.search(r"\(runtime/samples_workers.py:\d+ in fail(_oddly)?\)$", place)
+        assert "UnpicklableError: 1 and 2" in str(caught.value)
         assert await plant.call(Plant.echo, 1) == 1
 
 
