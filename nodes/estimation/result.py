@@ -53,7 +53,7 @@ def check_result(result: Any) -> str:
         raise ValueError(f"expected a TrackingResult, found {_kind(result)}")
     if result.lost:
         return ""
-    given = {"pose": (result.pose, (4, 4))}
+    given: dict[str, tuple[Any, tuple[int, ...]]] = {"pose": (result.pose, (4, 4))}
     given |= {"velocity": (result.velocity, (3,))} if result.velocity is not None else {}
     given |= {"covariance": (result.covariance, (6, 6))} if result.covariance is not None else {}
     for name, (array, shape) in given.items():

@@ -245,7 +245,7 @@ def test_of_a_camera_that_nobody_tracks_a_few_images_are_kept(tmp_path: Path) ->
     run(tmp_path, announced(), truth(10), events, image_count=4)
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())
     assert 2 <= len(names) <= 4
-    assert names[0] == "drone_eye_000000000000000.jpg"
+    assert names[0] == "drone+eye_000000000000000.jpg"
 
 
 OFFSET = (5.0, -3.0, 1.0)

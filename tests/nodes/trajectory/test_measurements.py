@@ -52,8 +52,8 @@ def test_each_sensor_has_a_file_of_its_measurements(tmp_path: Path) -> None:
     written = export_measurements(tmp_path, epoch=1000)
     assert [path.name for path in written] == [
         "drone+barometer.FluidPressure.csv",
-        "drone_down.Range.csv",
-        "drone_gnss.NavSatFix.csv",
+        "drone+down.Range.csv",
+        "drone+gnss.NavSatFix.csv",
     ]
     rows = written[0].read_text().splitlines()
     assert rows[0] == "stamp (ns),fluid_pressure (Pa)"
