@@ -367,7 +367,8 @@ class EstimatorAnnouncement(Announcement):
     Attributes:
         method: What it is, in a word or two: ``features``, ``ORB-SLAM3 rgbd``.
         scale_free: True if its unit of length is its own (monocular).
-        reads: Kinds of data that it computes with: ``grey``, ``depth``, ``imu``, ``lidar``.
+        reads: Kinds of data that it computes with: ``grey``, ``depth``, ``imu``, ``lidar``;
+            ``truth`` if it is made of that, as of an estimator for studies.
         eyes: Number of cameras whose images it takes together: 2 is a stereo rig.
         lenses: Distortion models that it can compute with, besides an ideal camera.
         rectifies: Whether it turns images of other lenses into those of a pinhole camera first.

@@ -55,6 +55,19 @@ def check_pose(event: Any, position: tuple[float, ...], orientation: tuple[float
         _check_all(event)
 
 
+def check_frames(event: Any, *names: str) -> None:
+    """Check that names of frames are not blank.
+
+    Raises:
+        ValueError: One of them is.
+    """
+    for name in names:
+        if not name.strip():
+            raise ValueError(
+                f"{type(event).__name__}: expected names of frames, found {_show(name)}"
+            )
+
+
 def check_covariance(event: Any, field: str, size: int) -> None:
     """Check that a covariance is empty, or has `size` rows of `size` finite numbers in one tuple.
 

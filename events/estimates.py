@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Category, Event, Quaternion, Vector3
-from events.checks import UNIT_TOLERANCE, check, check_covariance, check_pose
+from events.checks import UNIT_TOLERANCE, check, check_covariance, check_frames, check_pose
 from events.sensors import publish
 
 
@@ -44,6 +44,7 @@ class PoseEstimate(Event):
 
     def __post_init__(self) -> None:
         check_pose(self, self.position, self.orientation)
+        check_frames(self, self.frame_id, self.child_frame_id)
         if self.velocity is not None:
             check(self, self.velocity)
         check_covariance(self, "covariance", 6)

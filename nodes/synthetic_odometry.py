@@ -60,7 +60,7 @@ class SyntheticOdometry(Node[SyntheticOdometryConfig]):
     def announce(self) -> Iterable[Announcement]:
         """Announce the estimates."""
         method = f"truth, {self.config.drift:g} % drift, {self.config.latency * 1e3:g} ms late"
-        yield EstimatorAnnouncement(stamp=0, source=self.name, method=method)
+        yield EstimatorAnnouncement(stamp=0, source=self.name, method=method, reads=("truth",))
 
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:

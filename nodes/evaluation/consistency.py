@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import erfc, sqrt
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -12,6 +14,8 @@ from nodes.trajectory import Trajectory
 
 _SINGULAR = 1e-9
 """Smallest eigenvalue of a correlation matrix that can be inverted."""
+_THREE_SIGMA = float(chdtri(3, erfc(3.0 / sqrt(2.0))))
+"""NEES of three dimensions that is as rarely exceeded as 3 sigma of one: 14.16."""
 
 
 def consistency(
@@ -55,6 +59,9 @@ def consistency(
         inside = int(((nees >= low) & (nees <= high)).sum())
         found[f"nees_{name}"] = float(nees.mean()) if len(nees) else None
         found[f"nees_{name}_inside_percent"] = 100.0 * inside / len(valid)
+        if name == "position":
+            covered = int((nees <= _THREE_SIGMA).sum())
+            found["within_3_sigma_percent"] = 100.0 * covered / len(valid)
     return found
 
 

@@ -31,7 +31,7 @@ class Coverage(msgspec.Struct, frozen=True):
 
     Attributes:
         flight: From the first image to the last.
-        frames: How many images there were.
+        frames: How many images there were, or would have been.
         answered: How many of them have a pose: one within half an image's period.
         lost: Intervals without a pose, in order; they do not touch.
     """
@@ -55,7 +55,13 @@ class Coverage(msgspec.Struct, frozen=True):
         return 100.0 * self.answered / self.frames
 
 
-def cover(frames: Stamps, poses: Stamps, gap: int, announced: Sequence[Interval] = ()) -> Coverage:
+def cover(
+    frames: Stamps,
+    poses: Stamps,
+    gap: int,
+    announced: Sequence[Interval] = (),
+    planned: int | None = None,
+) -> Coverage:
     """Return what poses cover of a flight.
 
     Lost is what a user means by it: no pose for longer than `gap` although there were images, or
@@ -66,6 +72,8 @@ def cover(frames: Stamps, poses: Stamps, gap: int, announced: Sequence[Interval]
         poses: Stamps of the poses, strictly rising, shape (m,).
         gap: Silence that counts (ns).
         announced: Intervals in which the estimator itself reported that it was lost, in any order.
+        planned: When the flight should have ended (ns), if it was ended before: images were to
+            come until then at their usual rate, and are without a pose.
     """
     first, last = int(frames[0]), int(frames[-1])
     has_pose = answered(frames, poses)
@@ -80,7 +88,12 @@ def cover(frames: Stamps, poses: Stamps, gap: int, announced: Sequence[Interval]
     clipped = [Interval(max(s, first), min(e, last)) for s, e in announced]
     lost = [Interval(int(starts[k]), int(ends[k])) for k in silent]
     lost += [each for each in clipped if each.end > each.start]
-    return Coverage(Interval(first, last), len(frames), int(has_pose.sum()), union(lost))
+    count = len(frames)
+    if planned is not None and planned > last > first:
+        count += round((planned - last) * (count - 1) / (last - first))
+        lost.append(Interval(last, planned))
+        last = planned
+    return Coverage(Interval(first, last), count, int(has_pose.sum()), union(lost))
 
 
 def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:

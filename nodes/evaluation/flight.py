@@ -16,18 +16,21 @@ class Flight:
     Attributes:
         truth: Its true poses.
         recent: The last of them.
+        body: Frame of its body.
         collisions: In the order in which they came.
     """
 
     def __init__(self) -> None:
         self.truth = PoseRows()
         self.recent = RecentPoses()
+        self.body = "base_link"
         self.collisions: list[Collision] = []
         self._plan = PoseRows()
         self._setpoints = PoseRows()
 
     def add(self, event: Odometry) -> None:
         """Note where it is."""
+        self.body = event.child_frame_id
         self.truth.add(event.stamp, event.position, event.orientation)
         self.recent.add(event.stamp, event.position, event.orientation)
 
@@ -41,11 +44,11 @@ class Flight:
         rows = self._plan if len(self._plan) else self._setpoints
         return rows.trajectory() if len(rows) else None
 
-    def figures(self) -> dict[str, float]:
+    def figures(self, truth: Trajectory | None) -> dict[str, float]:
         """Return how often it hit something, and how far it was from its planned poses."""
         found: dict[str, float] = {"collisions": len(self.collisions)}
-        if len(self.truth) and len(self._plan):
-            found |= beside_the_plan(self.truth.trajectory(), self._plan.trajectory())
+        if truth is not None and len(self._plan):
+            found |= beside_the_plan(truth, self._plan.trajectory())
         return found
 
 

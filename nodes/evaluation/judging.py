@@ -6,6 +6,7 @@ Pure functions; `nodes.evaluation.node` collects, and `nodes.evaluation.results`
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -34,6 +35,11 @@ from runtime.schedule import SECOND
 Floats = npt.NDArray[np.float64]
 
 MILLISECOND = 1_000_000
+_MOST_TICKS = 100_000
+_BLOCK = 65_536
+_LATE = 5
+"""Periods that a pose may be late: whoever answers image by image needs two, and its camera one or
+two. Later than that, it had images after its own for it, if it answers them all."""
 
 
 class Errors(msgspec.Struct, frozen=True, eq=False):
@@ -52,14 +58,6 @@ class Errors(msgspec.Struct, frozen=True, eq=False):
     position: Floats
     rotation: Floats
 
-    def thinned(self, most: int) -> Errors:
-        """Return every row, or of more than `most` every second, fourth, …."""
-        step = 1
-        while len(self.stamps) > most * step:
-            step *= 2
-        kept = slice(None, None, step)
-        return Errors(self.stamps[kept], self.since[kept], self.position[kept], self.rotation[kept])
-
 
 class Judgement(msgspec.Struct, frozen=True, eq=False):
     """All that is known of one estimator at the end.
@@ -69,7 +67,8 @@ class Judgement(msgspec.Struct, frozen=True, eq=False):
         estimate: Its estimates, as it sent them.
         aligned: The same in the truth's frame, where there is a truth; `None` if it sent none.
         of_images: Errors of each pose at the time of its image.
-        of_ticks: Errors of the newest pose there was at each control tick.
+        of_ticks: Errors of the newest pose there was at each control tick; of a long flight at
+            every second one, fourth, ….
         lost: When it had no pose.
         final: Its trajectory after loop closures in the truth's frame, if it sent one.
     """
@@ -89,6 +88,8 @@ def judge(
     *,
     cameras: Mapping[str, Stamps] | None = None,
     end: int | None = None,
+    planned: int | None = None,
+    body: str = "base_link",
     alignment: How | Literal["auto"] = "auto",
     rate: float = 400.0,
     delta: float = 1.0,
@@ -104,6 +105,8 @@ def judge(
             first to the last image of the camera that the estimator follows; without cameras it
             is that of the truth.
         end: When the run ended (ns); the end of the truth if not given.
+        planned: When it was to end (ns), if it ended before.
+        body: Frame of the truth's body, whose pose is to be estimated.
         alignment: How the two frames are brought together; see `choose_alignment`.
         rate: Control ticks a second.
         delta: Metres of path over which relative errors are taken.
@@ -121,11 +124,11 @@ def judge(
         waits = min(max(usual, 0), round(gap * SECOND))
     due = truth.stamps if frames is None else frames
     due = due[: max(int(np.searchsorted(due, end - waits, side="right")), 1)]
-    coverage = cover(due, poses, round(gap * SECOND), record.reported_lost(end))
+    coverage = cover(due, poses, round(gap * SECOND), record.reported_lost(end), planned)
     due = due[truth.covers(due)]
-    inside = (truth.stamps >= coverage.flight.start) & (truth.stamps <= coverage.flight.end)
-    flight = truth.take(inside) if inside.any() else truth
-    path = flight.length()
+    start, stop = coverage.flight
+    inside = (truth.stamps >= start) & (truth.stamps <= stop)
+    path = float(np.ptp(truth.distances()[inside] if inside.any() else truth.distances()))
     figures: dict[str, Any] = {
         "method": record.method,
         "estimates": len(record),
@@ -136,6 +139,11 @@ def judge(
         "restarts": record.restarts,
         "repeated_stamps": record.repeated,
         "future_stamps": record.future,
+        "other_bodies": sum(
+            count
+            for name, count in record.bodies.items()
+            if name.rpartition("/")[2] != body.rpartition("/")[2]
+        ),
         "path_m": path,
         # Who never has a pose is at it until the end.
         "initialization_seconds": (
@@ -143,12 +151,15 @@ def judge(
         )
         / SECOND,
     }
-    without = _held(held_errors(truth, due, poses[:0], np.empty(0), coverage.lost), path)
+
+    def without() -> dict[str, float | None]:
+        return _held(held_errors(truth, due, poses[:0], np.empty(0), coverage.lost), path)
+
     how = choose_alignment(record.scale_free, record.frame_id) if alignment == "auto" else alignment
     final = _judge_final(record, truth, due, path, alignment, figures)
     judgement = Judgement(figures, estimate, lost=coverage.lost, final=final)
     if estimate is None:
-        figures |= without
+        figures |= without()
         return judgement
     # An interval that lasts to the end of the flight counts as long as it is: it took no less.
     if took := [seconds([each]) for each in coverage.lost if each.start >= poses[0]]:
@@ -160,11 +171,13 @@ def judge(
         latencies = (arrivals - poses) / MILLISECOND
         figures["latency_p50_ms"] = float(np.percentile(latencies, 50))
         figures["latency_p99_ms"] = float(np.percentile(latencies, 99))
+        period = max((np.median(np.diff(s)) for s in (poses, due) if len(s) > 1), default=0.0)
+        figures["not_causal"] = int((arrivals - poses > _LATE * period).sum()) if period else 0
     try:
         there, kept = associate(truth, estimate)
         aligned = align(kept, there, how)
     except ValueError as error:  # too little to align, or no time in common
-        figures |= {**without, "why": str(error)}
+        figures |= {**without(), "why": str(error)}
         return judgement
     moved = aligned.trajectory
     figures |= {"scale": aligned.scale, **absolute_errors(there, moved)}
@@ -190,13 +203,10 @@ def judge(
             scale = umeyama(moved.positions, there.positions, with_scale=True)[2]
             figures["scale_error_percent"] = 100.0 * abs(scale - 1.0)
     whole = transform(estimate, aligned.rotation, aligned.translation, aligned.scale)
-    of_ticks = errors_at_ticks(truth, whole, arrivals, rate) if len(arrivals) else None
-    if of_ticks is not None:
-        figures |= {
-            "available_rmse_m": rms(of_ticks.position),
-            "available_rot_rmse_deg": float(np.degrees(rms(of_ticks.rotation))),
-            "available_age_ms": float(np.mean(of_ticks.stamps - of_ticks.since)) / MILLISECOND,
-        }
+    of_ticks = None
+    if len(arrivals):
+        of_ticks, available = errors_at_ticks(truth, whole, arrivals, rate)
+        figures |= available
     return Judgement(figures, estimate, moved, of_images, of_ticks, coverage.lost, final)
 
 
@@ -242,16 +252,18 @@ def _said_with_poses(
     """Return the figures of velocities and covariances, as far as they were given."""
     figures: dict[str, Any] = {}
     rotation, scale = aligned.rotation, aligned.scale
-    rows = np.isin(there.stamps, [*record.velocities])
+    for name, each in (("velocities", record.velocities), ("covariances", record.covariances)):
+        if len(each):
+            figures[f"{name}_percent"] = 100.0 * len(each) / len(record)
+    rows, said = record.velocities.at(there.stamps)
     if rows.any():
-        said = np.array([record.velocities[stamp] for stamp in there.stamps[rows].tolist()])
         # The true velocity is the difference of the true positions, as densely as there are.
-        true = interpolated(truth.stamps, truth.velocities(), there.stamps[rows])
+        near = truth.near(there.stamps[rows])
+        true = interpolated(near.stamps, near.velocities(), there.stamps[rows])
         wrong = position_errors(true, scale * said @ rotation.T)
         figures["velocity_rmse_m_per_s"] = rms(wrong)
-    rows = np.isin(there.stamps, [*record.covariances])
+    rows, said = record.covariances.at(there.stamps)
     if rows.any():
-        said = np.array([record.covariances[stamp] for stamp in there.stamps[rows].tolist()])
         turn = np.kron(np.diag([scale, 1.0]), rotation)
         turned = turn @ said.reshape(-1, 6, 6) @ turn.T
         figures |= consistency(there.take(rows), aligned.trajectory.take(rows), turned)
@@ -290,7 +302,7 @@ def choose_alignment(scale_free: bool, frame_id: str) -> How:
 
 def errors_at_ticks(
     truth: Trajectory, estimate: Trajectory, arrivals: npt.NDArray[np.int64], rate: float
-) -> Errors | None:
+) -> tuple[Errors | None, dict[str, float]]:
     """Return the errors of the newest pose that a controller would have had at each of its ticks.
 
     Args:
@@ -300,20 +312,31 @@ def errors_at_ticks(
         rate: Ticks a second, from the first estimate's arrival to the end of the truth.
 
     Returns:
-        The errors; `None` if there was no tick.
+        The errors, of a long flight those of every second tick, fourth, …; and the figures of all.
+        `None` and nothing if there was no tick.
     """
     first, last = max(int(arrivals.min()), int(truth.stamps[0])), int(truth.stamps[-1])
     ticks = np.arange(first, last + 1, SECOND / rate).astype(np.int64)
     if not len(ticks):
-        return None
+        return None, {}
     order = np.argsort(arrivals, kind="stable")
-    came = np.searchsorted(arrivals[order], ticks, side="right")
     # Should poses overtake each other, the newest by stamp is the one to go by.
-    newest = np.maximum.accumulate(order)[came - 1]
-    there = truth.at(ticks)
-    return Errors(
-        stamps=ticks,
-        since=estimate.stamps[newest],
-        position=position_errors(there.positions, estimate.positions[newest]),
-        rotation=rotation_errors(there.orientations, estimate.orientations[newest]),
-    )
+    newest, came = np.maximum.accumulate(order), arrivals[order]
+    step = 2 ** max(math.ceil(math.log2(len(ticks) / _MOST_TICKS)), 0)
+    kept = []
+    sums = np.zeros(3)
+    for start in range(0, len(ticks), _BLOCK):  # which is a multiple of each step
+        now = ticks[start : start + _BLOCK]
+        rows = newest[np.searchsorted(came, now, side="right") - 1]
+        there = truth.at(now)
+        since = estimate.stamps[rows]
+        position = position_errors(there.positions, estimate.positions[rows])
+        rotation = rotation_errors(there.orientations, estimate.orientations[rows])
+        sums += (position**2).sum(), (rotation**2).sum(), (now - since).sum()
+        kept.append([each[::step] for each in (now, since, position, rotation)])
+    square, turned, age = (sums / len(ticks)).tolist()
+    return Errors(*map(np.concatenate, zip(*kept, strict=True))), {
+        "available_rmse_m": math.sqrt(square),
+        "available_rot_rmse_deg": math.degrees(math.sqrt(turned)),
+        "available_age_ms": age / MILLISECOND,
+    }

@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from nodes.trajectory import Trajectory
 
@@ -191,9 +190,22 @@ def rotation_errors(truth: Floats, estimate: Floats) -> Floats:
     Returns:
         Shape (n,).
     """
-    a = Rotation.from_quat(truth, scalar_first=True)
-    b = Rotation.from_quat(estimate, scalar_first=True)
-    return np.asarray((a.inv() * b).magnitude())
+    apart, along = (np.linalg.norm(estimate + s * truth, axis=1) for s in (-1.0, 1.0))
+    return np.asarray(4.0 * np.arctan2(np.minimum(apart, along), np.maximum(apart, along)))
+
+
+def _turns(first: Floats, last: Floats) -> Floats:
+    """Return the rotations from the first to the last, each in its first: quaternions (n, 4)."""
+    (w, x, y, z), (a, b, c, d) = first.T * [[1.0], [-1.0], [-1.0], [-1.0]], last.T
+    return np.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        axis=1,
+    )
 
 
 def interpolated(known: Indices, values: Floats, stamps: Indices) -> Floats:
@@ -233,10 +245,9 @@ def relative_errors(
     )
     true_motion = r1[first].inv().apply(p1)
     said_motion = r2[first].inv().apply(p2)
-    true_turn = r1[first].inv() * r1[last]
-    said_turn = r2[first].inv() * r2[last]
+    turns = (_turns(t.orientations[first], t.orientations[last]) for t in (truth, estimate))
     shifts = np.linalg.norm(said_motion - true_motion, axis=1)
-    return np.asarray(shifts), np.asarray((true_turn.inv() * said_turn).magnitude())
+    return np.asarray(shifts), rotation_errors(*turns)
 
 
 def rms(values: Floats) -> float:

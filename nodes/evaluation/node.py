@@ -32,7 +32,7 @@ from nodes.evaluation.judging import Judgement, judge
 from nodes.evaluation.live import LiveErrors
 from nodes.evaluation.record import EstimatorRecord
 from nodes.evaluation.results import FRAMES, write_results
-from nodes.evaluation.verdict import Thresholds, conclude
+from nodes.evaluation.verdict import Thresholds, conclude, planned_end
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.growing import GrowingFile
@@ -60,7 +60,7 @@ class EvaluationConfig(NodeConfig):
         thresholds: What the figures may be; if one is missed, the run's exit code is 1. Without
             any, an estimator is not judged, unless it misses what is asked of everybody (it was
             there for nine tenths of the flight, in one frame, with stamps that rise; its vehicle
-            hit nothing).
+            hit nothing; the run came to its planned end). With some, there must be an estimator.
         image_count: Sample images with features to keep of each estimator; 0 for none.
     """
 
@@ -157,7 +157,8 @@ class Evaluation(Node[EvaluationConfig]):
     @on(TrackingEvent)
     def tracking_events(self, event: TrackingEvent) -> None:
         """Note that an estimator lost or regained its way."""
-        self._records.setdefault(event.source, EstimatorRecord()).note(event)
+        record = self._records.setdefault(event.source, EstimatorRecord())
+        record.note(event, self.clock.now())
 
     @on(TrajectoryEstimate)
     def trajectories(self, event: TrajectoryEstimate) -> None:
@@ -200,22 +201,34 @@ class Evaluation(Node[EvaluationConfig]):
         if not self._records and self.clock.now() > 0:
             self.log.info("no estimator has announced itself or sent an estimate")
         judgements, verdict = await self.offload(self._finish, self.clock.now())
-        for name, judgement in judgements.items():
+        for name in judgements:
             figures = verdict["estimators"][name]
             rest = {k: v for k, v in figures.items() if k != "passed"}
             self.conclude(name, rest, passed=figures["passed"])
-            if judgement.figures.get("why"):
-                self.log.warning("%s: %s", name, judgement.figures["why"])
+            if figures.get("why"):
+                self.log.warning("%s: %s", name, figures["why"])
+        if not judgements and "failed" in verdict:
+            self.conclude(self.name, {"failed": verdict["failed"]}, passed=verdict["passed"])
 
     def _finish(self, end: int) -> tuple[dict[str, Judgement], dict[str, Any]]:
         config = self.config
         truths = {v: f.truth.trajectory() for v, f in self._flights.items() if len(f.truth)}
-        flown = {vehicle: flight.figures() for vehicle, flight in self._flights.items()}
+        flown = {v: flight.figures(truths.get(v)) for v, flight in self._flights.items()}
         judgements = {}
+        how = self.run_end
         for name, record in self._records.items():
             vehicle = self._vehicle_of(name)
             sensors = self._scans if "lidar" in record.reads else self._frames
-            judgement = self._judge(record, truths.get(vehicle), self._seen(vehicle, sensors), end)
+            seen = self._seen(vehicle, sensors)
+            body = self._flights.get(vehicle, Flight()).body
+            judgement = self._judge(
+                record,
+                truths.get(vehicle),
+                cameras=seen,
+                end=end,
+                planned=planned_end(how),
+                body=body,
+            )
             judgement.figures.update(flown.get(vehicle, {}))
             if len(self._vehicles.names) > 1:
                 judgement.figures["vehicle"] = vehicle
@@ -225,7 +238,9 @@ class Evaluation(Node[EvaluationConfig]):
             "what was sent before is not in the figures"
         )
         figures = {name: judgement.figures for name, judgement in judgements.items()}
-        verdict = conclude(figures, config.thresholds, [restarted] if self.restarts else [])
+        faults = [restarted] if self.restarts else []
+        declared = [name for name, record in self._records.items() if "truth" in record.reads]
+        verdict = conclude(figures, config.thresholds, faults, how, declared)
         if self.out is not None:
             plans = {self._named("plan", v): f.plan() for v, f in self._flights.items()}
             write_results(self.out, plans, judgements, verdict)
@@ -235,13 +250,7 @@ class Evaluation(Node[EvaluationConfig]):
             self._album.write(self.out / "frames")
         return judgements, verdict
 
-    def _judge(
-        self,
-        record: EstimatorRecord,
-        truth: Trajectory | None,
-        cameras: dict[str, npt.NDArray[np.int64]],
-        end: int,
-    ) -> Judgement:
+    def _judge(self, record: EstimatorRecord, truth: Trajectory | None, **seen: Any) -> Judgement:
         """Judge one estimator; whatever it sent, the others are judged."""
         if truth is None:
             why = "expected a truth to hold it against, found no odometry"
@@ -251,8 +260,7 @@ class Evaluation(Node[EvaluationConfig]):
             return judge(
                 record,
                 truth,
-                cameras=cameras,
-                end=end,
+                **seen,
                 alignment=config.alignment,
                 rate=config.control_rate,
                 delta=config.delta,

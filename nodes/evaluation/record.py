@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 
 import numpy as np
 import numpy.typing as npt
@@ -11,8 +12,36 @@ from events import PoseEstimate, TrackingEvent, TrackingLost, TrajectoryEstimate
 from nodes.evaluation.coverage import Interval
 from nodes.trajectory import PoseRows, Trajectory
 
+Floats = npt.NDArray[np.float64]
+
 _AHEAD = 1_000_000
 """Nanoseconds by which a stamp may be later than its arrival: clocks are that close."""
+
+
+class Said:
+    """Rows of numbers that came with some of the poses, by their stamps, which rise.
+
+    Args:
+        width: Numbers of a row.
+    """
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self._stamps, self._numbers = array("q"), array("d")
+
+    def add(self, stamp: int, numbers: tuple[float, ...]) -> None:
+        """Note what came with a pose."""
+        self._stamps.append(stamp)
+        self._numbers.extend(numbers)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def at(self, stamps: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.bool_], Floats]:
+        """Tell which stamps have a row, shape (n,), and return these, shape (m, width)."""
+        mine = np.array(self._stamps, np.int64)
+        rows = np.array(self._numbers, np.float64).reshape(-1, self._width)
+        return np.isin(stamps, mine), rows[np.isin(mine, stamps)]
 
 
 class EstimatorRecord:
@@ -29,10 +58,11 @@ class EstimatorRecord:
     Attributes:
         rows: The poses of its trajectory.
         repeated: Poses whose stamp was not later than the one before: sent twice, or backwards.
-        future: Poses of a time that had not come when they arrived.
+        future: Poses, and losses, of a time that had not come when they arrived.
+        bodies: How many poses are of which body (`child_frame_id`).
         elsewhere: Poses in another frame than the first one.
         restarts: How often it changed to another frame: each time it has lost where it is.
-        velocities: Those that poses came with, by stamp: 3 numbers.
+        velocities: Those that poses came with: 3 numbers.
         covariances: Likewise: 36 numbers, row by row.
         final: Its trajectory after loop closures, the last one that it sent; `None` if it sent
             none, or an empty one.
@@ -51,14 +81,15 @@ class EstimatorRecord:
         self.future = 0
         self.elsewhere = 0
         self.restarts = 0
-        self.velocities: dict[int, array[float]] = {}
-        self.covariances: dict[int, array[float]] = {}
+        self.bodies: Counter[str] = Counter()
+        self.velocities = Said(3)
+        self.covariances = Said(36)
         self.final: Trajectory | None = None
         self.final_frame_id = ""
         self._last_stamp: int | None = None
         self._last_frame = ""
         self._arrivals = array("q")
-        self._tracking: list[TrackingEvent] = []
+        self._tracking: list[tuple[int, bool]] = []
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> EstimatorRecord:
@@ -84,12 +115,13 @@ class EstimatorRecord:
             self.elsewhere += 1
             return False
         self.rows.add(event.stamp, event.position, event.orientation)
+        self.bodies[event.child_frame_id] += 1
         if now is not None:
             self._arrivals.append(now)
         if event.velocity is not None:
-            self.velocities[event.stamp] = array("d", event.velocity)
+            self.velocities.add(event.stamp, event.velocity)
         if event.covariance:
-            self.covariances[event.stamp] = array("d", event.covariance)
+            self.covariances.add(event.stamp, event.covariance)
         return True
 
     def add_final(self, event: TrajectoryEstimate) -> None:
@@ -98,9 +130,10 @@ class EstimatorRecord:
         self.final = Trajectory(*poses) if len(event.stamps) else None
         self.final_frame_id = event.frame_id
 
-    def note(self, event: TrackingEvent) -> None:
-        """Note that tracking was lost or regained."""
-        self._tracking.append(event)
+    def note(self, event: TrackingEvent, now: int) -> None:
+        """Note that tracking was lost or regained; of a time to come, it counts from now (ns)."""
+        self.future += event.stamp > now + _AHEAD
+        self._tracking.append((min(event.stamp, now + _AHEAD), isinstance(event, TrackingLost)))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -117,11 +150,11 @@ class EstimatorRecord:
         """
         found = []
         since: int | None = None
-        for event in self._tracking:
-            if isinstance(event, TrackingLost):
-                since = event.stamp if since is None else since
+        for stamp, lost in self._tracking:
+            if lost:
+                since = stamp if since is None else since
             elif since is not None:
-                found.append(Interval(since, event.stamp))
+                found.append(Interval(since, stamp))
                 since = None
         if since is not None:
             found.append(Interval(since, end))

@@ -28,8 +28,6 @@ from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
 from runtime.paths import source_file
 
-_MOST_TICKS = 100_000
-
 FRAMES = "base_link (FRD) in {}: timestamp[s] tx ty tz[m] qx qy qz qw"
 
 
@@ -60,8 +58,7 @@ def write_results(
         if judgement.of_images is not None:
             _write_errors(evaluation / f"{name}.csv", "arrival_ns", judgement.of_images)
         if judgement.of_ticks is not None:
-            thin = judgement.of_ticks.thinned(_MOST_TICKS)
-            _write_errors(evaluation / f"{name}.ticks.csv", "pose_ns", thin)
+            _write_errors(evaluation / f"{name}.ticks.csv", "pose_ns", judgement.of_ticks)
     text = msgspec.json.format(msgspec.json.encode(verdict), indent=2)
     (evaluation / "verdict.json").write_bytes(text + b"\n")
 

@@ -24,9 +24,10 @@ def held_errors(
 ) -> Floats:
     """Return the position error at each image of a flight, as its estimator said at that time.
 
-    An image has the error of the pose that is nearest in time, or, if it has none within a lost
-    interval, that of the last pose before plus the true path length since. Before the first pose,
-    that is the path length since the first image.
+    An image has the error of the worst pose that is nearer to it in time than to any other image,
+    so that nothing hides between images; if there is none, that of the nearest pose; or, if it has
+    no pose within a lost interval, that of the last pose before plus the true path length since.
+    Before the first pose, that is the path length since the first image.
 
     Args:
         truth: The true poses.
@@ -39,7 +40,7 @@ def held_errors(
         Metres, one for each image.
     """
     path = _path_at(truth, frames)
-    if not len(poses):
+    if not len(poses) or not len(frames):
         return np.asarray(path - path[:1])
     missing = np.zeros(len(frames), np.bool_)
     for start, end in lost:
@@ -48,6 +49,10 @@ def held_errors(
     after = np.clip(np.searchsorted(poses, frames), 1, max(len(poses) - 1, 1))
     nearer = abs(poses[after - 1] - frames) <= abs(poses[after % len(poses)] - frames)
     found = errors[np.where(nearer, after - 1, after % len(poses))]
+    own = np.searchsorted((frames[:-1] + frames[1:]) // 2, poses)  # the image of each pose
+    worst = np.full(len(frames), -np.inf)
+    np.maximum.at(worst, own, errors)
+    found = np.where(np.bincount(own, minlength=len(frames)) > 0, worst, found)
     before = np.searchsorted(poses, frames, side="right") - 1
     none = before < 0
     since = np.where(none, path[:1], _path_at(truth, poses)[before])

@@ -93,7 +93,7 @@ def judge_all(
             delta=config.delta,
             gap=config.gap,
         )
-        unknown = {"restarts", "repeated_stamps", "future_stamps"}
+        unknown = {"restarts", "repeated_stamps", "future_stamps", "other_bodies"}
         figures = {k: v for k, v in judgement.figures.items() if k not in unknown} | source.counts
         figures["method"] = source.file
         figures["compared"] = int(truth.poses.covers(poses.stamps).sum())

@@ -157,6 +157,8 @@ def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
     """Return what the top of the page says of an estimator."""
     passed = figures.get("passed")
     failed = figures.get("failed")
+    if passed is None and "why" in figures:
+        failed = [figures["why"]]
     laid = _ALIGNED.get(str(figures.get("alignment")), "")
     vehicle = f"of {figures['vehicle']}" if "vehicle" in figures else ""
     return {

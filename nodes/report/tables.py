@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from nodes.evaluation.verdict import AT_LEAST, COUNTS
+from nodes.evaluation.verdict import AT_LEAST, IF_ANY
 from nodes.report.contents import Facts, Run
 from nodes.report.style import number
 
@@ -31,6 +31,10 @@ MAIN = {
     "heading_rmse_deg": ("heading error, RMS", "°"),
     "nees_position": ("NEES of the position, 3 if consistent", ""),
     "nees_pose": ("NEES of the pose, 6 if consistent", ""),
+    "within_3_sigma_percent": ("share of the positions within 3 sigma of their covariance", "%"),
+    "covariances_percent": ("share of the poses with a covariance", "%"),
+    "covariance_invalid": ("covariances that are none", ""),
+    "velocities_percent": ("share of the poses with a velocity", "%"),
     "available_rmse_m": ("error of the newest pose at control ticks, RMS", "m"),
     "available_rot_rmse_deg": ("rotation error of the same, RMS", "°"),
     "plan_rmse_m": ("distance of the flight from its plan, RMS", "m"),
@@ -42,9 +46,14 @@ MAIN = {
     "lost_count": ("times lost", ""),
     "initialization_seconds": ("time before the first pose", "s"),
     "relocalization_max_seconds": ("longest time to have a pose again", "s"),
-    "restarts": ("times that it began anew in a frame of its own", ""),
+    "restarts": ("times that it began anew, in a frame of its own or as a node", ""),
     "repeated_stamps": ("poses whose stamp was not later than the one before", ""),
-    "future_stamps": ("poses of a time that had not come", ""),
+    "future_stamps": ("poses and losses of a time that had not come", ""),
+    "not_causal": ("poses so late that later images may be in them", ""),
+    "other_bodies": ("poses of another body than the truth's", ""),
+    "early_end": ("time that the run ended before its plan", "s"),
+    "ended_by": ("who ended the run", ""),
+    "reads_truth": ("whether it reads the truth", ""),
     "collisions": ("collisions of the vehicle", ""),
     "rate_hz": ("estimates a second", "Hz"),
 }
@@ -97,7 +106,7 @@ def figures(run: Run, *, main: bool) -> list[Row]:
     for name in names:
         values = [e.figures.get(name) for e in run.estimators]
         limit = asked.get(name)
-        if (limit is None or name in COUNTS) and all(value is None for value in values):
+        if (limit is None or name in IF_ANY) and all(value is None for value in values):
             continue
         meaning, unit = MAIN.get(name) or (name.replace("_", " "), _unit(name))
         why = [e.figures.get("failed") or () for e in run.estimators]

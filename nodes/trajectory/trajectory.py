@@ -13,7 +13,7 @@ from typing import IO, Any
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from events import Quaternion, Vector3
 
@@ -121,6 +121,16 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         steps = np.linalg.norm(np.diff(self.positions, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
+    def near(self, stamps: Stamps) -> Trajectory:
+        """Return two rows before and two after each stamp (ns), for what a few of many rows tell.
+
+        Between them `velocities` are those of the whole.
+        """
+        after = np.clip(np.searchsorted(self.stamps, stamps), 1, max(len(self) - 1, 1))
+        rows = np.zeros(len(self), np.bool_)
+        rows[np.clip(after[:, None] + np.arange(-2, 2), 0, len(self) - 1)] = True
+        return self.take(rows)
+
     def velocities(self) -> Floats:
         """Return velocities by differences of the positions, m/s in the parent frame, shape (n, 3).
 
@@ -189,11 +199,8 @@ class Trajectory(msgspec.Struct, frozen=True, eq=False):
         before = after - 1
         share = (stamps - self.stamps[before]) / (self.stamps[after] - self.stamps[before])
         a, b = self.positions[before], self.positions[after]
-        # Since the start, so that a float holds every nanosecond.
-        slerp = Slerp((self.stamps - self.stamps[0]).astype(np.float64), self.rotations())
-        turned = slerp((stamps - self.stamps[0]).astype(np.float64))
         positions = a + share[:, None] * (b - a)
-        orientations = turned.as_quat(scalar_first=True)
+        orientations = _slerp(self.orientations[before], self.orientations[after], share)
         same = self.stamps[after] == stamps
         positions[same], orientations[same] = b[same], self.orientations[after[same]]
         if stamps[0] == self.stamps[0]:
@@ -213,9 +220,11 @@ class PoseRows:
         self._blocks: list[npt.NDArray[np.void]] = []
         self._file: IO[bytes] | None = None
         self._written = 0
+        self._whole: Trajectory | None = None
 
     def __len__(self) -> int:
-        return self._written + sum(map(len, self._blocks)) + len(self._rows)
+        made = 0 if self._whole is None else len(self._whole)
+        return made + self._written + sum(map(len, self._blocks)) + len(self._rows)
 
     def add(self, stamp: int, position: Vector3, orientation: Quaternion) -> None:
         """Note a pose: nanoseconds, metres, quaternion w, x, y, z."""
@@ -229,12 +238,21 @@ class PoseRows:
         Raises:
             ValueError: Nothing has, or a pose is none.
         """
-        rows = np.concatenate([self._read(), *self._blocks, np.array(self._rows, _ROW)])
-        self._blocks, self._rows = [rows], []
+        parts = [self._read(), *self._blocks, np.array(self._rows, _ROW)]
+        self._blocks, self._rows = [], []
+        if (made := self._whole) is not None:
+            if not any(map(len, parts)):
+                return made
+            earlier = np.empty(len(made), _ROW)
+            earlier["stamp"], earlier["position"] = made.stamps, made.positions
+            earlier["orientation"] = made.orientations
+            parts.insert(0, earlier)
+        rows = np.concatenate(parts)
         if not (np.diff(rows["stamp"]) > 0).all():
             rows = rows[np.argsort(rows["stamp"], kind="stable")]
             rows = rows[np.append(np.diff(rows["stamp"]) > 0, True)]
-        return Trajectory(rows["stamp"], rows["position"], rows["orientation"])
+        self._whole = Trajectory(rows["stamp"], rows["position"], rows["orientation"])
+        return self._whole
 
     def _spill(self) -> None:
         block = np.array(self._rows, _ROW)
@@ -260,6 +278,18 @@ class PoseRows:
             found = np.frombuffer(file.read(self._written * _ROW.itemsize), _ROW)
         self._file, self._written = None, 0
         return found
+
+
+def _slerp(first: Floats, second: Floats, share: Floats) -> Floats:
+    """Return unit quaternions between others: shapes (n, 4), (n, 4) and (n,) to (n, 4)."""
+    second = np.where(np.sum(first * second, axis=1, keepdims=True) < 0.0, -second, second)
+    away, along = (np.linalg.norm(q, axis=1) for q in (second - first, second + first))
+    angle = 2.0 * np.arctan2(away, along)[:, None]
+    part, still = share[:, None], angle < 1e-8
+    sine = np.where(still, 1.0, np.sin(angle))
+    a = np.where(still, 1.0 - part, np.sin((1.0 - part) * angle) / sine)
+    b = np.where(still, part, np.sin(part * angle) / sine)
+    return np.asarray(a * first + b * second)
 
 
 def associate(

@@ -64,3 +64,12 @@ def test_a_threshold_that_is_missed_is_the_exit_code(tmp_path: Path) -> None:
     page = (tmp_path / "out" / "report.html").read_text()
     assert "ate_percent" in page
     assert 'src="http' not in page
+
+
+def test_thresholds_that_nobody_meets_are_exit_code_1(tmp_path: Path) -> None:
+    config = tmp_path / "nobody.toml"
+    node = '[[nodes]]\nname = "evaluation"\ntype = "nodes.evaluation:Evaluation"\n'
+    config.write_text(f'[run]\nduration = "1s"\n{node}thresholds = {{ ate_percent = 1.0 }}\n')
+    verdict = fly(tmp_path, config, code=1)["verdict"]
+    assert verdict["passed"] is False
+    assert "found none that announced itself" in verdict["estimators"]["evaluation"]["failed"][0]

@@ -195,10 +195,12 @@ def report(summary: Summary, folder: Path) -> None:
 
 
 def print_verdict(console: Console, verdict: Verdict) -> None:
-    """Print who passed, and what those failed that did not."""
+    """Print who passed, what those failed that did not, and why others were not judged."""
     for name, figures in verdict.estimators.items():
         passed = _STATES[figures["passed"]]
         reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
+        if figures["passed"] is None:
+            reasons = str(figures.get("why") or "")
         console.print(f"{name} {passed}{': ' + reasons if reasons else ''}", highlight=False)
 
 

@@ -19,6 +19,7 @@ def test_every_figure_and_threshold_is_explained() -> None:
     record = recorded(truth, silent=(5.0, 6.0), velocity=(1.0, 0.0, 0.0), covariance=(0.1,) * 36)
     record.final, record.final_frame_id = truth, "map"
     figures = {*judge(record, truth).figures} | {"plan_rmse_m", "plan_max_m", "collisions"}
+    figures |= {"early_end", "ended_by", "reads_truth"}
     assert {"relocalization_p50_seconds", "nees_pose", "final_ate_percent"} <= figures
     explained = set(re.findall(r"`(\w+)`", PAGE))
     assert figures - {"method"} <= explained
@@ -30,8 +31,11 @@ def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
     given = {name: getattr(Thresholds(), name) for name in Thresholds.__struct_fields__}
     assert {k: v for k, v in given.items() if v is not None} == {
         "coverage_percent": 90.0,
+        "covariance_invalid": 0,
         "restarts": 0,
         "repeated_stamps": 0,
         "future_stamps": 0,
+        "other_bodies": 0,
+        "early_end": 0.0,
         "collisions": 0,
     }

@@ -12,7 +12,7 @@ import pytest
 
 from events import Event, LidarScan, TrajectoryEstimate
 from nodes.evaluation import Evaluation
-from nodes.evaluation.judging import Judgement, judge
+from nodes.evaluation.judging import Judgement, errors_at_ticks, judge
 from nodes.evaluation.record import EstimatorRecord
 from nodes.report.folder import read_run
 from nodes.trajectory import Trajectory
@@ -179,3 +179,14 @@ def test_who_reads_a_lidar_answers_scans(tmp_path: Path) -> None:
     assert quick["frame_coverage_percent"] == pytest.approx(50.0, abs=1.0)
     camera = flown(tmp_path / "c", *images(), *scans(100 * MS), reads=("grey",))
     assert camera["frame_coverage_percent"] < 50.0
+
+
+def test_of_many_ticks_the_figures_are_those_of_all_and_a_few_rows_are_kept() -> None:
+    """A pose that is never replaced, of a body that moves along x at 1 m/s for 800 s."""
+    ends = np.array([0, 800 * SECOND])
+    there = Trajectory(ends, np.array([[0.0, 0, 0], [800.0, 0, 0]]), np.eye(4)[[0, 0]])
+    rows, found = errors_at_ticks(there, there.take(slice(1)), np.array([0]), 400.0)
+    assert rows is not None
+    assert len(rows.stamps) == 80_001  # every fourth
+    assert found["available_rmse_m"] == pytest.approx(800 / np.sqrt(3), rel=1e-4)
+    assert found["available_age_ms"] == pytest.approx(400e3, rel=1e-6)
