@@ -1,8 +1,8 @@
-"""Monado's interface for visual-inertial tracking (VIT), versions 1 and 2, by ctypes.
+"""Monado's interface for visual-inertial tracking (VIT), versions 1 to 3, by ctypes.
 
-Source of names, layouts and numbers: ``vit_interface.h`` of 1.0.1 and 2.0.1
-(gitlab.freedesktop.org/monado/utilities/vit). The two differ in what a library may offer besides
-poses, of which nothing is used here; both have the velocity beside the pose.
+Source of names, layouts and numbers: ``vit_interface.h`` of 1.0.1, 2.0.1 and 3.0.0
+(gitlab.freedesktop.org/monado/utilities/vit). They differ in what a library may offer besides
+poses, of which nothing is used here; all have the velocity beside the pose.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ class Library:
             self._call("api_get_version", *map(c.byref, version))
         except (OSError, AttributeError) as error:
             raise VitError(f"expected a library with the VIT interface, found {error}") from None
-        if version[0].value not in {1, 2}:
+        if version[0].value not in {1, 2, 3}:
             found = ".".join(str(part.value) for part in version)
-            raise VitError(f"{path}: expected version 1 or 2 of the VIT interface, found {found}")
+            raise VitError(f"{path}: expected version 1 to 3 of the VIT interface, found {found}")
         given = Config(None if config is None else str(config).encode(), cameras, 1, False)
         self._call("tracker_create", c.byref(given), c.byref(self._tracker))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import ClassVar, Literal, NamedTuple
@@ -45,9 +46,10 @@ class VitConfig(EstimatorConfig):
         mode: The sensors that are used.
         calibration: How it gets the calibration: by the ``interface``; from its own ``config``; or
             from files in the format of ``basalt``, ``openvins`` or ``kalibr`` (see ``export``).
-        patience: Real seconds that an image gets before the first pose, when the library may give
-            none and does not say so. It must be longer than the library takes for an image: a
-            pose that comes later marks the run as not reproducible.
+        patience: Real seconds that the first image gets, when the library may give no pose and
+            does not say so, and by which time stays behind real time up to the first pose. It must
+            be longer than the library takes for its start and an image: a first pose that comes
+            later marks the run as not reproducible.
         hold: How long simulated time waits for a pose, and what if none comes.
     """
 
@@ -57,6 +59,21 @@ class VitConfig(EstimatorConfig):
     calibration: Literal["interface", "config", "basalt", "openvins", "kalibr"] = "interface"
     patience: Duration = Duration(0.1)  # immutable
     hold: HoldConfig = HoldConfig(initialise=Duration(10.0))
+
+
+LEAST = 0.1
+"""Real seconds of patience that each image gets, if the setting has as many."""
+
+
+def patience_left(patience: float, image: float, now: float) -> float:
+    """Return the real seconds that an image gets for a first pose.
+
+    Args:
+        patience: As set.
+        image: Stamp of the image, seconds after that of the first.
+        now: Real seconds since the first image came.
+    """
+    return max(image + patience - now, min(patience, LEAST))
 
 
 class Vit(Estimator[VitConfig]):
@@ -79,7 +96,7 @@ class Vit(Estimator[VitConfig]):
         self.eyes = 2 if stereo else 1
         self.method = Path(self.config.library).stem.removeprefix("lib") or "VIT"
         self._hold: Hold[TrackingResult]
-        self._first: int | None = None
+        self._first: tuple[int, float] | None = None  # stamp and real time of the first image
         self._said = False
         self._pose = np.eye(4)
 
@@ -120,20 +137,20 @@ class Vit(Estimator[VitConfig]):
         hold, config = self._hold, self.config
         async for *images, samples in self.frames:
             stamp = self.exposed_at(images[0])
-            self._first = stamp if self._first is None else self._first
+            now = time.monotonic()
+            self._first = (stamp, now) if self._first is None else self._first
+            since, began = (stamp - self._first[0]) / 1e9, now - self._first[1]
             owed = hold.owe(stamp)
             self.start(self._deliver(images[0], owed))
-            early = not self._said and stamp - self._first < config.hold.initialise * 1e9
-            wait = float(config.patience if early else config.hold.max_wait)
+            early = not self._said and since < config.hold.initialise
+            wait = patience_left(config.patience, since, began) if early else config.hold.max_wait
             pixels = [image.data for image in images]
-            told = stamp, pixels, samples, wait if hold.expects else 0.0
+            told = stamp, pixels, samples, float(wait) if hold.expects else 0.0
             for of, result in await self._tracker.call(VitTracker.track, *told):
-                if not self._said and stamp - of > config.hold.tolerance_ns:
-                    hold.answers.why_not["its first pose came after its patience"] = None
                 self._said = True
-                hold.answer(of, result)
+                hold.answer(of, result, "lost" if result.lost else "")
             if early and not owed.work.done():
-                hold.answer(stamp, None)
+                hold.answer(stamp, None, "initialising")
 
     async def _deliver(self, image: Image, owed: Owed[TrackingResult]) -> None:
         """Publish the pose of an image; of one without, that it is lost."""

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from events import CameraAnnouncement, Event, Image, PoseEstimate, TrackingLost, TrackingRegained
 from nodes.vit import Vit
+from nodes.vit.node import patience_left
 from runtime.errors import NodeError, VisnavError
 from runtime.testing import run_nodes, spec
 from tests.nodes.estimation.conformance import Case, Record, run
@@ -112,7 +113,7 @@ def test_what_comes_after_its_patience_is_told(tmp_path: Path) -> None:
         duration=1.0,
     )
     assert result.of(PoseEstimate)
-    assert [*result.outside["est"].why_not] == ["its first pose came after its patience"]
+    assert [*result.outside["est"].why_not] == ["its first answer came too late to be held for"]
 
 
 def test_an_image_without_a_pose_is_lost_by_the_policy_of_the_hold(tmp_path: Path) -> None:
@@ -151,9 +152,25 @@ def test_a_library_that_crashes_is_an_error_with_its_signal(tmp_path: Path) -> N
 
 
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STUB_VERSION", "3")
-    with pytest.raises(NodeError, match=r"expected version 1 or 2 of the VIT.*, found 3\.0\.1"):
+    monkeypatch.setenv("STUB_VERSION", "4")
+    with pytest.raises(NodeError, match=r"expected version 1 to 3 of the VIT.*, found 4\.0\.1"):
         fly_stub(case())
+
+
+def test_the_third_version_has_the_same_structures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STUB_VERSION", "3")
+    record = fly_stub(case("delay 2"))
+    assert len(poses(record)) == len(record.flight.kinds)
+
+
+def test_patience_is_paid_once_and_not_for_every_image() -> None:
+    """With 5 s of it, 67 images without a pose (at 20 Hz) cost 12 s and not 5.5 minutes."""
+    now = 0.0
+    for number in range(67):
+        now += patience_left(5.0, number / 20, now)
+    assert now == pytest.approx(5.0 + 66 * 0.1)
+    assert patience_left(5.0, 1.0, 60.0) == 0.1  # whoever is late already gets some, too
+    assert patience_left(0.05, 1.0, 60.0) == 0.05
 
 
 @pytest.mark.parametrize(
