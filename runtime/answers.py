@@ -18,18 +18,19 @@ from typing import Literal, get_args
 import xxhash
 from typing_extensions import Buffer
 
-from runtime.digest import combined
+from runtime.digest import combined, fingerprint
 from runtime.errors import ConfigError
 from runtime.paths import source_file
 from runtime.schedule import SECOND
 from runtime.workers.costs import Costs
 
 Outcome = Literal["answered", "empty", "initialising", "skipped", "lost"]
-"""What became of a frame: answered; answered without content; not answered because the system was
-still initialising; skipped, as a later answer says; lost, as its time was over."""
+"""What became of a frame: answered; answered without content; still initialising, as the system
+says, or as it says nothing yet; skipped, as a later answer says; lost, as its time was over."""
 
-Wrong = Literal["late", "repeated", "unknown"]
-"""Answers that belong to no frame which waits: after its time, a second one, or of no frame."""
+Wrong = Literal["late", "repeated", "contradicting", "unknown"]
+"""Answers that belong to no frame which waits: after its time, a second one (or one that differs
+from the first), or of no frame."""
 
 COLUMNS = ("stamp_ns", "outcome", "latency_ms")
 FOLDER = "answers"
@@ -45,7 +46,7 @@ class Answers:
             way to say so.
         latency: Seconds declared from a frame to its answer; `None` if they vary.
         lost_allowed: How many frames may be lost.
-        why_not: Why an equal run might differ; empty if it would not.
+        why_not: Why an equal run might differ, whatever the system's own answers do.
         costs: What its answers cost, if its processes are known.
     """
 
@@ -62,6 +63,8 @@ class Answers:
         self._latencies = array("d")
         self._outcomes: list[Outcome] = []
         self._dues = array("q")
+        self._digests = array("Q")
+        self._says_lost = array("b")
         self._first: int | None = None
         self._initialised: int | None = None
         self._inputs: dict[str, xxhash.xxh3_128] = {}
@@ -73,14 +76,38 @@ class Answers:
             if self._first is None:
                 self._first = stamp
 
-    def settled(self, stamp: int, due: int, outcome: Outcome, latency: float = math.nan) -> None:
-        """Note what became of a frame that was due, and the real seconds that its answer took."""
+    @property
+    def says_lost(self) -> int:
+        """Answers that say that tracking is lost."""
+        return sum(self._says_lost)
+
+    def settled(
+        self,
+        stamp: int,
+        due: int,
+        outcome: Outcome,
+        latency: float = math.nan,
+        digest: int = 0,
+        says_lost: bool = False,
+    ) -> None:
+        """Note what became of a frame.
+
+        Args:
+            stamp: Of the frame (ns).
+            due: When its answer counts (ns).
+            outcome: What became of it.
+            latency: Real seconds that its answer took.
+            digest: Of what the answer holds.
+            says_lost: Whether it says that tracking is lost.
+        """
         with self._lock:
             self.counts[outcome] += 1
             self._stamps.append(stamp)
             self._latencies.append(latency)
             self._outcomes.append(outcome)
             self._dues.append(due)
+            self._digests.append(digest)
+            self._says_lost.append(says_lost)
             if outcome == "answered" and self._initialised is None:
                 self._initialised = stamp
 
@@ -91,9 +118,9 @@ class Answers:
         """
         with self._lock:
             kept = [n for n, due in enumerate(self._dues) if due <= now]
-            self._stamps = array("q", [self._stamps[n] for n in kept])
-            self._latencies = array("d", [self._latencies[n] for n in kept])
-            self._dues = array("q", [self._dues[n] for n in kept])
+            for name in ("_stamps", "_latencies", "_dues", "_digests", "_says_lost"):
+                column = getattr(self, name)
+                setattr(self, name, array(column.typecode, [column[n] for n in kept]))
             self._outcomes = [self._outcomes[n] for n in kept]
             for outcome in get_args(Outcome):
                 self.counts[outcome] = self._outcomes.count(outcome)
@@ -136,6 +163,12 @@ class Answers:
         with self._lock:
             digests = {name: each.hexdigest() for name, each in self._inputs.items()}
         return combined(digests) if digests else None
+
+    def outputs(self) -> str | None:
+        """Return the digest of all answers, by their frames' stamps; `None` if there were none."""
+        with self._lock:
+            rows = sorted(zip(self._stamps, self._outcomes, self._digests, strict=True))
+        return f"{fingerprint(rows):016x}" if rows else None
 
     def latency_quantiles(self, *quantiles: float) -> list[float | None]:
         """Return quantiles of the real seconds that answers took; `None` if there were none."""

@@ -32,10 +32,7 @@ class Digest:
     """
 
     def __init__(self) -> None:
-        self._encode_into = msgspec.msgpack.Encoder(
-            enc_hook=_encode_array,
-            order="deterministic",  # equal sets and mappings are encoded equally
-        ).encode_into
+        self._encode_into = _ENCODER.encode_into
         self._outputs: dict[str, _Output] = {}
 
     def __call__(self, sender: Sender[Any] | None, event: Event) -> None:
@@ -44,7 +41,7 @@ class Digest:
         Raises:
             ChannelTypeError: It holds an object that is no data.
         """
-        name = sender.name if sender else event.source.partition("/")[0] + ".announced"
+        name = self.name_of(sender, event)
         try:
             output = self._outputs[name]
         except KeyError:
@@ -61,6 +58,15 @@ class Digest:
         if len(pending) > _CHUNK:  # one call of the hash for many small events
             output.take_in()
 
+    @staticmethod
+    def name_of(sender: Sender[Any] | None, event: Event) -> str:
+        """Return the name of the output that an event belongs to."""
+        return sender.name if sender else event.source.partition("/")[0] + ".announced"
+
+    def mark(self, name: str) -> int:
+        """Return half of the fingerprint of an output's events so far, of 64 bits."""
+        return int(self._outputs[name].hexdigest()[:16], 16)
+
     def outputs(self) -> dict[str, str]:
         """Return the fingerprint of each output's events so far, 32 hexadecimal digits each."""
         return {name: output.hexdigest() for name, output in sorted(self._outputs.items())}
@@ -68,6 +74,12 @@ class Digest:
     def hexdigest(self) -> str:
         """Return the fingerprint of all events so far, 32 hexadecimal digits."""
         return combined(self.outputs())
+
+
+def fingerprint(data: Any) -> int:
+    """Return a fingerprint of data, arrays included, of 64 bits."""
+    found: int = xxhash.xxh3_64_intdigest(_ENCODER.encode(data))
+    return found
 
 
 def combined(outputs: Mapping[str, str]) -> str:
@@ -102,3 +114,7 @@ def _encode_array(value: Any) -> Any:
         return found
     shown = " ".join(f"{value!r:.80}".split())  # in one line
     raise TypeError(f"{shown} ({type(value).__name__})")
+
+
+# "deterministic": equal sets and mappings are encoded equally
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_encode_array, order="deterministic")

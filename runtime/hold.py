@@ -31,6 +31,7 @@ from typing_extensions import Buffer
 
 from runtime.answers import Answers, Outcome, Wrong, read_latencies
 from runtime.clock import Clock
+from runtime.digest import fingerprint
 from runtime.errors import MissingAnswerError
 from runtime.owed import LET_GO, Owed, future
 from runtime.paths import InputPath
@@ -129,7 +130,7 @@ class Hold(Generic[T]):
             self.answers.why_not["the clock is real"] = None
         self._changed = threading.Condition()
         self._owed: dict[int, Owed[T]] = {}  # by stamp, in the order of sending
-        self._settled: dict[int, Outcome] = {}
+        self._settled: dict[int, tuple[Outcome, int | None]] = {}  # and digest of the answer
         self._last: tuple[int, int] | None = None  # stamp and due of the newest frame
         self._began: tuple[int, float] | None = None  # stamp and real time of the first frame
         self._heard: float | None = None  # when it last answered anything
@@ -191,13 +192,19 @@ class Hold(Generic[T]):
         """Note frames that the system says it has received."""
         self.answers.got(count)
 
-    def answer(self, stamp: int, value: T | None) -> None:
+    def answer(
+        self, stamp: int, value: T | None, says: Literal["", "initialising", "lost"] = ""
+    ) -> None:
         """Take an answer.
 
         Args:
             stamp: Of the frame that it answers (ns).
-            value: What it holds; `None` if it is known only that there is no more to come.
+            value: What it holds, which is data; `None` if it is known only that there is no more
+                to come.
+            says: What it says of the system: nothing, that it still initialises, or that it has
+                lost track.
         """
+        digest = None if says == "initialising" else fingerprint(value)  # no answer yet
         with self._changed:
             if self._closed:
                 return
@@ -207,13 +214,18 @@ class Hold(Generic[T]):
             owed = self._match(stamp)
             if owed is None:
                 known = _nearest(stamp, self._settled, self.config.tolerance_ns)
-                before = None if known is None else self._settled[known]
+                before, earlier = (None, None) if known is None else self._settled[known]
                 kind: Wrong = "unknown"
-                if before is not None:
-                    kind = "repeated" if before in {"answered", "empty"} else "late"
+                if earlier is not None:
+                    same = value is None or digest == earlier  # no more to come, or the same
+                    kind = "repeated" if same else "contradicting"
+                elif before is not None:
+                    kind = "late"
                 self.answers.wrong(kind)
-                if before == "initialising":
-                    self._not_reproducible("its first answer came too late to be held for")
+                if kind == "contradicting":
+                    self._contradicted(stamp)
+                elif before == "initialising":
+                    self.doubt("its first answer came too late to be held for")
             if self._let_go:
                 self._log(f"{self.name}: it answers again")
             self._let_go, self._in_a_row = False, 0
@@ -224,7 +236,11 @@ class Hold(Generic[T]):
                     self._settle(self._owed[each], "initialising")
                 elif self._skips:
                     self._settle(self._owed[each], "skipped")
-            self._settle(owed, "empty" if value is None else "answered", value, now - owed.since)
+            outcome: Outcome = "empty" if value is None else "answered"
+            if says == "initialising":
+                outcome, value = "initialising", None
+            lost = says == "lost"
+            self._settle(owed, outcome, value, now - owed.since, digest, says_lost=lost)
 
     def gone(self, why: str) -> None:
         """Take note, at once, that the system is there no more.
@@ -258,6 +274,12 @@ class Hold(Generic[T]):
         """Raise an error in whoever waits for an answer, and with the next frame."""
         with self._changed:
             self._fail(error)
+
+    def doubt(self, why: str) -> None:
+        """Take note, and say in the log, why an equal run might differ."""
+        if why not in self.answers.why_not:
+            self._log(f"{self.name}: an equal run may differ: {why}")
+        self._not_reproducible(why)
 
     def close(self) -> None:
         """Watch no more, and take no answers; what is owed still stays so."""
@@ -305,13 +327,21 @@ class Hold(Generic[T]):
         return None if near is None else self._owed[near]
 
     def _settle(
-        self, owed: Owed[T], outcome: Outcome, value: T | None = None, seconds: float = float("nan")
+        self,
+        owed: Owed[T],
+        outcome: Outcome,
+        value: T | None = None,
+        seconds: float = float("nan"),
+        digest: int | None = None,
+        *,
+        says_lost: bool = False,
     ) -> None:
         del self._owed[owed.stamp]
-        self._settled[owed.stamp] = outcome
+        self._settled[owed.stamp] = outcome, digest
         while len(self._settled) > _REMEMBERED:
             del self._settled[next(iter(self._settled))]
-        self.answers.settled(owed.stamp, owed.due, outcome, seconds)
+        found = digest or 0
+        self.answers.settled(owed.stamp, owed.due, outcome, seconds, found, says_lost)
         (owed.work if owed.later is None else owed.later).set_result(value)
 
     def _release(self, owed: Owed[T]) -> None:
@@ -356,6 +386,15 @@ class Hold(Generic[T]):
         for owed in self._owed.values():
             (owed.work if owed.later is None else owed.later).set_exception(error)
         self._owed.clear()
+
+    def _contradicted(self, stamp: int) -> None:
+        """Take note of a second answer that differs: which one came first is up to real time."""
+        if self.answers.counts["contradicting"] == 1:
+            self._log(
+                f"{self.name}: expected one answer to the frame of {_seconds(stamp)}, found a "
+                "second one that differs (two that answer?): the first one counts"
+            )
+        self._not_reproducible("frames were answered twice, differently")
 
     def _not_reproducible(self, why: str) -> None:
         self.answers.why_not[why] = None

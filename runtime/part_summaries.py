@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import get_args
+from typing import Any, get_args
 
 import msgspec
 
@@ -111,20 +111,27 @@ class OutsideSummary(msgspec.Struct, frozen=True):
         sent: Frames that went out.
         received: Frames that the system confirmed; `None` if it cannot say.
         answered: Frames with an answer.
+        says_lost: Answers that say that tracking is lost, among those and the empty ones.
         empty: Frames with an answer that held nothing, such as no pose.
-        initialising: Frames without an answer, from before the first one, as was allowed.
+        initialising: Frames for which the system was still initialising: it said so, or had not
+            yet answered any, as was allowed.
         skipped: Frames that the system left out, as a later answer says.
         lost: Frames for which none came in time.
-        open: Frames on their way when the run ended.
+        open: Frames on their way when the run ended. `sent` is the sum of `answered`, `empty`,
+            `initialising`, `skipped`, `lost` and `open`.
         late: Answers to frames that were given up.
-        repeated: Second answers to a frame.
+        repeated: Second answers to a frame that say the same.
+        contradicting: Second answers to a frame that say something else.
         unknown: Answers whose stamp is no frame's.
         initialisation_s: From the first frame to the first that was answered.
         wall_p50_ms: Real time from a frame to its answer: median.
         wall_p99_ms: 99th percentile.
         inputs: Digest of all that the system was sent; equal if it got the same.
+        answers: Digest of all that it answered, each to its frame.
         reproducible: Whether an equal run gives the same, if the system answers the same.
         why_not: Why it may not.
+        repeats: Whether it has answered the same when run twice (``run --twice``); `None` if that
+            is unknown.
     """
 
     latency_ms: float | None
@@ -145,21 +152,29 @@ class OutsideSummary(msgspec.Struct, frozen=True):
     inputs: str | None
     reproducible: bool
     why_not: list[str]
+    says_lost: int = 0
+    contradicting: int = 0
+    answers: str | None = None
+    repeats: bool | None = None
 
     @classmethod
     def of(cls, answers: Answers) -> OutsideSummary:
         """Sum up what there is."""
-        counts = {name: answers.counts[name] for name in (*get_args(Outcome), *get_args(Wrong))}
+        counts: dict[str, Any] = {
+            name: answers.counts[name] for name in (*get_args(Outcome), *get_args(Wrong))
+        }
         p50, p99 = answers.latency_quantiles(0.5, 0.99)
         return cls(
             latency_ms=None if answers.latency is None else round(answers.latency * 1e3, 6),
             sent=answers.sent,
             received=answers.received,
+            says_lost=answers.says_lost,
             open=answers.sent - sum(counts[name] for name in get_args(Outcome)),
             initialisation_s=answers.initialisation,
             wall_p50_ms=None if p50 is None else p50 * 1e3,
             wall_p99_ms=None if p99 is None else p99 * 1e3,
             inputs=answers.inputs(),
+            answers=answers.outputs(),
             reproducible=not answers.why_not,
             why_not=list(answers.why_not),
             **counts,
@@ -170,17 +185,33 @@ class OutsideSummary(msgspec.Struct, frozen=True):
         return [
             *(f"{self.sent}", "–" if self.received is None else f"{self.received}"),
             *(str(each) for each in (self.answered, self.empty, self.initialising, self.skipped)),
-            *(str(each) for each in (self.lost, self.late, self.repeated, self.unknown)),
+            *(str(each) for each in (self.lost, self.open, self.says_lost, self.late)),
+            *(str(each) for each in (self.repeated, self.contradicting, self.unknown)),
             *(
                 "–" if each is None else f"{each:.3g}"
                 for each in (self.initialisation_s, self.latency_ms, self.wall_p50_ms)
             ),
             "yes" if self.reproducible else f"no: {'; '.join(self.why_not)}",
+            {True: "yes", False: "no", None: "unknown until run --twice"}[self.repeats],
         ]
+
+
+class TwiceSummary(msgspec.Struct, frozen=True):
+    """How a run compares with an equal one before; see `runtime.tools.twice`.
+
+    Attributes:
+        repeats: Whether all was the same.
+        first: Who differed first, the rig or a system outside, when, and by how much.
+        outputs: Those whose events differed.
+    """
+
+    repeats: bool
+    first: str = ""
+    outputs: list[str] = []
 
 
 OUTSIDE_COLUMNS = (
     *("sent", "received", "answered", "empty", "initialising", "skipped"),
-    *("lost", "late", "repeated", "of no frame"),
-    *("initialised s", "latency ms", "real p50 ms", "reproducible"),
+    *("no answer", "open", "says lost", "late", "repeated", "contradicting", "of no frame"),
+    *("initialised s", "latency ms", "real p50 ms", "inputs repeat", "answers repeat"),
 )

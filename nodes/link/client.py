@@ -39,7 +39,7 @@ GREETING = struct.Struct("<8sII")  # begins HELLO, WELCOME and REFUSED: magic, v
 MEMORY = struct.Struct("<Q")  # follows in WELCOME: size of the shared memory (bytes)
 FRAME_HEAD = struct.Struct("<QqII")  # sequence, stamp (ns), number of images, 0
 IMAGE_HEAD = struct.Struct("<IIIIIIQ")  # camera, kind, height, width, stride (bytes), 0, offset
-POSE_HEAD = struct.Struct("<QqIIII")  # sequence, stamp, status, covariance?, number of points, 0
+POSE_HEAD = struct.Struct("<QqIIII")  # sequence, stamp, status, what follows, number of points, 0
 DONE_BODY = struct.Struct("<Qq")  # sequence, stamp (ns)
 LONGEST, LONGEST_TEXT = 1 << 24, 4096  # bytes of a body; of a name, a reason, a line of the log
 
@@ -58,6 +58,7 @@ KINDS: dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]] = {
 
 STATUS = {"tracked": 0, "lost": 1, "initialising": 2}
 POSE_OF = {"camera": 0, "body": 1}
+COVARIANCE, VELOCITY = 1, 2  # what follows a pose
 
 
 class ProtocolError(ConnectionError):
@@ -222,6 +223,7 @@ class Link:
         pose: npt.ArrayLike,
         *,
         covariance: npt.ArrayLike | None = None,
+        velocity: npt.ArrayLike | None = None,
         points: npt.ArrayLike = (),
         inliers: npt.ArrayLike | None = None,
         status: str = "tracked",
@@ -232,7 +234,9 @@ class Link:
             frame: The frame.
             pose: Transform from the optical camera (or the body: see `ready`) to a frame that
                 stays the same, metres, shape (4, 4) or (3, 4).
-            covariance: Of x, y, z and the rotations about them, in that frame, shape (6, 6).
+            covariance: Of the pose's error: a shift along x, y, z and a rotation about them, all in
+                that frame, m², m rad and rad², shape (6, 6).
+            velocity: In that frame, metres per second, shape (3,).
             points: Features that were tracked: column and row, pixels, shape (n, 2).
             inliers: Which of them agree with the pose, shape (n,); all if not given.
             status: ``tracked``, ``lost`` or ``initialising``; only ``tracked`` has a pose.
@@ -241,8 +245,10 @@ class Link:
         xy = np.asarray(points, "<f4").reshape(-1, 2)
         flags = np.ones(len(xy), "u1") if inliers is None else np.asarray(inliers, bool)
         spread = b"" if covariance is None else np.asarray(covariance, "<f8").tobytes()
-        head = frame.sequence, frame.stamp, STATUS[status], int(bool(spread)), len(xy), 0
-        arrays = matrix.tobytes(), spread, xy.tobytes(), flags.tobytes()
+        speed = b"" if velocity is None else np.asarray(velocity, "<f8").tobytes()
+        follows = (COVARIANCE if spread else 0) | (VELOCITY if speed else 0)
+        head = frame.sequence, frame.stamp, STATUS[status], follows, len(xy), 0
+        arrays = matrix.tobytes(), spread, speed, xy.tobytes(), flags.tobytes()
         self._send(POSE, POSE_HEAD.pack(*head), *arrays)
 
     def lost(self, frame: Frame, points: npt.ArrayLike = ()) -> None:
@@ -290,8 +296,12 @@ def message(kind: int, *parts: bytes) -> bytes:
     return HEADER.pack(sum(map(len, parts)), kind) + b"".join(parts)
 
 
-def read_message(connection: socket.socket, head: bytes = b"") -> tuple[int, bytearray]:
+def read_message(connection: Any, head: bytes = b"") -> tuple[int, bytearray]:
     """Wait for a message, whose first bytes may be there, and return its type and body.
+
+    Args:
+        connection: A socket, or what has its `recv_into`.
+        head: The first bytes.
 
     Raises:
         EOFError: The other side has closed the connection.
@@ -304,7 +314,7 @@ def read_message(connection: socket.socket, head: bytes = b"") -> tuple[int, byt
     return kind, _exactly(connection, length)
 
 
-def _exactly(connection: socket.socket, size: int) -> bytearray:
+def _exactly(connection: Any, size: int) -> bytearray:
     data = bytearray(size)
     rest = memoryview(data)
     while rest:

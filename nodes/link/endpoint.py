@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import io
 import mmap
 import os
 import socket
@@ -24,7 +25,11 @@ import numpy.typing as npt
 from events.poses import inverse
 from nodes.link import client as wire
 from nodes.link.answers import LinkAnswer, LinkError, read_done, read_pose
+from runtime.workers.output import plain_lines
 from runtime.workers.shared_memory import anonymous_file
+
+_AT_ONCE = 1 << 16
+"""Bytes that are read together, should a program have much to say."""
 
 GREETING_TIME = 10.0
 """Real seconds that a connection has for HELLO."""
@@ -72,6 +77,14 @@ class _Program:
             self.connection.shutdown(socket.SHUT_RDWR)
 
 
+class _Stream(io.BufferedReader):
+    """What comes by a socket, read in large pieces."""
+
+    def recv_into(self, buffer: memoryview, _: int, __: int) -> int:
+        """Read as a socket does that waits for all."""
+        return self.readinto(buffer)
+
+
 class Endpoint:
     """Where one program at a time connects to a run.
 
@@ -86,7 +99,8 @@ class Endpoint:
         answered: Called with each answer, in the thread that reads.
         gone: Called once when the program is gone or is disconnected, with the reason; in the
             thread that reads. Not after `close`.
-        logged: Called with each line for the log, in the thread that reads.
+        logged: Called with each text for the log as it came, in the thread that reads: whatever
+            stands in it, and however many come.
         skips: Whether an answer frees the slots of all frames before its own, too.
     """
 
@@ -99,7 +113,7 @@ class Endpoint:
         slot_bytes: int,
         answered: Callable[[LinkAnswer], None],
         gone: Callable[[str], None],
-        logged: Callable[[str], None],
+        logged: Callable[[bytearray], None],
         skips: bool = False,
     ) -> None:
         self._path = path
@@ -268,7 +282,7 @@ class Endpoint:
         magic, version, _ = wire.GREETING.unpack_from(body.ljust(wire.GREETING.size, b"\0"))
         if kind != wire.HELLO or magic != wire.MAGIC:
             raise LinkError(f"expected HELLO with {wire.MAGIC!r}, found type {kind} with {magic!r}")
-        program.name = wire.text_of(body[wire.GREETING.size :]) or "a program without a name"
+        program.name = _in_a_line(body[wire.GREETING.size :]) or "a program without a name"
         if version != wire.VERSION:
             raise LinkError(f"expected version {wire.VERSION} of the protocol, found {version}")
         with self._changed:
@@ -285,12 +299,13 @@ class Endpoint:
 
     def _read(self, program: _Program) -> None:
         """Read until the program is gone."""
+        stream = _Stream(socket.SocketIO(program.connection, "r"), _AT_ONCE)
         while True:
-            kind, body = wire.read_message(program.connection)
+            kind, body = wire.read_message(stream)
             if kind == wire.BYE:
-                raise EOFError(f"it said goodbye {wire.text_of(body)}".rstrip())
+                raise EOFError(f"it said goodbye {_in_a_line(body)}".rstrip())
             if kind == wire.LOG:
-                self._logged(wire.text_of(body))
+                self._logged(body[: wire.LONGEST_TEXT])
             elif kind == wire.READY and not program.pose_of:
                 if body[4:] != bytes(4) or bytes(body[:4]) not in POSE_OF:
                     raise LinkError(f"READY.pose_of: expected 0 or 1, found {bytes(body)!r}")
@@ -314,13 +329,36 @@ class Endpoint:
             for other in [m for m in program.owed if m == n or (self._skips and m < n)]:
                 program.free.append(program.owed.pop(other)[1])
             self._changed.notify_all()
-        if (pose := answer.pose) is not None:
-            if program.pose_of == "body":
-                pose = pose @ self._body_from_camera
-            if program.origin is None:
-                program.origin = inverse(pose)
-            answer = msgspec.structs.replace(answer, pose=program.origin @ pose)
+        if answer.pose is not None:
+            answer = self._of_the_camera(program, answer, answer.pose)
         self._answered(answer)
+
+    def _of_the_camera(
+        self, program: _Program, answer: LinkAnswer, pose: npt.NDArray[np.float64]
+    ) -> LinkAnswer:
+        """Return an answer whose pose is the camera's, in the camera at the first pose."""
+        lever = np.zeros(3)  # from what the program has the pose of to the camera, in its frame
+        if program.pose_of == "body":
+            of_body, pose = pose, pose @ self._body_from_camera
+            lever = pose[:3, 3] - of_body[:3, 3]
+        if program.origin is None:
+            program.origin = inverse(pose)
+        turn, covariance, velocity = program.origin[:3, :3], answer.covariance, answer.velocity
+        if covariance is not None:
+            moved = np.zeros((6, 6))
+            moved[:3, :3] = moved[3:, 3:] = turn
+            moved[:3, 3:] = -turn @ np.cross(np.eye(3), lever)  # a rotation moves the camera
+            covariance = moved @ covariance @ moved.T
+        return msgspec.structs.replace(
+            answer,
+            pose=program.origin @ pose,
+            covariance=covariance,
+            velocity=None if velocity is None else turn @ velocity,
+        )
+
+
+def _in_a_line(text: bytearray) -> str:
+    return " ".join(plain_lines(text[: wire.LONGEST_TEXT])).rstrip()
 
 
 def _bound(path: Path) -> socket.socket:

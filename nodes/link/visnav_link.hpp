@@ -207,16 +207,18 @@ public:
         }
     }
 
-    // Answer a frame. The covariance is 6×6, of x, y, z and the rotations about them; points are
-    // columns and rows of tracked features, in turns; a missing inlier flag is 1.
+    // Answer a frame. The covariance is 6×6, of a shift along x, y, z and a rotation about them, the
+    // velocity in m/s, both in the frame of the poses; points are columns and rows of tracked
+    // features, in turns; a missing inlier flag is 1.
     void pose(const Frame& frame, const Pose& pose, Status status = Status::tracked,
               const std::vector<float>& points = {}, std::vector<std::uint8_t> inliers = {},
-              const double* covariance = nullptr) {
+              const double* covariance = nullptr, const double* velocity = nullptr) {
         const std::size_t count = points.size() / 2;
         inliers.resize(count, 1);
-        std::string body = answer(frame) + words(status, covariance != nullptr, count, 0);
+        std::string body = answer(frame) + words(status, (covariance ? 1 : 0) | (velocity ? 2 : 0), count, 0);
         append(body, pose.matrix.data(), sizeof pose.matrix);
         append(body, covariance, covariance ? 36 * sizeof(double) : 0);
+        append(body, velocity, velocity ? 3 * sizeof(double) : 0);
         append(body, points.data(), 2 * count * sizeof(float));
         append(body, inliers.data(), count);
         send(32, body);

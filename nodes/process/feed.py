@@ -105,7 +105,8 @@ class Feed:
             self.unanswered.pop(stamp, None)
         self._initialised = self._initialised or answer.pose is not None
         useful = answer.pose is not None or (answer.status == "lost" and self._initialised)
-        self._hold.answer(answer.stamp, answer if useful else None)
+        says = answer.status if answer.status in ("initialising", "lost") else ""
+        self._hold.answer(answer.stamp, answer if useful else None, says)
 
     def _lose(self, why: str) -> None:
         """Take note that the program is gone, and of another that takes its place."""

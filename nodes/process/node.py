@@ -31,6 +31,7 @@ from runtime.bundles import Field, Matcher, Slot
 from runtime.hold import Hold
 from runtime.owed import Owed
 from runtime.streams import Stream
+from runtime.workers.output import Throttle
 
 _BEYOND = 64
 """Frames beyond its slots that wait for a program without which a run in lockstep goes on."""
@@ -63,6 +64,8 @@ class Process(Estimator[ProcessConfig]):
     its exit code and last lines are in the error, and `hold` says what becomes of the run.
     """
 
+    starts_programs = True
+
     def __init__(self) -> None:
         config = self.config
         self.needs = frozenset(config.images)
@@ -80,6 +83,7 @@ class Process(Estimator[ProcessConfig]):
         found = (s.config for s in self.siblings(Node) if isinstance(s.config, PublishingConfig))
         self._bridge = next((each for each in found if hasattr(each, "domain_id")), None)
         folder = None if self.out is None else self.out / "programs" / self.name
+        self._show = Throttle(lambda line: self.log.info("%s", line))
         self._launch = Launch(config, self._bridge if config.feed == "ros2" else None, folder)
 
     # Before the run.
@@ -100,11 +104,13 @@ class Process(Estimator[ProcessConfig]):
             return
         if missing := self._launch.missing("build", command):
             raise ProgramError(missing)
-        build = self._launch.start(command, lambda line: self.log.info("build: %s", line))
+        show = Throttle(lambda line: self.log.info("build: %s", line))
+        build = self._launch.start(command, show)
         try:
             await self.offload(build.wait)
         finally:  # of a run that is to end, too
             build.leave()
+            show.end()
         if build.code != 0:
             raise ProgramError(f"build: {' '.join(command)} {build.story()}")
 
@@ -212,7 +218,7 @@ class Process(Estimator[ProcessConfig]):
             skips=config.hold.skips == "allowed" or real,
             slots=slots,
             slot_bytes=pixels * sum(KINDS[kind][1] for kind in config.images),
-            logged=self._show,
+            logged=self._show.take,
         )
 
     # In the run.
@@ -256,7 +262,8 @@ class Process(Estimator[ProcessConfig]):
         lost = answer.pose is None
         self._pose = self._pose if answer.pose is None else answer.pose
         reason = "the program says so" if lost else ""
-        self.publish(image, TrackingResult(self._pose, lost, reason, answer.points, answer.inliers))
+        found = answer.points, answer.inliers, answer.velocity, answer.covariance
+        self.publish(image, TrackingResult(self._pose, lost, reason, *found))
 
     # After the run.
 
@@ -278,15 +285,13 @@ class Process(Estimator[ProcessConfig]):
             if self._connected and self._program.wait(self.config.grace) and self._program.code:
                 self.log.warning("%s %s", self.config.command[0], self._program.story())
             self._program.close()
+        self._show.end()
         self._launch.close()
 
     # What is known of the program, in any thread.
 
     def _processes(self) -> list[int]:
         return [] if self._program is None else self._program.processes()
-
-    def _show(self, line: str) -> None:
-        self.log.info("%s", line)
 
     def _note_end(self, story: str) -> None:
         """Take note that the program has ended by itself."""

@@ -10,13 +10,11 @@ import subprocess
 import sys
 import threading
 import time
+import tty
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from runtime.workers.output import Output, how_it_ended
-
-LINES = 100
-"""Lines a (real) second that are handed on; what is printed beyond is counted."""
 
 _AT_ONCE = 1 << 16
 """Bytes that are read together."""
@@ -38,7 +36,8 @@ class Program:
         folder: Working folder.
         environment: All variables.
         grace: Seconds that it may take to end once it gets SIGTERM.
-        printed: Called in a thread with lines that it prints, at most `LINES` a second.
+        printed: Called in a thread with each line that it prints, at once: it writes to a terminal
+            of its own, so that no library keeps its output back.
         ended: Called in a thread, at once, when it has ended by itself, with how and what it last
             printed.
 
@@ -61,21 +60,21 @@ class Program:
     ) -> None:
         self.code: int | None = None
         self._grace = grace
-        self._printed, self._ended = printed, ended
-        self._output = Output(self._show)
-        self._second, self._shown = 0, 0
+        self._ended = ended
+        self._output = Output(printed)
         self._closing = False
         self._over = threading.Event()
         self._how = ""
         self._control, theirs = socket.socketpair()
         guard = [sys.executable, "-I", "-S", str(Path(__file__).with_name("guard.py"))]
-        with theirs:
+        self._terminal, prints = _terminal()
+        with theirs, os.fdopen(prints, "wb", buffering=0) as stdout:
             self._guard = subprocess.Popen(  # noqa: S603  # what the user's file says
                 [*guard, str(theirs.fileno()), str(grace), *command],
                 cwd=folder,
                 env=environment,
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
+                stdout=stdout,
                 stderr=subprocess.STDOUT,
                 pass_fds=(theirs.fileno(),),
                 process_group=0,  # so that a terminal's Ctrl-C does not reach it
@@ -116,8 +115,7 @@ class Program:
 
     def _watch(self) -> None:
         """Read what it prints, and note its end, until its guard has gone."""
-        assert self._guard.stdout is not None
-        output, control = self._guard.stdout.fileno(), self._control.fileno()
+        output, control = self._terminal, self._control.fileno()
         news = select.poll()
         news.register(output, select.POLLIN)
         news.register(control, select.POLLIN)
@@ -131,14 +129,15 @@ class Program:
                 told += more
                 if not self._over.is_set() and (told.endswith(b"\n") or not more):
                     self._note_end(output, told.decode().strip())
-        self._guard.stdout.close()
+        os.close(output)
         self._guard.wait()
         self._control.close()
         self._output.end()
-        self._say_how_many_more()
 
     def _read(self, output: int) -> bool:
-        data = os.read(output, _AT_ONCE)
+        data = b""
+        with contextlib.suppress(OSError):  # a terminal that nobody writes to any more
+            data = os.read(output, _AT_ONCE)
         self._output.take(data)
         return bool(data)
 
@@ -155,15 +154,15 @@ class Program:
         if not self._closing:
             self._ended(self.story())
 
-    def _show(self, line: str) -> None:
-        """Hand a line on, unless there were too many within a second."""
-        if (second := int(time.monotonic())) != self._second:
-            self._say_how_many_more()
-            self._second, self._shown = second, 0
-        self._shown += 1
-        if self._shown <= LINES:
-            self._printed(line)
 
-    def _say_how_many_more(self) -> None:
-        if self._shown > LINES:
-            self._printed(f"({self._shown - LINES} more lines)")
+def _terminal() -> tuple[int, int]:
+    """Return both ends of a terminal without a keyboard, or of a pipe if there is none to be had.
+
+    What is written to it arrives as it is, and is not echoed.
+    """
+    try:
+        ours, theirs = os.openpty()
+    except OSError:
+        return os.pipe()
+    tty.setraw(theirs)
+    return ours, theirs

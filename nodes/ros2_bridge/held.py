@@ -69,6 +69,7 @@ class HeldEstimator:
         self._sequences: dict[bytes, int] = {}  # by GID
         self._there: dict[str, None] = {}  # tokens of its publishers
         self._came = self._gone = False
+        self._answerers: set[bytes] = set()  # GIDs
 
     def follow(self, session: Session) -> None:
         """Take its answers from now on, and note when it comes and goes; may wait."""
@@ -96,6 +97,7 @@ class HeldEstimator:
         self._owed = image.stamp
         if self._gone and not self.missing(matched()):
             self._gone = False
+            self._answerers.clear()
             self.hold.back()
         return self.hold.owe(image.stamp)
 
@@ -122,6 +124,10 @@ class HeldEstimator:
             incoming.complain("message repeated", f"number {number} again")
             return False
         self._sequences[attached.gid] = number
+        if incoming is self._topics[0]:
+            self._answerers.add(attached.gid)
+            if len(self._answerers) > 1:
+                self.hold.doubt(f"several publishers answer at {incoming.topic.name}")
         if number > expected:
             raise MissingAnswerError(
                 f"{self.hold.name}: {incoming.topic.name}: expected message {expected} of its "

@@ -3,14 +3,85 @@
 from __future__ import annotations
 
 import collections
+import re
 import signal
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterable
 
 _LONGEST = 4096
 """Bytes of a line; a longer one is cut into several."""
 
 _KEPT = 20
 """Lines that are told of a process that has ended."""
+
+LINES = 100
+"""Lines a (real) second of one process that are handed on; what is beyond is counted."""
+
+# A lone carriage return, as of a progress bar, ends a line, too; the next byte may be its "\n".
+_LINE_END = re.compile(rb"\r?\n|\r(?!\Z)")
+
+_ESCAPES = re.compile(
+    r"\x1b\[[0-?]*[ -/]*[@-~]"  # colours, moves of the cursor
+    r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)?"  # titles
+    r"|\x1b[ -/]*[0-~]?|[^\t\x20-\x7e\xa0-\U0010ffff]"  # all else that controls
+)
+
+
+def plain_lines(data: bytes | bytearray) -> Iterable[str]:
+    """Yield text of another process in lines of bounded length, without what controls terminals."""
+    for line in _LINE_END.split(data.removesuffix(b"\r")):
+        for begin in range(0, max(len(line), 1), _LONGEST):
+            text = line[begin : begin + _LONGEST].decode(errors="replace")
+            if text.isprintable():
+                yield text.rstrip()
+                continue
+            yield " ".join(_ESCAPES.sub("", text).splitlines()).rstrip()
+
+
+class Throttle:
+    """Hands on lines from any thread, at most `LINES` a second, and says how many more there were.
+
+    Args:
+        printed: Called with each line.
+        now: Real seconds.
+    """
+
+    def __init__(
+        self, printed: Callable[[str], None], now: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._printed, self._now = printed, now
+        self._lock = threading.Lock()
+        self._second, self._shown = 0, 0
+
+    def __call__(self, line: str) -> None:
+        """Hand a line on, unless there were too many within a second."""
+        with self._lock:
+            if (second := int(self._now())) != self._second:
+                self._say_how_many_more()
+                self._second, self._shown = second, 0
+            self._shown += 1
+            if self._shown <= LINES:
+                self._printed(line)
+
+    def take(self, text: bytes | bytearray) -> None:
+        """Hand the lines of a text on, or count them, which costs little."""
+        with self._lock:
+            if self._shown > LINES and int(self._now()) == self._second:
+                self._shown += text.count(b"\n") + 1
+                return
+        for line in plain_lines(text):
+            self(line)
+
+    def end(self) -> None:
+        """Say how many lines were left out at last."""
+        with self._lock:
+            self._say_how_many_more()
+            self._shown = 0
+
+    def _say_how_many_more(self) -> None:
+        if self._shown > LINES:
+            self._printed(f"({self._shown - LINES} more lines)")
 
 
 class Output:
@@ -27,8 +98,8 @@ class Output:
 
     def take(self, data: bytes) -> None:
         """Take what was read."""
-        *lines, begun = (self._begun + data).split(b"\n")
-        while len(begun) > _LONGEST:
+        *lines, begun = _LINE_END.split(self._begun + data)
+        while len(begun.removesuffix(b"\r")) > _LONGEST:
             lines.append(begun[:_LONGEST])
             begun = begun[_LONGEST:]
         self._begun = begun
@@ -48,9 +119,9 @@ class Output:
         return f"{what}; its last output:\n" + "\n".join(self._last)
 
     def _take_line(self, line: bytes) -> None:
-        text = line.decode(errors="replace").rstrip()
-        self._last.append(text)
-        self._printed(text)
+        for text in plain_lines(line):
+            self._last.append(text)
+            self._printed(text)
 
 
 def how_it_ended(code: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
 import random
 import threading
 from collections.abc import Callable, Coroutine
@@ -18,6 +19,7 @@ from runtime.answers import Answers
 from runtime.errors import MissingAnswerError
 from runtime.hold import BEHIND, IN_A_ROW, Hold, HoldConfig
 from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.part_summaries import OUTSIDE_COLUMNS, OutsideSummary
 from runtime.real_clock import RealClock
 from runtime.testing import run_in_lockstep
 from runtime.units import Duration
@@ -406,3 +408,107 @@ async def test_in_real_time_nothing_is_held_and_skips_are_counted() -> None:
 
 async def _value(owed: Any) -> Any:
     return await owed
+
+
+class TestSums:
+    """What became of the frames adds up, whatever happens."""
+
+    @settings(max_examples=60, deadline=None)
+    @given(
+        st.lists(st.sampled_from(["owe", "answer", "twice", "empty", "says", "lost", "wait",
+                                  "gone", "back", "stranger"]), max_size=40),
+        st.sampled_from(["refused", "allowed"]),
+        st.sampled_from(["lost", "continue", "error"]),
+        st.sampled_from([0.0, 0.1, 10.0]),
+        st.integers(0, 2**16),
+    )  # fmt: skip
+    def test_what_was_sent_is_what_became_of_it(
+        self, acts: list[str], skips: str, on_missing: str, initialise: float, seed: int
+    ) -> None:
+        dice, wall = random.Random(seed), Wall()
+
+        async def main() -> Hold[str]:
+            config = {"skips": skips, "on_missing": on_missing, "initialise": Duration(initialise)}
+            loop = asyncio.get_running_loop()
+            hold = hold_in(loop, wall, 0.04, **config)
+            stamps = [0]
+            for act in acts:
+                stamp = dice.choice(stamps)
+                match act:
+                    case "owe":
+                        stamps.append(stamps[-1] + PERIOD)
+                        with contextlib.suppress(MissingAnswerError):
+                            hold.owe(stamps[-1])
+                        await asyncio.sleep(0.033)
+                    case "answer" | "twice":
+                        hold.answer(stamp, act)
+                        if act == "twice":
+                            hold.answer(stamp, "something else")
+                    case "empty":
+                        hold.answer(stamp, None)
+                    case "says":
+                        hold.answer(stamp, None, "initialising")
+                    case "lost":
+                        hold.answer(stamp, "lost", "lost")
+                    case "wait":
+                        wall.seconds += dice.choice([0.5, 11.0])
+                        hold.look()
+                    case "gone":
+                        hold.gone("killed")
+                    case "back":
+                        hold.back()
+                    case "stranger":
+                        hold.answer(stamp + 7_000_000, "of no frame")
+            hold.close()
+            return hold
+
+        found = OutsideSummary.of(run_in_lockstep(main()).answers)
+        parts = (found.answered, found.empty, found.initialising, found.skipped, found.lost)
+        assert found.sent == sum(parts) + found.open
+        assert min(*parts, found.open) >= 0
+        assert found.says_lost <= found.answered + found.empty
+        shown = dict(zip(OUTSIDE_COLUMNS, found.row(), strict=True))
+        columns = ("answered", "empty", "initialising", "skipped", "no answer", "open")
+        assert int(shown["sent"]) == sum(int(shown[column]) for column in columns)
+
+    def test_what_it_says_of_itself_is_counted(self) -> None:
+        def act(hold: Hold[str], wall: Wall, number: int) -> None:
+            says: Any = {0: "initialising", 3: "lost"}.get(number, "")
+            hold.answer(number * PERIOD, None if says == "initialising" else "pose", says)
+
+        came, hold = fly(act)
+        assert [value for _, value in came] == [None, "pose", "pose", "pose", "pose"]
+        assert hold.answers.counts == {"initialising": 1, "answered": 4}
+        assert hold.answers.says_lost == 1
+
+
+class TestTwoAnswers:
+    @pytest.mark.parametrize(("second", "why"), [("0", []), ("1", ["frames were answered twice"])])
+    def test_a_second_answer_that_differs_is_told(self, second: str, why: list[str]) -> None:
+        """Of two systems at one topic, the quicker one decides: no equal run is promised."""
+
+        def act(hold: Hold[str], wall: Wall, number: int) -> None:
+            hold.answer(number * PERIOD, "0")
+            hold.answer(number * PERIOD, second)
+
+        came, hold = fly(act)
+        assert {value for _, value in came} == {"0"}
+        kind = "contradicting" if why else "repeated"
+        assert hold.answers.counts == {"answered": 5, kind: 5}
+        assert [each.partition(",")[0] for each in hold.answers.why_not] == why
+        assert OutsideSummary.of(hold.answers).reproducible is not bool(why)
+
+    def test_one_that_says_that_no_more_is_to_come_contradicts_nothing(self) -> None:
+        def act(hold: Hold[str], wall: Wall, number: int) -> None:
+            answer_all(hold, wall, number)
+            hold.answer(number * PERIOD, None)
+
+        _, hold = fly(act)
+        assert hold.answers.counts == {"answered": 5, "repeated": 5}
+        assert not hold.answers.why_not
+
+    def test_the_digest_of_answers_is_that_of_each_to_its_frame(self) -> None:
+        def digest(value: str) -> str | None:
+            return fly(lambda hold, _, n: hold.answer(n * PERIOD, value))[1].answers.outputs()
+
+        assert digest("a") == digest("a") != digest("b")

@@ -46,13 +46,14 @@ def run_tables(summary: Summary) -> Iterator[Table]:
         workers.add_row(name, *(row[k] for k in columns))
     if workers.row_count:
         yield _numbers(workers)
-    # The eight of its columns for which a terminal has room.
+    # The columns for which a terminal has room: first what together makes all that was sent.
     title = "systems outside the process: frames"
-    names = ("system", "sent", "answered", "init", "skipped", "lost", "late", "real ms", "repeats")
-    outside = Table(*names, title=title)
+    names = ("sent", "answered", "empty", "init", "skipped", "no answer", "open", "real ms")
+    shown = (0, 2, 3, 4, 5, 6, 7, 15, 16, 17)
+    outside = Table("system", *names, "inputs repeat", "answers repeat", title=title)
     for name, system in sorted(summary.outside.items()):
         row = system.row()
-        outside.add_row(name, *(row[k] for k in (0, 2, 4, 5, 6, 7, 12, 13)))
+        outside.add_row(name, *(row[k] for k in shown))
     if outside.row_count:
         yield _numbers(outside)
     stalls = Table("node", "times", "longest ms", "where", title="the loop stood still")

@@ -24,11 +24,12 @@ int main() try {
         for (const visnav::Imu& sample : frame->imu)
             imu += double(sample.stamp) + sample.angular_velocity[2] + sample.linear_acceleration[0];
         std::vector<double> covariance(36);
+        const double velocity[3] = {double(frame->sequence), 2, 3};
         std::iota(covariance.begin(), covariance.end(), double(frame->sequence));
         switch (frame->sequence % 4) {
         case 0: link.pose(*frame, visnav::Pose::from_quaternion(colours, depths, imu, 0, 0, 0, 2)); break;
         case 1: link.pose(*frame, visnav::Pose::from_quaternion(colours, depths, imu, 0.5, 0.5, 0.5, 0.5),
-                          visnav::Link::Status::tracked, {1, 2, 3, 4}, {1, 0}, covariance.data()); break;
+                          visnav::Link::Status::tracked, {1, 2, 3, 4}, {1, 0}, covariance.data(), velocity); break;
         case 2: frame->sequence % 8 == 2 ? link.lost(*frame) : link.initialising(*frame); break;
         default: link.done(*frame);
         }

@@ -39,6 +39,7 @@ def main() -> None:
                     frame,
                     pose[:3],
                     covariance=covariance,
+                    velocity=[frame.sequence, 2, 3],
                     points=[[1, 2], [3, 4]],
                     inliers=[1, 0],
                 )

@@ -15,6 +15,7 @@ import numpy as np
 
 from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
 from nodes.link import Endpoint, LinkAnswer, describe
+from runtime.workers.output import plain_lines
 
 HEADER_PATH = Path(__file__).parents[3] / "nodes" / "link"
 LIMIT = 40.0
@@ -60,9 +61,13 @@ class Noted:
             slot_bytes=8 * 6 * 7,
             answered=self.answers.put,
             gone=self.gone.put,
-            logged=self.logs.put,
+            logged=self._log,
             **settings,
         )
+
+    def _log(self, text: bytearray) -> None:
+        for line in plain_lines(text):
+            self.logs.put(line)
 
     def answer(self) -> LinkAnswer:
         return self.answers.get(timeout=LIMIT)

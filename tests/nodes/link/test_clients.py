@@ -80,6 +80,8 @@ def test_frames_and_answers(mirror: list[str], tmp_path: Path) -> None:
                 assert answer.pose[:3, :3].tolist() == [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
                 assert answer.covariance is not None
                 assert answer.covariance.ravel().tolist() == [n + k for k in range(36)]
+                assert answer.velocity is not None
+                assert answer.velocity.tolist() == [n, 2, 3]
                 assert answer.points.tolist() == [[1, 2], [3, 4]]
                 assert answer.inliers.tolist() == [True, False]
             else:

@@ -142,11 +142,12 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
     assert frame.imu["linear_acceleration"].tolist() == [[4, 5, 6]]
 
     full, lost, done, log = sent[2:]
-    assert struct.unpack_from("<QqIIII", full) == (0, 77, 0, 1, 2, 0)
+    assert struct.unpack_from("<QqIIII", full) == (0, 77, 0, 3, 2, 0)
     assert struct.unpack_from("<12d", full, 32) == (1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0)
     assert struct.unpack_from("<36d", full, 128) == tuple(range(36))
-    assert struct.unpack_from("<4f", full, 128 + 288) == (1, 2, 3, 4)
-    assert full[128 + 288 + 16 :] == b"\1\0"
+    assert struct.unpack_from("<3d", full, 128 + 288) == (7, 8, 9)
+    assert struct.unpack_from("<4f", full, 128 + 312) == (1, 2, 3, 4)
+    assert full[128 + 312 + 16 :] == b"\1\0"
     assert struct.unpack_from("<QqIIII", lost) == (0, 77, 1, 0, 0, 0)
     assert len(lost) == 128
     assert done == struct.pack("<Qq", 0, 77)
@@ -154,10 +155,8 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
 
 
 def _answer(link: Link, frame: Any) -> bool:
-    covariance = np.arange(36).reshape(6, 6)
-    link.pose(
-        frame, np.eye(4), covariance=covariance, points=[[1, 2], [3, 4]], inliers=[True, False]
-    )
+    sure: dict[str, Any] = {"covariance": np.arange(36).reshape(6, 6), "velocity": [7, 8, 9]}
+    link.pose(frame, np.eye(4), points=[[1, 2], [3, 4]], inliers=[True, False], **sure)
     link.lost(frame)
     link.done(frame)
     link.log("grüße")
@@ -195,7 +194,7 @@ def test_an_answer_that_is_changed_anywhere_is_read_or_named(data: st.DataObject
         (pose(0, 0)[:-1], "POSE: expected 128 bytes"),
         (pose(0, 0) + b"\0", "POSE: expected 128 bytes for 0 points, found 129"),
         (pose(0, 0, status=3), "POSE.status"),
-        (struct.pack("<QqIIII", 0, 0, 0, 2, 0, 0) + bytes(96), "POSE.has_covariance"),
+        (struct.pack("<QqIIII", 0, 0, 0, 4, 0, 0) + bytes(96), "POSE.follows"),
         (struct.pack("<QqIIII", 0, 0, 0, 0, 2**32 - 1, 0) + bytes(96), "4294967295 points"),
         (pose(0, 0, np.full((4, 4), np.nan)), "POSE.pose: expected finite"),
         (pose(0, 0, np.zeros((4, 4))), "POSE.pose: expected a rotation"),

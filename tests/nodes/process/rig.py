@@ -20,6 +20,7 @@ from events import (
     Image,
     Imu,
     ImuAnnouncement,
+    Odometry,
     VehicleAnnouncement,
 )
 from nodes.estimation import Estimator, RgbdFrame, TrackingResult
@@ -44,6 +45,7 @@ class EyesConfig(NodeConfig):
     rate: float = 30.0
     leaves_out: tuple[int, ...] = ()
     inertial: bool = True
+    truth: bool = False
 
 
 class Eyes(Node[EyesConfig]):
@@ -52,6 +54,7 @@ class Eyes(Node[EyesConfig]):
     frames = Output(Image)
     depth = Output(DepthImage)
     samples = Output(Imu)
+    poses = Output(Odometry)
     count = 0
 
     def announce(self) -> list[Announcement]:
@@ -109,6 +112,15 @@ class Eyes(Node[EyesConfig]):
     @every(hz="rate")
     def see(self, tick: Tick) -> None:
         stamp, number = self.clock.now(), self.count
+        if self.config.truth:
+            still: dict[str, Any] = dict.fromkeys(
+                ("linear_velocity", "angular_velocity"), (0.0,) * 3
+            )
+            pose: dict[str, Any] = {
+                "position": (1.0, 2.0, -0.1),
+                "orientation": (1.0, 0.0, 0.0, 0.0),
+            }
+            self.poses.send(Odometry(stamp=stamp, source="drone", **pose, **still))
         self.count += 1
         for eye, name in enumerate(self.config.cameras):
             if number in self.config.leaves_out and eye == len(self.config.cameras) - 1:

@@ -45,13 +45,21 @@ def main() -> None:
         sys.exit("no vocabulary")
     held: list[Frame] = []
     with Link("stub") as link:
-        link.ready()
+        link.ready("body" if "sure" in modes else "camera")
         for frame in link:
             number = frame.sequence
             if "log" in modes:
                 link.log(f"imu {len(frame.imu)} {frame.imu['stamp'].tolist()}")
             if "flood" in modes:
                 print("x" * 200 + "\n" * 500, flush=True)
+            if "spies" in modes:  # wherever it was told of, and in the run's folder
+                told = [Path(each) for name, each in os.environ.items() if "VISNAV" in name]
+                places = {*told, Path(os.environ["VISNAV_FOLDER"]).parents[1]}
+                found = [str(file) for place in places for file in place.rglob("*.tum")]
+                link.log(f"spied: {found or 'nothing'}")
+            if "logs" in modes and number == 5:
+                for n in range(int(modes["logs"])):
+                    link.log(f"\x1b[31m{n}\nmore")
             if "burns" in modes:
                 until = time.process_time() + float(modes["burns"])
                 while time.process_time() < until:
@@ -72,6 +80,15 @@ def main() -> None:
                     for each in reversed(held):
                         link.pose(each, pose_of(each))
                     held.clear()
+            elif "unsteady" in modes and number == 5:  # as threads make a system
+                pose = pose_of(frame)
+                pose[0, 3] = 1e-12 * os.getpid()
+                link.pose(frame, pose)
+            elif "sure" in modes:  # in a world of its own: a quarter of a turn about z
+                pose = np.eye(4)[[1, 0, 2, 3]] * [[-1.0], [1.0], [1.0], [1.0]]
+                pose[:3, 3] = (5.0, 6.0, 7.0 + number)
+                spread = np.diag([1.0, 2, 3, 4, 5, 6]) * 1e-4
+                link.pose(frame, pose, covariance=spread, velocity=[0.1, 0.2, 0.3])
             elif "skips" in modes and number % 3:
                 if modes["skips"] == "done":
                     link.done(frame)

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.process.program import LINES, Program
-from runtime.workers.output import Output, how_it_ended
+from nodes.process.program import Program
+from runtime.workers.output import LINES, Output, Throttle, how_it_ended, plain_lines
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -199,14 +199,49 @@ def test_a_run_that_is_killed_leaves_nothing_behind() -> None:
     assert gone_soon(daemon)
 
 
-def test_a_flood_is_read_and_counted_but_not_logged(start: type[Started]) -> None:
+def test_a_flood_is_counted_but_not_logged() -> None:
+    found: list[str] = []
+    seconds = iter([*[5.0] * 150, *[6.9] * 20, *[7.0] * 101])
+    limited = Throttle(found.append, lambda: next(seconds))
+    for _ in range(271):
+        limited("x")
+    limited.end()
+    limited.end()
+    assert found == ["x"] * LINES + ["(50 more lines)"] + ["x"] * (20 + LINES) + ["(1 more lines)"]
+
+
+def test_all_of_a_flood_is_read(start: type[Started]) -> None:
     it = start(*python("import os\nfor n in range(200): os.write(1, b'x' * 99 + b'\\n' * 1000)"))
     it.program.wait()
     it.program.close()
-    seconds = 1 + sum(1 for line in it.lines if line.endswith("more lines)"))
-    assert len(it.lines) <= (LINES + 1) * seconds
-    told = sum(int(line[1:].split()[0]) for line in it.lines if line.endswith("more lines)"))
-    assert told + sum(1 for line in it.lines if not line.endswith("more lines)")) == 200_000
+    assert len(it.lines) == 200_000
+
+
+def test_lines_come_when_they_are_printed(start: type[Started]) -> None:
+    """A library's output is not kept back in blocks: it is a terminal that it is printed to."""
+    it = start(*python("import sys, time\nprint('init', sys.stdout.isatty())\ntime.sleep(600)"))
+    assert it.wait_for_line() == "init True"
+
+
+@pytest.mark.parametrize(
+    ("printed", "lines"),
+    [
+        (b"\x1b[1;32mready\x1b[0m\n", ["ready"]),
+        (b"\x1b]0;title\x07a\x1b[2J\x1b[H\x07b\x00\n", ["ab"]),
+        (b"1 %\r2 %\r100 %\r\ndone\r\n", ["1 %", "2 %", "100 %", "done"]),
+        ("gr\u00fc\u00dfe\x85\u2028wide \u98db\n".encode(), ["gr\u00fc\u00dfe wide \u98db"]),
+        (b"\xff\x9b31m\n", ["\ufffd\ufffd31m"]),
+        (b"x" * 5000 + b"\n", ["x" * 4096, "x" * 904]),
+    ],
+)
+def test_what_controls_a_terminal_is_left_out(printed: bytes, lines: list[str]) -> None:
+    found: list[str] = []
+    output = Output(found.append)
+    for byte in printed:
+        output.take(bytes([byte]))
+    output.end()
+    assert found == lines
+    assert [*plain_lines(printed.removesuffix(b"\n"))] == lines
 
 
 @given(st.lists(st.binary(max_size=3000), max_size=20))
@@ -220,8 +255,7 @@ def test_lines_are_the_same_however_they_arrive(pieces: list[bytes]) -> None:
         return found
 
     whole = b"".join(pieces)
-    if all(len(line) <= 4096 for line in whole.split(b"\n")):
-        assert lines(pieces) == lines([whole])
+    assert lines(pieces) == lines([whole])
     assert "".join(lines(pieces)) or not whole.strip()
 
 

@@ -271,6 +271,6 @@ def test_a_system_that_lost_frames_is_told_at_the_top_and_in_a_table(tmp_path: P
     (tmp_path / "summary.json").write_bytes(msgspec.json.encode(written))
     page = Page(write_report(tmp_path, formats=()))
     assert "failed slam (answers) lost_frames: expected at most 0, found 1" in page.text
-    assert "slam 3 – 2 0 0 0 1 0 0 0 0 15 4" in page.text
+    assert "slam 3 – 2 0 0 0 1 0 0 0 0 0 0 0 15 4" in page.text
     assert "no: frames were lost after 10 s of real time" in page.text
     assert f"digest of what slam was sent {answers.inputs()}" in page.text

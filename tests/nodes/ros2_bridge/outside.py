@@ -57,6 +57,7 @@ class Outside:
         takes = [(topic(name), lambda m, n=name: self._take(n, m)) for name in heard]
         self.session.subscribe_in_order(takes)
         self._poses = self.session.publisher(topic(POSES), held=True)
+        self._rival = self.session.publisher(topic(POSES), held=True)
         self._done = self.session.publisher(topic(DONE), held=True)
 
     def leave(self) -> None:
@@ -109,6 +110,11 @@ def out_of_order(stub: Outside, stamp: int, x: float) -> None:
 def twice(stub: Outside, stamp: int, x: float) -> None:
     stub.pose(stamp, x)
     stub.pose(stamp, x + 1.0)
+
+
+def in_turns(stub: Outside, stamp: int, x: float) -> None:
+    stub.pose(stamp, x)
+    stub._poses, stub._rival = stub._rival, stub._poses
 
 
 def through_a_double(stub: Outside, stamp: int, x: float) -> None:
@@ -179,7 +185,16 @@ def comes_back(stub: Outside, stamp: int, x: float) -> None:
 BEHAVIOURS: dict[str, Callable[[Outside, int, float], None]] = {
     each.__name__: each
     for each in (
-        *(at_once, slowly, out_of_order, twice, through_a_double, stamps_of_the_future, floods),
+        *(
+            at_once,
+            in_turns,
+            slowly,
+            out_of_order,
+            twice,
+            through_a_double,
+            stamps_of_the_future,
+            floods,
+        ),
         *(not_a_number, skips, says_done, initialises, stops, loses_one, dies, comes_back),
     )
 }
