@@ -28,6 +28,7 @@ from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.logs import file_handler, logging_to
 from runtime.node import Node
 from runtime.node_runner import log_error, with_place, wrap
+from runtime.private_results import private_results
 from runtime.real_clock import RealClock
 from runtime.sender import Sender, Tap
 from runtime.summary import Summary, summarise
@@ -51,6 +52,8 @@ def execute(
     watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None = None,
     only: Collection[str] = (),
     stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
+    digest: Digest | None = None,
+    complete: Callable[[Summary], Summary] = lambda summary: summary,
 ) -> Summary:
     """Run a configuration to its end.
 
@@ -63,20 +66,26 @@ def execute(
             bar, a monitor.
         only: Nodes to run here; the others run in other processes. All, if empty.
         stand_ins: Classes that run in the place of some nodes' own, by the node's name.
+        digest: What takes in all events; by default one is made if the settings say so.
+        complete: Called with the summary before it is written; returns what is.
 
     Raises:
         VisnavError: Something went wrong; what was recorded until then is complete, and what is to
             be written after a run has been.
     """
     handlers = list(handlers or [])
+    programs = any(spec.node.starts_programs for spec in config.nodes)
     with contextlib.ExitStack() as stack:
         folder = None if out is None else stack.enter_context(results.Folder(out))
         if out is not None:
             results.write_config(out, config)
             handlers.append(file_handler(out / "log.txt"))
-        run = _Run(config, out, folder, log_events, watch, only, stand_ins)
+        run = _Run(config, out, folder, log_events, watch, only, stand_ins, digest)
         stack.enter_context(logging_to(handlers, config.run.log, run.now))
-        summary = event_loop.run_to_end(run.loop, run.main(), run.escaped)
+        with contextlib.ExitStack() as private:
+            if out is not None and programs:
+                run.private = private.enter_context(private_results(out))
+            summary = complete(event_loop.run_to_end(run.loop, run.main(), run.escaped))
         if out is not None:
             run.conclude(out, summary)
     if run.supervisor.state.error is not None:
@@ -115,6 +124,8 @@ class _Run:
     """One run, from its loop to what is called when it is over; see `execute`."""
 
     supervisor: Supervisor
+    private: Path | None = None
+    """Where nodes write that start no programs; `None` for the run's folder."""
 
     def __init__(
         self,
@@ -125,6 +136,7 @@ class _Run:
         watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
         only: Collection[str],
         stand_ins: Mapping[str, type[Node[Any]]],
+        digest: Digest | None,
     ) -> None:
         self.loop = make_loop(config.run)
         self._clock: Clock | None = None
@@ -135,7 +147,7 @@ class _Run:
         self._only = only
         self._stand_ins = stand_ins
         wanted = config.run.clock == "lockstep" if config.run.digest is None else config.run.digest
-        self._digest = Digest() if wanted else None
+        self._digest = digest or (Digest() if wanted else None)
         self._taps: list[Tap] = [self._digest] if self._digest else []
         if log_events:
             self._taps.append(_log_event)
@@ -150,7 +162,13 @@ class _Run:
         task_factory.install(loop)
         clock = self._clock = make_clock(run, loop)
         self.supervisor = supervisor = Supervisor(
-            self._config, clock, self._taps, self._out, self._only, self._stand_ins
+            self._config,
+            clock,
+            self._taps,
+            self.private or self._out,
+            self._only,
+            self._stand_ins,
+            self._out,
         )
         if self._folder is not None:
             supervisor.state.before_first_update = self._folder.flown

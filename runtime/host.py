@@ -75,6 +75,7 @@ class Host(Protocol):
     seed: int
     clock: Clock
     out: Path | None
+    out_of_programs: Path | None
     checking: bool
     siblings: tuple[Sibling, ...]
     shared: dict[str, Any]

@@ -105,6 +105,9 @@ class Node(Generic[C]):
     """What is over when it ends the run: the ``plan`` that it carries out (of a pilot, of a replay:
     also of all that fly), or what a person wants by whose ``hand`` it acts (a window, keys). Of any
     other node, the run ends early."""
+    starts_programs: ClassVar[bool] = False
+    """Whether it starts programs, which are judged: what other nodes write is not in the run's
+    folder before its end then (`runtime.private_results`)."""
     files: ClassVar[tuple[str, ...]] = ()
     """What it writes into the run's folder, besides what settings of type `OutputPath` name."""
     declared: ClassVar[Declared]
@@ -344,7 +347,7 @@ def make_node(
     node.log = NodeLogger(name)
     node.rng = np.random.default_rng([host.seed, zlib.crc32(name.encode())])
     node.seed = host.seed
-    node.out = host.out
+    node.out = host.out_of_programs if cls.starts_programs else host.out
     node.sources = dict(sources or {})
     node.restarts = restarts
     node.checking = host.checking

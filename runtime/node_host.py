@@ -40,6 +40,7 @@ class NodeHost:
     Args:
         state: Of the run.
         out: Folder for what nodes write, or `None`.
+        out_of_programs: That for nodes that start programs.
         instruments: What looks on.
         parameters: Changes settings of nodes.
         create: Makes a task that the run owns.
@@ -53,6 +54,7 @@ class NodeHost:
         self,
         state: RunState,
         out: Path | None,
+        out_of_programs: Path | None,
         instruments: Instruments,
         parameters: ParameterServer,
         create: Create,
@@ -61,6 +63,7 @@ class NodeHost:
     ) -> None:
         self.state = state
         self.out = out
+        self.out_of_programs = out_of_programs
         self.seed = state.config.run.seed
         self.clock = state.clock
         self.siblings = siblings(state.config, state.runners)

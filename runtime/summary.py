@@ -19,6 +19,7 @@ from runtime.part_summaries import (
     OutsideSummary,
     StreamSummary,
     TickSummary,
+    TwiceSummary,
     WorkerSummary,
 )
 from runtime.run_state import RunState
@@ -90,6 +91,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         processes: Where which nodes ran, if not all in one process.
         workers: What workers cost, by ``node.Factory``, and programs, by their nodes.
         outside: How systems outside the process answered, by name.
+        twice: How it compares with an equal run before; `None` if there was none.
     """
 
     name: str
@@ -117,6 +119,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     processes: list[ProcessSummary] = []
     workers: dict[str, WorkerSummary] = {}
     outside: dict[str, OutsideSummary] = {}
+    twice: TwiceSummary | None = None
 
 
 def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:

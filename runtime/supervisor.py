@@ -63,6 +63,7 @@ class Supervisor:
         clock: The run's clock.
         taps: See every event before its listeners do.
         out: Folder for what nodes write, or `None`.
+        out_of_programs: That for nodes that start programs, if it is another one.
         only: Nodes that run here, if others run in other processes.
         stand_ins: Classes in the place of some nodes' own, by the node's name.
 
@@ -82,6 +83,7 @@ class Supervisor:
         out: Path | None = None,
         only: Collection[str] = (),
         stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
+        out_of_programs: Path | None = None,
     ) -> None:
         here = [spec for spec in config.nodes if not only or spec.name in only]
         runners = {}
@@ -95,6 +97,7 @@ class Supervisor:
         self._host = NodeHost(
             self.state,
             out,
+            out_of_programs or out,
             self.instruments,
             self.parameters,
             self._own,

@@ -139,7 +139,7 @@ class McapRecorder(Node[McapRecorderConfig]):
             waits = f"{self._waits} times for the disk, {self._waited:.1f} s in all"
             self.log.info(
                 "%s: %d events, %.1f MB; at most %.1f MB waited%s",
-                process.path,
+                Path(process.path).name,
                 result.written,
                 result.size / 1e6,
                 backlog.peak / 1e6,

@@ -18,6 +18,7 @@ from runtime.part_summaries import (
     OutsideSummary,
     StreamSummary,
     TickSummary,
+    TwiceSummary,
     WorkerSummary,
 )
 
@@ -45,6 +46,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     ticks: dict[str, TickSummary] = {}
     workers: dict[str, WorkerSummary] = {}
     outside: dict[str, OutsideSummary] = {}
+    twice: TwiceSummary | None = None
     stalls: dict[str, int] = {}
     announcements: list[dict[str, Any]] = []
     environment: dict[str, str] = {}

@@ -151,9 +151,11 @@ def facts(run: Run) -> list[tuple[str, str]]:
         "ended by": f.reason,
         "error": f.error,
         "digest": f.clock and _digest(f),
+        "run twice": f.twice and (f.twice.first or "it repeats"),
     }
     rows += [(name, str(value)) for name, value in known.items() if value is not None]
     rows += [(f"digest of what {k} was sent", o.inputs) for k, o in f.outside.items() if o.inputs]
+    rows += [(f"digest of what {k} answered", o.answers) for k, o in f.outside.items() if o.answers]
     rows += [(f"dropped at {port}", str(s.dropped)) for port, s in f.streams.items() if s.dropped]
     rows += [
         (f"unmatched sets at {port}", _counts(s.missed))

@@ -149,7 +149,7 @@ class RerunView(Node[RerunConfig]):
                 "%d of %d events dropped: the view was too slow", dropped, self._received
             )
         if self.config.mode == "save" and self.out is not None:
-            self.log.info("%s: rerun opens it", self.out / part_name(self, self.config.file))
+            self.log.info("%s: rerun opens it", part_name(self, self.config.file))
 
     async def _begin(self) -> None:
         if not self._begun:

@@ -168,6 +168,7 @@ class _DryHost:
 
     checking = True
     out: Path | None = None
+    out_of_programs: Path | None = None
 
     def __init__(self, config: Config, clock: Clock) -> None:
         self.seed = config.run.seed

@@ -53,6 +53,7 @@ class NoHost:
         self.clock: Clock = LockstepClock(with_loop)
         with_loop.close()
         self.out: Path | None = None
+        self.out_of_programs: Path | None = None
         self.checking = False
         self.siblings: tuple[Sibling, ...] = ()
         self.shared: dict[str, Any] = {}

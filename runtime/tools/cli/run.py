@@ -77,6 +77,12 @@ def run(
             min=0, max=65535, metavar="PORT", help="Show the monitor as a page, on this port."
         ),
     ] = None,
+    twice: Annotated[
+        bool,
+        typer.Option(
+            "--twice", help="Run it twice, and say whether it repeats; exit code 1 if it does not."
+        ),
+    ] = False,
     flight: Annotated[
         str, typer.Option(hidden=True, help='For sweeps: "use" a recorded flight, or "record" it.')
     ] = "",
@@ -89,11 +95,13 @@ def run(
     leaves it where it is.
 
     Ends with 0, also after Ctrl-C, SIGTERM, SIGHUP or a closed window (a second Ctrl-C is
-    immediate); with 1 if a threshold of the run was not met; with 2 if something failed.
+    immediate); with 1 if a threshold of the run was not met, or it was run twice and differed;
+    with 2 if something failed.
     """
     from runtime.execute import execute
     from runtime.tools.cli.observers import Observers
     from runtime.tools.plugins import load_configuration
+    from runtime.tools.twice import run_twice
 
     if "VISNAV_LIFELINE" in os.environ:
         from runtime.tools.sweep.process import end_with_the_sweep
@@ -113,7 +121,7 @@ def run(
 
         stand_ins = recorded(settings, record=flight == "record")
     observers = Observers(settings, name, quiet=quiet, trace=trace, top=top, web=web)
-    summary = execute(
+    summary = (run_twice if twice else execute)(
         settings,
         folder,
         handlers=observers.handlers,
@@ -125,6 +133,8 @@ def run(
     if not quiet:
         report(summary, folder)
     code = 1 if summary.verdict is not None and summary.verdict.passed is False else 0
+    if summary.twice is not None and not summary.twice.repeats:
+        code = 1
     leave_behind(code)
 
 
@@ -181,6 +191,9 @@ def report(summary: Summary, folder: Path) -> None:
         digest += f" (not promised, because of {', '.join(summary.not_deterministic)})"
     if summary.verdict is not None:
         print_verdict(console, summary.verdict)
+    if (twice := summary.twice) is not None:
+        found = "[green]repeats[/green]" if twice.repeats else "[red]differs[/red]: "
+        console.print(f"run twice, it {found}{twice.first}", highlight=False)
     page = ": open report.html" if (folder / "report.html").is_file() else ""
     took = ""
     if summary.clock == "lockstep":

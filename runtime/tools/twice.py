@@ -1,0 +1,129 @@
+"""``run --twice``: whether an equal run gives the same; if not, who differs first, and by how much.
+
+The first of both runs writes nothing: so no program finds in a folder what it is judged by.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from array import array
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import replace
+
+from events import Event
+from runtime.config.model import Config
+from runtime.digest import Digest
+from runtime.errors import ConfigError
+from runtime.execute import execute
+from runtime.part_summaries import OutsideSummary, TwiceSummary
+from runtime.sender import Sender
+from runtime.summary import Summary
+
+log = logging.getLogger("visnav.runtime")
+
+
+class Track(Digest):
+    """A digest of all events that remembers each, to be compared with those of an equal run.
+
+    Args:
+        before: That of the first run.
+
+    Attributes:
+        first: The first event that is not as it was then: output, event, and metres between the
+            positions, if it has one.
+    """
+
+    def __init__(self, before: Track | None = None) -> None:
+        super().__init__()
+        self.first: tuple[str, Event, float] | None = None
+        self._before = before
+        self._marks: dict[str, array[int]] = {}  # by output: fingerprints so far, their half
+        self._places: dict[str, array[float]] = {}
+
+    def __call__(self, sender: Sender[Any] | None, event: Event) -> None:
+        """Take in one event."""
+        super().__call__(sender, event)
+        name = self.name_of(sender, event)
+        marks = self._marks.setdefault(name, array("Q"))
+        marks.append(self.mark(name))
+        place = getattr(event, "position", (math.nan,) * 3)
+        if self._before is None:
+            self._places.setdefault(name, array("d")).extend(place)
+            return
+        number, then = len(marks) - 1, self._before._marks.get(name, array("Q"))
+        if self.first is None and (number >= len(then) or then[number] != marks[number]):
+            was = self._before._places.get(name, array("d"))[3 * number : 3 * number + 3]
+            self.first = name, event, math.dist(place, was) if len(was) == 3 else math.nan
+
+
+def run_twice(config: Config, out: Path | None, only: Collection[str], **options: Any) -> Summary:
+    """Run a configuration twice, and compare.
+
+    Args:
+        config: What to run.
+        out: Folder for the results of the second run.
+        only: Nodes to run here: all.
+        options: Of `execute`, for the second run.
+
+    Raises:
+        ConfigError: Time is real, or other processes have a part in the run.
+        VisnavError: Something went wrong in one of the runs.
+    """
+    if config.run.clock != "lockstep" or only:
+        found = "--only" if only else f'clock = "{config.run.clock}"'
+        raise ConfigError(f'--twice: expected one process and clock = "lockstep", found {found}')
+    first = Track()
+    before = execute(config, digest=first)
+    second = Track(first)
+    return execute(
+        config,
+        out,
+        digest=second,
+        complete=lambda summary: compared(before, summary, second),
+        **options,
+    )
+
+
+def compared(before: Summary, after: Summary, track: Track) -> Summary:
+    """Return the summary of the second run, with what there is to say of both."""
+    outputs = sorted(
+        name
+        for name in before.digests | after.digests
+        if before.digests.get(name) != after.digests.get(name)
+    )
+    outside, systems = {}, []
+    for name, system in after.outside.items():
+        was = before.outside.get(name, system)
+        outside[name] = _compared(was, system)
+        if (was.inputs, was.answers) != (system.inputs, system.answers):
+            systems.append(name)
+    same = not outputs and not systems
+    twice = TwiceSummary(same, "" if same else _who(after, track, outputs + systems), outputs)
+    if not same:
+        log.warning("run twice, it differs: %s", twice.first)
+    return replace(after, outside=outside, twice=twice)
+
+
+def _compared(was: OutsideSummary, now: OutsideSummary) -> OutsideSummary:
+    if was.inputs != now.inputs:
+        why = [*now.why_not, "its inputs differed when run twice"]
+        return replace(now, reproducible=False, why_not=why)
+    return replace(now, repeats=was.answers == now.answers)
+
+
+def _who(summary: Summary, track: Track, differ: list[str]) -> str:
+    """Return who differs first, in words."""
+    if track.first is None:  # events are missing at the end of an output
+        return f"{', '.join(differ)} at the end"
+    output, event, apart = track.first
+    node = output.partition(".")[0]
+    outside = node in summary.outside or event.source in summary.outside
+    far = "" if math.isnan(apart) else f", {apart:.2g} m apart"
+    return (
+        f"{'the system ' + event.source if outside else 'the rig, ' + node}, in {output}: "
+        f"{type(event).__name__} of {event.source}, {event.stamp / 1e9:.6f} s{far}"
+    )
