@@ -282,7 +282,7 @@ NOT_FINITE = TrackingResult(pose(((0, 3), math.nan)))
         (None, "expected a TrackingResult, found None"),
         (np.eye(4), "expected a TrackingResult, found shape (4, 4) of float64"),
         (TrackingResult(None), "pose: * of shape (4, 4), found None"),  # type: ignore[arg-type]
-        (TrackingResult(np.eye(4).tolist()), "pose: * of shape (4, 4), found a list"),
+        (TrackingResult([[1.0]]), "pose: * of shape (4, 4), found a list"),  # type: ignore[arg-type]
         (TrackingResult(np.eye(3)), "pose: * shape (4, 4), found shape (3, 3) of float64"),
         (TrackingResult(np.eye(4, dtype=object)), "pose: * found shape (4, 4) of object"),
         (NOT_FINITE, "pose: expected finite numbers, found nan (not_finite = *lost*)"),

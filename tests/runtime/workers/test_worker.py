@@ -84,11 +84,11 @@ async def test_an_exception_of_the_object_comes_back_with_the_workers_traceback(
         assert "in the worker:" in caught.value.__notes__[0]
         assert "samples_workers.py" in caught.value.__notes__[0]
         for method in (Plant.fail, Plant.fail_oddly):
-            with pytest.raises((LookupError, RuntimeError)) as caught:
+            with pytest.raises((LookupError, RuntimeError)) as failed:
                 await plant.call(method)
-            place = with_place(wrap("vo", caught.value))
+            place = with_place(wrap("vo", failed.value))
             assert re.search(r"\(runtime/samples_workers.py:\d+ in fail(_oddly)?\)$", place)
-        assert "UnpicklableError: 1 and 2" in str(caught.value)
+        assert "UnpicklableError: 1 and 2" in str(failed.value)
         assert await plant.call(Plant.echo, 1) == 1
 
 
