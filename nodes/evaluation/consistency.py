@@ -14,6 +14,7 @@ from nodes.trajectory import Trajectory
 
 _SINGULAR = 1e-9
 """Smallest eigenvalue of a correlation matrix that can be inverted."""
+_BLOCK = 4096
 _THREE_SIGMA = float(chdtri(3, erfc(3.0 / sqrt(2.0))))
 """NEES of three dimensions that is as rarely exceeded as 3 sigma of one: 14.16."""
 
@@ -70,6 +71,9 @@ def positive_definite(matrices: Floats) -> npt.NDArray[np.bool_]:
 
     They are scaled to correlations before, as their units differ.
     """
+    if len(matrices) > _BLOCK:  # each copy of many takes much memory
+        blocks = np.split(matrices, range(_BLOCK, len(matrices), _BLOCK))
+        return np.concatenate([positive_definite(block) for block in blocks])
     variances = np.einsum("nii->ni", matrices)
     possible = np.isfinite(matrices).all(axis=(1, 2)) & (variances > 0.0).all(axis=1)
     deviations = np.sqrt(np.where(possible[:, None], variances, 1.0))

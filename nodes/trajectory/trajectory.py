@@ -238,16 +238,22 @@ class PoseRows:
         Raises:
             ValueError: Nothing has, or a pose is none.
         """
-        parts = [self._read(), *self._blocks, np.array(self._rows, _ROW)]
-        self._blocks, self._rows = [], []
-        if (made := self._whole) is not None:
-            if not any(map(len, parts)):
-                return made
-            earlier = np.empty(len(made), _ROW)
-            earlier["stamp"], earlier["position"] = made.stamps, made.positions
-            earlier["orientation"] = made.orientations
-            parts.insert(0, earlier)
-        rows = np.concatenate(parts)
+        made, written = self._whole, self._written
+        parts = [*self._blocks, np.array(self._rows, _ROW)]
+        if made is not None and not (written or any(map(len, parts))):
+            return made
+        known = 0 if made is None else len(made)
+        rows = np.empty(known + written + sum(map(len, parts)), _ROW)
+        if made is not None:
+            rows["stamp"][:known], rows["position"][:known] = made.stamps, made.positions
+            rows["orientation"][:known] = made.orientations
+        if self._file is not None:
+            with self._file as file:
+                file.seek(0)
+                room = rows[known : known + written].view(np.uint8)
+                room[:] = np.frombuffer(file.read(room.nbytes), np.uint8)
+        rows[known + written :] = np.concatenate(parts)
+        self._blocks, self._rows, self._file, self._written = [], [], None, 0
         if not (np.diff(rows["stamp"]) > 0).all():
             rows = rows[np.argsort(rows["stamp"], kind="stable")]
             rows = rows[np.append(np.diff(rows["stamp"]) > 0, True)]
@@ -269,15 +275,6 @@ class PoseRows:
             self._written += len(block)
         except OSError:
             self._blocks.append(block)
-
-    def _read(self) -> npt.NDArray[np.void]:
-        if self._file is None:
-            return np.empty(0, _ROW)
-        with self._file as file:
-            file.seek(0)
-            found = np.frombuffer(file.read(self._written * _ROW.itemsize), _ROW)
-        self._file, self._written = None, 0
-        return found
 
 
 def _slerp(first: Floats, second: Floats, share: Floats) -> Floats:
