@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
+import subprocess
+import sys
 from pathlib import Path
 
 _PROJECT = Path(__file__).parents[1] / "pyproject.toml"
@@ -30,3 +33,18 @@ def install_command(extra: str) -> str:
         if f"extra == '{extra}'" in requirement.replace('"', "'")
     ]
     return f"pip install {' '.join(repr(each) for each in wanted or [f'visnav-runtime[{extra}]'])}"
+
+
+def why_missing(library: str) -> str:
+    """Return why a worker's library cannot be imported; empty if it can.
+
+    Another process tries it, if it is there: what it needs of the system may be missing.
+    """
+    if library in sys.modules:
+        return "" if sys.modules[library] else f"No module named '{library}'"
+    if importlib.util.find_spec(library) is None:
+        return f"No module named '{library}'"
+    command = [sys.executable, "-c", f"import {library}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+    last = [f"exit code {done.returncode}", *done.stderr.strip().splitlines()][-1]
+    return last if done.returncode else ""

@@ -53,7 +53,7 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
         Raises:
             FatalError: Always.
         """
-        self.log(logging.CRITICAL, msg, *args)
+        self.log(logging.CRITICAL, msg, *args, extra={"reported": True})  # as the run's error
         raise FatalError(self.node, msg % args if args else msg)
 
 

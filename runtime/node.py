@@ -27,16 +27,18 @@ import msgspec
 import numpy as np
 from typing_extensions import TypeVar
 
-from events import Announcement
+from events import Announcement, Event
 from runtime.bundles import Matcher
 from runtime.clock import Clock
 from runtime.declarations import Declared, read_declarations
+from runtime.errors import DeclarationError, suggest
 from runtime.hold import Hold, HoldConfig
 from runtime.host import Host, RunEnd, Sibling
 from runtime.json_values import plain
 from runtime.logs import NodeLogger
+from runtime.ports import MAX_HZ
 from runtime.schedule import SECOND, Tick, Ticker
-from runtime.sender import Sender
+from runtime.sender import Listener, Sender
 from runtime.stepping import Stepping
 from runtime.streams import Stream
 from runtime.workers.worker import Worker
@@ -171,7 +173,16 @@ class Node(Generic[C]):
 
         For nodes that choose among what is announced: call it in `on_announcement`. What the file
         says of the port holds nevertheless.
+
+        Raises:
+            DeclarationError: The node's class declares no such port.
         """
+        ports = [*self.declared.listening, *self.declared.bundle_fields()]
+        if port not in ports:
+            raise DeclarationError(
+                f"narrow: expected one of {', '.join(ports) or 'no ports'}, found {port!r}"
+                + suggest(port, ports)
+            )
         self.sources.setdefault(port, source)
 
     def on_change(self, before: C) -> None:
@@ -208,6 +219,16 @@ class Node(Generic[C]):
         too.
         """
         return tuple(each for each in self._host.siblings if issubclass(each.node, cls))
+
+    def senders_of(self, *events: type[Event]) -> list[str]:
+        """Return the names of the other nodes that may send some types of event."""
+        listener = Listener(self.name, lambda _: None, events)
+        return [
+            each.name
+            for each in self.siblings(Node)
+            if each.name != self.name
+            and any(listener.may_receive(o.event) for o in each.node.declared.outputs.values())
+        ]
 
     def share(self, name: str, make: Callable[[], R]) -> R:
         """Return what nodes of this process share under a name; whoever asks first makes it.
@@ -278,7 +299,12 @@ class Node(Generic[C]):
         """Call a function at a rate from the first update on, as `@every` does.
 
         For rates that are known only at run time; call it in `on_startup`.
+
+        Raises:
+            DeclarationError: The rate is not above 0, or above `MAX_HZ`.
         """
+        if not 0 < hz <= MAX_HZ:
+            raise DeclarationError(f"every: expected a rate above 0, up to {MAX_HZ} Hz, found {hz}")
         return self._host.every(self, hz, call, name or getattr(call, "__name__", "tick"))
 
     def stop(self, reason: str) -> None:

@@ -8,7 +8,9 @@ from typing import Any
 
 # casefold() turns the micro sign µ into the Greek letter μ, which looks the same.
 _UNITS = {"ns": 1e-9, "us": 1e-6, "μs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
-_DURATION = re.compile(r"\s*([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(ns|us|μs|ms|s|min|h)\s*")
+_DURATION = re.compile(r"\s*(-?)([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*([^\W\d_]+)\s*")
+_LONG_NAMES = {"sec": "s", "second": "s", "m": "min", "minute": "min", "hr": "h", "hour": "h"}
+_LONG_NAMES |= {"msec": "ms", "millisecond": "ms", "usec": "us", "microsecond": "us"}
 _LONGEST = 2**63 / 1e9  # what 64 bits of nanoseconds hold: 292 years
 
 
@@ -26,7 +28,17 @@ class Duration(float):
         if isinstance(value, int | float) and not isinstance(value, bool):
             seconds = value
         elif isinstance(value, str) and (match := _DURATION.fullmatch(value.casefold())):
-            seconds = float(match[1]) * _UNITS[match[2]]
+            sign, number, unit = match.groups()
+            if unit not in _UNITS:
+                meant = _LONG_NAMES.get(unit.removesuffix("s"))
+                guess = f' (did you mean "{sign}{number}{meant}"?)' if meant else ""
+                raise ValueError(
+                    f'found "{value.strip()}", of no known unit{guess}; expected a duration in ns, '
+                    "us, ms, s, min or h"
+                )
+            seconds = float(sign + number) * _UNITS[unit]
+        if seconds < 0:
+            raise ValueError("expected a duration that is not negative")
         if not 0 <= seconds < _LONGEST:
             raise ValueError('expected a duration such as 0.5, "80ms" or "2min"')
         return cls(seconds)

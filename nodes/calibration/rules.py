@@ -11,7 +11,9 @@ import numpy as np
 from events import (
     Announcement,
     CameraAnnouncement,
+    DepthImage,
     EstimatorAnnouncement,
+    Image,
     Imu,
     ImuAnnouncement,
     LidarAnnouncement,
@@ -176,6 +178,9 @@ def needs(config: Config, announced: Announced) -> Iterator[Finding]:
             found = f"it needs {', '.join(lacking)}, which no {what} gives"
             cure = "add one" if "lidar" in lacking else "add it to the camera's images"
             yield Finding(spec.name, found, cure)
+        read = {each.event for each in spec.node.declared.inputs.values()}
+        if {Image, DepthImage} & read and not cameras(announced):
+            yield Finding(spec.name, "it reads images, and no camera is announced", "add one")
         inertial = "inertial" in str(getattr(spec.config, "mode", ""))
         if inertial and not any(isinstance(each, ImuAnnouncement) for each in announced):
             yield Finding(spec.name, "it needs an IMU, which nobody announces", "add one")

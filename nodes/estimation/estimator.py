@@ -48,6 +48,7 @@ from nodes.estimation.result import (
 from nodes.estimation.rig import SensorChoice
 from runtime import Bundle, Node, NodeConfig, Output, on
 from runtime.errors import DeclarationError, NodeError, suggest
+from runtime.extras import why_missing
 from runtime.node import matchers
 from runtime.units import Latency
 
@@ -167,6 +168,8 @@ class Estimator(Node[C], ABC):
     """Name of the method, for the report."""
     scale_free: bool = False
     """Whether the unit of length is the tracker's own, as that of a single camera is."""
+    library: tuple[str, str] = "", ""
+    """The module that its worker imports and that may be missing, and how it is installed."""
 
     estimates = Output(PoseEstimate)
     tracking_events = Output(TrackingEvent)
@@ -307,8 +310,12 @@ class Estimator(Node[C], ABC):
     def check(self) -> Iterable[str]:
         """Return the error if no camera gives what is needed, or there is no IMU for it.
 
-        Says in the log what is rectified.
+        If the file is only checked, also if its library is missing. Says in the log what is
+        rectified.
         """
+        library, install = self.library
+        if self.checking and library and (why := why_missing(library)):
+            yield f"{self.method} needs {library} ({why}): {install}"
         if missing := self._missing():
             yield missing
         if self._rectification is not None:

@@ -108,7 +108,10 @@ class Evaluation(Node[EvaluationConfig]):
             self._records[announcement.source] = record
 
     def check(self) -> Iterable[str]:
-        """Say if there is no such vehicle as the file names."""
+        """Say if there is no such vehicle as the file names, or nobody to judge."""
+        asked = self.config.thresholds != Thresholds()
+        if asked and not (self._records or self.senders_of(PoseEstimate, TrajectoryEstimate)):
+            yield "thresholds: expected an estimator to judge, found none"
         if (name := self.config.vehicle) and name not in (names := self._vehicles.names):
             yield (
                 f"vehicle: expected one that is announced ({', '.join(names) or 'none'}), "

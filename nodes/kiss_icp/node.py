@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from nodes.estimation import WORKER_ENVIRONMENT, EstimatorConfig, LidarEstimator
-from nodes.kiss_icp.process import KissIcpProcess
+from nodes.kiss_icp.process import INSTALL, KissIcpProcess
 from nodes.kiss_icp.settings import KissIcpSettings
 
 
@@ -24,6 +24,7 @@ class KissIcp(LidarEstimator[KissIcpConfig]):
     """
 
     method = "KISS-ICP"
+    library = "kiss_icp", INSTALL
 
     async def on_ready(self) -> None:
         """Start KISS-ICP, in a process of its own."""

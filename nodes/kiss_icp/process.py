@@ -17,6 +17,8 @@ from nodes.kiss_icp.settings import KissIcpSettings
 from runtime.errors import MissingDependencyError
 from runtime.extras import install_command
 
+INSTALL = install_command("kiss-icp")
+
 
 class KissIcpProcess:
     """Registers each scan with a map of voxels.
@@ -37,9 +39,7 @@ class KissIcpProcess:
             from kiss_icp.config import KISSConfig
             from kiss_icp.kiss_icp import KissICP
         except ImportError as error:
-            raise MissingDependencyError(
-                f"KISS-ICP needs kiss_icp ({error}): {install_command('kiss-icp')}"
-            ) from error
+            raise MissingDependencyError(f"KISS-ICP needs kiss_icp ({error}): {INSTALL}") from error
         reach = settings.max_range or lidar.max_range
         # All is given: what is not, it would read from the environment.
         config = KISSConfig(

@@ -18,7 +18,7 @@ from nodes.estimation import (
     StereoInertialFrame,
     sample_rows,
 )
-from nodes.orb_slam3.process import OrbSlam3Process
+from nodes.orb_slam3.process import INSTALL, OrbSlam3Process
 from nodes.orb_slam3.settings import LENSES, Mode, OrbSettings, Settings, make_settings
 from nodes.orb_slam3.vocabulary_file import find_vocabulary
 from runtime import Bundle, Duration
@@ -70,6 +70,7 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
     """
 
     deterministic: ClassVar[bool] = False
+    library = "pyorbslam3", INSTALL
 
     frames = Bundle(Frame, keep="latest")
 
@@ -87,9 +88,10 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         """Return the errors: no camera, an IMU on another body, or no vocabulary."""
         missing = [*super().check()]
         yield from missing
+        if missing:
+            return
         try:
-            if not missing:
-                self._settings()
+            self._settings()
             find_vocabulary(self.config.vocabulary)
         except ValueError as error:
             yield str(error)

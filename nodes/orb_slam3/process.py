@@ -33,9 +33,11 @@ Floats = npt.NDArray[np.float64]
 Points = npt.NDArray[np.float32]
 
 INSTALL = (
-    f"{install_command('orbslam3')}, and on Debian and Ubuntu "
-    "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6"
+    f"make orbslam3, or: {install_command('orbslam3')}, on Debian and Ubuntu "
+    "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6, and then "
+    "python -m runtime vocabulary config.toml"
 )
+"""All that ORB-SLAM3 needs, with its vocabulary; `make` serves in a checkout."""
 
 _REACH = 6.0
 """Pixels between a map point, projected, and the corner that it was found at; a corner high in

@@ -150,6 +150,11 @@ class Pilot(Node[C], ABC):
         for port in self._open_ports:
             self.narrow(port, vehicle or announcement.source)
 
+    def check(self) -> Iterable[str]:
+        """Say if there is nothing to fly."""
+        if not self._vehicles and not self.senders_of(Odometry, PoseEstimate):
+            yield "expected a vehicle to fly, found none: add one, such as a Multirotor"
+
     def update_pose(self, pose: Odometry | PoseEstimate) -> None:
         """Note the vehicle's pose; the first one starts the flight."""
         self.pose = pose

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from nodes.estimation import WORKER_ENVIRONMENT, Estimator, EstimatorConfig, MonocularFrame
-from nodes.svo.process import SvoProcess
+from nodes.svo.process import INSTALL, SvoProcess
 from nodes.svo.settings import SvoSettings
 from runtime import Bundle
 
@@ -28,6 +28,7 @@ class Svo(Estimator[SvoConfig]):
     needs = frozenset({"grey"})
     lenses = frozenset()
     method = "SVO"
+    library = "svo_cpp", INSTALL
     scale_free = True
 
     frames = Bundle(MonocularFrame, keep="latest")

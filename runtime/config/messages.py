@@ -29,9 +29,8 @@ def explain(message: str, value: Any, type_: type[msgspec.Struct], where: str) -
     place = where + path if not where.endswith(")") or not path else f"{where}: {path[1:]}"
     if match := re.fullmatch(r"Object contains unknown field `(.*)`", text):
         known = _fields_at(type_, path)
-        listed = ", ".join(known) or "no settings"
         found = f"found unknown key {match[1]!r}" + suggest(match[1], known)
-        return f"{place}: expected one of {listed}; {found}"
+        return f"{place}: {found}; expected one of {', '.join(known) or 'no settings'}"
     if match := re.fullmatch(r"Object missing required field `(.*)`", text):
         return f"{place}: expected a setting {show(match[1])}, found none"
     if "found" in text:  # a check of our own, which has said it all

@@ -88,7 +88,8 @@ def _part(nodes: dict[str, dict[str, Any]], name: str, where: str) -> dict[str, 
         raise ConfigError(f"{where}: expected one of {', '.join(found)}; found {show(name)}")
     known = ["run", *nodes, *(path.rpartition(".")[2] for path in parts)]
     raise ConfigError(
-        f'{where}: expected "run" or the name of a node, found {show(name)}' + suggest(name, known)
+        f"{where}: expected run or a node ({', '.join(nodes)}), found {show(name)}"
+        + suggest(name, known)
     )
 
 

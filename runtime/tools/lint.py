@@ -11,14 +11,16 @@ each thing that is odd; its name, with hyphens, is the rule's, and its docstring
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 import msgspec
 
-from events import Announcement
-from runtime.config.model import Config
+from events import Announcement, EstimatorAnnouncement, Shutdown, WindowClosed
+from runtime.config.model import Config, NodeSpec
 from runtime.errors import suggest
+from runtime.graph import edges
 from runtime.tools.plugins import offers
+from runtime.tools.preflight import mentioned_in
 
 GROUP = "visnav.lint"
 
@@ -79,3 +81,45 @@ def lint(
             each = (msgspec.structs.replace(one, rule=name) for one in rule(config, announcements))
             found += [one for one in each if f"{name}:{one.subject}" not in accepted]
     return found
+
+
+def no_end(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:  # noqa: ARG001
+    """Nothing but Ctrl-C ends a run without a duration, a pilot or a replay."""
+    if not config.run.duration and not any(map(_may_end, config.nodes)):
+        found = "it has no duration, and no node that ends it, as a pilot or a replay does"
+        yield Finding("run", found, "give it a duration")
+
+
+def idle(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:  # noqa: ARG001
+    """Without anybody who sends it orders, a vehicle stands still."""
+    heard = {receiver for *_, receiver, _ in edges([(s.name, s.node) for s in config.nodes])}
+    for spec in config.nodes:
+        handlers = spec.node.declared.handlers
+        only = handlers and len(handlers) == len(spec.node.declared.listening)
+        if only and spec.name not in heard and not _may_end(spec):
+            events = dict.fromkeys(e.__name__ for h in handlers.values() for e in h.events)
+            found = f"it waits for {' or '.join(events)}, which no node sends"
+            yield Finding(spec.name, found, "add one that does")
+
+
+def nobody_judged(config: Config, announced: Sequence[Announcement]) -> Iterator[Finding]:
+    """Who judges wants an estimator."""
+    sent = edges([(spec.name, spec.node) for spec in config.nodes])
+    judged = {receiver for *_, receiver, port in sent if port == "estimates"}
+    for spec in config.nodes:
+        if "thresholds" in spec.config.__struct_fields__ and not (
+            spec.name in judged or any(isinstance(a, EstimatorAnnouncement) for a in announced)
+        ):
+            yield Finding(spec.name, "nobody sends estimates that it could judge", "add one")
+
+
+RULES: list[Rule] = [no_end, idle, nobody_judged]
+
+
+def _may_end(spec: NodeSpec) -> bool:
+    """Return whether a node may end the run."""
+    sends = (output.event for output in spec.node.declared.outputs.values())
+    ends = "stop" in mentioned_in(spec.node) or any(
+        issubclass(event, Shutdown | WindowClosed) for event in sends
+    )
+    return ends and bool(getattr(spec.config, "end_run", True))

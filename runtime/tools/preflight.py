@@ -111,7 +111,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
     async def exchange(announced: Announced) -> list[Announcement]:
         everything.extend(each for of_node in announced.values() for each in of_node)
         errors.extend(_announced_twice(announced))
-        warnings.extend(_unknown_sources(config.nodes, everything))
+        (warnings if uncertain else errors).extend(_unknown_sources(config.nodes, everything))
         return everything
 
     def failed(phase: Phase, runner: NodeRunner, error: NodeError) -> None:
@@ -126,7 +126,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
         elif phase == "announce":
             if runner.spec.name not in cut_short:
                 errors.append(str(error))
-        else:
+        elif not any(each.startswith(f"{runner.spec.name}: inputs.") for each in errors):
             (warnings if uncertain else errors).append(str(error))
 
     try:
@@ -253,6 +253,12 @@ def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:
 
 def _unread(cls: type[Node[Any]]) -> list[str]:
     """Return the inputs that no method of a class mentions."""
+    mentioned = mentioned_in(cls)
+    return [port for port in (*cls.declared.inputs, *cls.declared.bundles) if port not in mentioned]
+
+
+def mentioned_in(cls: type[Node[Any]]) -> set[Any]:
+    """Return the names and texts in the methods of a class."""
     mentioned: set[Any] = set()
 
     def look(code: CodeType) -> None:
@@ -268,7 +274,7 @@ def _unread(cls: type[Node[Any]]) -> list[str]:
             function = getattr(value, "fget", None) or getattr(value, "__func__", value)
             if isinstance(code := getattr(function, "__code__", None), CodeType):
                 look(code)
-    return [port for port in (*cls.declared.inputs, *cls.declared.bundles) if port not in mentioned]
+    return mentioned
 
 
 def _announced_twice(announced: Mapping[str, Iterable[Announcement]]) -> Iterator[str]:
@@ -288,7 +294,7 @@ def _announced_twice(announced: Mapping[str, Iterable[Announcement]]) -> Iterato
 def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement]) -> Iterator[str]:
     """Say which `inputs` name a source from which nothing will come.
 
-    A node may send what it has not announced, so these are warnings.
+    A node that announces nothing may send from anywhere below its name.
     """
     specs = {spec.name: spec for spec in nodes}
     sources = dict.fromkeys([*specs, *(each.source for each in announced)])

@@ -7,7 +7,9 @@ that it comes at once however much the packages import.
 from __future__ import annotations
 
 import ast
+import contextlib
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -51,6 +53,40 @@ class Commands(TyperGroup):
                 + suggest(name, _commands())
             )
         return name, load(_chosen(name)), rest
+
+    def make_context(self, *args: Any, **options: Any) -> Any:
+        """Read the arguments before the command."""
+        with _plain_errors():
+            return super().make_context(*args, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Read the command's arguments, and call it."""
+        with _plain_errors():
+            return super().invoke(ctx)
+
+
+_USAGE_ERROR = typer.BadParameter.__mro__[2]
+"""Click's base of all that can be wrong with arguments, which Typer shows in a box."""
+
+
+@contextlib.contextmanager
+def _plain_errors() -> Iterator[None]:
+    """Turn errors about arguments into ours, which are one line.
+
+    Raises:
+        ConfigError: An argument is wrong.
+    """
+    try:
+        yield
+    except _USAGE_ERROR as error:
+        found: Any = error
+        if type(error).__name__ == "NoArgsIsHelpError":  # prints the help, and is meant
+            raise
+        message = " ".join(found.format_message().split()).replace("Value error, ", "").rstrip(".")
+        path = getattr(getattr(found, "ctx", None), "command_path", "python -m runtime")
+        raise ConfigError(
+            f"{message[:1].lower()}{message[1:]}; `{path} --help` says what it takes"
+        ) from None
 
 
 def load(offer: Offer) -> Any:

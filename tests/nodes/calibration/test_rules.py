@@ -10,7 +10,6 @@ import msgspec
 import pytest
 
 from events import Announcement, CameraAnnouncement, CameraInfo, EstimatorAnnouncement
-from nodes.calibration import rules
 from runtime.config.model import Config
 from runtime.config.reading import parse
 from runtime.tools.lint import Finding, lint
@@ -28,10 +27,19 @@ def file(mode: str = "rgbd_inertial", latency: str = "15ms", accept: Sequence[st
     """Return a file in which ORB-SLAM3 is judged."""
     nodes = [SLAM | {"mode": mode, "latency": latency}]
     nodes.append({"name": "evaluation", "type": "nodes.evaluation:Evaluation"})
-    return parse({"run": {"accept": list(accept)}, "nodes": nodes}, "test")
+    return parse({"run": {"accept": list(accept), "duration": 1}, "nodes": nodes}, "test")
 
 
-ON_A_LIDAR = parse({"nodes": [{"name": "kiss", "type": "nodes.kiss_icp:KissIcp"}]}, "test")
+def nodes_of(*types: str, duration: float = 1.0, **settings: Any) -> Config:
+    """Return a file with nodes called a, b, …, the last with settings."""
+    nodes = [{"name": name, "type": each} for name, each in zip("abc", types, strict=False)]
+    nodes[-1] |= settings
+    return parse({"run": {"duration": duration}, "nodes": nodes}, "test")
+
+
+DRONE, EVALUATION = "sims.multirotor:Multirotor", "nodes.evaluation:Evaluation"
+PILOT = "nodes.pilots:WaypointFollower"
+ON_A_LIDAR = nodes_of("nodes.kiss_icp:KissIcp")
 
 
 def square(**more: Any) -> CameraAnnouncement:
@@ -98,12 +106,22 @@ ODD: list[tuple[str, Config, list[Announcement], str]] = [
     ("stamps", file(), [LEFT, msgspec.structs.replace(RIGHT, time_jitter=1e-3)], "have a jitter"),
     ("needs", file(), [square()], "it needs an IMU, which nobody announces"),
     ("needs", ON_A_LIDAR, [square(), IMU], "it needs lidar, which no sensor gives"),
+    ("needs", nodes_of(DRONE, "nodes.window:ImageWindow"), [], "no camera is announced"),
+    ("no-end", nodes_of(DRONE, EVALUATION, duration=0.0), [], "it has no duration, and no node"),
+    (
+        "no-end",
+        nodes_of(DRONE, PILOT, duration=0.0, waypoints=[[0, 0, -1]], end_run=False),
+        [],
+        "and no node that ends it",
+    ),
+    ("idle", nodes_of(DRONE, EVALUATION), [square()], "waits for Command or Setpoint, which no"),
+    ("nobody-judged", nodes_of(DRONE, EVALUATION), [square()], "nobody sends estimates"),
 ]
 
 
 def test_every_rule_is_offered_and_has_an_odd_case() -> None:
     assert {name for name, *_ in ODD} == set(all_rules())
-    assert all(rule.__doc__ for rule in rules.RULES)
+    assert all(rule.__doc__ for rule in all_rules().values())
 
 
 @pytest.mark.parametrize(("name", "config", "announced", "said"), ODD)
@@ -126,6 +144,8 @@ def test_nothing_is_said_of_a_sound_rig() -> None:
     near = msgspec.structs.replace(pair[1], position=(0.15, 0.12, -0.03), rate=30.0)
     assert [each.rule for each in lint(file("rgbd"), [pair[0], near])] == []
     assert lint(ON_A_LIDAR, [lidar()]) == []
+    flown = nodes_of(DRONE, PILOT, duration=0.0, waypoints=[[0, 0, -1]])
+    assert lint(flown, [square()]) == []
 
 
 def test_of_a_recording_no_noise_is_known() -> None:
@@ -153,7 +173,8 @@ def test_what_a_file_accepts_is_left_out_and_a_wrong_name_is_said() -> None:
 @pytest.mark.slow
 def test_the_command_ends_with_1_on_findings_and_check_warns(tmp_path: Path) -> None:
     text = (
-        '[[nodes]]\nname = "drone"\ntype = "sims.multirotor:Multirotor"\n'
+        '[run]\naccept = ["no-end", "idle"]\n[[nodes]]\nname = "drone"\n'
+        'type = "sims.multirotor:Multirotor"\n'
         '[[nodes.cameras]]\nname = "camera"\n'
         '[[nodes]]\nname = "odometry"\ntype = "nodes.visual_odometry:VisualOdometry"\n'
         '[[nodes]]\nname = "evaluation"\ntype = "nodes.evaluation:Evaluation"\n'

@@ -220,7 +220,7 @@ def test_two_estimates_of_one_name_need_another(tmp_path: Path) -> None:
         (["--alignment", "so3"], "judge.alignment: expected"),
         (["--axes", "flu"], "judge.axes: expected"),
         (["--gap", "soon"], "judge.gap: expected a duration"),
-        (["--threshold", "ate=1"], "judge.thresholds: expected one of ate_rmse_m"),
+        (["--threshold", "ate=1"], "judge.thresholds: found unknown key 'ate'"),
         (["--threshold", "ate_percent=low"], "judge.thresholds.ate_percent: expected"),
     ],
 )

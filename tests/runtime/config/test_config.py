@@ -41,12 +41,12 @@ def message(tmp_path: Path, text: str, *overrides: str) -> str:
 
 
 IN_RUN = [
-    ('clok = "real"', "run: expected one of name, clock, ", "'clok' (did you mean 'clock'?)"),
+    ('clok = "real"', "run: found unknown key ", "'clok' (did you mean 'clock'?)"),
     ('clock = "fast"', 'run.clock: expected "lockstep" or "real"', 'found "fast"'),
     ("seed = -1", "run.seed: expected a whole number >= 0", "found -1"),
     ("seed = 1.5", "run.seed: expected a whole number", "found 1.5"),
-    ('duration = "5 parsec"', "run.duration: expected a duration such as", 'found "5 parsec"'),
-    ("duration = -1", "run.duration: expected a duration such as", "found -1"),
+    ('duration = "5 parsec"', "run.duration: found ", '"5 parsec", of no known unit'),
+    ("duration = -1", "run.duration: expected a duration that is not", "found -1"),
     ("duration = inf", "run.duration: expected a duration such as", "found inf"),
     ("speed = 0", "run.speed: expected a number > 0", "found 0"),
     ('speed = "slow"', 'run.speed: expected a number or "max"', 'found "slow"'),
@@ -59,24 +59,24 @@ IN_RUN = [
 def test_mistakes_in_the_run(tmp_path: Path, line: str, expected: str, found: str) -> None:
     text = message(tmp_path, f"[run]\n{line}\n{SPEAKER}")
     assert text.startswith(f"c.toml: {expected}")
-    assert text.endswith(found)
+    assert found in text
 
 
 IN_DRONE = [
-    ("wrld = 1", "expected one of world, origin, cameras, ", "'wrld' (did you mean 'world'?)"),
+    ("wrld = 1", "found unknown key ", "'wrld' (did you mean 'world'?)"),
     ("world = 1", "world: expected a text", "found 1"),
     ("position = [1]", "position: expected a list of length 2", "found [1]"),
     ('position = [1, "a"]', "position[1]: expected a number", 'found "a"'),
     ("control_rate = 0", "control_rate: expected a number > 0", "found 0"),
     ("camera_processes = true", "camera_processes: expected a whole number", "found true"),
     ("imu = 3", "imu: expected a table", "found 3"),
-    ("imu = { gyro = 3 }", "imu: expected one of position, orientation, gyro", "key 'gyro'"),
-    ("gains = { x = 3 }", "gains: expected one of ", "unknown key 'x'"),
-    ("limits = { x = 3 }", "limits: expected one of ", "unknown key 'x'"),
+    ("imu = { gyro = 3 }", "imu: found unknown key 'gyro'", "expected one of position, "),
+    ("gains = { x = 3 }", "gains: found ", "unknown key 'x'"),
+    ("limits = { x = 3 }", "limits: found ", "unknown key 'x'"),
     ('setpoint_timeout = "x"', "setpoint_timeout: expected a duration such as", 'found "x"'),
     ("cameras = 3", "cameras: expected a list", "found 3"),
     (CAMERAS + 'rate = "x"', "cameras[1].rate: expected a number", 'found "x"'),
-    (CAMERAS + "rte = 3", "cameras[1]: expected one of name, ", "(did you mean 'rate'?)"),
+    (CAMERAS + "rte = 3", "cameras[1]: found unknown key ", "(did you mean 'rate'?)"),
     (CAMERAS + "fov = 200", "cameras[1]: fov: expected at most 170 degrees ", "found 200 degrees"),
     (CAMERAS + 'images = ["red"]', 'cameras[1].images[0]: expected "rgb" or', 'found "red"'),
     (CAMERAS + "images = []", "cameras[1]: images: expected one or more", "found none"),
@@ -89,7 +89,7 @@ IN_DRONE = [
 def test_mistakes_in_a_node(tmp_path: Path, line: str, expected: str, found: str) -> None:
     text = message(tmp_path, SPEAKER + DRONE + line)
     assert text.startswith(f"c.toml: nodes[1] (drone): {expected}")
-    assert text.endswith(found)
+    assert found in text
 
 
 OF_NODES = [

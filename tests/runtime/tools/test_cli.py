@@ -119,8 +119,17 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Speaker")
     mistakes: list[tuple[list[str | Path], str]] = [
         (["run", "none.toml"], "error: none.toml: expected a readable file, found: No such"),
-        (["check", path, "--set", "speaker.rte=3"], "error: sample.toml: nodes[0] (speaker): exp"),
-        (["graph", path, "--set", "speakr.rate=3"], "\"speakr\" (did you mean 'speaker'?)"),
+        (
+            ["check", path, "--set", "speaker.rte=3"],
+            "sample.toml: nodes[0] (speaker): found",
+        ),
+        (
+            ["graph", path, "--set", "speakr.rate=3"],
+            'a node (speaker), found "speakr" (did you mean \'sp',
+        ),
+        (["run"], "error: missing argument 'config'; `python -m "),
+        (["run", path, "--sed", "3"], "error: no such option: --sed"),
+        (["run", path, "--web", "x"], "error: invalid value for '--web': "),
         (["nodes", "Multirotr"], "(did you mean 'Multirotor'?)"),
     ]
     for arguments, line in mistakes:
@@ -134,7 +143,8 @@ def test_check_says_what_is_right_and_warns_of_what_is_not_connected(tmp_path: P
     done = command_here("check", config_file(tmp_path, "Speaker", "Echo"), folder=tmp_path)
     assert done.returncode == 0
     assert done.stdout.rstrip().endswith("2 nodes, 1 connections: right")
-    done = command_here("check", config_file(tmp_path, "Reader"), folder=tmp_path)
+    path = config_file(tmp_path, "Reader", run="duration = 1")
+    done = command_here("check", path, folder=tmp_path)
     assert done.returncode == 0
     assert done.stderr == "warning: reader.pings: expects Ping, and no node sends it\n"
     assert not (tmp_path / "runs").exists()
