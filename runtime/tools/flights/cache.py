@@ -7,7 +7,9 @@ used for longest are removed. A flight is written by one process at a time, and 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +22,8 @@ from runtime.tools.flights.layout import opened
 from runtime.tools.flights.part import content_key, flight_of
 from runtime.tools.flights.player import stand_ins
 from runtime.tools.flights.recorder import record as fly
+
+_LOG = logging.getLogger("visnav.flights")
 
 LIMIT = 20.0
 """Gigabytes, unless ``VISNAV_FLIGHTS_GB`` says otherwise."""
@@ -47,16 +51,24 @@ def recorded(config: Config, *, record: bool) -> dict[str, type[Node[Any]]]:
     if part is None:
         return {}
     path = home() / f"{content_key(part)}.flight"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _locked(path):  # whoever comes second waits, and finds it
-        found = opened(path)
-        if found is None and record:
-            _write(part, path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for each in (path, _unfinished(path)):
+            if each.exists() and not each.is_file():
+                raise OSError(errno.EEXIST, "what is no file", str(each))
+        with _locked(path):  # whoever comes second waits, and finds it
             found = opened(path)
-        if found is None or found[0].unfit:
-            return {}
-        os.utime(path)
-        return stand_ins(config, *found)
+            if found is None and record:
+                _write(part, path)
+                found = opened(path)
+            if found is None or found[0].unfit:
+                return {}
+            os.utime(path)
+    except OSError as error:
+        what = f"{error.filename or home()}: {error.strerror}"
+        _LOG.warning("expected a cache of flights, found %s: the run flies itself", what)
+        return {}
+    return stand_ins(config, *found)
 
 
 def home() -> Path:
@@ -70,7 +82,8 @@ def kept() -> list[Kept]:
     found = []
     for path in home().glob("[!.]*.flight"):
         with contextlib.suppress(OSError):  # removed meanwhile
-            found.append(Kept(path, path.stat().st_size, path.stat().st_mtime))
+            if path.is_file():
+                found.append(Kept(path, path.stat().st_size, path.stat().st_mtime))
     return sorted(found, key=lambda each: -each.used)
 
 
@@ -80,7 +93,8 @@ def remove_beyond(gigabytes: float) -> list[Kept]:
     What a run has open stays there for it. One that is being flown just now is left alone.
     """
     for unfinished in home().glob(".*.new"):  # left by a process that was killed, unless locked
-        _remove(unfinished, unfinished.with_name(unfinished.stem[1:]))
+        if unfinished.is_file():
+            _remove(unfinished, unfinished.with_name(unfinished.stem[1:]))
     sizes = 0
     beyond = [each for each in kept() if (sizes := sizes + each.size) > gigabytes * 1e9]
     return [each for each in beyond if _remove(each.path, each.path)]
@@ -88,7 +102,7 @@ def remove_beyond(gigabytes: float) -> list[Kept]:
 
 def _remove(file: Path, flight: Path) -> bool:
     """Remove a file of a flight, unless that is locked."""
-    with contextlib.suppress(BlockingIOError), _locked(flight, wait=False):
+    with contextlib.suppress(OSError), _locked(flight, wait=False):
         file.unlink(missing_ok=True)
         return True
     return False
@@ -96,7 +110,7 @@ def _remove(file: Path, flight: Path) -> bool:
 
 def _write(part: Config, path: Path) -> None:
     """Fly, and keep it if it can be used again or never can; nothing if it could not be flown."""
-    new = path.with_name(f".{path.name}.new")
+    new = _unfinished(path)
     try:
         fly(part, new)
         limit = float(os.environ.get("VISNAV_FLIGHTS_GB", LIMIT))
@@ -108,8 +122,18 @@ def _write(part: Config, path: Path) -> None:
         new.unlink(missing_ok=True)
 
 
+def _unfinished(path: Path) -> Path:
+    """Return the file that a flight is written to before it is whole."""
+    return path.with_name(f".{path.name}.new")
+
+
 @contextlib.contextmanager
 def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
-    with path.with_name(f".{path.name}.lock").open("w") as file:
+    # Neither a pipe of this name nor a link makes it wait for ever, or write elsewhere.
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+    file = os.open(path.with_name(f".{path.name}.lock"), flags, 0o644)
+    try:
         fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield
+    finally:
+        os.close(file)

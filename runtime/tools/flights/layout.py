@@ -130,6 +130,8 @@ class Writer:
 
 def opened(path: Path) -> tuple[Flight, memoryview] | None:
     """Return a flight and its file's content; `None` if it cannot be read as it is."""
+    if not path.is_file():  # a pipe would wait for ever
+        return None
     try:
         with path.open("rb") as file:
             content = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))

@@ -21,7 +21,7 @@ from runtime.digest import Digest
 from runtime.errors import NodeError
 from runtime.tools.flights.cache import home, kept, recorded, remove_beyond
 from runtime.tools.flights.layout import Action, Writer, event_at
-from runtime.tools.flights.part import content_key, flight_of, settings_key
+from runtime.tools.flights.part import _imported, content_key, flight_of, settings_key
 from runtime.tools.flights.recorder import record
 from tests.runtime.tools.flights import samples
 from tests.runtime.tools.flights.samples import Seen, events_of, flown
@@ -167,6 +167,46 @@ def test_the_key_knows_modules_beside_a_node_of_ones_own(
         file.write_text(file.read_text() + "# changed\n")
         keys.add(content_key(part))
     assert len(keys) == 1 + len(files)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import json, helper",
+        "from os import (\n    path,\n)\nfrom helper import (\n    it,\n)",
+        "from . import (\n    air as a,\n    helper,\n)",
+        "from .helper \\\n    import it",
+        "if TYPE_CHECKING:\n    import helper",
+        "def later():\n    try:\n        x = 1; import helper\n    except ImportError: pass",
+    ],
+)
+def test_every_way_to_import_is_known(statement: str, tmp_path: Path) -> None:
+    package = tmp_path / "flying"
+    package.mkdir()
+    for file in ("__init__.py", "air.py", "helper.py"):
+        (package / file).write_text("")
+    (tmp_path / "helper.py").write_text("")
+    (package / "craft.py").write_text(statement)
+    found = {*_imported(package / "craft.py", "flying")}
+    assert ("flying.helper" if "from ." in statement else "helper") in found
+
+
+@pytest.mark.parametrize("name", ["{}", ".{}.lock", ".{}.new", ""])
+@pytest.mark.parametrize("kind", ["fifo", "folder"])
+def test_what_has_a_name_of_the_cache_neither_hangs_nor_fails_a_run(
+    kind: str, name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = flown(tmp_path, "captain.end=0.2")
+    part = flight_of(config)
+    assert part is not None
+    path = home() / name.format(f"{content_key(part)}.flight") if name else home()
+    path.parent.mkdir(parents=True)
+    os.mkfifo(path) if kind == "fifo" else path.mkdir()
+    used = (kind, name) in {("fifo", ".{}.lock"), ("folder", "")}
+    assert bool(recorded(config, record=True)) is used
+    assert (f"found {path}: " in caplog.text) is not used
+    remove_beyond(0.0)
+    assert path.exists()
 
 
 _OTHER_CODE = b"cevents\nNoLongerThere\n."  # a pickle that only other code can read
