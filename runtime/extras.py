@@ -7,6 +7,7 @@ import importlib.util
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 _PROJECT = Path(__file__).parents[1] / "pyproject.toml"
 """Of a checkout; an installed wheel has none."""
@@ -40,9 +41,10 @@ def why_missing(library: str) -> str:
 
     Another process tries it, if it is there: what it needs of the system may be missing.
     """
-    if library in sys.modules:
-        return "" if sys.modules[library] else f"No module named '{library}'"
-    if importlib.util.find_spec(library) is None:
+    modules: dict[str, Any] = {**sys.modules}
+    if modules.get(library):
+        return ""
+    if library in modules or importlib.util.find_spec(library) is None:  # None: kept from import
         return f"No module named '{library}'"
     command = [sys.executable, "-c", f"import {library}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603

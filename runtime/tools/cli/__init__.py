@@ -12,6 +12,7 @@ import contextlib
 import io
 import os
 import sys
+from pathlib import Path
 from typing import NoReturn
 
 import typer
@@ -31,6 +32,9 @@ def _all() -> None:
 
 def main() -> None:
     """Run the command line; the process ends here."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started this
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
     try:
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
@@ -41,14 +45,23 @@ def main() -> None:
     except SystemExit as end:
         if isinstance(getattr(end.__context__, "__cause__", None), KeyboardInterrupt):
             interrupted()  # typer has made it an exit without a word
+        if isinstance(
+            end.__context__, BrokenPipeError
+        ):  # this, too, with a code that means "failed"
+            _unheard()
         raise
-    except BrokenPipeError:  # whoever reads what we print has heard enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(2)
+    except BrokenPipeError:
+        _unheard()
     except Exception as error:
         from runtime.tools.cli.run import leave_behind
 
         leave_behind(2, f"error: {_described(error)}")
+
+
+def _unheard() -> NoReturn:
+    """End the process: whoever reads what it prints has heard enough."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(2)
 
 
 def program() -> None:

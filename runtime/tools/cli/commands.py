@@ -65,7 +65,7 @@ class Commands(TyperGroup):
             return super().invoke(ctx)
 
 
-_USAGE_ERROR = typer.BadParameter.__mro__[2]
+_USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
 """Click's base of all that can be wrong with arguments, which Typer shows in a box."""
 
 

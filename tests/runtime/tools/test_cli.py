@@ -127,7 +127,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
             ["graph", path, "--set", "speakr.rate=3"],
             'a node (speaker), found "speakr" (did you mean \'sp',
         ),
-        (["run"], "error: missing argument 'config'; `python -m "),
+        (["run"], "error: missing argument 'config'; `"),
         (["run", path, "--sed", "3"], "error: no such option: --sed"),
         (["run", path, "--web", "x"], "error: invalid value for '--web': "),
         (["nodes", "Multirotr"], "(did you mean 'Multirotor'?)"),
