@@ -2,6 +2,9 @@
 
 Levels: trace (5), debug, info, warning, error, and fatal, which also stops the run. Each node has
 a logger, ``visnav.<node>``; lines carry the time of the run's clock.
+
+Whatever is logged, a run ends: messages are cut, what waits is bounded, and a slow terminal is
+given up soon after the end. What is left out is counted and said.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import logging
 import logging.handlers
 import queue
 import sys
+import time
 from collections.abc import Callable, Iterator, MutableMapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -30,6 +34,39 @@ LEVELS = {
     "error": logging.ERROR,
     "fatal": logging.CRITICAL,
 }
+
+
+LONGEST = 65_536
+"""Characters of a message in ``log.txt``."""
+
+LONGEST_SHOWN = 2_000
+"""Characters of a message in the terminal."""
+
+LONGEST_HIGHLIGHTED = 400
+"""Characters of a message with colours: finding what to colour takes the square of a word."""
+
+MOST_WAITING = 64 << 20
+"""Characters, of lines and about them, that wait to be written; more are dropped."""
+
+PATIENCE = 2.0
+"""Real seconds that a terminal has, once the run is over, to show what still waits."""
+
+_OF_RECORD = 300  # what a record takes besides its message, in characters
+
+_HARMFUL = {
+    code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"
+} | {code: f"\\u{code:04x}" for code in (0x2028, 0x2029, *range(0x202A, 0x202F))}
+
+
+def harmless(text: str, longest: int = LONGEST) -> str:
+    """Return a text that neither steers a terminal nor looks like other lines of a log.
+
+    It is cut to `longest` characters and says so; escapes and the like become visible, and lines
+    after the first begin with a bar.
+    """
+    if len(text) > longest:
+        text = f"{text[:longest]}… ({len(text):,} characters)"
+    return text.translate(_HARMFUL).replace("\n", "\n    | ")
 
 
 class NodeLogger(logging.LoggerAdapter[logging.Logger]):
@@ -58,24 +95,81 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
 
 
 class _Queued(logging.handlers.QueueHandler):
-    """Queues records; their tracebacks stay apart from their messages."""
+    """Queues records, as long as there is room; their tracebacks stay apart from their messages."""
+
+    def __init__(self, records: queue.SimpleQueue[logging.LogRecord]) -> None:
+        super().__init__(records)
+        self.given = self.taken = self.dropped = 0
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Queue a record, or count that there is no room; errors have some of their own."""
+        room = MOST_WAITING * (2 if record.levelno >= logging.ERROR else 1)
+        if self.given - self.taken > room:
+            self.dropped += 1
+            return
+        self.given += _size(record)
+        super().enqueue(record)
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
         """Make message and traceback while what they describe is as it is."""
         record = copy.copy(record)
-        record.msg, record.args = record.getMessage(), None
+        text = record.getMessage()
+        record.length = len(text)
+        record.msg, record.args = harmless(text), None
         if record.exc_info:
-            record.exc_text = logging.Formatter().formatException(record.exc_info)
+            trace = logging.Formatter().formatException(record.exc_info)
+            record.exc_text = harmless(trace).replace("\n    | ", "\n")
             record.exc_info = None
         return record
 
 
+class _Listener(logging.handlers.QueueListener):
+    """Hands queued records to the handlers; once the run is over, to a terminal not for long."""
+
+    def __init__(
+        self, queued: _Queued, records: queue.SimpleQueue[Any], handlers: list[logging.Handler]
+    ) -> None:
+        super().__init__(records, *handlers, respect_handler_level=True)
+        self.ends = float("inf")
+        self.unshown = 0
+        self._queued = queued
+
+    def handle(self, record: logging.LogRecord) -> None:
+        """Hand a record to those handlers that want it."""
+        self._queued.taken += _size(record)
+        late = time.monotonic() > self.ends
+        for handler in self.handlers:
+            if late and isinstance(handler.formatter, _OneLine):
+                self.unshown += 1
+            elif record.levelno >= handler.level:
+                handler.handle(record)
+
+    def say(self, text: str) -> None:
+        """Warn of something at the very end."""
+        self.ends = float("inf")
+        self.handle(self._queued.prepare(self._record(text)))
+
+    def _record(self, text: str) -> logging.LogRecord:
+        fields = {"name": "visnav.runtime", "levelno": logging.WARNING, "levelname": "WARNING"}
+        record = logging.makeLogRecord({**fields, "msg": text})
+        for each in self._queued.filters:
+            each(record)  # type: ignore[operator]
+        return record
+
+
+def _size(record: logging.LogRecord) -> int:
+    return len(record.msg) + len(record.exc_text or "") + _OF_RECORD
+
+
 class _OneLine(logging.Formatter):
-    """Leaves out tracebacks, which are for ``log.txt``."""
+    """Leaves out tracebacks and the ends of long messages, which are for ``log.txt``."""
 
     def format(self, record: logging.LogRecord) -> str:
         record = copy.copy(record)
         record.exc_info = record.exc_text = None
+        text, length = record.getMessage(), getattr(record, "length", 0)
+        if len(text) > LONGEST_SHOWN:
+            record.msg, record.args = f"{text[:LONGEST_SHOWN]}… ({length:,} characters)", None
         return super().format(record)
 
 
@@ -115,7 +209,7 @@ def logging_to(
         return True
 
     handler.addFilter(stamp)
-    listener = logging.handlers.QueueListener(records, *handlers, respect_handler_level=True)
+    listener = _Listener(handler, records, handlers)
     root, ours = logging.getLogger(), logging.getLogger("visnav")
     before = ours.level
     root.addHandler(handler)
@@ -124,7 +218,12 @@ def logging_to(
     try:
         yield
     finally:
+        listener.ends = time.monotonic() + PATIENCE
         listener.stop()
+        if handler.dropped:
+            listener.say(f"{handler.dropped} log lines were dropped: they came too fast")
+        if listener.unshown:
+            listener.say(f"{listener.unshown} log lines are not shown here: they came too fast")
         ours.setLevel(before)
         root.removeHandler(handler)
         for each in handlers:
@@ -146,12 +245,19 @@ def terminal_handler(console: Console | None = None) -> logging.Handler:
     handler = RichHandler(console=console, show_path=False, show_time=False, markup=False)
     handler.setFormatter(_OneLine("%(seconds)9.3f %(logger_name)s: %(message)s"))
     handler.addFilter(lambda record: not getattr(record, "reported", False))
+    handler.addFilter(_without_colours_if_long)
     return handler
+
+
+def _without_colours_if_long(record: logging.LogRecord) -> bool:
+    if len(record.msg) > LONGEST_HIGHLIGHTED:
+        record.highlighter = None
+    return True
 
 
 def file_handler(path: Path) -> logging.Handler:
     """Return a handler that writes everything to a file."""
-    handler = _File(path, mode="w", encoding="utf-8", delay=False)
+    handler = _File(path, mode="w", encoding="utf-8", errors="backslashreplace", delay=False)
     handler.setFormatter(
         logging.Formatter("%(seconds)12.6f %(levelname)-8s %(logger_name)s: %(message)s")
     )

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import logging
+import threading
+import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
-from runtime import Duration, Node, NodeConfig, Tick, every
+from runtime import Duration, Node, NodeConfig, Tick, every, logs
 from runtime.config.model import Config, RunConfig
 from runtime.errors import FatalError
 from runtime.execute import execute
-from runtime.logs import LEVELS, NodeLogger, file_handler, logging_to
+from runtime.logs import LEVELS, NodeLogger, file_handler, logging_to, terminal_handler
 from runtime.testing import run_node, spec
 
 
@@ -99,3 +103,83 @@ def test_libraries_log_warnings_only(tmp_path: Path) -> None:
         logging.getLogger("some.library").warning("größer als erwartet")
     text = (tmp_path / "log.txt").read_text(encoding="utf-8")
     assert text == "    1.500000 WARNING  some.library: größer als erwartet\n"
+
+
+def shown(*messages: str, level: int = logging.INFO) -> list[str]:
+    """Return what a terminal shows of these messages."""
+    text = io.StringIO()
+    with logging_to([terminal_handler(Console(file=text, width=10_000))], "info", lambda: 0):
+        for message in messages:
+            logging.getLogger("visnav.n").log(level, "%s", message)
+    return [line.rstrip() for line in text.getvalue().splitlines()]
+
+
+def test_a_line_of_three_megabytes_is_cut_and_says_how_long_it_is(tmp_path: Path) -> None:
+    begin = time.monotonic()
+    (line,) = shown("x" * 3_000_000)
+    assert len(line) < 2 * logs.LONGEST_SHOWN
+    assert line.endswith("x… (3,000,000 characters)")
+    with logging_to([file_handler(tmp_path / "log.txt")], "info", lambda: 0):
+        logging.getLogger("visnav.n").info("%s", "x" * 3_000_000)
+    written = (tmp_path / "log.txt").read_text(encoding="utf-8")
+    assert written.endswith("x… (3,000,000 characters)\n")
+    assert len(written) < logs.LONGEST + 100
+    assert time.monotonic() - begin < 10
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("\x1b[2J\x07 gone", r"\x1b[2J\x07 gone"),
+        ("one\r\ntwo", "one\\x0d\n    | two"),
+        ("\x9b31m \u202e evil \u2028", r"\x9b31m \u202e evil \u2028"),
+        ("Grüße\t\U0001f681", "Grüße\t\U0001f681"),
+    ],
+)
+def test_what_steers_a_terminal_is_made_visible(message: str, expected: str) -> None:
+    keeper = Keeper()
+    with logging_to([keeper], "info", lambda: 0):
+        logging.getLogger("visnav.n").info("%s", message)
+    assert [record.getMessage() for record in keeper.records] == [expected]
+
+
+def test_what_is_no_text_is_written_nevertheless(tmp_path: Path) -> None:
+    with logging_to([file_handler(tmp_path / "log.txt")], "info", lambda: 0):
+        logging.getLogger("visnav.n").info("%s", "a\udc80b")
+    assert "a\\udc80b" in (tmp_path / "log.txt").read_text(encoding="utf-8")
+
+
+def test_a_flood_is_bounded_and_what_is_dropped_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "MOST_WAITING", 50_000)
+    gate = threading.Event()
+
+    class Slow(Keeper):
+        def emit(self, record: logging.LogRecord) -> None:
+            gate.wait()
+            super().emit(record)
+
+    keeper = Slow()
+    with logging_to([keeper], "info", lambda: 0):
+        for _ in range(1000):
+            logging.getLogger("visnav.n").info("%s", "x" * 700)
+        logging.getLogger("visnav.n").error("the end")
+        gate.set()
+    *_, error, last = [record.getMessage() for record in keeper.records]
+    assert error == "the end"
+    assert last == f"{1002 - len(keeper.records)} log lines were dropped: they came too fast"
+    assert 40 < len(keeper.records) < 60
+
+
+def test_a_terminal_does_not_keep_a_run_from_ending(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "PATIENCE", -1.0)
+    terminal, keeper = Keeper(), Keeper()
+    terminal.setFormatter(logs._OneLine())
+    gate = threading.Event()
+    keeper.addFilter(lambda _: gate.wait())
+    with logging_to([keeper, terminal], "info", lambda: 0):
+        for number in range(10):
+            logging.getLogger("visnav.n").info("%d", number)
+        threading.Timer(0.05, gate.set).start()  # when the block is over
+    assert len(keeper.records) == 11
+    said = [record.getMessage() for record in terminal.records]
+    assert said[-1] == f"{11 - len(said)} log lines are not shown here: they came too fast"
