@@ -66,7 +66,14 @@ def _end_with_the_run(connection: socket.socket) -> None:
     gone.register(connection, 0)  # which leaves POLLHUP
     gone.poll()
     time.sleep(_GRACE)
+    _end_group(signal.SIGKILL)
     os._exit(1)
+
+
+def _end_group(number: signal.Signals) -> None:
+    """Send a signal to what this process has started, if it leads a group of its own."""
+    if os.getpgrp() == os.getpid():
+        os.killpg(0, number)
 
 
 def _make(pipe: SharedPipe, message: bytearray) -> Any:
@@ -128,3 +135,5 @@ def _portable(error: Exception) -> Exception:
 if __name__ == "__main__":
     socket_fd, in_fd, out_fd = map(int, sys.argv[1:4])
     main(socket_fd, in_fd, out_fd, float(sys.argv[4]))
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    _end_group(signal.SIGTERM)

@@ -18,6 +18,7 @@ import functools
 import math
 import os
 import select
+import signal
 import socket
 import struct
 import subprocess
@@ -325,7 +326,7 @@ class _Process:
         except WorkerTimeoutError as hung:
             error = hung
         except Exception as unexpected:  # such as a second answer, by a fork of it
-            self._child.kill()
+            self._kill()
             error = WorkerDiedError(self._story(f"expected an answer, found {unexpected!r}"))
         self._fail(error)
 
@@ -357,7 +358,7 @@ class _Process:
             raise self._hung()
 
     def _hung(self) -> WorkerTimeoutError:
-        self._child.kill()
+        self._kill()
         return WorkerTimeoutError(
             self._story(f"no answer in {self._timeout:g} s (timeout of self.worker)")
         )
@@ -406,13 +407,19 @@ class _Process:
         self._costs.look_at(self._child.pid)
         self._pipe.shut_down()
 
+    def _kill(self) -> None:
+        """Kill the process, and what it has started and left behind."""
+        with contextlib.suppress(OSError):
+            os.killpg(self._child.pid, signal.SIGKILL)
+
     def join(self, until: float) -> None:
         """Wait until it has ended, by force if it has not by a time of `time.monotonic`."""
         try:
             self._child.wait(max(until - time.monotonic(), 0))
         except subprocess.TimeoutExpired:
-            self._child.kill()
+            self._kill()
             self._child.wait()
+        self._kill()
         self._reader.join()
         self._output.join(_GRACE)
         self._pipe.close()
