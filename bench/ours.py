@@ -98,7 +98,7 @@ class HandlerOther(Node[OtherConfig]):
     def ping(self, event: Ping) -> bool | None:
         """Reply, if it is meant."""
         if event.receiver == self.number:
-            self.pongs.send(Pong(stamp=event.stamp, source="other", number=event.number))
+            self.pongs.send(Pong(stamp=event.stamp, source=self.name, number=event.number))
             return True
         return None
 
@@ -114,7 +114,7 @@ class StreamOther(Node[OtherConfig]):
         number = self.config.number
         async for event in self.pings:
             if event.receiver == number:
-                self.pongs.send(Pong(stamp=event.stamp, source="other", number=event.number))
+                self.pongs.send(Pong(stamp=event.stamp, source=self.name, number=event.number))
 
 
 def measure(case: Case, digest: bool = False) -> Samples:

@@ -16,7 +16,11 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Announcement(Event):
-    """Base of all announcements; `source` names what is announced."""
+    """Base of all announcements; `source` names what is announced.
+
+    Who announces a source speaks for it, and for those below it. This class itself says only that;
+    with the source ``*``, of all for whom nobody else speaks.
+    """
 
     category: ClassVar[Category] = Category.ANNOUNCEMENT
 
@@ -306,7 +310,7 @@ class LidarAnnouncement(SensorAnnouncement):
 
 
 class WindAnnouncement(Announcement):
-    """Wind that a vehicle feels, which is sent as `Wind`; `source` is the vehicle's name.
+    """Wind that a vehicle feels, which is sent as `Wind`; `source` is ``world/vehicle``.
 
     Attributes:
         rate: Hertz at which it is sent.

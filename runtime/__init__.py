@@ -19,6 +19,13 @@ Read the core in this order:
 tracing and sweeps.
 """
 
+import signal as _signal
+import sys as _sys
+
+# Until `runtime.__main__` has taken over, Ctrl-C ends the process without a traceback.
+if _sys.argv[:1] == ["-m"] and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
+    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
+
 from runtime import neighbours as _neighbours  # noqa: F401  # first, as it checks `events`
 from runtime.bundles import Bundle
 from runtime.clock import Clock

@@ -104,6 +104,14 @@ class ChannelBusyError(ChannelError):
     """A second coroutine wanted to wait on an input that has one waiting."""
 
 
+class HandlerCircleError(ChannelError):
+    """Handlers of several nodes answer one another without end."""
+
+
+class ChannelSourceError(ChannelError):
+    """An event says that another node has sent it."""
+
+
 class ChannelTypeError(ChannelError, TypeError):
     """An output was sent something else than it declares, or what has no digest."""
 

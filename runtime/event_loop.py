@@ -12,6 +12,8 @@ import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
+from runtime.task_factory import RunTask
+
 R = TypeVar("R")
 
 GRACE = 1.0
@@ -41,7 +43,8 @@ def run_to_end(
         BaseException: Whatever `main` raises.
     """
     try:
-        task = loop.create_task(main)
+        task = RunTask(0, main, loop=loop, name="the run")
+        task.protected = True
         escapes = 0
         while not task.done():
             try:
@@ -53,7 +56,8 @@ def run_to_end(
                 if escapes > _MOST_ESCAPES:
                     raise
                 escaped(error)
-        return task.result()
+        result: R = task.result()
+        return result
     finally:
         _close(loop)
 

@@ -6,12 +6,15 @@ type of event, in the order of the nodes in the file and of the declarations in 
 
 from __future__ import annotations
 
+import dis
+import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from events import Announcement, CameraAnnouncement, Odometry, PoseStamped, VehicleAnnouncement
 from runtime.links import Link
 from runtime.node import Node, senders
-from runtime.sender import Deliver, Listener, Tap
+from runtime.sender import Deliver, Listener, Tap, Voices
 from runtime.tasks import Fault
 
 Sources = Mapping[str, Mapping[str, str]]
@@ -82,6 +85,7 @@ def connect(
     last: Iterable[Listener] = (),
     elsewhere: Callable[[str], Iterable[Listener]] = no_listeners,
     wrap: Wrap = unwrapped,
+    voices: Voices | None = None,
 ) -> list[Listener]:
     """Freeze every output's listeners, and return all that are here.
 
@@ -96,6 +100,7 @@ def connect(
         last: Listeners after all nodes.
         elsewhere: Given ``node.port``, returns its listeners in other processes.
         wrap: Puts something round the nodes' handlers.
+        voices: Who may send in which name; without it, all in any.
     """
     connected = [
         listener
@@ -108,8 +113,27 @@ def connect(
     for node in nodes:
         others = [listener for listener in connected if listener.node != node.name]
         for sender in senders(node).values():
-            sender.connect([*elsewhere(sender.name), *others], taps, fault)
+            sender.connect([*elsewhere(sender.name), *others], taps, fault, voices)
     return connected
+
+
+def truth_readers(
+    nodes: Iterable[Node[Any]],
+    listeners: Iterable[Listener],
+    announcements: Iterable[Announcement],
+) -> set[str]:
+    """Return the nodes that receive true poses of vehicles or cameras, and do not say what for."""
+    truths = [
+        (Odometry if isinstance(each, VehicleAnnouncement) else PoseStamped, each.source)
+        for each in announcements
+        if isinstance(each, VehicleAnnouncement | CameraAnnouncement)
+    ]
+    said = {node.name for node in nodes if node.flies or node.reads_truth}
+    return {
+        each.node
+        for each in listeners
+        if each.node not in said and any(each.receives(*truth) for truth in truths)
+    } - {"run"}
 
 
 def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str, str, str]]:
@@ -155,6 +179,46 @@ def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str,
         and (name, port) not in connected
         and port not in cls.declared.optional_fields()
     ]
+
+
+def circles(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[str]:
+    """Return the circles of handlers each of which always sends what the next one handles."""
+    after = {
+        (name, handler): [
+            (f"{name}.{output} → {other}.{another}", (other, another))
+            for output in _always_sends(cls, handler)
+            for other, receiving in nodes
+            for another, handles in receiving.declared.handlers.items()
+            if other != name
+            and handles.source is None
+            and issubclass(cls.declared.outputs[output].event, handles.events)
+        ]
+        for name, cls in nodes
+        for handler in cls.declared.handlers
+    }
+    found: dict[frozenset[str], str] = {}
+
+    def follow(place: tuple[str, str], way: dict[tuple[str, str], str]) -> None:
+        for step, following in after[place]:
+            if following in way:
+                steps = [*way.values(), step]
+                steps = steps[[*way].index(following) + 1 :]
+                found.setdefault(frozenset(steps), ", ".join(steps))
+            elif following > next(iter(way)):  # else it was found from there
+                follow(following, {**way, following: step})
+
+    for place in after:
+        follow(place, {place: ""})
+    return list(found.values())
+
+
+def _always_sends(cls: type[Node[Any]], handler: str) -> list[str]:
+    """Return the outputs by which a handler sends whatever the event is: it has no branches."""
+    code = list(dis.get_instructions(inspect.unwrap(getattr(cls, handler))))
+    names = {each.argval for each in code if each.opname in {"LOAD_ATTR", "LOAD_METHOD"}}
+    if "send" not in names or any(each.is_jump_target for each in code):
+        return []
+    return [output for output in cls.declared.outputs if output in names]
 
 
 def _linked(link: Link, deliver: Deliver, fault: Fault | None) -> Deliver:

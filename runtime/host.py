@@ -51,6 +51,8 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
             or replays carries out, without an error; or a person's wish where there is no plan.
         duration: Seconds that the run was to take; `None` if the file does not say.
         restarts: How often each node of this process was brought up anew.
+        truth_readers: Nodes of this process that received true poses, but those that fly, and those
+            whose `reads_truth` says what for.
     """
 
     stamp: int
@@ -60,6 +62,7 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
     planned: bool
     duration: float | None = None
     restarts: dict[str, int]
+    truth_readers: frozenset[str] = frozenset()
 
 
 class Host(Protocol):

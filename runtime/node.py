@@ -110,6 +110,9 @@ class Node(Generic[C]):
     starts_programs: ClassVar[bool] = False
     """Whether it starts programs, which are judged: what other nodes write is not in the run's
     folder before its end then (`runtime.private_results`)."""
+    reads_truth: ClassVar[str] = ""
+    """What it receives true poses for, if not to fly or to estimate: ``judging``, ``recording``,
+    ``showing``. All others that do are named in the summary."""
     files: ClassVar[tuple[str, ...]] = ()
     """What it writes into the run's folder, besides what settings of type `OutputPath` name."""
     declared: ClassVar[Declared]

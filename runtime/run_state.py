@@ -44,6 +44,7 @@ class RunState:
         error: The first that went wrong, if anything did.
         interruption: An exception that is to be raised in a node that blocks the loop.
         announcements: What the nodes announced.
+        truth_readers: As in `RunEnd`.
         all_nodes: All nodes there have been, those restarted or dropped included.
         tickers: By ``node.method``.
         links: All links of the nodes that there are, by ``node.port``.
@@ -69,6 +70,7 @@ class RunState:
     error: Exception | None = None
     interruption: Exception | None = None
     announcements: list[Announcement] = field(default_factory=list)
+    truth_readers: set[str] = field(default_factory=set)
     all_nodes: list[Node[Any]] = field(default_factory=list)
     tickers: dict[str, Ticker] = field(default_factory=dict)
     links: dict[str, Link] = field(default_factory=dict)

@@ -7,13 +7,21 @@ been resumed. Who listens is decided by `runtime.graph` before the first event.
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
+from types import FrameType
 from typing import Any, Generic, TypeVar
 
-from events import Event
-from runtime.errors import ChannelClosedError, ChannelThreadError, ChannelTypeError
+from events import Announcement, Event
+from runtime.errors import (
+    ChannelClosedError,
+    ChannelSourceError,
+    ChannelThreadError,
+    ChannelTypeError,
+    HandlerCircleError,
+)
 from runtime.streams import Stream
 from runtime.tasks import FanOut, Fault
 
@@ -25,6 +33,71 @@ Deliver = Callable[[Any], Any]
 Tap = Callable[["Sender[Any] | None", Event], None]
 """Sees every event before its listeners do: the digest, the event log. (An announcement has no
 sender.)"""
+
+
+class Voices:
+    """Who may send in which name: a node in its own and in those that it announces.
+
+    What is below a name, such as ``drone/imu``, is whose the name is. Whoever announces ``*`` (a
+    replay does) speaks for all for whom nobody else does.
+
+    Args:
+        nodes: All nodes' names.
+        scripted: Those that may send in any name: scripts of tests.
+    """
+
+    def __init__(self, nodes: Iterable[str], scripted: Collection[str] = ()) -> None:
+        self._owners = {name: name for name in nodes}
+        self._scripted = frozenset(scripted)
+        self._for_others: set[str] = set()
+        self._announced: set[tuple[type[Announcement], str]] = set()
+
+    def announce(self, node: str, announcement: Announcement) -> None:
+        """Take in that a node announces a source, and so speaks for it.
+
+        Raises:
+            ChannelSourceError: The source is another's.
+        """
+        kind, source = type(announcement), announcement.source
+        if kind is Announcement and source == "*":
+            self._for_others.add(node)
+            return
+        if node in self._scripted:
+            return
+        self._check(node, source, f"{kind.__name__} of {source!r}")
+        self._owners.setdefault(source, node)
+        if kind is not Announcement and (kind, source) in self._announced:
+            raise ChannelSourceError(
+                f"{node}: expected to announce each source once, found {kind.__name__} of "
+                f"{source!r} twice"
+            )
+        self._announced.add((kind, source))
+
+    def check(self, port: str, event: Event) -> None:
+        """Raise an error if an event is sent by ``node.port`` in the name of another."""
+        node = port.partition(".")[0]
+        if node not in self._scripted and not (
+            node in self._for_others and self.owner(event.source) is None
+        ):
+            self._check(port, event.source, f"{type(event).__name__} of {event.source!r}")
+
+    def owner(self, source: str) -> str | None:
+        """Return the node whose a source is; `None` if it is nobody's."""
+        while source not in self._owners and "/" in source:
+            source = source.rpartition("/")[0]
+        return self._owners.get(source)
+
+    def _check(self, sender: str, source: str, found: str) -> None:
+        """Raise an error if a source is not that of a sender, ``node`` or ``node.port``."""
+        node = sender.partition(".")[0]
+        owner = self.owner(source)
+        if owner == node or (sender == node and owner is None):
+            return
+        whose = f"which is {owner}'s" if owner else "which nobody announces"
+        raise ChannelSourceError(
+            f"{sender}: expected a source that is {node!r}, below it, or announced by this node, "
+            f"found {found}, {whose}"
+        )
 
 
 class Sender(Generic[T]):
@@ -47,9 +120,12 @@ class Sender(Generic[T]):
         "_outside",
         "_routes",
         "_sent",
+        "_source",
+        "_sources",
         "_taps",
         "_thread",
         "_to_streams",
+        "_voices",
         "_waiting",
         "event",
         "name",
@@ -62,6 +138,9 @@ class Sender(Generic[T]):
         self._outside = outside
         self._thread = 0
         self._expected: type[T] | None = None
+        self._source = ""  # of the event that was checked last
+        self._sources: set[str] = set()  # of all that were
+        self._voices: Voices | None = None
         self._sent = 0
         self.send: Callable[[T], bool] = self._refuse
         """Deliver an event now; True if a handler ended the delivery."""
@@ -76,9 +155,17 @@ class Sender(Generic[T]):
         self._fault: Fault = _raise
 
     def connect(
-        self, candidates: Iterable[Listener], taps: Iterable[Tap] = (), fault: Fault | None = None
+        self,
+        candidates: Iterable[Listener],
+        taps: Iterable[Tap] = (),
+        fault: Fault | None = None,
+        voices: Voices | None = None,
     ) -> None:
-        """Freeze who listens, in order, and pick the shortest way to deliver to them."""
+        """Freeze who listens, in order, and pick the shortest way to deliver to them.
+
+        Without `voices`, events may be of any source.
+        """
+        self._voices = voices
         self._candidates = tuple(c for c in candidates if c.may_receive(self.event))
         self._listeners = tuple(c.deliver for c in self._candidates)
         for route in self._known.values():
@@ -134,11 +221,16 @@ class Sender(Generic[T]):
                 f"{threading.current_thread().name!r}: return the event from the function and send "
                 f"it after the await, or use loop.call_soon_threadsafe({self.name}.send, event)"
             )
+        if event.source not in self._sources:
+            if self._voices is not None:
+                self._voices.check(self.name, event)
+            self._sources.add(event.source)
+        self._source = self._to_streams.source = event.source
         if not self._outside:
             self._expected = self._to_streams.expected = self.event
 
     def _send_to_all(self, event: T) -> bool:
-        if event.__class__ is not self._expected:
+        if event.__class__ is not self._expected or event.source is not self._source:
             self._check(event)
         self._sent += 1
         listeners = self._listeners  # a listener may connect anew meanwhile
@@ -166,7 +258,7 @@ class Sender(Generic[T]):
         return False
 
     def _send_tapped(self, event: T) -> bool:
-        if event.__class__ is not self._expected:
+        if event.__class__ is not self._expected or event.source not in self._sources:
             self._check(event)
         for tap in self._taps:
             tap(self, event)
@@ -195,7 +287,18 @@ class Sender(Generic[T]):
     def _go_on(
         self, listeners: tuple[Deliver, ...], failed: Deliver, error: BaseException, event: T
     ) -> bool:
-        """Report the listener that raised, and deliver to those after it."""
+        """Report the listener that raised, and deliver to those after it.
+
+        Of handlers that answer one another, the first `send` reports: the last has no room left.
+        """
+        if isinstance(error, RecursionError):
+            if _sends(sys._getframe(2)):
+                raise error
+            if circle := _circle(error):
+                error = HandlerCircleError(
+                    "expected handlers that come to an end, found some that answer one another: "
+                    + circle
+                )
         self._fault(failed, error)
         for deliver in listeners[listeners.index(failed) + 1 :]:
             try:
@@ -263,6 +366,36 @@ class Route:
         self.key = key
         self.listeners = listeners
         self.sent = 0
+
+
+_SENDING = {Sender._send_to_all.__code__, Sender._send_routed.__code__}
+
+
+def _sends(frame: FrameType | None) -> bool:
+    """Return whether this frame, or one that it was called by, delivers to handlers."""
+    while frame is not None and frame.f_code not in _SENDING:
+        frame = frame.f_back
+    return frame is not None
+
+
+def _circle(error: BaseException) -> str:
+    """Return the ports and handlers through which an error has come again and again, if any."""
+    frames: dict[FrameType, None] = {}  # each stands there once for each time it was raised in
+    trace = error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code in _SENDING:
+            frames[trace.tb_frame] = None
+        trace = trace.tb_next
+    steps = []
+    for frame in frames:
+        deliver = frame.f_locals["deliver"]
+        node = getattr(getattr(deliver, "__self__", None), "name", "?")
+        handler = getattr(deliver, "__name__", "?")
+        steps.append(f"{frame.f_locals['self'].name} → {node}.{handler}")
+    if not steps or steps[-1] not in steps[:-1]:
+        return ""
+    last = len(steps) - 1 - steps[-2::-1].index(steps[-1])
+    return ", ".join(sorted(steps[last:], key=steps.index))
 
 
 def _raise(_: Deliver, error: BaseException) -> None:

@@ -11,8 +11,9 @@ from collections.abc import Awaitable, Callable, Collection
 from typing import Literal
 
 from events import Announcement
-from runtime.errors import NodeError
-from runtime.node_runner import NodeRunner
+from runtime.errors import ChannelSourceError, NodeError
+from runtime.node_runner import NodeRunner, wrap
+from runtime.sender import Voices
 
 Phase = Literal["on_startup", "announce", "check", "on_ready"]
 
@@ -29,6 +30,7 @@ async def start_up(
     exchange: Callable[[Announced], Awaitable[list[Announcement]]],
     ready: Step | None = None,
     failed: Callable[[Phase, NodeRunner, NodeError], None],
+    voices: Voices,
     give_up: Callable[[], bool] = lambda: False,
 ) -> None:
     """Take nodes through their phases up to the first update.
@@ -39,6 +41,7 @@ async def start_up(
         exchange: Given what the nodes here announce, returns what all nodes of the run announce.
         ready: Runs a node's `on_ready`; without it, that phase is left out.
         failed: Called when a node fails; if it returns, the next node follows.
+        voices: Takes in who speaks for whom.
         give_up: Asked, once all nodes had their `on_startup`, whether to leave out what follows.
     """
     announced: Announced = {}
@@ -51,7 +54,12 @@ async def start_up(
         return
     for runner in runners:
         try:
-            announced[runner.spec.name] = runner.announcements()
+            announced[runner.spec.name] = found = runner.announcements()
+            for announcement in found:
+                try:
+                    voices.announce(runner.spec.name, announcement)
+                except ChannelSourceError as error:
+                    raise wrap(runner.spec.name, error) from error
         except NodeError as error:
             failed("announce", runner, error)
     everything = await exchange(announced)

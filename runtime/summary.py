@@ -87,6 +87,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         stalls: Times the loop did not turn, by node.
         longest_stalls: The worst of them, by node.
         announcements: What nodes announced.
+        truth_readers: Nodes that received true poses, but those that fly, judge, record or show.
         environment: Machine and versions; the command line, and the commit of the current folder.
         processes: Where which nodes ran, if not all in one process.
         workers: What workers cost, by ``node.Factory``, and programs, by their nodes.
@@ -114,6 +115,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     ticks: dict[str, TickSummary]
     stalls: dict[str, int]
     longest_stalls: dict[str, Stall]
+    truth_readers: list[str]
     announcements: list[dict[str, Any]]
     environment: dict[str, str]
     processes: list[ProcessSummary] = []
@@ -198,6 +200,7 @@ def summarise(
         ticks=tick_summaries(state),
         stalls=dict(stalls),
         longest_stalls=longest_stalls,
+        truth_readers=sorted(state.truth_readers),
         announcements=[
             {"type": type(a).__name__, **plain(a, a.source)} for a in state.announcements
         ],
@@ -274,6 +277,7 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
         events=dict(sorted(events.items())),
         stalls=dict(stalls),
         longest_stalls=of_all("longest_stalls"),
+        truth_readers=sorted({node for part in parts for node in part.truth_readers}),
         processes=processes,
         **{
             field: of_all(field)

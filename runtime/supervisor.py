@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from events import Announcement, Event, Shutdown, WindowClosed
+from events import Announcement, EstimatorAnnouncement, Event, Shutdown, WindowClosed
 from runtime import code_location, graph
 from runtime.clock import Clock
 from runtime.config.model import Config
@@ -37,8 +37,9 @@ from runtime.node_runner import NodeRunner, log_error, wrap
 from runtime.parameter_server import ParameterServer
 from runtime.run_state import RunState
 from runtime.schedule import SECOND, Once
-from runtime.sender import Deliver, Listener, Tap
+from runtime.sender import Deliver, Listener, Tap, Voices
 from runtime.startup import Announced, Phase, start_up
+from runtime.task_factory import RunTask
 
 if TYPE_CHECKING:
     from runtime.peers.peers import Peers
@@ -66,6 +67,7 @@ class Supervisor:
         out_of_programs: That for nodes that start programs, if it is another one.
         only: Nodes that run here, if others run in other processes.
         stand_ins: Classes in the place of some nodes' own, by the node's name.
+        scripted: Nodes that may send in any name: scripts of tests.
 
     Attributes:
         state: What is known of the run.
@@ -84,6 +86,7 @@ class Supervisor:
         only: Collection[str] = (),
         stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
         out_of_programs: Path | None = None,
+        scripted: Collection[str] = (),
     ) -> None:
         here = [spec for spec in config.nodes if not only or spec.name in only]
         runners = {}
@@ -106,6 +109,7 @@ class Supervisor:
         )
         self.stepping = self._host.stepping
         self._taps = tuple(taps)
+        self._voices = Voices([spec.name for spec in config.nodes], scripted)
         self.peers: Peers | None = None
         if several:
             from runtime.peers.peers import Peers
@@ -131,6 +135,8 @@ class Supervisor:
     def _own(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
         """Make a task of the run."""
         task = asyncio.get_running_loop().create_task(coro, name=name)
+        if isinstance(task, RunTask):
+            task.protected = True
         self._tasks[task] = None
         task.add_done_callback(lambda _: self._tasks.pop(task, None))
         return task
@@ -172,6 +178,7 @@ class Supervisor:
             planned=error is None and self._is_planned(by),
             duration=state.config.run.duration or None,
             restarts={name: max(each.starts - 1, 0) for name, each in state.runners.items()},
+            truth_readers=frozenset(state.truth_readers),
         )
         if error is not None or state.stop_requested:
             state.clock.hurry()
@@ -252,7 +259,9 @@ class Supervisor:
             last=[Listener("run", self._receive_end, (Shutdown, WindowClosed))],
             elsewhere=self.peers.listeners if self.peers is not None else graph.no_listeners,
             wrap=self.instruments.listener,
+            voices=self._voices,
         )
+        self.state.truth_readers |= graph.truth_readers(nodes, listeners, self.state.announcements)
         if self.peers is not None:
             self.peers.connect(listeners, self._listener_failed)
         self.parameters.connect(listeners, taps, self._listener_failed)
@@ -267,8 +276,7 @@ class Supervisor:
 
     def _receive_end(self, event: Event) -> None:
         reason = getattr(event, "reason", "") or type(event).__name__
-        names = [spec.name for spec in self.state.config.nodes]
-        by = next((n for n in names if f"{event.source}/".startswith(f"{n}/")), event.source)
+        by = self._voices.owner(event.source) or event.source
         self.stop(f"{event.source}: {reason}", by=by)
 
     # Starting.
@@ -293,6 +301,11 @@ class Supervisor:
             for tap in self._taps:
                 tap(None, announcement)
         self.connect()
+        for each in state.announcements:
+            node = self._voices.owner(each.source)
+            undeclared = isinstance(each, EstimatorAnnouncement) and "truth" not in each.reads
+            if undeclared and node in state.truth_readers:
+                log.warning("%s: receives true poses, and does not announce so", node)
         state.running = True
         state.first_update = time.monotonic()
         if self.peers is None:
@@ -329,7 +342,14 @@ class Supervisor:
             before = await self.peers.meet()
             for runner in runners:
                 runner.starts = before
-        await start_up(runners, start=start, exchange=exchange, ready=ready, failed=_give_up)
+        await start_up(
+            runners,
+            start=start,
+            exchange=exchange,
+            ready=ready,
+            failed=_give_up,
+            voices=self._voices,
+        )
         if self.peers is not None:
             self.connect()  # so that each knows what the others receive
             await self.peers.begin()

@@ -11,10 +11,12 @@ import asyncio
 import contextvars
 import functools
 import logging
+import sys
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from runtime import tasks
+from runtime import code_location, tasks
+from runtime.errors import NodeError
 from runtime.self_test import PYTHON, passes
 from runtime.streams import Stream
 from runtime.tasks import Nesting, ResumableCoroutine
@@ -90,8 +92,8 @@ async def _exercise(factory: Factory | None, loop: asyncio.AbstractEventLoop) ->
     return good and cancelled.cancelled() and numbers.receive_nowait() == 5
 
 
-class _Task(asyncio.Task[Any]):
-    """A task whose place in a set does not depend on its address.
+class RunTask(asyncio.Task[Any]):
+    """A task whose place in a set does not depend on its address, and that the run may protect.
 
     Code that goes through a set of tasks (a `TaskGroup` that cancels them, a caller of
     `asyncio.wait`) does so in the same order in equal runs.
@@ -100,12 +102,34 @@ class _Task(asyncio.Task[Any]):
     tasks = 0
     """How many this one has made: its own count, so that no observer changes it."""
 
+    protected = False
+    """Whether nodes cannot cancel it, but for the one whose name it has: it is the run's."""
+
     def __init__(self, number: int, coro: Coroutine[Any, Any, Any], **options: Any) -> None:
         self._number = number
         super().__init__(coro, **options)
 
     def __hash__(self) -> int:
         return self._number
+
+    def cancel(self, msg: Any | None = None) -> bool:
+        """Cancel it, as `asyncio.Task` does.
+
+        Raises:
+            NodeError: It is protected, and a node that is not its own cancels it.
+        """
+        caller = sys._getframe(1)
+        if self.protected and not caller.f_globals.get("__name__", "").startswith("runtime."):
+            node, place = code_location.of_thread(caller)
+            if node not in {"runtime", self.get_name()}:
+                error = NodeError(
+                    node,
+                    "expected it to cancel no tasks but its own, found it cancelling "
+                    f"that of {self.get_name()}",
+                )
+                error.place = place
+                raise error
+        return super().cancel(msg)
 
 
 def _task_factory(
@@ -124,6 +148,6 @@ def _task_factory(
         context = contextvars.copy_context()
         coro = ResumableCoroutine(coro, loop, context, nesting)
     parent: Any = tasks.current_tasks.get(loop)
-    counter = parent if isinstance(parent, _Task) else nesting
+    counter = parent if isinstance(parent, RunTask) else nesting
     counter.tasks += 1
-    return _Task(counter.tasks, coro, loop=loop, context=context, **options)
+    return RunTask(counter.tasks, coro, loop=loop, context=context, **options)

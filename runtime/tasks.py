@@ -212,14 +212,15 @@ class FanOut:
     Args:
         streams: None of them declared with ``wake="soon"``.
         fault: Called with the stream that could not take an event; without it, that is raised.
-        check: Called with an event of another type than `expected`; may raise.
+        check: Called with an event of another type or source than `expected`; may raise.
 
     Attributes:
         sent: How many events were offered.
-        expected: The type of events that need no check.
+        expected: The type of events that need no check,
+        source: and their source.
     """
 
-    __slots__ = ("_check", "_fault", "expected", "sent", "streams")
+    __slots__ = ("_check", "_fault", "expected", "sent", "source", "streams")
 
     def __init__(
         self,
@@ -229,16 +230,17 @@ class FanOut:
     ) -> None:
         self.streams: tuple[Any, ...] = streams
         self.sent = 0
-        self.expected: type | None = None
+        self.expected: Any = None
+        self.source = ""
         self._fault = fault
-        self._check = check
+        self._check = check or _accept
 
     def send(self, event: Any) -> bool:
         """Offer an event; return False, because a stream never ends a delivery.
 
         One function does it all: a call or two a receiver would cost as much as the receivers.
         """
-        if event.__class__ is not self.expected and self._check is not None:
+        if event.__class__ is not self.expected or event.source is not self.source:
             self._check(event)
         self.sent += 1
         tasks, loop, sender, nesting = current_tasks, None, None, _NOTHING
@@ -285,6 +287,10 @@ class FanOut:
         if self._fault is None:
             raise error
         self._fault(stream.offer, error)
+
+
+def _accept(_: Any) -> None:
+    pass
 
 
 def _set_current_task(

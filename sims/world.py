@@ -98,7 +98,7 @@ class World(Inhabitant, Node[WorldConfig]):
         for vehicle in self._world.vehicles if not wind.still else ():
             yield WindAnnouncement(
                 stamp=0,
-                source=vehicle,
+                source=f"{self.name}/{vehicle}",
                 rate=self.config.rate,
                 velocity=wind.velocity,
                 turbulence=wind.w20,
@@ -120,7 +120,8 @@ class World(Inhabitant, Node[WorldConfig]):
         world.simulation.advance_to(stamp)
         for vehicle in world.vehicles:
             velocity = world.air.velocity_at(vehicle)
-            self.wind.send(Wind(stamp=world.simulation.time_ns, source=vehicle, velocity=velocity))
+            source = f"{self.name}/{vehicle}"
+            self.wind.send(Wind(stamp=world.simulation.time_ns, source=source, velocity=velocity))
 
     def set_wind(self, velocity: tuple[float, float, float]) -> None:
         """Set the mean wind, m/s NED, from the next millisecond on; gusts and turbulence stay.

@@ -35,6 +35,8 @@ _SAMPLES = 1500
 class _Collector(Node):
     """Keeps what sensors send, in memory, images in grey; no node to be listed for a file."""
 
+    reads_truth = "judging"
+
     def __init__(self) -> None:
         self.cameras: dict[str, CameraAnnouncement] = {}
         self.imu_announced: ImuAnnouncement | None = None

@@ -66,6 +66,7 @@ class DatasetWriter(Node[DatasetConfig]):
     what came then.
     """
 
+    reads_truth = "recording"
     images = Input(Image, bound=_WAITING, overflow="drop_oldest")
     depth_images = Input(DepthImage, bound=_WAITING, overflow="drop_oldest")
 

@@ -80,6 +80,7 @@ class Evaluation(Node[EvaluationConfig]):
     verdict put into the run's summary.
     """
 
+    reads_truth = "judging"
     files = ("trajectories", "evaluation", "frames")
     scores = Output(Score)
 

@@ -45,6 +45,8 @@ class FoxgloveServer(Node[FoxgloveConfig]):
     transforms, clouds and the paths flown so far.
     """
 
+    reads_truth = "showing"
+
     def __init__(self) -> None:
         self._server: Server | None = None
         self._publishing: Publishing | None = None

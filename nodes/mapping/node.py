@@ -68,6 +68,7 @@ class MappingConfig(NodeConfig):
 class Mapping(Node[MappingConfig]):
     """A coloured cloud of the world, from depth images and the true poses."""
 
+    reads_truth = "mapping"
     frames = Bundle(ColourDepthPose, keep="latest")
     clouds = Output(PointCloud)
 

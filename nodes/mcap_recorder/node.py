@@ -40,6 +40,7 @@ class McapRecorder(Node[McapRecorderConfig]):
     another node handles. They are recorded in the order in which it gets them.
     """
 
+    reads_truth = "recording"
     events = Input(Event, bound=_WAITING, overflow="drop_oldest")
 
     def __init__(self) -> None:

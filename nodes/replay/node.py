@@ -170,8 +170,8 @@ class Replay(Node[ReplayConfig]):
             self.log.fatal("%s", error)
 
     def announce(self) -> Iterable[Announcement]:
-        """Announce what was announced."""
-        return self._announcements
+        """Announce what was announced, and that others' events come from here."""
+        return [*self._announcements, Announcement(stamp=0, source="*")]
 
     async def run(self) -> None:
         """Send all events, from start to end, and again if that is wanted."""

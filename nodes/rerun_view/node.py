@@ -52,6 +52,8 @@ class RerunView(Node[RerunConfig]):
     that other nodes send as they end, such as the cloud of a mapping.
     """
 
+    reads_truth = "showing"
+
     def __init__(self) -> None:
         self._announcements: list[Announcement] = []
         self._received = 0

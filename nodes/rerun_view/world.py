@@ -197,8 +197,9 @@ class World:
             self._path(entity, PLAN, _THIN)
             self._extend(entity, number, event.stamp, event.position)
 
-    def wind(self, vehicle: str, events: Sequence[Numbered[Wind]]) -> None:
+    def wind(self, source: str, events: Sequence[Numbered[Wind]]) -> None:
         """Put the wind as an arrow at its vehicle, some times a second: a metre for each m/s."""
+        vehicle = source.rpartition("/")[2]
         for number, event in events:
             there = self._truth[vehicle].at(event.stamp) if vehicle in self._truth else None
             if there is not None and event.stamp >= self._wind_due.get(vehicle, 0):

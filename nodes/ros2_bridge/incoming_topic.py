@@ -62,8 +62,10 @@ class IncomingTopic:
         self._complaints.add(self.topic.name, kind, detail)
 
     def announce(self) -> Iterator[Announcement]:
-        """Announce the estimator or the pilot whose messages these are."""
+        """Announce the estimator or the pilot whose messages these are; else their source."""
         given = self.subscription
+        if given.source:
+            yield Announcement(stamp=0, source=self.source)
         if given.use in {"velocity", "position", "pose"}:
             yield PilotAnnouncement(stamp=0, source=self.source, vehicle=given.vehicle)
         if given.use == "estimate":

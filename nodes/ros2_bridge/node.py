@@ -73,6 +73,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     and in one order: a subscriber that reads slowly slows the run down.
     """
 
+    reads_truth = "showing"
     ends_run = "hand"
     estimates = Output(PoseEstimate)
     setpoints = Output(Setpoint)

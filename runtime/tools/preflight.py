@@ -30,14 +30,14 @@ from runtime.clock import Clock
 from runtime.config.model import Config, NodeSpec
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
 from runtime.execute import make_clock, make_loop
-from runtime.graph import input_types, unconnected
+from runtime.graph import circles, input_types, unconnected
 from runtime.hold import Hold, HoldConfig
 from runtime.node import Node
 from runtime.node_host import siblings
 from runtime.node_runner import NodeRunner
 from runtime.paths import written
 from runtime.schedule import Tick, Ticker
-from runtime.sender import Listener
+from runtime.sender import Listener, Voices
 from runtime.startup import Announced, Phase, start_up
 from runtime.stepping import Stepping
 
@@ -76,6 +76,10 @@ def of_file(config: Config, only: Collection[str] = ()) -> Findings:
         for spec in here
         for port in _unread(spec.node)
     ]
+    warnings += [
+        f"expected handlers that come to an end, found some that always answer one another: {each}"
+        for each in circles([(spec.name, spec.node) for spec in config.nodes])
+    ]
     return Findings(list(_clashes(here)), warnings)
 
 
@@ -110,7 +114,6 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
 
     async def exchange(announced: Announced) -> list[Announcement]:
         everything.extend(each for of_node in announced.values() for each in of_node)
-        errors.extend(_announced_twice(announced))
         (warnings if uncertain else errors).extend(_unknown_sources(config.nodes, everything))
         return everything
 
@@ -135,6 +138,7 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
             start=start,
             exchange=exchange,
             failed=failed,
+            voices=Voices(spec.name for spec in config.nodes),
             give_up=lambda: bool(errors),  # what others then miss is of no interest
         )
     finally:
@@ -275,20 +279,6 @@ def mentioned_in(cls: type[Node[Any]]) -> set[Any]:
             if isinstance(code := getattr(function, "__code__", None), CodeType):
                 look(code)
     return mentioned
-
-
-def _announced_twice(announced: Mapping[str, Iterable[Announcement]]) -> Iterator[str]:
-    """Say what two nodes announce, or one twice."""
-    first: dict[tuple[type[Announcement], str], str] = {}
-    for node, announcements in announced.items():
-        for each in announcements:
-            key = type(each), each.source
-            if key in first:
-                yield (
-                    f"{node}: expected to announce what nobody else does, found "
-                    f"{type(each).__name__} of {each.source} by {first[key]}, too"
-                )
-            first.setdefault(key, node)
 
 
 def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement]) -> Iterator[str]:

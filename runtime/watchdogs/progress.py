@@ -35,6 +35,9 @@ _LOOK = 0.01
 
 _MOST_NAMED = 3
 
+_PATIENCE = 3.0
+"""Real seconds after Ctrl-C in which a node that blocks the loop in the start-up may go on."""
+
 
 class ProgressWatchdog:
     """Watches a run of the thread that makes it; a context as long as the run.
@@ -66,9 +69,14 @@ class ProgressWatchdog:
     def _watch(self) -> None:
         mark: Any = None
         starvation = Starvation()
-        since, due, interrupted = 0.0, 0.0, 0.0
+        since, due, interrupted, deaf = 0.0, 0.0, 0.0, 0.0
         while not self._end.wait(min(self._limit / 8, _LONGEST_PAUSE)):
             found, now = self._mark(), time.monotonic()
+            if self._is_deaf():
+                deaf = deaf or now
+                if self._main and now - deaf > _PATIENCE:
+                    deaf = now
+                    self._interrupt()
             if found != mark:
                 mark, since, due, interrupted = found, now, self._limit, now
                 starvation = Starvation()
@@ -91,6 +99,11 @@ class ProgressWatchdog:
             ):
                 interrupted, starvation = time.monotonic(), Starvation()
                 self._interrupt()
+
+    def _is_deaf(self) -> bool:
+        """Tell whether Ctrl-C is not heard before the first update, as somebody blocks the loop."""
+        run = self._state
+        return bool(run.stop_requested) and run.stopped is None and run.first_update is None
 
     def _mark(self) -> tuple[Any, ...]:
         """Return what is the same for as long as nothing goes on; in any thread."""

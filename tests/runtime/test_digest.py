@@ -55,7 +55,7 @@ def digest(*events: Event) -> str:
 
 
 def measured(data: npt.NDArray[Any], extra: Any = None) -> Measured:
-    return Measured(stamp=0, source="", data=data, extra=extra)
+    return Measured(stamp=0, source="vague", data=data, extra=extra)
 
 
 def by_speaker(events: Iterable[Said]) -> dict[str, list[tuple[type, Said]]]:

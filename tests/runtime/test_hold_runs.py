@@ -69,7 +69,7 @@ class Outside(Node[OutsideConfig]):
     async def deliver(self, owed: Owed[int]) -> None:
         number = await owed
         if number is not None:
-            self.pongs.send(Pong(stamp=owed.stamp, source=str(number)))
+            self.pongs.send(Pong(stamp=owed.stamp, source=f"{self.name}/{number}"))
 
     async def on_shutdown(self) -> None:
         self.frames.put(None)

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
 
-from events import Shutdown, WindowClosed
-from runtime import Node, Output
+from events import (
+    Announcement,
+    EstimatorAnnouncement,
+    Odometry,
+    PoseStamped,
+    Shutdown,
+    VehicleAnnouncement,
+    WindowClosed,
+)
+from runtime import Input, Node, Output, on
 from runtime.config.model import NodeSpec
 from runtime.host import RunEnd
 from runtime.node import NodeConfig
@@ -116,3 +125,65 @@ def test_a_run_counts_how_often_a_node_was_brought_up_anew() -> None:
     end = ended(spec(Ends, "x", {"how": "raise"}, on_error="restart"), duration=1.5)
     assert end.restarts == {"reader": 0, "x": 1}
     assert (end.by, end.planned) == ("", True)
+
+
+class Vehicle(Node):
+    flies = True
+    odometry = Output(Odometry)
+
+    def announce(self) -> Iterable[Announcement]:
+        place: dict[str, Any] = {"position": (0.0, 0.0, 0.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
+        figures: dict[str, Any] = {"mass": 1.0, "max_thrust": 20.0, "control_rate": 400.0}
+        yield VehicleAnnouncement(stamp=0, source=self.name, **figures, **place)
+
+
+class EstimatorConfig(NodeConfig):
+    reads: tuple[str, ...] = ("rgb",)
+
+
+class Estimator(Node[EstimatorConfig]):
+    def announce(self) -> Iterable[Announcement]:
+        reads = self.config.reads
+        yield EstimatorAnnouncement(stamp=0, source=self.name, method="none", reads=reads)
+
+
+class Peeps(Estimator):
+    @on(Odometry)
+    def peep(self, _: Odometry) -> None: ...
+
+
+class PeepsAtCameras(Estimator):
+    poses = Input(PoseStamped)
+
+
+class Shows(Peeps):
+    reads_truth = "showing"
+
+
+class FromElsewhere(Estimator):
+    @on(Odometry, source="other")
+    def peep(self, _: Odometry) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("node", "reads", "truth_readers", "warned"),
+    [
+        (Estimator, ["rgb"], set(), False),
+        (Peeps, ["rgb"], {"x"}, True),
+        (Peeps, ["truth"], {"x"}, False),
+        (PeepsAtCameras, ["rgb"], set(), False),  # there is no camera
+        (Shows, ["rgb"], set(), False),
+        (FromElsewhere, ["rgb"], set(), False),
+    ],
+)
+def test_a_run_says_who_received_the_truth(
+    node: type[Estimator],
+    reads: list[str],
+    truth_readers: set[str],
+    warned: bool,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    end = ended(spec(Vehicle, "drone"), spec(node, "x", {"reads": reads}))
+    assert end.truth_readers == truth_readers
+    told = [record.getMessage() for record in caplog.records]
+    assert told == (["x: receives true poses, and does not announce so"] if warned else [])

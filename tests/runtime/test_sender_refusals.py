@@ -27,7 +27,7 @@ class Loud(Said):
 
 
 def loud() -> Loud:
-    return Loud(stamp=0, source="drone")
+    return Loud(stamp=0, source="careless")
 
 
 def connected(kind: str, event: type[Event], heard: list[Any]) -> Sender[Any]:
@@ -167,8 +167,9 @@ def test_a_thread_can_hand_an_event_to_the_loop() -> None:
 
         async def run(self) -> None:
             loop = asyncio.get_running_loop()
-            self.said.send(said())
-            await self.offload(lambda: loop.call_soon_threadsafe(self.said.send, said()))
+            mine = said(source=self.name)
+            self.said.send(mine)
+            await self.offload(lambda: loop.call_soon_threadsafe(self.said.send, mine))
 
     assert len(run_nodes([spec(Careful, "careful")], duration=0.1).of(Said)) == 2
 

@@ -130,14 +130,14 @@ class LastWord(Diarist):
     async def on_end(self) -> None:
         await self.offload(time.sleep, 0.01)  # such as asking a worker
         DIARY.append(f"{self.name} has a last word")
-        self.pings.send(Ping(stamp=self.clock.now(), source=f"{self.name}'s last word"))
+        self.pings.send(Ping(stamp=self.clock.now(), source=f"{self.name}/last word"))
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_last_words_reach_all_nodes_before_any_shuts_down(clock: str) -> None:
     supervise([*diarists("a"), spec(LastWord, "b"), *diarists("c")], clock=clock, duration=0.1)
     end = DIARY[DIARY.index("b has a last word") :]
-    heard = [f"{name} heard b's last word" for name in "ac"]
+    heard = [f"{name} heard b/last word" for name in "ac"]
     assert end[1 : 1 + len(heard)] == heard
     assert end[1 + len(heard)] == "c down"
 
@@ -154,7 +154,7 @@ def test_last_words_that_fail_or_hang_keep_nobody() -> None:
     nodes = [*diarists("a"), spec(Choking, "b"), spec(Stuck, "c"), spec(LastWord, "d")]
     outcome = supervise(nodes, duration=0.1, shutdown_limit=0.1)
     assert str(outcome.error) == "b: OSError: disk full"
-    assert "a heard d's last word" in DIARY
+    assert "a heard d/last word" in DIARY
     assert [line for line in DIARY if "down" in line] == ["d down", "c down", "b down", "a down"]
 
 

@@ -73,7 +73,7 @@ def test_a_node_hears_the_scripts_announcements_before_all_else() -> None:
 
         @on(Said)
         def hear(self, event: Said) -> None:
-            self.told.send(said("".join(self.names)))
+            self.told.send(said("".join(self.names), source=self.name))
 
     result = run_node(Listens, inputs=[*at(0), Ready(stamp=0, source="camera")])
     assert [e.text for e in result.of(Said)] == ["camera"]
@@ -152,7 +152,7 @@ def test_the_seed_decides_the_random_numbers() -> None:
         told = Output(Said)
 
         async def run(self) -> None:
-            self.told.send(said(str(self.rng.integers(1 << 60))))
+            self.told.send(said(str(self.rng.integers(1 << 60)), self.name))
 
     def thrown(seed: int) -> list[Event]:
         return run_node(Dice, seed=seed).sent

@@ -56,11 +56,12 @@ def test_wind_is_announced_sent_and_felt_alike_by_all(world: str) -> None:
     nodes = (drone("a", 0.0, world), drone("b", 3.0, world), surroundings(world, wind=WIND))
     result = fly(*nodes, inputs=orders, duration=4.0)
     assert {(e.source, e.velocity) for e in result.of(WindAnnouncement)} == {
-        ("a", (0.0, 4.0, 0.0)),
-        ("b", (0.0, 4.0, 0.0)),
+        ("world/a", (0.0, 4.0, 0.0)),
+        ("world/b", (0.0, 4.0, 0.0)),
     }
     felt = {
-        name: np.array([e.velocity for e in result.of(Wind) if e.source == name]) for name in "ab"
+        name: np.array([e.velocity for e in result.of(Wind) if e.source == f"world/{name}"])
+        for name in "ab"
     }
     assert len(felt["a"]) == len(felt["b"]) == 200
     assert felt["a"].std(axis=0).min() > 0.05

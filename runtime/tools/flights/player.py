@@ -26,6 +26,7 @@ _DONE.set_result(None)
 class StandIn(Node[Any]):
     """Sends again what a node has sent; made for each node of a flight by `stand_ins`."""
 
+    reads_truth = "recording"
     player: ClassVar[Player]
 
     async def on_startup(self) -> None:

@@ -19,5 +19,5 @@ class Still(Node):
     def show(self, tick: Tick) -> None:
         """Send it."""
         self.images.send(
-            Image(stamp=tick.stamp, source="drone/front", frame_id="f", data=self._image)
+            Image(stamp=tick.stamp, source=f"{self.name}/front", frame_id="f", data=self._image)
         )

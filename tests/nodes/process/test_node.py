@@ -459,7 +459,7 @@ def test_one_that_a_bridge_feeds_is_told_where_and_its_end_is_the_bridges_to_jud
         "topic": "/slam/pose",
         "type": "geometry_msgs/msg/PoseStamped",
         "as": "estimate",
-        "source": "slam",
+        "source": "poses",
         "answers_to": "drone/camera",
         "latency": 0.015,
         "timeout": 0.5,

@@ -46,7 +46,8 @@ class Talker(Node[TalkerConfig]):
         self._heard: dict[str, Event] = {}
 
     def announce(self) -> Iterable[Announcement]:
-        return [samples.vehicle(), samples.camera(), samples.imu(), samples.estimator()]
+        others = Announcement(stamp=0, source="*")
+        return [samples.vehicle(), samples.camera(), samples.imu(), samples.estimator(), others]
 
     @every(hz="rate")
     def talk(self, tick: Tick) -> None:

@@ -182,8 +182,8 @@ def test_two_nodes_do_not_announce_the_same() -> None:
 
     (told,) = preflight.of_nodes(config((Giving, "a"), (Double, "b"))).errors
     assert told == (
-        "b: expected to announce what nobody else does, found EstimatorAnnouncement of a/front "
-        "by a, too"
+        "b: expected a source that is 'b', below it, or announced by this node, "
+        "found EstimatorAnnouncement of 'a/front', which is a's"
     )
 
 

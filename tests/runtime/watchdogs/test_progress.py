@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
+import os
 import re
+import signal
+import threading
 import time
+from collections.abc import Iterable
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
 
+from events import Announcement
 from runtime import Node, Tick, every
 from runtime.config.model import Config, RunConfig
+from runtime.errors import NodeError, NodeTimeoutError
 from runtime.execute import execute
 from runtime.testing import spec
 from runtime.units import Duration
@@ -70,3 +78,47 @@ def test_a_run_that_stands_still_names_the_node_and_the_line(node: type[Node], w
     summary = execute(Config(run=run, nodes=nodes), handlers=[Told(logging.WARNING)])
     assert summary.reason == "duration"
     assert any(re.search(Told.wanted, line) for line in Told.lines), Told.lines
+
+
+class Endless(Node):
+    """Never comes to the end of what it announces."""
+
+    def announce(self) -> Iterable[Announcement]:
+        while True:
+            time.sleep(0.01)  # that is the fault
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_a_node_that_blocks_the_start_up_is_named_and_a_first_ctrl_c_is_heard(
+    interrupted: bool, tmp_path: Path
+) -> None:
+    limit = Duration(60 if interrupted else 0.2)
+    run = RunConfig(startup_limit=limit, progress_limit=Duration(0.2))
+    ctrl_c = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+    if interrupted:
+        ctrl_c.start()
+    begin = time.monotonic()
+    with pytest.raises(NodeTimeoutError, match=r"^endless: expected it to give back the loop"):
+        execute(Config(run=run, nodes=(spec(Endless, "endless"),)), tmp_path)
+    assert time.monotonic() - begin < 20  # as soon as the watchdog, a thread, gets to look
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["ended_by"] == ("user" if interrupted else "endless")
+
+
+class Cancels(Node):
+    """Cancels all tasks of the loop, whosesoever they are."""
+
+    async def run(self) -> None:
+        await self.clock.sleep(0.2)
+        for task in asyncio.all_tasks():
+            task.cancel()
+
+
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
+def test_a_node_that_cancels_all_tasks_is_named(clock: str, tmp_path: Path) -> None:
+    run = RunConfig(clock=clock, duration=Duration(1.0))  # type: ignore[arg-type]
+    nodes = (spec(Busy, "busy"), spec(Cancels, "cancels"), spec(Busy, "busy2"))
+    with pytest.raises(NodeError, match=r"^cancels: expected it to cancel no tasks but its own"):
+        execute(Config(run=run, nodes=nodes), tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["ended_by"], summary["error"][:8]) == ("cancels", "cancels:")
