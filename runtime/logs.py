@@ -55,7 +55,7 @@ _OF_RECORD = 300  # what a record takes besides its message, in characters
 
 _HARMFUL = {
     code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"
-} | {code: f"\\u{code:04x}" for code in (0x2028, 0x2029, *range(0x202A, 0x202F))}
+} | {code: f"\\u{code:04x}" for code in (*range(0x2028, 0x202F), *range(0xD800, 0xE000))}
 
 
 def harmless(text: str, longest: int = LONGEST) -> str:
@@ -257,7 +257,7 @@ def _without_colours_if_long(record: logging.LogRecord) -> bool:
 
 def file_handler(path: Path) -> logging.Handler:
     """Return a handler that writes everything to a file."""
-    handler = _File(path, mode="w", encoding="utf-8", errors="backslashreplace", delay=False)
+    handler = _File(path, mode="w", encoding="utf-8", delay=False)
     handler.setFormatter(
         logging.Formatter("%(seconds)12.6f %(levelname)-8s %(logger_name)s: %(message)s")
     )
