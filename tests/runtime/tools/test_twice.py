@@ -19,6 +19,7 @@ from runtime.testing import spec
 from runtime.tools.twice import run_twice
 from runtime.units import Duration
 from tests.nodes.process.rig import Eyes, program
+from tests.runtime.tools.samples_cli import command_here
 
 
 class DriftConfig(NodeConfig):
@@ -93,3 +94,22 @@ def test_a_system_is_unknown_until_it_was_run_twice(unsteady: bool, tmp_path: Pa
 def test_in_real_time_nothing_can_be_compared(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match='--twice: expected one process and clock = "lockstep"'):
         twice(tmp_path, spec(Drift, "drone"), clock="real")
+
+
+FILE = """
+[run]
+duration = "0.4s"
+[[nodes]]
+name = "drone"
+type = "tests.runtime.tools.test_twice:Drift"
+"""
+
+
+@pytest.mark.parametrize(
+    ("differs_at", "code", "said"),
+    [(1000, 0, "run twice, it repeats"), (2, 1, "run twice, it differs: the rig, drone, in")],
+)
+def test_the_exit_code_says_it(differs_at: int, code: int, said: str, tmp_path: Path) -> None:
+    (tmp_path / "run.toml").write_text(f"{FILE}differs_at = {differs_at}\n")
+    done = command_here("run", "run.toml", "--twice", folder=tmp_path)
+    assert (done.returncode, said in done.stdout) == (code, True), done
