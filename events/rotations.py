@@ -72,6 +72,11 @@ def rotate_inverse(rotation: Quaternion, vector: Vector3) -> Vector3:
     return rotate((w, -x, -y, -z), vector)
 
 
+def cross(a: Vector3, b: Vector3) -> Vector3:
+    """Return the cross product of two vectors."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
 def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
     """Return the rotation by `yaw` about z, then `pitch` about the new y, then `roll` about x.
 

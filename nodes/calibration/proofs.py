@@ -26,7 +26,7 @@ from nodes.dataset.rig import Rig
 INTEGRATED = 5.0
 """Seconds over which the IMU is integrated."""
 
-_POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.01, 0.1, 0.3, 0.005, 1e-5
+_POSITION, _GLOBAL, _ROLLING, _DEPTH, _EXPORT = 0.005, 0.1, 0.3, 0.005, 1e-5
 """Metres; pixels, global and rolling shutter; metres; pixels."""
 
 _MOST = 0.99

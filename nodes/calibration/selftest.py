@@ -131,7 +131,7 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
     if imu is None or kept.imu_announced is None:
         notes.append(f"{spec.name} has no IMU: proofs 1 and 2 do not apply.")
     else:
-        begin = kept.imu[0].stamp + 50_000_000
+        begin = max(kept.imu[0].stamp, kept.taken_off) + 50_000_000  # in mid-flight
         figures[1].append(proofs.integration(kept.imu_announced, kept.imu, motion, begin))
         seconds = needed(imu, standing)
         still = _run(_standing(table, seconds), config)

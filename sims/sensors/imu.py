@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import ImuAnnouncement, Quaternion, Vector3
-from events.rotations import inverse, multiply, rotate, rotate_inverse, slerp
+from events.rotations import cross, inverse, multiply, rotate, rotate_inverse, slerp
 from sims.sensors.sensor import Mount, NonNegative
 
 _BLOCK = 512
@@ -317,7 +317,7 @@ def motion_at(
         velocity: Of the body's origin, metres per second NED.
         rates: Angular velocity of the body, rad/s in its frame.
     """
-    lever = rotate(orientation, _cross(rates, parameters.position))
+    lever = rotate(orientation, cross(rates, parameters.position))
     x, y, z = (a + b for a, b in zip(velocity, lever, strict=True))
     return Motion(multiply(orientation, parameters.rotation), (x, y, z))
 
@@ -370,10 +370,6 @@ def _limited(vector: Vector3, limit: float, step: float) -> Vector3:
         x, y, z = (min(max(value, -limit), limit) for value in vector)
         vector = (x, y, z)
     return vector
-
-
-def _cross(a: Vector3, b: Vector3) -> Vector3:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def _vector(array: Any) -> Vector3:

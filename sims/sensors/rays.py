@@ -74,7 +74,7 @@ class Rays:
             distances,
             normals.reshape(-1),
             count,
-            reach,
+            mujoco.mjMAXVAL,  # not `reach`: a plane whose middle is farther would not be met
         )
         distances[(geoms < 0) | (distances > reach)] = np.inf
         return Hits(distances, geoms, normals)

@@ -10,7 +10,6 @@ import mujoco
 
 from events import Announcement, Event, Imu, ImuAnnouncement, TransformStamped
 from events.frames import flip_yz, flip_yz_rotation
-from events.rotations import rotate_inverse
 from runtime import Node, Tick
 from sims.cameras.rig import DrawnWorld
 from sims.sensors.barometer import Barometer
@@ -57,10 +56,7 @@ class VehicleImu:
     def sample(self, stamp: int, state: State) -> Imu:
         """Return the measurement of the present, in a state of the same stamp."""
         parameters, physics = self._model.parameters, self._physics
-        rates = state.angular_velocity
-        _, force = physics.imu()  # between two steps the acceleration is constant
-        if parameters.mounted:
-            rates = rotate_inverse(parameters.rotation, rates)
+        rates, force = physics.imu(stamp)
         if parameters.sampling == "mean":
             motion = motion_at(
                 parameters, state.orientation, state.velocity, state.angular_velocity

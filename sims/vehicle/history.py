@@ -63,9 +63,9 @@ class History:
     def at(self, stamp_ns: int) -> tuple[Floats, Floats]:
         """Return the world's state at a time in the past that is kept, or a step ahead at most.
 
-        On a whole millisecond it is the state of that step. Between two steps velocities go
-        linearly from one to the other, and positions as the step carried them (semi-implicit
-        Euler). Before time 0 all is as it was then.
+        On a whole millisecond positions are those of that step, between two as the step carried
+        them (semi-implicit Euler); velocities are as of `Simulation.state_at`. Before time 0 all
+        is as it was then.
 
         Returns:
             Generalised positions, shape (nq,), and velocities, shape (nv,); not to be written to.
@@ -86,12 +86,11 @@ class History:
                 f"`keep` asked for, found {stamp_ns} ns"
             )
         qpos, qvel = self._states[step - oldest]
-        if not rest:
-            return qpos, qvel
         if step + 1 < steps:
             _, later = self._states[step + 1 - oldest]
         else:
             later = self._simulation.data.qvel
-        between = qpos.copy()
-        mujoco.mj_integratePos(self._simulation.model, between, later, rest * 1e-9)
-        return between, qvel + (later - qvel) * (rest / TIMESTEP_NS)
+        if rest:
+            qpos = qpos.copy()
+            mujoco.mj_integratePos(self._simulation.model, qpos, later, rest * 1e-9)
+        return qpos, qvel + (later - qvel) * (0.5 + rest / TIMESTEP_NS)

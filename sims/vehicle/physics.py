@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Quaternion, Vector3
-from events.rotations import normalize
+from events.frames import flip_yz, flip_yz_rotation
+from events.rotations import cross, normalize, rotate_inverse
 from sims.vehicle.model import VehicleParameters, mover_of, read_parameters
 from sims.vehicle.simulation import Simulation
 
@@ -82,15 +83,19 @@ class Physics:
         pose, twist = int(joint.qposadr[0]), int(joint.dofadr[0])
         motor = model.actuator(f"{name}/motor1").id
         thrust = int(model.actuator(f"{name}/motor1").actadr[0])
-        sensor = int(model.sensor(f"{name}/gyroscope").adr[0])
+        site = model.site(f"{name}/imu")
+        self._lever = flip_yz(tuple(site.pos.tolist()))
+        self._mounted = flip_yz_rotation(tuple(site.quat.tolist()))
         # Views on MuJoCo's own memory; `tolist` makes plain floats of them in one C call each.
         self._of_pose, self._of_twist = slice(pose, pose + 7), slice(twist, twist + 6)
         self._pose = self.data.qpos[self._of_pose]
         self._twist = self.data.qvel[self._of_twist]
         self._motors = self.data.ctrl[motor : motor + 4]
-        self.thrusts = self.data.act[thrust : thrust + 4]
+        self._rotors = slice(thrust, thrust + 4)
+        self.thrusts = self.data.act[self._rotors]
         """Thrust of each rotor, 0 to 1 of its greatest; present values, not to be written to."""
-        self._imu = self.data.sensordata[sensor : sensor + 6]
+        thrusts = [motor.max_thrust for motor in self.parameters.motors]
+        self._gains = np.array(thrusts) / self.parameters.mass
 
     @property
     def time_ns(self) -> int:
@@ -111,14 +116,13 @@ class Physics:
 
     def state(self) -> State:
         """Return where the vehicle is and how it moves."""
-        return _state(self._pose, self._twist)
+        return self.state_at(self.time_ns)[0]
 
     def state_at(self, stamp_ns: int) -> tuple[State, Floats, Floats]:
         """Return the state at a time at or after `time_ns`, less than or just one step later.
 
         Returns:
-            The vehicle's state; copies of the world's generalised positions, shape (nq,), and
-            velocities, shape (nv,), for a renderer.
+            The vehicle's state; the world's, as `Simulation.state_at` returns it, for a renderer.
 
         Raises:
             ValueError: The time is before `time_ns`, or more than a step later.
@@ -130,15 +134,26 @@ class Physics:
         """Return the vehicle's state in one of the world, such as one of `history`."""
         return _state(qpos[self._of_pose], qvel[self._of_twist])
 
-    def imu(self) -> tuple[Vector3, Vector3]:
-        """Return the true angular velocity (rad/s, FRD) and specific force (m/s², FRD).
+    def imu(self, stamp_ns: int = 0) -> tuple[Vector3, Vector3]:
+        """Return the true angular velocity (rad/s) and specific force (m/s²) of the IMU.
 
-        Measured at the vehicle's site `imu`, which is the centre of mass unless it was moved. At
-        rest the specific force is (0, 0, -9.81).
+        They are those at the vehicle's site `imu`, along its axes turned to FRD: the centre of
+        mass and the body's axes unless it was moved. At rest the specific force is (0, 0, -9.81).
+
+        Args:
+            stamp_ns: As of `state_at`; before `time_ns` it is that.
         """
-        self.simulation.refresh()
-        wx, wy, wz, ax, ay, az = self._imu.tolist()
-        return (wx, -wy, -wz), (ax, -ay, -az)
+        ahead = max(stamp_ns - self.time_ns, 0)
+        rates = self.state_at(self.time_ns + ahead)[0].angular_velocity
+        (x, y, z), turning = self.accelerations()
+        now = _state(self._pose, self._twist).orientation
+        fx, fy, fz = rotate_inverse(now, (x, y, z - self.parameters.gravity))
+        # Of all forces the rotors' change most within a step, and they are fixed to the body.
+        fz -= float(self._gains @ self.data.act_dot[self._rotors]) * ahead * 1e-9
+        ax, ay, az = cross(turning, self._lever)
+        bx, by, bz = cross(rates, cross(rates, self._lever))
+        force = (fx + ax + bx, fy + ay + by, fz + az + bz)
+        return rotate_inverse(self._mounted, rates), rotate_inverse(self._mounted, force)
 
     def accelerations(self) -> tuple[Vector3, Vector3]:
         """Return the true acceleration (m/s² NED) and angular acceleration (rad/s² FRD).

@@ -107,7 +107,9 @@ class Simulation:
         implicitly, may differ slightly.)
 
         Returns:
-            Copies of the generalised positions, shape (nq,), and velocities, shape (nv,).
+            Copies of the generalised positions, shape (nq,), and of the velocities with which
+            these change, shape (nv,). MuJoCo's own velocities are half a step old: the position
+            goes with one of them through the whole step before, so it is that of its middle.
 
         Raises:
             ValueError: The time is before `time_ns`, or more than a step later.
@@ -117,13 +119,12 @@ class Simulation:
         if not 0 <= ahead <= TIMESTEP_NS:
             expected = f"{self.time_ns} to {self.time_ns + TIMESTEP_NS} ns"
             raise ValueError(f"state_at: expected a time of {expected}, found {stamp_ns} ns")
+        self.refresh()
         if ahead:
-            self.refresh()
             # As semi-implicit Euler does it: first the velocity, and with that the position.
             next_qvel = qvel + self.data.qacc * (TIMESTEP_NS * 1e-9)
             mujoco.mj_integratePos(self.model, qpos, next_qvel, ahead * 1e-9)
-            qvel += self.data.qacc * (ahead * 1e-9)
-        return qpos, qvel
+        return qpos, qvel + self.data.qacc * ((ahead + TIMESTEP_NS / 2) * 1e-9)
 
     def refresh(self) -> None:
         """Have sensors, contacts and accelerations be those of the present instant."""

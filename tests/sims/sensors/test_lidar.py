@@ -312,3 +312,13 @@ def test_a_turn_costs_less_than_its_rays_cast_one_millisecond_after_the_other(wo
             call()
             times[index].append(time.process_time() - begin)
     assert min(times[0]) < 0.8 * min(times[1])
+
+
+def test_the_floor_of_the_hall_is_met_far_from_its_middle() -> None:
+    spec, dynamics = load_scene("hall", bare=True)
+    attach_vehicle(spec, "drone", (0.0, 0.0, -1.0), 0.0)
+    settings = spec_of(max_range=5.0, elevations=(-90.0, -60.0), channels=4, columns=12)
+    state = np.array([6.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # the middle is out of reach
+    scanner = Scanner(model_to_bytes(spec.compile()), dynamics, (settings,), "drone", 1)
+    points = scanner.scan("lidar", START, state[None]).points
+    assert points[:, 2] == pytest.approx(np.ones(48), abs=1e-5)

@@ -68,6 +68,13 @@ def test_out_of_reach_is_infinite_on_either_side() -> None:
         RangeFinderSpec(name="range", min_range=5.0, max_range=5.0)
 
 
+def test_ground_whose_middle_is_out_of_reach_is_met() -> None:
+    """A plane has no bounding sphere: a cut-off of MuJoCo's would take its middle for all of it."""
+    down = finder(orientation=(0, -90, 0), max_range=5.0)
+    assert measured(down, (40.0, 20.0, -1.0)) == pytest.approx(1.0)
+    assert measured(down, (40.0, 20.0, -6.0)) == math.inf
+
+
 def test_in_a_cone_the_nearest_counts() -> None:
     """Looking down from 1 m with 60 degrees is 1 m still; at a slant, the near side."""
     assert measured(finder(orientation=(0, -90, 0), field_of_view=60)) == pytest.approx(1.0)
