@@ -19,7 +19,7 @@ from sims.simulator import Rate
 from sims.worlds import Dynamics, Scene, WorldError
 from sims.worlds.bodies import BodyMotion, BodySpec, add_bodies
 from sims.worlds.lights import FogSpec, LightSpec, add_fog, change_lights
-from sims.worlds.wind import WindSpec
+from sims.worlds.wind import WindSpec, check_strength
 
 
 class WorldConfig(NodeConfig):
@@ -127,8 +127,9 @@ class World(Inhabitant, Node[WorldConfig]):
         """Set the mean wind, m/s NED, from the next millisecond on; gusts and turbulence stay.
 
         Raises:
-            ValueError: The settings have no wind that could be changed.
+            ValueError: The settings have no wind that could be changed, or it is too strong.
         """
+        check_strength(velocity)
         if self._world.air is None:
             raise ValueError("wind: expected some in the world's settings, found none")
         self._world.air.velocity = velocity

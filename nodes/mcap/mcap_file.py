@@ -10,6 +10,7 @@ and perhaps half a chunk at its end; `read` reads it all the same, and `recover`
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -90,6 +91,8 @@ class McapWriter:
         self._fsync = fsync
         self._schemas: dict[str, int] = {}
         self._counts: dict[int, int] = {}
+        self._topics: dict[int, dict[str, str]] = {}
+        self._times: tuple[int, int] | None = None
         self._pending = 0
         try:
             self._file = WholeWrites((open_file or open_anew)(path))  # type: ignore[arg-type]
@@ -125,7 +128,14 @@ class McapWriter:
         if schema is None:
             schema = self._writer.register_schema(type_, "ros2msg", definition.encode())
             self._schemas[type_] = schema
-        return self._writer.register_channel(topic, "cdr", schema, dict(metadata or {}))
+        channel = self._writer.register_channel(topic, "cdr", schema, dict(metadata or {}))
+        self._topics[channel] = {
+            "name": topic,
+            "type": type_,
+            "serialization_format": "cdr",
+            "offered_qos_profiles": (metadata or {}).get("offered_qos_profiles", ""),
+        }
+        return channel
 
     def write(self, channel: int, time: int, data: bytes | bytearray) -> None:
         """Add a message, with the next number of its channel; its bytes are copied."""
@@ -133,6 +143,8 @@ class McapWriter:
         self._counts[channel] = (sequence + 1) & 0xFFFFFFFF
         self._writer.add_message(channel, time, data, time, sequence)  # type: ignore[arg-type]
         self.messages += 1
+        first, last = self._times or (time, time)
+        self._times = min(first, time), max(last, time)
         self._pending += len(data)
 
     @property
@@ -171,6 +183,33 @@ class McapWriter:
         except OSError as error:
             raise unwritable(self.path, error) from error
         self._file.close()
+
+    def bag_metadata(self) -> str:
+        """Return the text of the metadata.yaml with which the file's folder is a bag of ROS 2."""
+        first, last = self._times or (0, 0)
+        facts = {
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "duration": {"nanoseconds": last - first},
+            "message_count": self.messages,
+        }
+        counts = {topic["name"]: 0 for topic in self._topics.values()}
+        for channel, count in self._counts.items():
+            counts[self._topics[channel]["name"]] += count
+        topics = {topic["name"]: topic for topic in self._topics.values()}
+        bag = facts | {
+            "version": 5,
+            "storage_identifier": "mcap",
+            "relative_file_paths": [self.path.name],
+            "topics_with_message_count": [
+                {"topic_metadata": topic, "message_count": counts[name]}
+                for name, topic in topics.items()
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [facts | {"path": self.path.name}],
+        }
+        # All JSON is YAML.
+        return json.dumps({"rosbag2_bagfile_information": bag}, indent=1) + "\n"
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         """Add a file to the recording."""

@@ -164,12 +164,15 @@ class McapRecorder(Node[McapRecorderConfig]):
             with contextlib.suppress(RuntimeError):  # the run is over, and `_finish` raises it
                 loop.call_soon_threadsafe(self._fail, error)
 
+        path = self.out / part_name(self, self.config.file)
+        is_first = self.name == self.siblings(McapRecorder)[0].name  # of a bag there is one
         request = WriteRequest(
-            path=str(self.out / part_name(self, self.config.file)),
+            path=str(path),
             config=self.config,
             attachment=str(self.out / "config.toml"),
             niceness=5,
             cores=spare_cores() if self.clock.kind == "real" else (),
+            metadata=str(path.with_name("metadata.yaml")) if is_first else "",
         )
         return WriterProcess(request, self._backlog, failed, complain)
 

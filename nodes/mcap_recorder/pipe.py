@@ -34,6 +34,7 @@ class WriteRequest(msgspec.Struct, frozen=True):
         attachment: A file to add, if it is there.
         niceness: How much to stand back for others.
         cores: To run on; all if empty.
+        metadata: The file beside it that makes a bag of ROS 2 of their folder; none if empty.
     """
 
     path: str
@@ -41,6 +42,7 @@ class WriteRequest(msgspec.Struct, frozen=True):
     attachment: str
     niceness: int
     cores: tuple[int, ...]
+    metadata: str = ""
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):

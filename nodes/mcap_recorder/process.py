@@ -46,6 +46,7 @@ class FileWriter:
         if attachment.is_file():
             self._writer.attach(attachment.name, "application/toml", attachment.read_bytes())
         self._events = EventWriter(self._writer, config, self._complain)
+        self._metadata = request.metadata
         self._complaints: set[str] = set()
         self._written = 0
         self._in_chunk = 0
@@ -64,6 +65,11 @@ class FileWriter:
             self._end_chunk()
             facts = {"end": str(last), "events": str(self._written)}
             self._writer.close({"visnav": facts})
+            if self._metadata:
+                try:
+                    Path(self._metadata).write_text(self._writer.bag_metadata(), "utf-8")
+                except OSError as error:
+                    self._complain(f"{self._metadata}: cannot be written: {error.strerror}")
         except RecordingError as error:
             self._written -= self._in_chunk
             self._writer.abandon()

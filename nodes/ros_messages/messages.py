@@ -209,7 +209,7 @@ class Messages:
     def fix(
         self, time: Time, event: NavSatFix, sensor: SensorAnnouncement | None = None
     ) -> bytearray:
-        """Return a sensor_msgs/NavSatFix of a plain GPS fix; its covariance is in ENU."""
+        """Return a sensor_msgs/NavSatFix, whose status is the event's; its covariance is in ENU."""
         status = self._store.message("sensor_msgs/msg/NavSatStatus")
         type_ = self._store.message("sensor_msgs/msg/NavSatFix")
         covariance, known = _ZEROS_9, type_.COVARIANCE_TYPE_UNKNOWN
@@ -218,7 +218,7 @@ class Messages:
             known = type_.COVARIANCE_TYPE_KNOWN
         message = type_(
             header=self._header(time, _frame(sensor), event.source),
-            status=status(status=status.STATUS_FIX, service=status.SERVICE_GPS),
+            status=status(status=event.status, service=status.SERVICE_GPS),
             latitude=event.latitude,
             longitude=event.longitude,
             altitude=event.altitude,

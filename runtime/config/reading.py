@@ -24,7 +24,7 @@ import re
 import sys
 import tomllib
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -249,12 +249,28 @@ def convert(value: Any, type_: type[S], where: str) -> S:
     """Turn a table into a struct.
 
     Raises:
-        ConfigError: A key is unknown or missing, or a value is of the wrong type or size.
+        ConfigError: A key is unknown or missing, or a value is of the wrong type or size, or not
+            finite. (A run's `speed` may be infinite.)
     """
+    for path, number in _not_finite(value):
+        if type_ is not RunConfig or math.isnan(number):
+            text = f"expected a finite number, found {number} - at `${path}`"
+            raise ConfigError(explain(text, value, type_, where))
     try:
         return msgspec.convert(value, type_, dec_hook=_decode)
     except msgspec.ValidationError as error:
         raise ConfigError(explain(str(error), value, type_, where)) from None
+
+
+def _not_finite(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    if isinstance(value, float) and not math.isfinite(value):
+        yield path, value
+    elif isinstance(value, Mapping):
+        for key, each in value.items():
+            yield from _not_finite(each, f"{path}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, each in enumerate(value):
+            yield from _not_finite(each, f"{path}[{index}]")
 
 
 def _node(entry: Any, where: str, folder: Path) -> NodeSpec:

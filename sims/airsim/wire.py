@@ -22,6 +22,9 @@ REQUEST, REPLY, NOTIFICATION = 0, 1, 2
 LONGEST = 4 << 20
 """Bytes of a message that a server takes."""
 
+MOST_LISTS = 50_000
+"""Lists and maps in a message that a server takes: 4 MB of empty ones would take seconds."""
+
 LONGEST_REPLY = 1 << 30
 """Bytes of a message that a client takes: float images of several cameras are long."""
 
@@ -99,10 +102,27 @@ def decode(message: bytes) -> Request | Reply:
     Raises:
         WireFormatError: They are none.
     """
+    left = MOST_LISTS
+
+    def count(each: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise WireFormatError(f"expected at most {MOST_LISTS} lists and maps, found more")
+        return each
+
     try:
         found = msgpack.unpackb(
-            message, raw=False, unicode_errors="replace", strict_map_key=False, timestamp=0
+            message,
+            raw=False,
+            unicode_errors="replace",
+            strict_map_key=False,
+            timestamp=0,
+            list_hook=count,
+            object_hook=count,
         )
+    except WireFormatError:
+        raise
     except Exception as error:  # of many kinds, by the bytes
         raise WireFormatError(f"expected msgpack, found {type(error).__name__}: {error}") from None
     match found:

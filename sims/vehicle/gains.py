@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from math import radians
+from typing import Annotated
 
 import msgspec
+
+Factor = Annotated[float, msgspec.Meta(ge=0)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Tilt = Annotated[float, msgspec.Meta(gt=0, lt=1.5)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 class Gains(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -31,22 +37,22 @@ class Gains(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         derivative_cutoff: Cut-off frequency of the low-pass filter on every derivative, Hz.
     """
 
-    position_xy: float = 1.5
-    position_z: float = 2.0
-    velocity_xy_p: float = 3.4
-    velocity_xy_i: float = 1.0
-    velocity_xy_d: float = 0.1
-    velocity_z_p: float = 6.0
-    velocity_z_i: float = 2.0
-    velocity_z_d: float = 0.0
-    tilt: float = 8.0
-    yaw: float = 3.0
-    rate_xy_p: float = 20.0
-    rate_xy_i: float = 10.0
-    rate_xy_d: float = 0.4
-    rate_z_p: float = 6.0
-    rate_z_i: float = 2.0
-    derivative_cutoff: float = 40.0
+    position_xy: Positive = 1.5
+    position_z: Positive = 2.0
+    velocity_xy_p: Positive = 3.4
+    velocity_xy_i: Factor = 1.0
+    velocity_xy_d: Factor = 0.1
+    velocity_z_p: Positive = 6.0
+    velocity_z_i: Factor = 2.0
+    velocity_z_d: Factor = 0.0
+    tilt: Factor = 8.0
+    yaw: Factor = 3.0
+    rate_xy_p: Factor = 20.0
+    rate_xy_i: Factor = 10.0
+    rate_xy_d: Factor = 0.4
+    rate_z_p: Factor = 6.0
+    rate_z_i: Factor = 2.0
+    derivative_cutoff: Positive = 40.0
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -65,13 +71,20 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         max_thrust: Greatest upward thrust there, as a share of the same; the rest is for steering.
     """
 
-    tilt: float = radians(35.0)
-    speed: float = 12.0
-    climb: float = 4.0
-    descent: float = 2.0
-    approach: float = 3.0
-    integral: float = 3.0
-    tilt_rate: float = 8.0
-    yaw_rate: float = 2.0
-    min_thrust: float = 0.08
-    max_thrust: float = 0.9
+    tilt: Tilt = radians(35.0)
+    speed: Positive = 12.0
+    climb: Positive = 4.0
+    descent: Positive = 2.0
+    approach: Positive = 3.0
+    integral: Factor = 3.0
+    tilt_rate: Positive = 8.0
+    yaw_rate: Positive = 2.0
+    min_thrust: Share = 0.08
+    max_thrust: Share = 0.9
+
+    def __post_init__(self) -> None:
+        if not self.min_thrust < self.max_thrust:
+            raise ValueError(
+                f"min_thrust: expected less than max_thrust, {self.max_thrust:g}, found "
+                f"{self.min_thrust:g}"
+            )

@@ -16,6 +16,7 @@ import numpy as np
 from events import Vector3
 from events.frames import flip_yz, flip_yz_rotation
 from events.rotations import from_yaw
+from sims.worlds.loading import WorldError
 
 TIMESTEP_NS = 1_000_000
 """Nanoseconds of one physics step."""
@@ -31,6 +32,17 @@ AIR_DENSITY = 1.225
 
 AIR_VISCOSITY = 1.8e-5
 """Pascal seconds."""
+
+_OPTIONS: dict[str, Any] = {
+    "timestep": TIMESTEP_NS * 1e-9,
+    "gravity": [0.0, 0.0, -GRAVITY],
+    "density": AIR_DENSITY,
+    "viscosity": AIR_VISCOSITY,
+    "wind": [0.0, 0.0, 0.0],  # which is a setting of `World`
+    # Semi-implicit Euler: nothing here is stiff, and MuJoCo's implicit integrators cost more.
+    "integrator": int(mujoco.mjtIntegrator.mjINT_EULER),
+}
+"""Of a world in which there is a vehicle."""
 
 _VEHICLE = Path(__file__).with_name("vehicle.xml")
 
@@ -92,6 +104,7 @@ def attach_vehicle(world: mujoco.MjSpec, name: str, position: Vector3, yaw: floa
 
     Raises:
         ValueError: The name is empty, contains a slash, or is taken.
+        WorldError: The world asks for other physics in its ``<option>``.
     """
     if not name or "/" in name:
         raise ValueError(f"expected a vehicle's name without a slash, found {name!r}")
@@ -103,13 +116,16 @@ def attach_vehicle(world: mujoco.MjSpec, name: str, position: Vector3, yaw: floa
         quat=flip_yz_rotation(from_yaw(yaw)),
     )
     world.attach(vehicle, prefix=f"{name}/", frame=frame)
-    option: Any = world.option
-    option.timestep = TIMESTEP_NS * 1e-9
-    option.gravity = [0.0, 0.0, -GRAVITY]
-    option.density = AIR_DENSITY
-    option.viscosity = AIR_VISCOSITY
-    # Semi-implicit Euler: nothing here is stiff, and MuJoCo's implicit integrators cost more.
-    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    default: Any = mujoco.MjSpec().option
+    for key, value in _OPTIONS.items():
+        found = np.asarray(getattr(world.option, key))
+        if not any(np.allclose(found, each, atol=0.0) for each in (value, getattr(default, key))):
+            given, ours = (" ".join(f"{x:g}" for x in np.ravel(each)) for each in (found, value))
+            raise WorldError(
+                f'world: <option>: expected {key}="{ours}", or none, since vehicles are simulated '
+                f'so, found {key}="{given}"'
+            )
+        setattr(world.option, key, value)
 
 
 def read_parameters(model: mujoco.MjModel, name: str) -> VehicleParameters:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from events import Quaternion, Vector3
 from events.frames import flip_yz, flip_yz_rotation
 from events.rotations import cross, normalize, rotate_inverse
-from sims.vehicle.model import VehicleParameters, mover_of, read_parameters
+from sims.vehicle.model import TIMESTEP_NS, VehicleParameters, mover_of, read_parameters
 from sims.vehicle.simulation import Simulation
 
 Floats = npt.NDArray[np.float64]
@@ -187,6 +187,9 @@ class Physics:
         self._pose[:] = (x, -y, -z, qw, qx, -qy, -qz)
         self._twist[:] = (vx, -vy, -vz, wx, -wy, -wz)
         self.simulation.changed()
+        if not self.touching():  # as `Simulation.state_at` tells of it; a push may be of any size
+            self._twist -= self.data.qacc[self._of_twist] * (TIMESTEP_NS * 0.5e-9)
+            self.simulation.changed()
 
     def stop_rotors(self) -> None:
         """Have the rotors stand still at once."""

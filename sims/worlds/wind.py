@@ -19,12 +19,30 @@ KNOT = 0.514444
 W20 = {"none": 0.0, "light": 15 * KNOT, "moderate": 30 * KNOT, "severe": 45 * KNOT}
 """Wind at a height of 20 feet, m/s, by the strength of the turbulence that it makes."""
 
+STRONGEST = 50.0
+"""Metres per second of mean wind and gusts together. In a step of 1 ms, a vehicle that is carried
+by more may get past a wall without touching it."""
+
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT
 """Heights between which the model holds, metres; it is used beyond with these."""
 
 SLOWEST = 1.0
 """Metres per second through the air below which turbulence is met as at this speed: at 0 it would
 stand still."""
+
+
+def check_strength(*velocities: Vector3) -> None:
+    """Refuse air that moves faster than a step of the physics resolves.
+
+    Raises:
+        ValueError: The velocities (m/s) are more than `STRONGEST` together.
+    """
+    total = sum(math.hypot(*velocity) for velocity in velocities)
+    if not total <= STRONGEST:
+        raise ValueError(
+            f"velocity: expected up to {STRONGEST:g} m/s, gusts included, since the wind could "
+            f"carry a vehicle through walls otherwise, found {total:g} m/s"
+        )
 
 
 class Gust(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -79,8 +97,12 @@ class WindSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     velocity: Vector3 = (0.0, 0.0, 0.0)
     gusts: tuple[Gust, ...] = ()
     turbulence: (
-        Literal["none", "light", "moderate", "severe"] | Annotated[float, msgspec.Meta(ge=0)]
+        Literal["none", "light", "moderate", "severe"]
+        | Annotated[float, msgspec.Meta(ge=0, le=STRONGEST)]
     ) = "none"
+
+    def __post_init__(self) -> None:
+        check_strength(self.velocity, *(gust.velocity for gust in self.gusts))
 
     @property
     def w20(self) -> float:

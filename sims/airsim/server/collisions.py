@@ -16,20 +16,24 @@ if TYPE_CHECKING:
     from sims.airsim.server.node import AirsimServer
 
 APART = 10
-"""Looks, of 20 ms each, without any contact after which the next contact is a new one."""
+"""Looks, of 20 ms each, without contact with a thing after which the next contact is a new one."""
+
+_ANYTHING: dict[str, int] = {"": 0}
+"""What a vehicle that was just put somewhere touches for `APART` looks."""
 
 
 class Collisions:
     """Notes each vehicle's last collision.
 
     That is what its node tells of as such; and, since with AirSim contact with the ground counts,
-    however gentle, any contact after a while without one. So standing at the start does not count,
-    and landing does.
+    however gentle, any contact with a thing after a while without one. So standing at the start
+    does not count, and landing does; and the ground under it does not hide a wall.
     """
 
     def __init__(self, server: AirsimServer) -> None:
         self._server = server
-        self._apart: dict[str, int] = {}
+        self._touched: dict[str, dict[str, int]] = {}
+        """By vehicle what it has touched, and how many looks ago."""
 
     @rpc("simGetCollisionInfo")
     def collision_info(self, vehicle: str) -> CollisionInfo:
@@ -42,7 +46,7 @@ class Collisions:
     def forget(self, vehicle: ServedVehicle) -> None:
         """Forget a vehicle's collision, and take what it touches now as no new one."""
         vehicle.collision = CollisionInfo()
-        self._apart[vehicle.name] = 0
+        self._touched[vehicle.name] = _ANYTHING
 
     def note(self, event: VehicleEvent) -> None:
         """Take notice of what a vehicle's node tells."""
@@ -56,11 +60,13 @@ class Collisions:
             if not isinstance(vehicle, ServedMultirotor):
                 continue
             vehicle.state()
-            apart = self._apart.get(vehicle.name, 0)
-            touching = vehicle.physics.touching()
-            self._apart[vehicle.name] = 0 if touching else apart + 1
-            if touching and apart >= APART:
-                self._take(vehicle, vehicle.physics.contacts())
+            contacts = vehicle.physics.contacts() if vehicle.physics.touching() else []
+            before = self._touched.get(vehicle.name, _ANYTHING)
+            aged = {name: looks + 1 for name, looks in before.items() if looks < APART}
+            self._touched[vehicle.name] = aged | {each.other: 0 for each in contacts}
+            new = [each for each in contacts if each.other not in before]
+            if new and "" not in before:
+                self._take(vehicle, new)
 
     def _take(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
         """Keep the deepest of some contacts as a collision."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import socket
+import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -22,6 +23,10 @@ OPEN_REQUESTS = 256
 
 LONGEST_QUEUE = 64 << 20
 """Bytes of replies that a client may leave unread; with more, its connection is closed."""
+
+SILENT, IDLE = 5.0, 300.0
+"""Real seconds after which a connection that never spoke, or that did and waits for nothing, makes
+room for another one, if there is none."""
 
 SMALL, LARGE = 256, 2048
 """Bytes that are read in one turn of the loop: some requests, or a part of a long one."""
@@ -61,6 +66,7 @@ class Connection:
         self._tasks: set[asyncio.Task[Any]] = set()
         self._unsent: deque[memoryview] = deque()
         self._is_closed = False
+        self._heard, self._spoke = time.monotonic(), False
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -68,6 +74,12 @@ class Connection:
             if hasattr(socket, option):
                 client.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
         self._loop.add_reader(client, self._read)
+
+    def spare_for(self) -> float:
+        """Return for how many real seconds it could have made room; negative if it may stay."""
+        if self._open or self._unsent:
+            return -1.0
+        return time.monotonic() - self._heard - (IDLE if self._spoke else SILENT)
 
     def close(self, reason: str = "") -> None:
         """Close the connection: what only it waits for ends, and a vehicle's task goes on.
@@ -113,6 +125,7 @@ class Connection:
             self.close(str(error))
 
     def _serve(self, request: wire.Request) -> None:
+        self._heard, self._spoke = time.monotonic(), True
         self._incidents.count("requests" if request.id is not None else "notifications")
         try:
             if self._open >= OPEN_REQUESTS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import Callable
 
 from runtime.logs import NodeLogger
 from sims.airsim.server.connection import Connection
@@ -21,6 +22,7 @@ class Listener:
         port: Port to listen on; 0 for any that is free.
         most: Connections that may be open at once.
         log: Where refusals are logged.
+        on_change: Called whenever a client has come or left, with whether any is there.
 
     Attributes:
         port: The port.
@@ -29,7 +31,14 @@ class Listener:
         ValueError: The port is not free.
     """
 
-    def __init__(self, host: str, port: int, most: int, log: NodeLogger) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        most: int,
+        log: NodeLogger,
+        on_change: Callable[[bool], None] = lambda _: None,
+    ) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             self._socket = socket.create_server((host, port), family=family)
@@ -40,6 +49,7 @@ class Listener:
         self._socket.setblocking(False)
         self.port: int = self._socket.getsockname()[1]
         self._most = most
+        self._on_change = on_change
         self._incidents = Incidents(log)
         self._connections: set[Connection] = set()
 
@@ -50,6 +60,7 @@ class Listener:
 
     def close(self) -> None:
         """Close all connections, and log what was counted."""
+        self._on_change = lambda _: None
         asyncio.get_running_loop().remove_reader(self._socket)
         self._socket.close()
         for connection in tuple(self._connections):
@@ -63,11 +74,19 @@ class Listener:
             return
         address = f"{host}:{port}"
         if len(self._connections) >= self._most:
-            self._incidents.refused(address, f"expected at most {self._most} connections")
-            client.close()
-            return
+            idlest = max(self._connections, key=Connection.spare_for)
+            if idlest.spare_for() < 0.0:
+                self._incidents.refused(address, f"expected at most {self._most} connections")
+                client.close()
+                return
+            idlest.close("it was idle, and another client came")
         self._incidents.count("connections")
         connection = Connection(
-            client, address, self._table, self._flavour, self._incidents, self._connections.discard
+            client, address, self._table, self._flavour, self._incidents, self._left
         )
         self._connections.add(connection)
+        self._on_change(bool(self._connections))
+
+    def _left(self, connection: Connection) -> None:
+        self._connections.discard(connection)
+        self._on_change(bool(self._connections))

@@ -32,6 +32,8 @@ Thrust = Callable[[State], float]
 
 _STILL = 0.05
 """Metres per second that count as none."""
+_SLOW = 0.2
+"""Metres per second with which a path may end: what comes next begins where it ended."""
 _SETTLING = 5
 """Updates without progress near the end after which a path has ended."""
 _STUCK = 5 * RATE
@@ -89,8 +91,9 @@ def along_path(
 ) -> Task:
     """Fly along a path (m) from its first point, where the vehicle is, to its last.
 
-    It has succeeded when there is no progress any more within 0.5 m of the end, and failed if
-    there is none for 5 s elsewhere (where AirSim waits for the timeout), or at the timeout.
+    It has succeeded when there is no progress any more within 0.5 m of the end, and hardly any
+    speed; it has failed if there is no progress for 5 s elsewhere (where AirSim waits for the
+    timeout), or at the timeout.
     """
     carrot, least, idle = Carrot(path, lookahead), min(_STILL, 0.1 * speed) / RATE, 0
 
@@ -103,7 +106,8 @@ def along_path(
         is_near = carrot.is_last and apart <= CLOSE
         idle = idle + 1 if carrot.progress - before <= least else 0
         is_there = is_near or not remaining
-        if idle > (_SETTLING if is_there else _STUCK):
+        is_slow = math.hypot(*state.velocity) <= _SLOW
+        if idle > (_SETTLING if is_there and is_slow else _STUCK):
             return is_there
         share = 0.0 if is_near else braked(speed, remaining) / max(apart, CLOSE)
         down = _to_height(state, target[2], speed) if abs(z) <= CLOSE else z * share

@@ -6,6 +6,8 @@ and set-points as any pilot does.
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
@@ -14,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Announcement, Command, PoseEstimate, Setpoint, VehicleEvent
-from runtime import NodeConfig, Output, Tick, every, on
+from runtime import Duration, NodeConfig, Output, Tick, every, on
 from runtime.node import Node
 from runtime.paths import JsonOrPath, NameOrPath
 from sims.airsim.server.accepted import Accepted
@@ -63,6 +65,8 @@ class AirsimServerConfig(NodeConfig):
             equal runs; with ``awaited``, if it waits for each task before it asks for anything.
         default_vehicle: Name of the vehicle that an empty name stands for; empty for the first by
             name.
+        abandoned: Real time after which the run ends if time stands since the last client has
+            left.
         world: Name or path of the world, as of a simulator; empty for that of the vehicles.
         estimators: Estimators in clients' scripts, whose poses are judged.
         settings: The settings.json that clients get when they ask for it: its text, or a file;
@@ -85,6 +89,7 @@ class AirsimServerConfig(NodeConfig):
     flavour: Literal["airsim", "cosys"] = "airsim"
     time: Literal["running", "paused", "awaited"] = "running"
     default_vehicle: str = ""
+    abandoned: Duration = Duration(600.0)  # immutable
     world: NameOrPath = ""
     estimators: tuple[ScriptEstimator, ...] = ()
     settings: JsonOrPath = ""
@@ -150,12 +155,15 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         if self.config.time == "running" and not self.checking:
             await self.images.start()  # simulated time would wait for it later
         self._listener: Listener | None = None
+        self._waiting: threading.Timer | None = None
         if self.checking:
             return
         config = self.config
         if config.time != "running" and (reason := self.stepping.fixed()):
             raise ValueError(f'time: expected "running", found "{config.time}": {reason}')
-        self._listener = Listener(config.host, config.port, config.connections, self.log)
+        self._listener = Listener(
+            config.host, config.port, config.connections, self.log, self._attended
+        )
         self.port = self._listener.port
         self.share(PORTS, dict[str, int])[self.name] = self.port
 
@@ -181,6 +189,32 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         """Close all connections."""
         if self._listener is not None:
             self._listener.close()
+        self._attended(True)
+
+    def _attended(self, is_anybody: bool) -> None:
+        """Take note of whether any client is there, without whom time might stand for ever."""
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
+        awaited, seconds = self.config.time == "awaited", self.config.abandoned
+        if is_anybody or (self.stepping.state == "running" and not awaited):
+            return
+        self.log.warning(
+            "time stands, or will, and no client is left to let it run: the run ends in %g s of "
+            "real time unless one comes (abandoned)",
+            seconds,
+        )
+        # Real seconds: the loop's own timers are simulated, and stand.
+        call = asyncio.get_running_loop().call_soon_threadsafe
+        self._waiting = threading.Timer(seconds, call, [self._give_up])
+        self._waiting.daemon = True
+        self._waiting.start()
+
+    def _give_up(self) -> None:
+        if self.stepping.state == "running":  # a vehicle is on its way still
+            self._attended(False)
+        else:
+            self.stop(f"no client came for {self.config.abandoned:g} s while time stood")
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:

@@ -13,15 +13,13 @@ from events.frames import flip_yz
 from events.geodesy import from_geodetic
 from sims.airsim.server.methods import rpc
 from sims.airsim.structures import GeoPoint, Vector3r
+from sims.worlds.wind import check_strength
 
 if TYPE_CHECKING:
     from sims.airsim.server.node import AirsimServer
 
 FARTHEST_PLACE = 1e9
 """Degrees, and metres above the sea."""
-
-STRONGEST_WIND = 100.0
-"""Metres per second, beyond which the physics would not be those of air any more."""
 
 MOST_MESSAGES, LONGEST_MESSAGE = 1000, 500
 """Messages of clients that are logged, and characters of one."""
@@ -39,8 +37,7 @@ class Scenery:
     def set_wind(self, velocity: Vector3r) -> None:
         """Set the mean wind, in the world's NED frame; gusts and turbulence of the file stay."""
         wind = velocity.x_val, velocity.y_val, velocity.z_val
-        if not math.hypot(*wind) <= STRONGEST_WIND:
-            raise ValueError(f"wind: expected up to {STRONGEST_WIND:g} m/s, found {wind}")
+        check_strength(wind)
         self._blow(wind)
 
     def reset(self) -> None:

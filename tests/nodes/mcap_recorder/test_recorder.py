@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Reader
 
-from events import Event, Image
+from events import Event, Image, Odometry
 from nodes.mcap.disk import RecordingError
 from nodes.mcap.mcap_file import McapWriter, contents, read
 from nodes.mcap_recorder import McapRecorder, McapRecorderConfig, pipe
@@ -58,6 +59,10 @@ def test_a_run_is_recorded_to_its_end(tmp_path: Path) -> None:
     ]
     assert reader.end() == 3 * SECOND
     assert contents(path).metadata["visnav"]["events"] == str(len(events))
+    with Reader(tmp_path) as bag:  # the folder is one of ROS 2, for evo among others
+        assert (bag.start_time, bag.message_count) == (0, sum(1 for _ in bag.messages()))
+        counts = {each.topic: each.msgcount for each in bag.connections}
+        assert counts["/drone/odom"] == sum(isinstance(each, Odometry) for each in events)
 
 
 @pytest.mark.slow

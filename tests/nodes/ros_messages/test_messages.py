@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -147,6 +148,8 @@ def test_pressure_field_and_fix_are_in_the_bodys_frame_and_axes(messages: Messag
     assert xyz(message.magnetic_field) == (2e-5, -1e-6, -4e-5)
     assert not message.magnetic_field_covariance.any()
     fix = NavSatFix(stamp=0, source="drone", latitude=47.4, longitude=8.5, altitude=488.0)
+    none = msgspec.structs.replace(fix, status=-1)
+    assert read(messages.fix(TIME, none), "sensor_msgs/msg/NavSatFix").status.status == -1
     message = read(messages.fix(TIME, fix), "sensor_msgs/msg/NavSatFix")
     assert (message.latitude, message.longitude, message.altitude) == (47.4, 8.5, 488.0)
     assert (message.status.status, message.status.service) == (0, 1)

@@ -65,6 +65,11 @@ def test_mistakes_in_the_run(tmp_path: Path, line: str, expected: str, found: st
 IN_DRONE = [
     ("wrld = 1", "found unknown key ", "'wrld' (did you mean 'world'?)"),
     ("world = 1", "world: expected a text", "found 1"),
+    ("position = [nan, 0]", "position[0]: expected a finite number", "found nan"),
+    ("imu = { g_sensitivity = inf }", "imu.g_sensitivity: expected a finite number", "found inf"),
+    ("limits = { min_thrust = 5 }", "limits.min_thrust: expected a number <= 1", "found 5"),
+    ("limits = { min_thrust = 0.95 }", "limits: min_thrust: expected less than ", "found 0.95"),
+    ("gains = { tilt = -1 }", "gains.tilt: expected a number >= 0", "found -1"),
     ("position = [1]", "position: expected a list of length 2", "found [1]"),
     ('position = [1, "a"]', "position[1]: expected a number", 'found "a"'),
     ("control_rate = 0", "control_rate: expected a number > 0", "found 0"),

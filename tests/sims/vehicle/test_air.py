@@ -15,7 +15,7 @@ from events import Vector3
 from events.rotations import normalize, rotate, rotate_inverse
 from sims.vehicle import Physics, Simulation, attach_vehicle
 from sims.vehicle.air import Air, drag, equivalent_box
-from sims.worlds.wind import Gust, WindSpec
+from sims.worlds.wind import STRONGEST, Gust, WindSpec
 from tests.sims.vehicle.flight import UP, WORLD, compiled
 from tests.sims.vehicle.test_physics import MS, wild
 
@@ -123,3 +123,18 @@ def test_a_wind_that_is_set_holds_from_then_on() -> None:
     physics.advance_to(11 * MS)
     assert air.velocity_at("drone") == (0.0, 2.0, 0.0)
     assert physics.model.opt.wind.tolist() == [0.0, -2.0, 0.0]
+
+
+def test_the_strongest_wind_carries_nothing_through_a_wall_unseen() -> None:
+    """Faster wind is refused: at 500 m/s the vehicle was behind the wall one step later."""
+    for wind in ((0.0, 50.1, 0.0), (float("nan"), 0.0, 0.0)):
+        with pytest.raises(ValueError, match="velocity: expected up to 50 m/s"):
+            WindSpec(velocity=wind)
+    with pytest.raises(ValueError, match="found 60 m/s"):
+        WindSpec(velocity=(30.0, 0.0, 0.0), gusts=(Gust(velocity=(0.0, 30.0, 0.0)),))
+    physics, _ = windy(WindSpec(velocity=(STRONGEST, 0.0, 0.0)), height=3.0)
+    touched = set()
+    for millisecond in range(1000):
+        physics.advance_to(millisecond * MS)
+        touched |= {each.other for each in physics.contacts()}
+    assert "wall" in touched

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sims.vehicle import Physics, attach_vehicle, read_parameters
+from sims.worlds import WorldError
 from tests.sims.vehicle.flight import WORLD, compiled
 
 
@@ -70,3 +71,15 @@ def test_a_forward_camera_does_not_see_the_airframe() -> None:
             ray = [1.0, tan(radians(50.0)) * column / 20.0, row / 20.0]
             distance = mujoco.mj_ray(model, data, [0.1, 0.0, 1.0], ray, visible, 1, -1, hit)
             assert distance == -1.0, f"ray {ray} meets geom {hit[0]} at {distance}"
+
+
+@pytest.mark.parametrize(
+    "option", ['gravity="0 0 -1.62"', 'timestep="0.005"', 'wind="3 0 0"', 'integrator="RK4"']
+)
+def test_options_of_a_world_that_would_be_ignored_are_refused(option: str) -> None:
+    key, _, value = option.partition("=")
+    attach_vehicle(mujoco.MjSpec.from_string(WORLD), "drone", (0.0, 0.0, -1.0), 0.0)
+    world = WORLD.replace("<mujoco>", f"<mujoco><option {option}/>")
+    with pytest.raises(WorldError, match=f"<option>: expected {key}=.*found {key}=") as caught:
+        attach_vehicle(mujoco.MjSpec.from_string(world), "drone", (0.0, 0.0, -1.0), 0.0)
+    assert value in str(caught.value) or key == "integrator"

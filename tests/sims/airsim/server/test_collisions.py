@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from sims.airsim.server.collisions import Collisions
 from sims.airsim.server.segmentation import initial_id
+from sims.airsim.server.vehicles import ServedMultirotor
+from sims.vehicle.physics import Contact
 from tests.sims.airsim.scripts import Caller, drone, with_script
 
 NORTH = {"is_rate": True, "yaw_or_rate": 0.0}
@@ -105,3 +109,47 @@ def test_each_of_two_drones_names_the_other(tiny_world: str) -> None:
     with_script(script, nodes)
     assert found["a"]["has_collided"]
     assert found["a"]["object_name"] in {"b", "floor"}
+
+
+class Touching(ServedMultirotor):
+    """A vehicle that touches what it is told."""
+
+    name = "drone"
+
+    def __init__(self) -> None:
+        self.now: set[str] = set()
+        self.physics: Any = self
+
+    def state(self) -> Any:
+        """Do nothing."""
+
+    def touching(self) -> bool:
+        """Return whether it touches anything."""
+        return bool(self.now)
+
+    def contacts(self) -> list[Contact]:
+        """Return one contact with each thing."""
+        return [Contact(each, (0.0,) * 3, (0.0,) * 3, 0.0) for each in sorted(self.now)]
+
+
+@pytest.mark.parametrize(
+    ("looks", "told"),
+    [
+        (["floor"] * 30, []),
+        (["floor"] * 30 + ["floor wall"] * 30, ["wall"]),  # which the floor hid once
+        ([""] * 30 + ["floor"] * 5 + [""] * 5 + ["floor"], ["floor"]),  # a bounce is one
+        (["floor"] * 30 + [""] * 30 + ["floor"], ["floor"]),
+        ([""] * 5 + ["floor"] * 30, []),  # it is put down
+    ],
+)
+def test_a_contact_that_begins_while_another_lasts_is_told(
+    looks: list[str], told: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[str] = []
+    vehicle = Touching()
+    collisions = Collisions(SimpleNamespace(vehicles={"drone": vehicle}))  # type: ignore[arg-type]
+    monkeypatch.setattr(collisions, "_take", lambda _, new: found.extend(c.other for c in new))
+    for look in looks:
+        vehicle.now = {*look.split()}
+        collisions.watch()
+    assert found == told

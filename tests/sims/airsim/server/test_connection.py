@@ -299,6 +299,23 @@ def test_more_connections_than_allowed_are_closed_and_logged_once(
     assert int(re.findall(r"(\d+) refused", caplog.text)[-1]) >= 136
 
 
+def test_connections_that_never_speak_make_room_for_others(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("sims.airsim.server.connection.SILENT", 0.0)
+
+    async def scenario(methods: Methods, clients: Clients) -> None:
+        assert (await (await clients.connect()).call("ping")).result is True
+        for _ in range(100):
+            await clients.connect()
+        assert (await (await clients.connect()).call("ping")).result is True
+        assert (await clients.all[0].call("ping")).result is True, "it spoke"
+
+    with caplog.at_level(logging.WARNING):
+        serve(scenario)
+    assert "connection closed: it was idle, and another client came" in caplog.text
+
+
 async def _answered(client: Client) -> bool:
     client.send((0, "ping", []))
     with contextlib.suppress(ConnectionResetError):
@@ -315,6 +332,7 @@ async def _answered(client: Client) -> bool:
         b"\xdd\x00\xff\xff\xff" * 2000,
         b"\x94\x00\x00\xa4ping\x91\x81\x90\x00",  # a list as a key
         b"\x95\x00\x00\xa4ping\x90\x00",
+        wire.request(0, "ping", [[[]] * wire.MOST_LISTS]),
         b"\xdb\xff\xff\xff\xff" + b"x" * (wire.LONGEST + 1),
     ],
 )

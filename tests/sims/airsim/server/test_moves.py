@@ -201,3 +201,13 @@ def test_a_landing_waits_until_nothing_moves_for_more_than_ten_updates() -> None
     states = [lying] * 10 + [falling] + [lying] * 12
     names = [type(steered(task, 0.0, state)).__name__ for state in states]
     assert names == ["VelocitySetpoint"] * 21 + ["Land", "NoneType"]
+
+
+@pytest.mark.parametrize(("speed", "ends"), [(3.0, None), (0.1, True)])
+def test_a_place_is_reached_when_the_vehicle_is_slow_too(speed: float, ends: bool | None) -> None:
+    """Else a landing that follows would coast on for a metre first."""
+    task = moves.along_path([(0.0, 0.0, -2.0), (9.0, 0.0, -2.0)], 12.0, -1.0, Heading(), 60.0)
+    there = at((9.0, 0.0, -2.0), (speed, 0.0, 0.0))
+    orders = [steered(task, count * STEP, there) for count in range(20)]
+    found = next((each for each in orders if isinstance(each, bool)), None)
+    assert found is ends

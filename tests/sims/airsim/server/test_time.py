@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import math
 import random
 import socket
@@ -16,7 +17,7 @@ import pytest
 
 from runtime.node import Node
 from runtime.schedule import SECOND, Once
-from runtime.testing import spec
+from runtime.testing import run_nodes, spec
 from sims.airsim import wire
 from sims.airsim.client.rpc import RpcCallError, RpcClient
 from sims.airsim.server import AirsimServer
@@ -200,3 +201,25 @@ def test_clients_that_flood_the_server_do_not_stop_time(tiny_world: str) -> None
         assert airsim("now") > begin + 0.1
 
     with_script(script, [drone(world=tiny_world)], time="running", duration=1e6)
+
+
+def test_a_run_that_a_client_left_standing_ends(caplog: pytest.LogCaptureFixture) -> None:
+    """It would stand for ever, since `duration` is simulated. The limit is real: 0.1 s here."""
+
+    class Leaver(Node):
+        """Connects, pauses and leaves."""
+
+        async def run(self) -> None:
+            port = self.share(PORTS, dict[str, int])["airsim"]
+
+            def work() -> None:
+                with contextlib.closing(Caller(port)) as call:
+                    call("simPause", True)
+
+            threading.Thread(target=work, daemon=True).start()
+
+    server = spec(AirsimServer, "airsim", {"port": 0, "abandoned": 0.1})
+    with caplog.at_level(logging.WARNING):
+        result = run_nodes([drone(), server, spec(Leaver, "client")], duration=3600.0)
+    assert "no client is left to let it run" in caplog.text
+    assert "no client came for 0.1 s while time stood" in result.reason
