@@ -13,6 +13,7 @@ import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Imu, ImuAnnouncement
@@ -80,7 +81,8 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
     """Return how far the ideal IMU, integrated, gets from the truth: proof 1.
 
     Rotation by the exponential of the mean of two angular velocities, velocity by the trapezoidal
-    rule on the rotated specific forces, position likewise; of an IMU that averages, by its sample.
+    rule on the rotated specific forces, position likewise, on splines through the samples; of an
+    IMU that averages, by its sample.
     """
     used = [s for s in samples if begin <= s.stamp <= begin + round(INTEGRATED * 1e9)]
     stamps = np.array([s.stamp for s in used], np.int64)
@@ -91,7 +93,12 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
     a, b = (motion.mounted(stamps[:1] + d, imu.position, imu.orientation)[0] for d in (-near, near))
     turn, place, velocity = turns[0], places[0].copy(), (b[0] - a[0]) / (2e-9 * near)
     gravity = np.array([0.0, 0.0, GRAVITY])
-    for index, step in enumerate(np.diff(stamps) / 1e9, 1):
+    seconds = (stamps - stamps[0]) / 1e9
+    if not imu.averaged:
+        fine = np.interp(np.arange(4 * len(stamps) - 3) / 4.0, np.arange(len(stamps)), seconds)
+        rates, forces = (CubicSpline(seconds, each)(fine) for each in (rates, forces))
+        seconds = fine
+    for index, step in enumerate(np.diff(seconds), 1):
         rate = rates[index] if imu.averaged else (rates[index - 1] + rates[index]) / 2.0
         after = turn * Rotation.from_rotvec(rate * step)
         if imu.averaged:
@@ -103,12 +110,12 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
         velocity = velocity + step * (force + gravity)
         turn = after
     off = float(np.linalg.norm(place - places[-1]))
-    seconds = (stamps[-1] - stamps[0]) / 1e9
+    length = seconds[-1]
     remark = "" if off <= _POSITION else (
-        f"the ideal IMU, integrated over {seconds:.2f} s, ends {off:.3f} m from the truth: its "
+        f"the ideal IMU, integrated over {length:.2f} s, ends {off:.3f} m from the truth: its "
         "samples, their stamps or its mounting are not what is announced"
     )  # fmt: skip
-    return Figure(imu.source, f"position after {seconds:.2f} s", off, _POSITION, "m", remark)
+    return Figure(imu.source, f"position after {length:.2f} s", off, _POSITION, "m", remark)
 
 
 def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Points:

@@ -118,7 +118,11 @@ class Touching(ServedMultirotor):
 
     def __init__(self) -> None:
         self.now: set[str] = set()
-        self.physics: Any = self
+
+    @property
+    def physics(self) -> Any:
+        """What it touches is told here."""
+        return self
 
     def state(self) -> Any:
         """Do nothing."""
