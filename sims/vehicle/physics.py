@@ -185,10 +185,13 @@ class Physics:
         )
         qw, qx, qy, qz = normalize(state.orientation)
         self._pose[:] = (x, -y, -z, qw, qx, -qy, -qz)
-        self._twist[:] = (vx, -vy, -vz, wx, -wy, -wz)
+        twist = np.array((vx, -vy, -vz, wx, -wy, -wz))
+        self._twist[:] = twist
         self.simulation.changed()
-        if not self.touching():  # as `Simulation.state_at` tells of it; a push may be of any size
-            self._twist -= self.data.qacc[self._of_twist] * (TIMESTEP_NS * 0.5e-9)
+        for _ in range(5):  # to where `Simulation.state_at` tells of this twist
+            if self.touching():  # a push may be of any size
+                break
+            self._twist[:] = twist - self.data.qacc[self._of_twist] * (TIMESTEP_NS * 0.5e-9)
             self.simulation.changed()
 
     def stop_rotors(self) -> None:
