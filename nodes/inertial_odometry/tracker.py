@@ -2,7 +2,9 @@
 
 The IMU says where the map should be in the next image, all landmarks found there correct the
 filter (tightly coupled: none is too few), and the filter's pose is what the map grows from. Where
-nothing is seen, the IMU alone carries the pose on.
+landmarks are few, an alignment of edges and surfaces corrects it, too. Where nothing is seen, the
+IMU alone carries the pose on, for a while; then the camera is lost, and what it does not find
+again becomes a new map, in a frame of its own.
 """
 
 from __future__ import annotations
@@ -23,18 +25,24 @@ from nodes.inertial_odometry.rolling_shutter import Rows as ImageRows
 from nodes.odometry.images import Depth, Grey
 from nodes.odometry.pose import rays
 from nodes.stereo_odometry import StereoMatcher, StereoSettings
-from nodes.visual_odometry.features import FeatureTracker
+from nodes.visual_odometry.alignment import Alignment
+from nodes.visual_odometry.features import BELIEVED, FeatureTracker
 from nodes.visual_odometry.landmarks import MapMatch
 from nodes.visual_odometry.patches import Rows
 from nodes.visual_odometry.settings import FeatureSettings
-from nodes.visual_odometry.surfaces import surfaces_at
+from nodes.visual_odometry.surfaces import Surfaces, surfaces_at
 
-_KNOWN = 0.3
-"""Standard deviations of velocity (m/s) and gravity (m/s²) from which on the IMU is of use."""
+_KNOWN = 0.3, 0.03
+"""Standard deviations of velocity (m/s) and gravity (radians) below which the IMU is of use."""
 _READING = 0.8
 """Noise of a reading of depth, as a share of that of one pixel: errors of place included."""
-_REJECTED = 10
-"""Images in a row that contradict the IMU, after which the filter begins again from the map."""
+_BENT = 0.003
+"""The same of surfaces that are not quite planes, as a share of inverse depth."""
+_PLACED = 0.5, 0.5
+"""Noise of a landmark's place, which does not change from image to image, as a share of that of one
+sighting: of its pixel, and of its depth."""
+_SLOTS = (-1, -2)
+"""Numbers of the images that may be the reference of an alignment, beside those of key frames."""
 
 
 class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -64,8 +72,6 @@ class InertialTracker(FeatureTracker):
         stereo: Settings of the stereo matching.
     """
 
-    _aligns = False  # as the filter takes landmarks only, and carries the pose without them
-
     def __init__(
         self,
         camera: CameraAnnouncement,
@@ -89,7 +95,9 @@ class InertialTracker(FeatureTracker):
         self._time: float | None = None  # of the filter, seconds
         self._epoch: int | None = None
         self._seen_at = 0.0
-        self._rejected = 0
+        self._force = np.zeros(3)
+        self._noted = self._referred = _SLOTS[0]
+        self._noted_pose = np.eye(4)
 
     def fuse(
         self,
@@ -116,7 +124,7 @@ class InertialTracker(FeatureTracker):
             np.column_stack([(samples[:, 0] - self._epoch) / 1e9, samples[:, 1:]])
         )
         self._samples = np.vstack([self._samples, samples])
-        self._rates = rates = self._advance(now)
+        self._rates = self._advance(now)
         if self._readout > 0:
             image, other = self._straightened(image, other)
         if self._matcher is None:
@@ -124,20 +132,25 @@ class InertialTracker(FeatureTracker):
         else:
             depth = self._matcher.depth(image, np.asarray(other, np.uint8))
         self._now = now
+        self._force = samples[:, 4:].mean(axis=0) if len(samples) else np.zeros(3)
         result = self.track(stamp, image, depth)
-        if self._time is None and not result.lost:
-            self._time = self._seen_at = now
-            self._filter.start(rates[3:])
-            self._filter.remember(0)
-        if not self._is_known:
+        if self._time is None:
             return result
-        if result.lost and now - self._seen_at <= self._inertial.carry:
-            result = msgspec.structs.replace(result, lost=False, reason="")
+        lost = result.lost
+        if self._is_known:
+            lost &= not self._is_carried
+            velocity = (
+                self._filter.state.rotation @ self._filter.camera[:3, :3] @ self._camera_velocity()
+            )
+        else:
+            # In a map begun at a guess, a pose is of use when the IMU can carry it.
+            lost |= self._maps > 0
+            velocity = None
         return msgspec.structs.replace(
             result,
-            velocity=self._filter.state.rotation
-            @ self._filter.camera[:3, :3]
-            @ self._camera_velocity(),
+            lost=lost,
+            reason=result.reason or ("the velocity is not known yet" if lost else ""),
+            velocity=velocity,
             covariance=self._camera_covariance(),
         )
 
@@ -146,7 +159,7 @@ class InertialTracker(FeatureTracker):
         """Whether velocity and gravity are known well enough to go on without images."""
         variances = np.diag(self._filter.covariance)
         return self._time is not None and bool(
-            max(variances[V].max(), variances[G].max()) < _KNOWN**2
+            variances[V].max() < _KNOWN[0] ** 2 and variances[G].max() < _KNOWN[1] ** 2
         )
 
     def _advance(self, now: float) -> Floats:
@@ -206,30 +219,77 @@ class InertialTracker(FeatureTracker):
         """Return the pose that the IMU predicts, once the filter knows enough; world to camera."""
         return inverse(self._camera_pose()) if self._is_known else super()._expect(grey)
 
+    def _starts(self, stamp: int, match: MapMatch | None) -> tuple[list[Floats], bool]:
+        return ([self._pose], False) if self._is_known else super()._starts(stamp, match)
+
     def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
         """Find the map in an image, and let the landmarks found correct the filter."""
         match = super()._match(grey, inverse_of)
-        if self._time is None:
-            return match
         if match is not None and not self._filter.update(self._sighting(match, inverse_of)):
-            self._rejected += 1
-            if self._rejected < _REJECTED:
-                match = None
-            else:
-                self._filter.restart(inverse(match.pose))
+            match = None
+        return self._corrected(match)
+
+    def _aligned(
+        self,
+        grey: Grey,  # noqa: ARG002
+        inverse_of: Depth,  # noqa: ARG002
+        alignment: Alignment,
+        match: MapMatch | None,
+    ) -> MapMatch | None:
+        """Let an alignment correct the filter."""
+        if first := bool((alignment.reference == self._noted_pose).all()):
+            self._referred = self._noted
+        believed, pose = BELIEVED * alignment.information, inverse(alignment.pose)
+        if self._filter.update_pose(pose, self._referred, believed, first):
+            match = match or MapMatch.without_landmarks(alignment.pose)
+        return self._corrected(match)
+
+    def _corrected(self, match: MapMatch | None) -> MapMatch | None:
+        """Return a match at the filter's pose."""
         self._pose = inverse(self._camera_pose())
         if match is None:
             return None
-        self._seen_at, self._rejected = self._now, 0
+        self._seen_at = self._now
         return msgspec.structs.replace(match, pose=self._pose)
+
+    def _note(self, grey: Grey, inverse_of: Depth, aligned: bool) -> None:
+        super()._note(grey, inverse_of, aligned)
+        self._noted = _SLOTS[self._referred == _SLOTS[0]]
+        self._noted_pose = self._pose
+        self._filter.remember(self._noted)
 
     def _add_keyframe(self, grey: Grey, inverse_of: Depth, rows: Rows, pixels: Floats) -> None:
         super()._add_keyframe(grey, inverse_of, rows, pixels)
         number = next(reversed(self._keyframes))
         if number == 0:
             self._filter.forget()
-        if self._time is not None:
-            self._filter.remember(number)
+            if self._time is None:  # the first map, or one at a guessed pose
+                self._filter.start(self._force, inverse(self._pose))
+                self._time = self._seen_at = self._now
+            self._note(grey, inverse_of, False)
+        new = np.flatnonzero(self._map.keyframes == number)
+        read = self._surfaces_at(inverse_of, self._map.pixels[new], self._settings.depth_noise)
+        self._filter.remember(number, self._seen(new, self._map.pixels[new], read, _PLACED))
+
+    def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
+        """Return that nothing was found; after a while, start a new map.
+
+        That is where the IMU has carried the camera, while that is known; else in a new frame.
+        """
+        result = self._lost(stamp, "too few landmarks of the map were found")
+        if stamp - (self._lost_since or stamp) < self._settings.reset_timeout * 1e9:
+            return result
+        if self._is_carried:
+            return self._start_map(stamp, grey, inverse_of, "by a new map, where the IMU says")
+        begun, self._time = self._time, None
+        started = self._start_map(stamp, grey, inverse_of, "by a new map, at a guessed pose")
+        if started.lost:
+            self._time = begun
+        return started
+
+    @property
+    def _is_carried(self) -> bool:
+        return self._is_known and self._now - self._seen_at <= self._inertial.carry
 
     def _camera_pose(self) -> Floats:
         """Return the camera in the world, shape (4, 4)."""
@@ -241,12 +301,21 @@ class InertialTracker(FeatureTracker):
     def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:
         """Return the landmarks of a match that agree with it."""
         rows, pixels = match.rows[match.agree], match.pixels[match.agree]
-        noise = self._settings.depth_noise
-        read = self._surfaces_at(inverse_of, pixels, noise)
+        read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
+        return self._seen(rows, pixels, read, (1.0, 1.0))
+
+    def _seen(
+        self, rows: Rows, pixels: Floats, read: Surfaces, noise: tuple[float, float]
+    ) -> Sighting:
+        """Return landmarks at pixels, with shares of the noise of a pixel and of its depth."""
         measured = rays(pixels, self._matrix)
         measured[:, 2] = read.inverse
         scale = np.empty_like(measured)
-        scale[:, :2] = (self._info.fx, self._info.fy)
-        scale[:, :2] /= self._inertial.pixel_noise
-        scale[:, 2] = np.where(read.continuous, 1.0 / (_READING * noise), 0.0)
+        pixel_noise = noise[0] * self._inertial.pixel_noise
+        scale[:, :2] = np.array([self._info.fx, self._info.fy]) / pixel_noise
+        # A pixel that is off reads the depth beside it, which on a slanted surface is another.
+        slant = pixel_noise * np.linalg.norm(read.slope, axis=1)
+        noises = [noise[1] * _READING * self._settings.depth_noise, slant, _BENT * read.inverse]
+        variance = sum(np.square(each) for each in noises)
+        scale[:, 2] = np.where(read.continuous, 1.0 / np.sqrt(variance), 0.0)
         return Sighting(self._map.places[rows], self._map.keyframes[rows], measured, scale)

@@ -3,7 +3,8 @@
 Block matching (K. Konolige, "Small vision systems", ISRR 1997; OpenCV's `cv2.StereoBM`) on halved
 images says where surfaces are continuous, and starts the optical flow that finds a corner in the
 right image to a few hundredths of a pixel, and back. Block matching alone draws slanted surfaces
-towards whole pixels: in the hall its trajectory has four times the error.
+towards whole pixels: in the hall its trajectory has four times the error. Where it finds nothing,
+as on surfaces of one colour, flow starts from afar, and finds the corner's neighbours, too.
 """
 
 from __future__ import annotations
@@ -30,6 +31,13 @@ _OFF_ROW = 0.6
 """Pixels by which a corner may leave its row."""
 _COARSE = 2.0
 """Noise of block matching, in units of that of flow."""
+_LEVELS = 3
+"""Times that flow halves the images where block matching found nothing."""
+_ASIDE = 4
+"""Pixels from such a corner to its neighbours, by which its plane is found."""
+_BESIDE = np.array([(_ASIDE, 0), (-_ASIDE, 0), (0, _ASIDE), (0, -_ASIDE)])
+_TORN, _BENT = 0.02, 0.15
+"""Share of its disparity, and pixels, by which a corner's may differ from its neighbours' mean."""
 
 
 class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -115,16 +123,40 @@ class StereoMatcher:
             pixels: Column and row, shape (n, 2).
             noise: Standard deviation of inverse depth, 1/m.
         """
-        coarse = surfaces_at(inverse, pixels, _COARSE * noise)
-        rows = np.flatnonzero(coarse.continuous)
-        if not len(rows) or self._pair is None:
-            return coarse
-        guess = pixels[rows] - coarse.inverse[rows, None] * (self._unit, 0.0)
-        found, good = follow_both_ways(*self._pair, pixels[rows], guess, _WINDOW, 0)
-        disparity = pixels[rows, 0] - found[:, 0]
-        good &= np.abs(found - guess).max(axis=1) < _REFINED
-        good &= np.abs(found[:, 1] - pixels[rows, 1]) < _OFF_ROW
-        good &= disparity > self._least
+        found = surfaces_at(inverse, pixels, _COARSE * noise)
+        if self._pair is None or not len(pixels):
+            return found
+        rows, without = np.flatnonzero(found.continuous), np.flatnonzero(~found.continuous)
+        there, slope = found.inverse * self._unit, found.slope.copy()
         fine = np.zeros(len(pixels))
-        fine[rows[good]] = disparity[good] / self._unit
-        return Surfaces(fine, coarse.slope, fine > 0)
+        if len(rows):
+            disparity, good = self._disparity(pixels[rows], there[rows], 0)
+            good &= np.abs(disparity - there[rows]) < _REFINED
+            fine[rows[good]] = disparity[good]
+        if len(without):
+            # Blocks match on little texture, and at no outline; flow finds any corner, and says by
+            # its neighbourhood whether that is a plane.
+            centre = pixels[without]
+            disparity, good = self._disparity(centre, np.zeros(len(centre)), _LEVELS)
+            beside, all_good = self._disparity(
+                (centre[:, None] + _BESIDE).reshape(-1, 2), disparity.repeat(len(_BESIDE)), 0
+            )
+            right, left, below, above = beside.reshape(-1, len(_BESIDE)).T
+            bend = np.abs(np.stack([right + left, below + above]) / 2 - disparity).max(axis=0)
+            good &= all_good.reshape(-1, len(_BESIDE)).all(axis=1)
+            good &= bend < np.maximum(_TORN * disparity, _BENT)
+            fine[without[good]] = disparity[good]
+            change = np.stack([right - left, below - above], axis=1) / (2 * _ASIDE)
+            slope[without] = change / self._unit
+        return Surfaces(fine / self._unit, slope, fine > 0)
+
+    def _disparity(
+        self, pixels: Floats, guess: Floats, levels: int
+    ) -> tuple[Floats, npt.NDArray[np.bool_]]:
+        """Return disparities by flow from a guess, shape (n,), and which are good, shape (n,)."""
+        assert self._pair is not None
+        there = pixels - guess[:, None] * (1.0, 0.0)
+        found, good = follow_both_ways(*self._pair, pixels, there, _WINDOW, levels)
+        disparity = pixels[:, 0] - found[:, 0]
+        good &= np.abs(found[:, 1] - pixels[:, 1]) < _OFF_ROW
+        return disparity, good & (disparity > self._least)

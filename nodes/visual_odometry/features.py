@@ -39,7 +39,7 @@ from nodes.odometry.pose import (
     solve_pose,
 )
 from nodes.odometry.relocalization import detect_and_describe, relocalize
-from nodes.visual_odometry.alignment import View
+from nodes.visual_odometry.alignment import Alignment, View
 from nodes.visual_odometry.keyframes import ORB_POINTS, Described, Keyframe, find_corners, squares
 from nodes.visual_odometry.landmarks import Landmarks, MapMatch
 from nodes.visual_odometry.motion import Motion
@@ -58,7 +58,7 @@ _FEW = 120
 _ENOUGH = 60 / 512**2
 """Agreeing landmarks a pixel that give a pose alone: a smaller image has room for fewer of them.
 With less than that, edges and surfaces are aligned, too."""
-_BELIEVED = 0.03
+BELIEVED = 0.03
 """Share of an alignment's information that counts beside landmarks: errors of pixels that lie
 beside each other are not independent, and some of the pixels may be on things that move."""
 _FEWEST = 4
@@ -129,14 +129,10 @@ class FeatureTracker:
         match = self._match(grey, inverse_of)
         if self._aligns and (match is None or match.agree.sum() < self._enough):
             view = View.of(grey, inverse_of)
-            starts = [match.pose] if match and lost else [self._motion.expected(stamp)]
-            if match is None and lost:
-                starts += [self._motion.steady(stamp), self._pose]
-            alignment = self._references.align(view, starts, lost)
+            starts, guessed = self._starts(stamp, match)
+            alignment = self._references.align(view, starts, guessed)
             if alignment is not None:
-                believed = _BELIEVED * alignment.information
-                match = self._find(grey, inverse_of, alignment.pose, believed)
-                match = match or MapMatch.without_landmarks(alignment.pose)
+                match = self._aligned(grey, inverse_of, alignment, match)
         if match is None:
             return self._lose(stamp, grey, inverse_of)
         (self._motion.placed if lost else self._motion.measured)(stamp, match.pose)
@@ -150,7 +146,7 @@ class FeatureTracker:
         read = self._surfaces_at(inverse_of, match.pixels[agree], noise)
         self._map.fuse(self._pose, rows[agree], read, _READING * noise)
         self._before = self._reduced(grey), rows[agree], match.pixels[agree]
-        self._references.note(grey, inverse_of, self._pose, alignment is not None)
+        self._note(grey, inverse_of, alignment is not None)
         points, inliers = match.pixels, agree
         if alignment is None:
             far = self._is_far(rows[agree])
@@ -170,6 +166,30 @@ class FeatureTracker:
             inliers=inliers,
             map=self._maps,
         )
+
+    def _starts(self, stamp: int, match: MapMatch | None) -> tuple[list[Floats], bool]:
+        """Return poses to begin an alignment with, and whether these are guesses only."""
+        lost = self._lost_since is not None
+        starts = [match.pose] if match and lost else [self._motion.expected(stamp)]
+        if match is None and lost:
+            starts += [self._motion.steady(stamp), self._pose]
+        return starts, lost
+
+    def _aligned(
+        self,
+        grey: Grey,
+        inverse_of: Depth,
+        alignment: Alignment,
+        match: MapMatch | None,  # noqa: ARG002
+    ) -> MapMatch | None:
+        """Return what was found in an image that is aligned, beside a match of few landmarks."""
+        believed = BELIEVED * alignment.information
+        found = self._find(grey, inverse_of, alignment.pose, believed)
+        return found or MapMatch.without_landmarks(alignment.pose)
+
+    def _note(self, grey: Grey, inverse_of: Depth, aligned: bool) -> None:
+        """Remember an image whose pose is known, and whether it is by an alignment."""
+        self._references.note(grey, inverse_of, self._pose, aligned)
 
     def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
         """Find the map in an image, from the previous pose or, if lost, by relocalization."""

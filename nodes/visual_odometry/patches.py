@@ -15,6 +15,10 @@ import numpy.typing as npt
 
 from nodes.odometry.images import Floats, Grey, follow_both_ways
 
+_SAME = 0.5
+"""Least correlation of a patch with what is found: flow finds noise wherever it begins, and so says
+of any expected place that it is right."""
+
 Rows = npt.NDArray[np.int64]
 
 MARGIN = 4
@@ -69,7 +73,24 @@ def find_patches(
     start = middle + patches.expected - centre
     end, good = follow_both_ways(wanted, there, start, start, window, 0)
     shift = end - start.astype(np.float32)  # which is where the flow starts
-    return patches.expected + shift, good & (np.abs(shift).max(axis=1) < MARGIN)
+    good &= np.abs(shift).max(axis=1) < MARGIN
+    inner = slice(half - window // 2, half + window // 2 + 1)
+    wanted = wanted.reshape(-1, side, side)[:, inner, inner]
+    good &= _correlation(wanted, image, centre + shift) > _SAME
+    return patches.expected + shift, good
+
+
+def _correlation(wanted: Grey, image: Grey, pixels: Floats) -> Floats:
+    """Return how well squares, shape (n, w, w), correlate with an image around pixels, (n, 2)."""
+    steps = np.arange(wanted.shape[1], dtype=np.float32) - wanted.shape[1] // 2
+    x, y = pixels.T.astype(np.float32)[..., None] + steps
+    columns = np.repeat(x[:, None], len(steps), axis=1).reshape(-1, len(steps))
+    rows = np.repeat(y.reshape(-1, 1), len(steps), axis=1)
+    found = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    pair = np.stack([wanted.reshape(len(x), -1), found.reshape(len(x), -1)]).astype(np.float64)
+    pair -= pair.mean(axis=2, keepdims=True)
+    size = np.sqrt((pair**2).sum(axis=2)).prod(axis=0)
+    return np.asarray((pair[0] * pair[1]).sum(axis=1) / np.maximum(size, 1e-9))
 
 
 def _cut_warped(patches: Patches, images: Mapping[int, Grey], centre: Floats, half: int) -> Grey:

@@ -11,7 +11,7 @@ from nodes.estimation.rectification import ALIGNED, misalignment
 from nodes.stereo_odometry import StereoMatcher, StereoSettings
 from nodes.stereo_odometry.node import StereoTracker
 from nodes.visual_odometry.settings import FeatureSettings
-from nodes.visual_odometry.surfaces import inverse_depth
+from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
 from tests.nodes.visual_odometry.world import INFO, look, pose
 
 BASELINE = 0.1
@@ -36,6 +36,20 @@ def test_depth_at_corners_is_within_the_stated_noise() -> None:
     errors = (found.inverse - true)[found.continuous]
     assert np.median(np.abs(errors)) < matcher.depth_noise
     assert np.abs(np.median(errors)) < 0.5 * matcher.depth_noise
+
+
+def test_corners_on_a_surface_of_one_colour_have_depth() -> None:
+    pixels = np.array([(x, y) for x in range(100, 280, 45) for y in range(40, 200, 45)], np.float64)
+    left, right = np.full((2, INFO.height, INFO.width), 190, np.uint8)
+    for x, y in pixels.astype(int).tolist():
+        left[y : y + 9, x : x + 9] = 60
+        right[y : y + 9, x - 11 : x - 2] = 60
+    matcher = StereoMatcher(INFO, BASELINE)
+    coarse = inverse_depth(matcher.depth(left, right))
+    assert not surfaces_at(coarse, pixels, matcher.depth_noise).continuous.any()
+    found = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
+    assert found.continuous.mean() > 0.8
+    assert np.allclose(INFO.fx * BASELINE * found.inverse[found.continuous], 11.0, atol=0.1)
 
 
 @pytest.mark.parametrize("other", ["black", "unrelated", "swapped"])
