@@ -65,6 +65,8 @@ class NodeRunner:
         self.phase_task: asyncio.Task[Any] | None = None
         self._create = create
         self._succeeded = False
+        self.first_error = False
+        """Whether what fails in a step of the end is the run's error, which is printed then."""
 
     def awaited(self) -> list[asyncio.Task[Any]]:
         """Return the tasks that the run waits for in this phase."""
@@ -208,7 +210,8 @@ class NodeRunner:
             if isinstance(error, asyncio.CancelledError) and _is_cancelled():
                 raise
             wrong = wrap(self.spec.name, error)
-            log_error(wrong, last=False)
+            log_error(wrong, last=self.first_error)
+            self.first_error = False
             return [wrong]
         return []
 

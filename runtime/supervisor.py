@@ -410,6 +410,7 @@ class Supervisor:
         if not self.state.running:  # what has started may still send farewells to what has, too
             self.connect()
         for runner in self.state.runners.values():
+            runner.first_error = self.state.error is None
             for error in await runner.end(self.state.shutdown_limit()):
                 self.state.note_error(error)
         for name, runner in reversed(self.state.runners.items()):
@@ -431,6 +432,7 @@ class Supervisor:
     async def _shut_down(self, runner: NodeRunner) -> None:
         """End one node, unless that is done: it receives nothing afterwards."""
         async with runner.shutdown_lock:
+            runner.first_error = self.state.error is None
             for error in await runner.shut_down(self.state.shutdown_limit()):
                 self.state.note_error(error)
             self.connect()

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from runtime import Node
 from runtime.part_summaries import TickSummary
 from runtime.summary import Summary
 from runtime.tools.cli.graph import layers
@@ -137,6 +138,25 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
         assert (done.returncode, done.stdout) == (2, "")
         assert len(done.stderr.splitlines()) == 1
         assert line in done.stderr
+
+
+@pytest.mark.parametrize("node", ["Fatal", "FailsLast"])
+def test_an_error_is_printed_once(node: str, tmp_path: Path) -> None:
+    text = f"[[nodes]]\nname = 'n'\ntype = '{__name__}:{node}'\n[run]\nduration = 0.1\n"
+    (tmp_path / "f.toml").write_text(text)
+    done = command("run", "f.toml", "-q", folder=tmp_path)
+    assert (done.returncode, done.stderr.count("went wrong")) == (2, 1), done.stderr
+    assert "went wrong" in (tmp_path / "runs" / "run" / "log.txt").read_text()
+
+
+class Fatal(Node):
+    async def run(self) -> None:
+        self.log.fatal("it went wrong")
+
+
+class FailsLast(Node):
+    async def on_shutdown(self) -> None:
+        raise OSError("it went wrong")
 
 
 def test_check_says_what_is_right_and_warns_of_what_is_not_connected(tmp_path: Path) -> None:
