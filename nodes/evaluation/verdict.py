@@ -206,7 +206,7 @@ def _of_run(name: str, figures: Mapping[str, Any], end: RunEnd, declared: bool) 
     again = end.restarts.get(node_of(name, end.restarts), 0)
     if again or "restarts" in figures:  # who restarts in a new frame has it in both
         found["restarts"] = max(figures.get("restarts", 0), again)
-    if declared or node_of(name, getattr(end, "truth_readers", ())):
+    if declared or node_of(name, end.truth_readers):
         found["reads_truth"] = "declared" if declared else "undeclared"
     return found
 

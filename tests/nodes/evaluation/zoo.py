@@ -242,7 +242,10 @@ GOOD: dict[str, Animal] = {
     ),
     "body of a name with a prefix": Animal(says(given(0, child_frame_id="drone/base_link"))),
     "corrects itself": Animal(corrected(lambda _, p: p)),
-    "says that it reads the truth": Animal(says(), reads=("truth",)),
+    "says that it reads the truth": Animal(
+        says(), reads=("truth",), end=ended(truth_readers=frozenset({"est"}))
+    ),
+    "another reads the truth": Animal(says(), end=ended(truth_readers=frozenset({"map"}))),
     "the pilot has landed before": Animal(
         says(), end=ended(by="pilot", reason="landed", stamp=11 * SECOND)
     ),
@@ -423,6 +426,9 @@ BAD: dict[str, Animal] = {
         says(between((0, 3))),
         "early_end",
         end=ended(by="other", error="SVD did not converge", **EARLY),
+    ),
+    "reads the truth in silence": bad(
+        says(), "reads_truth", end=ended(truth_readers=frozenset({"est"}))
     ),
     "restarts as a node": bad(says(), "restarts", end=ended(restarts={"est": 1})),
 }
