@@ -128,11 +128,15 @@ class JointStart:
                 whom=lambda m: not m.ready,
             )
             return self._reference() is None
+
+        def told() -> bool:
+            return reference.begin is not None and ready()
+
         await self._until(
-            lambda: reference.over != "" or (reference.begin is not None and ready()),
+            lambda: reference.over != "" or told(),
             whom=lambda m: not m.ready or m is reference,
         )
-        return not reference.over
+        return told()  # then the run has begun, even if the one that said so is gone since
 
     def say(self, message: Message) -> None:
         """Send a message to all processes, also to those that come, or come back, from now on."""

@@ -5,15 +5,20 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections import defaultdict, deque
+from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from events import Image
 from runtime.peers.authentication import derive
 from runtime.peers.handshake import Handshakes
+from runtime.peers.joint_start import JointStart
+from runtime.peers.messages import FirstUpdate
 from runtime.peers.peers import Peers
+from runtime.peers.waiting import Waiting
 from runtime.sender import Listener
 from tests.runtime.peers import samples
 
@@ -219,6 +224,21 @@ def test_all_begin_whatever_happens(
                 member.outbox.close()
 
     asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("told", "over", "begins"), [(True, "gone", True), (False, "gone", False), (True, "", True)]
+)
+def test_who_was_told_that_the_run_begins_waits_for_nobody_who_is_gone(
+    told: bool, over: str, begins: bool
+) -> None:
+    """It may have stood still while the others began, and ended; the loss is one of the run."""
+    membership: Any = SimpleNamespace(
+        present=list, largest=lambda: 1, waiting=Waiting(lambda: (), 1.0)
+    )
+    reference: Any = SimpleNamespace(over=over, begin=FirstUpdate(0, 0) if told else None)
+    start = JointStart(membership, Still(), 1.0)  # type: ignore[arg-type]
+    assert asyncio.run(start._decided(reference)) is begins
 
 
 class Token:
