@@ -11,7 +11,7 @@ from nodes.odometry.pose import rays
 from nodes.visual_odometry.features import FeatureTracker
 from nodes.visual_odometry.keyframes import find_corners, squares
 from nodes.visual_odometry.landmarks import Landmarks
-from nodes.visual_odometry.patches import find_patches
+from nodes.visual_odometry.patches import Patches, find_patches
 from nodes.visual_odometry.settings import FeatureSettings
 from nodes.visual_odometry.surfaces import inverse_depth, surfaces_at
 from tests.nodes.visual_odometry.world import INFO, look, pose
@@ -204,3 +204,12 @@ def test_a_lost_camera_finds_a_key_frame_that_optical_flow_does_not_reach() -> N
     assert not said.lost
     assert said.reason == "against a key frame"
     assert np.linalg.norm(said.pose[:3, 3] - there[:3, 3]) < 0.01
+
+
+def test_a_patch_of_noise_is_not_found_where_it_is_expected() -> None:
+    first, second = np.random.default_rng(1).integers(60, 120, (2, 200, 300), np.uint8)
+    pixels = np.array([(x, y) for x in range(40, 260, 20) for y in range(40, 160, 20)], np.float64)
+    turns = np.tile(np.eye(2), (len(pixels), 1, 1))
+    patches = Patches(np.zeros(len(pixels), np.int64), pixels, pixels, turns)
+    assert find_patches(patches, {0: first}, first, 11)[1].all()
+    assert find_patches(patches, {0: first}, second, 11)[1].mean() < 0.05
