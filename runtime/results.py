@@ -1,8 +1,8 @@
 """A run's folder: whose it is, and files in it that are written as a whole or not at all.
 
 A folder that the runtime has made has a marker in it, and only such a folder is ever moved or
-removed. The marker says which process uses it, and when its first update was; that process holds
-a lock on it. Not here: what nodes write.
+removed. The marker says which process uses it, when its first update was, and in the end which
+files it has made; that process holds a lock on it. Not here: what nodes write.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import contextlib
 import datetime as dt
 import errno
 import fcntl
+import itertools
 import logging
 import os
 import re
@@ -75,6 +76,8 @@ class Folder:
         traceback: TracebackType | None,
     ) -> None:
         with _readable(self._out), _locked(self._out.parent):
+            made = (f"made: {file}\n" for file in sorted(_files(self._out)))
+            os.write(self._marker, "".join(made).encode(errors="surrogateescape"))
             if not self._flown and self._aside.exists():
                 self._give_back()
                 print(
@@ -194,11 +197,29 @@ def _read(marker: int) -> str:
 
 
 def _move(source: Path, place: Path) -> None:
-    """Move a run's folder into the place of another."""
+    """Move a run's folder into the place of another, which is removed if all in it is a run's.
+
+    Else it is kept, by the first free number from 2 on.
+    """
     _check(place)
     if place.exists():
-        shutil.rmtree(place)
+        marked = (place / MARKER).read_bytes().decode(errors="surrogateescape").splitlines()
+        made = {line.removeprefix("made: ") for line in marked}
+        if others := sorted(_files(place) - made):
+            numbers = itertools.count(2)
+            names = (place.with_name(f"{place.stem}.{number}") for number in numbers)
+            kept = next(name for name in names if not os.path.lexists(name))
+            place.rename(kept)
+            log.warning("%s is kept: its run is not known to have made %s", kept, others[0])
+        else:
+            shutil.rmtree(place)
     source.rename(place)
+
+
+def _files(folder: Path) -> set[str]:
+    """Return what is in a folder that a run has made, by its path in there, but for the marker."""
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return {str(path.relative_to(folder)) for path in found} - {MARKER}
 
 
 @contextlib.contextmanager

@@ -67,17 +67,17 @@ def test_a_failed_run_leaves_its_summary(tmp_path: Path) -> None:
     assert found.events["Ping"] in {5, 6}  # one is due as it fails
 
 
-def test_what_an_earlier_run_left_does_not_pass_for_this_ones(tmp_path: Path) -> None:
-    """But what is none of a run's stays, and so do recordings."""
-    run(tmp_path, Speaker)
-    stays = [tmp_path / "flight.mcap", tmp_path / "mine" / "notes.txt"]
-    goes = [tmp_path / "report.html", tmp_path / "evaluation" / "vo.csv"]
-    for file in [*stays, *goes]:
-        file.parent.mkdir(exist_ok=True)
-        file.touch()
-    run(tmp_path, Speaker)
-    assert all(file.exists() for file in stays)
-    assert not any(file.exists() for file in goes)
+def test_what_no_run_has_made_is_never_removed(tmp_path: Path) -> None:
+    """An earlier run is moved whole, and removed two runs later if all in it is its own."""
+    out = tmp_path / "run"
+    for mine in ("mine/notes.txt", "", "", ""):
+        run(out, Speaker)
+        if mine:
+            (out / mine).parent.mkdir()
+            (out / mine).touch()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["run", "run.1", "run.2"]
+    found = {each.parent.parent.name for each in tmp_path.rglob("notes.txt")}
+    assert found == {"run.2"}
 
 
 def test_a_folder_that_no_run_has_written_is_left_as_it_is(tmp_path: Path) -> None:
