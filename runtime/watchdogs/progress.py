@@ -80,7 +80,12 @@ class ProgressWatchdog:
             if found != mark:
                 mark, since, due, interrupted = found, now, self._limit, now
                 starvation = Starvation()
-            if now - since < due / 2:
+                if self._state.first_update is None:
+                    starvation.look()  # from here on
+            waited = now - since
+            if self._state.first_update is None and waited >= due / 2:
+                waited -= starvation.look()  # a start that computes is not waited for
+            if waited < due / 2:
                 continue
             seen: Counter[tuple[str, str]] = Counter()
             answer = self._ask(max(min(since + due, now + 1.0), now + self._limit / 4), seen)

@@ -80,6 +80,30 @@ def test_a_run_that_stands_still_names_the_node_and_the_line(node: type[Node], w
     assert any(re.search(Told.wanted, line) for line in Told.lines), Told.lines
 
 
+class Starting(Node):
+    async def on_startup(self) -> None:
+        await self.offload(self.wait_to_be_told)
+
+    def wait_to_be_told(self) -> None:
+        end = time.monotonic() + 1.0
+        while Told.awaited() and time.monotonic() < end:  # five limits: enough to be told of it
+            time.sleep(0.01)
+
+
+@pytest.mark.parametrize("starved", [False, True])
+def test_a_start_is_reported_only_if_it_had_a_processor(
+    starved: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = time.monotonic()
+    known = {"look": lambda _: time.monotonic() - begin} if starved else {"look": lambda _: 0.0}
+    monkeypatch.setattr("runtime.watchdogs.progress.Starvation", type("Starvation", (), known))
+    Told.lines.clear()
+    Told.wanted = "the run has waited for starting: on_startup"
+    run = RunConfig(duration=Duration(0.1), progress_limit=Duration(0.2), stall=Duration(0))
+    execute(Config(run=run, nodes=(spec(Starting, "starting"),)), handlers=[Told(logging.WARNING)])
+    assert any(Told.wanted in line for line in Told.lines) is not starved, Told.lines
+
+
 class Endless(Node):
     """Never comes to the end of what it announces."""
 
