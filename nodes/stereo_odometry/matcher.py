@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from events import CameraInfo
 from nodes.odometry.images import Depth, Floats, Grey, follow_both_ways, grey_image
+from nodes.visual_odometry.patches import SAME, around, correlation
 from nodes.visual_odometry.surfaces import Surfaces, surfaces_at
 
 _LARGE = 320
@@ -31,6 +32,9 @@ _OFF_ROW = 0.6
 """Pixels by which a corner may leave its row."""
 _COARSE = 2.0
 """Noise of block matching, in units of that of flow."""
+_STEP, _DISTINCT = 3.0, 1.5
+"""Pixels beside a disparity at which what differs, by the correlation, must be so many times more:
+so it is known to 3 / 15 / √0.5 = 0.3 pixels, if noise is all that differs."""
 _LEVELS = 3
 """Times that flow halves the images where block matching found nothing."""
 _ASIDE = 4
@@ -132,6 +136,7 @@ class StereoMatcher:
         if len(rows):
             disparity, good = self._disparity(pixels[rows], there[rows], 0)
             good &= np.abs(disparity - there[rows]) < _REFINED
+            good &= self._is_distinct(pixels[rows], disparity)
             fine[rows[good]] = disparity[good]
         if len(without):
             # Blocks match on little texture, and at no outline; flow finds any corner, and says by
@@ -145,6 +150,7 @@ class StereoMatcher:
             bend = np.abs(np.stack([right + left, below + above]) / 2 - disparity).max(axis=0)
             good &= all_good.reshape(-1, len(_BESIDE)).all(axis=1)
             good &= bend < np.maximum(_TORN * disparity, _BENT)
+            good &= self._is_distinct(centre, disparity)
             fine[without[good]] = disparity[good]
             change = np.stack([right - left, below - above], axis=1) / (2 * _ASIDE)
             slope[without] = change / self._unit
@@ -160,3 +166,13 @@ class StereoMatcher:
         disparity = pixels[:, 0] - found[:, 0]
         good &= np.abs(found[:, 1] - pixels[:, 1]) < _OFF_ROW
         return disparity, good & (disparity > self._least)
+
+    def _is_distinct(self, pixels: Floats, disparity: Floats) -> npt.NDArray[np.bool_]:
+        """Return which disparities are those of something: noise and level edges fit any."""
+        assert self._pair is not None
+        left, there = around(self._pair[0], pixels, _WINDOW), pixels - disparity[:, None] * (1, 0)
+        at, before, after = (
+            correlation(left, around(self._pair[1], there + np.array([step, 0.0]), _WINDOW))
+            for step in (0.0, -_STEP, _STEP)
+        )
+        return (at > SAME) & (1.0 - np.maximum(before, after) > _DISTINCT * (1.0 - at))

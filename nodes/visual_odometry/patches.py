@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from nodes.odometry.images import Floats, Grey, follow_both_ways
 
-_SAME = 0.5
+SAME = 0.5
 """Least correlation of a patch with what is found: flow finds noise wherever it begins, and so says
 of any expected place that it is right."""
 
@@ -76,18 +76,22 @@ def find_patches(
     good &= np.abs(shift).max(axis=1) < MARGIN
     inner = slice(half - window // 2, half + window // 2 + 1)
     wanted = wanted.reshape(-1, side, side)[:, inner, inner]
-    good &= _correlation(wanted, image, centre + shift) > _SAME
+    good &= correlation(wanted, around(image, centre + shift, window)) > SAME
     return patches.expected + shift, good
 
 
-def _correlation(wanted: Grey, image: Grey, pixels: Floats) -> Floats:
-    """Return how well squares, shape (n, w, w), correlate with an image around pixels, (n, 2)."""
-    steps = np.arange(wanted.shape[1], dtype=np.float32) - wanted.shape[1] // 2
+def around(image: Grey, pixels: Floats, window: int) -> Grey:
+    """Return the squares of an image around pixels, shape (n, 2); shape (n, window, window)."""
+    steps = np.arange(window, dtype=np.float32) - window // 2
     x, y = pixels.T.astype(np.float32)[..., None] + steps
-    columns = np.repeat(x[:, None], len(steps), axis=1).reshape(-1, len(steps))
-    rows = np.repeat(y.reshape(-1, 1), len(steps), axis=1)
+    columns, rows = np.tile(x, window), np.repeat(y, window, axis=1)  # a square a row
     found = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    pair = np.stack([wanted.reshape(len(x), -1), found.reshape(len(x), -1)]).astype(np.float64)
+    return np.asarray(found, np.uint8).reshape(-1, window, window)
+
+
+def correlation(one: Grey, other: Grey) -> Floats:
+    """Return how well squares, shape (n, w, w), correlate, shape (n,)."""
+    pair = np.stack([one.reshape(len(one), -1), other.reshape(len(one), -1)]).astype(np.float64)
     pair -= pair.mean(axis=2, keepdims=True)
     size = np.sqrt((pair**2).sum(axis=2)).prod(axis=0)
     return np.asarray((pair[0] * pair[1]).sum(axis=1) / np.maximum(size, 1e-9))

@@ -52,6 +52,19 @@ def test_corners_on_a_surface_of_one_colour_have_depth() -> None:
     assert np.allclose(INFO.fx * BASELINE * found.inverse[found.continuous], 11.0, atol=0.1)
 
 
+def test_a_level_edge_in_noise_has_no_depth() -> None:
+    random = np.random.default_rng(2)
+    images = np.full((2, INFO.height, INFO.width), 40.0)
+    images[:, 120:] = 60.0
+    left, right = np.clip(images + random.normal(0.0, 4.0, images.shape), 0, 255).astype(np.uint8)
+    matcher = StereoMatcher(INFO, BASELINE)
+    coarse = inverse_depth(matcher.depth(left, right))
+    columns, rows = np.meshgrid(np.arange(90.0, 300.0), np.arange(114.0, 126.0))
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    found = matcher.surfaces_at(coarse, pixels, matcher.depth_noise)
+    assert not found.continuous.any()
+
+
 @pytest.mark.parametrize("other", ["black", "unrelated", "swapped"])
 def test_images_that_do_not_match_have_no_depth(other: str) -> None:
     left, right, _ = pair(pose())
