@@ -131,14 +131,22 @@ class InertialFilter:
         imu: Its model.
         camera: The optical camera in the IMU's frame, shape (4, 4).
         capacity: Number of key frames that are remembered.
+        common: Shares of variance that the errors of all landmarks in one image have in common, so
+            that many tell no more than its inverse: of what is seen, and of places besides.
 
     Attributes:
         state: The estimate.
         covariance: Of the state's error, shape (17, 17).
     """
 
-    def __init__(self, imu: ImuModel, camera: Floats, capacity: int) -> None:
-        self._imu, self.camera = imu, camera
+    def __init__(
+        self,
+        imu: ImuModel,
+        camera: Floats,
+        capacity: int,
+        common: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self._imu, self.camera, self._common = imu, camera, common
         self._capacity = capacity
         back = inverse(camera)
         none = np.zeros(3)
@@ -193,6 +201,7 @@ class InertialFilter:
             group, numbers = np.zeros(len(placed.places), np.intp), np.array([number])
             found = self._by_landmarks(self.state, placed, group, numbers)
             told = np.zeros((6, 6)) if found is None else found[0][POSE, POSE]
+            told = told / (1.0 + self._common[1] * (len(placed.places) - 1))
             self._of_frames[here, here] += np.linalg.inv(told + np.eye(6) / _VAGUE**2)
         self._with_frames[:, here] = self.covariance[:, POSE]
 
@@ -229,6 +238,11 @@ class InertialFilter:
         """Take in landmarks of an image; return False, changing nothing, if they contradict."""
         numbers, group = np.unique(seen.keyframes, return_inverse=True)
         return self._correct(numbers, lambda state: self._by_landmarks(state, seen, group, numbers))
+
+    def misfit(self, seen: Sighting) -> float:
+        """Return by how much half of the landmarks miss their pixels, in standard deviations."""
+        *_, image = self._image(self.state, seen)
+        return float(np.median(np.hypot(*((seen.measured - image) * seen.scale)[:, :2].T)))
 
     def update_pose(self, camera: Floats, number: int, information: Floats, first: bool) -> bool:
         """Take in a pose that an image has by a key frame; return False if it contradicts.
@@ -321,18 +335,15 @@ class InertialFilter:
         group: npt.NDArray[np.intp],
         numbers: npt.NDArray[np.int64],
     ) -> tuple[Floats, Floats] | None:
-        in_body = (seen.places - state.position) @ state.rotation
-        x, y, z = ((in_body - self.camera[:3, 3]) @ self.camera[:3, :3]).T
-        ahead = z > 0.05
+        in_body, ahead, image = self._image(state, seen)
         if ahead.mean() < _AHEAD:
             return None
-        inverse = 1.0 / np.where(ahead, z, 1.0)
-        image = np.stack([x * inverse, y * inverse, inverse], axis=1)
+        inverse = image[:, 2]
         residual = (seen.measured - image) * seen.scale
         size = np.abs(residual)
         size[:, :2] = np.hypot(residual[:, 0], residual[:, 1])[:, None]
         weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(size, _HUBER))) * ahead[:, None]
-        by_point = np.zeros((len(x), 3, 3))
+        by_point = np.zeros((len(image), 3, 3))
         by_point[:, 0, 0] = by_point[:, 1, 1] = inverse
         by_point[:, :, 2] = -image * inverse[:, None]
         by_body = (by_point * (weight * seen.scale)[:, :, None]) @ self.camera[:3, :3].T
@@ -341,13 +352,22 @@ class InertialFilter:
         rotations = np.array([rotation for rotation, _ in frames])[group]
         positions = np.array([position for _, position in frames])[group]
         arms = np.einsum("nji,nj->ni", rotations, seen.places - positions)
-        matrix = np.zeros((len(x), 3, 1 + len(numbers), 6))
+        matrix = np.zeros((len(image), 3, 1 + len(numbers), 6))
         matrix[:, :, 0, :3], matrix[:, :, 0, 3:] = by_body @ crosses(in_body), -by_world
-        rows = np.arange(len(x))
+        rows = np.arange(len(image))
         matrix[rows, :, 1 + group, :3] = -by_world @ rotations @ crosses(arms)
         matrix[rows, :, 1 + group, 3:] = by_world
-        flat = matrix.reshape(3 * len(x), -1)
-        return flat.T @ flat, flat.T @ (weight * residual).ravel()
+        flat = matrix.reshape(3 * len(image), -1)
+        share = 1.0 / (1.0 + self._common[0] * (len(image) - 1))
+        return share * (flat.T @ flat), share * (flat.T @ (weight * residual).ravel())
+
+    def _image(self, state: State, seen: Sighting) -> tuple[Floats, npt.NDArray[np.bool_], Floats]:
+        """Return landmarks in the IMU's frame, which are ahead, and what should be measured."""
+        in_body = (seen.places - state.position) @ state.rotation
+        x, y, z = ((in_body - self.camera[:3, 3]) @ self.camera[:3, :3]).T
+        ahead = z > 0.05
+        inverse = 1.0 / np.where(ahead, z, 1.0)
+        return in_body, ahead, np.stack([x * inverse, y * inverse, inverse], axis=1)
 
 
 def _level(down: Floats) -> Floats:

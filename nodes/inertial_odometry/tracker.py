@@ -41,6 +41,15 @@ _BENT = 0.003
 _PLACED = 0.5, 0.5
 """Noise of a landmark's place, which does not change from image to image, as a share of that of one
 sighting: of its pixel, and of its depth."""
+_COMMON, _COMMON_BY_EYES = (0.02, 0.0), (0.02, 0.1)
+"""Shares of variance that the errors of all landmarks in an image have in common: of what is seen,
+and of places. That of a depth sensor's noise is none; how a surface lies and looks shifts the
+disparities of all that is on it."""
+_MISFIT = 1.5
+"""Standard deviations of a pixel by which half of the landmarks may miss theirs."""
+_PATIENCE, _DOUBTED = 0.4, 0.6
+"""Seconds over which the share of images is taken whose landmarks contradict the filter, and that
+beyond which the filter is not believed: it begins anew, in a frame of its own."""
 _SLOTS = (-1, -2)
 """Numbers of the images that may be the reference of an alignment, beside those of key frames."""
 
@@ -90,12 +99,15 @@ class InertialTracker(FeatureTracker):
         super().__init__(camera.info, features, surfaces)
         self._imu, self._inertial, self._readout = ImuModel(imu), inertial, camera.readout
         mounted = inverse(self._imu.pose) @ pose_matrix(camera.position, camera.orientation)
-        self._filter = InertialFilter(self._imu, mounted, features.keyframes + 1)
+        common = _COMMON if self._matcher is None else _COMMON_BY_EYES
+        self._filter = InertialFilter(self._imu, mounted, features.keyframes + 1, common)
         self._samples = np.empty((0, 7))
         self._time: float | None = None  # of the filter, seconds
         self._epoch: int | None = None
         self._seen_at = 0.0
         self._force = np.zeros(3)
+        self._doubt = 0.0  # share of the last images whose landmarks contradict
+        self._judged_at = 0.0
         self._noted = self._referred = _SLOTS[0]
         self._noted_pose = np.eye(4)
 
@@ -158,7 +170,7 @@ class InertialTracker(FeatureTracker):
     def _is_known(self) -> bool:
         """Whether velocity and gravity are known well enough to go on without images."""
         variances = np.diag(self._filter.covariance)
-        return self._time is not None and bool(
+        return not (self._time is None or self._is_doubted) and bool(
             variances[V].max() < _KNOWN[0] ** 2 and variances[G].max() < _KNOWN[1] ** 2
         )
 
@@ -225,9 +237,22 @@ class InertialTracker(FeatureTracker):
     def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
         """Find the map in an image, and let the landmarks found correct the filter."""
         match = super()._match(grey, inverse_of)
-        if match is not None and not self._filter.update(self._sighting(match, inverse_of)):
-            match = None
-        return self._corrected(match)
+        if match is not None:
+            seen = self._sighting(match, inverse_of)
+            agrees = self._filter.update(seen)
+            self._judge(agrees and self._filter.misfit(seen) < _MISFIT)
+            match = match if agrees else None
+        return None if self._is_doubted else self._corrected(match)
+
+    def _judge(self, agrees: bool) -> None:
+        """Note whether the landmarks of an image agree with the filter."""
+        share = min((self._now - self._judged_at) / _PATIENCE, 1.0) if self._is_known else 0.0
+        self._doubt += share * ((not agrees) - self._doubt)
+        self._judged_at = self._now
+
+    @property
+    def _is_doubted(self) -> bool:
+        return self._doubt > _DOUBTED
 
     def _aligned(
         self,
@@ -237,6 +262,8 @@ class InertialTracker(FeatureTracker):
         match: MapMatch | None,
     ) -> MapMatch | None:
         """Let an alignment correct the filter."""
+        if self._is_doubted:
+            return None
         if first := bool((alignment.reference == self._noted_pose).all()):
             self._referred = self._noted
         believed, pose = BELIEVED * alignment.information, inverse(alignment.pose)
@@ -266,6 +293,7 @@ class InertialTracker(FeatureTracker):
             if self._time is None:  # the first map, or one at a guessed pose
                 self._filter.start(self._force, inverse(self._pose))
                 self._time = self._seen_at = self._now
+                self._doubt = 0.0
             self._note(grey, inverse_of, False)
         new = np.flatnonzero(self._map.keyframes == number)
         read = self._surfaces_at(inverse_of, self._map.pixels[new], self._settings.depth_noise)
@@ -277,12 +305,14 @@ class InertialTracker(FeatureTracker):
         That is where the IMU has carried the camera, while that is known; else in a new frame.
         """
         result = self._lost(stamp, "too few landmarks of the map were found")
-        if stamp - (self._lost_since or stamp) < self._settings.reset_timeout * 1e9:
+        waited = stamp - (self._lost_since or stamp)
+        if waited < self._settings.reset_timeout * 1e9 and not self._is_doubted:
             return result
         if self._is_carried:
             return self._start_map(stamp, grey, inverse_of, "by a new map, where the IMU says")
         begun, self._time = self._time, None
-        started = self._start_map(stamp, grey, inverse_of, "by a new map, at a guessed pose")
+        why = ", as its landmarks contradict the IMU" if self._is_doubted else ""
+        started = self._start_map(stamp, grey, inverse_of, f"by a new map, at a guessed pose{why}")
         if started.lost:
             self._time = begun
         return started

@@ -78,6 +78,21 @@ def test_landmarks_correct_the_pose_and_nothing_is_more_certain_than_its_key_fra
     assert np.sqrt(np.diag(doubtful.covariance)[POSE]).min() > 0.19
 
 
+def test_many_landmarks_with_errors_in_common_tell_no_more_than_a_few() -> None:
+    def deviation(count: int, common: tuple[float, float]) -> float:
+        made = InertialFilter(MODEL, np.eye(4), 5, common)
+        made.start(np.array([0.0, 0.0, -9.81]))
+        made.covariance[POSE, POSE] = np.eye(6)
+        made.remember(0, sighting(count))
+        made.covariance[POSE, POSE] += np.eye(6)
+        assert made.update(sighting(count))
+        return float(np.sqrt(made.covariance[P, P].trace() - 3.0))
+
+    for common in ((0.0, 0.0), (0.1, 0.0), (0.0, 0.1)):
+        few, many = deviation(50, common), deviation(800, common)
+        assert (many < 0.5 * few) == (common == (0.0, 0.0)), (few, many)
+
+
 def test_a_map_that_contradicts_is_not_believed() -> None:
     made = started()
     seen = sighting()
