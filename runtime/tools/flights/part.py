@@ -10,6 +10,7 @@ import json
 import os
 import re
 import sys
+import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ _DRIVERS = (
     "/proc/driver/nvidia/version",
 )
 _VARIABLES = re.compile("MUJOCO_|E?GL|_?_?E?GL[VX]?_|LIBGL_|GALLIUM_|MESA_|LP_")
+_PARSING = threading.Lock()
+"""Python 3.11's parser counts the depth of all threads in one place (cpython#106905)."""
 _NAMED = re.compile(r'\bfile\w*\s*=\s*"([^"]+)"')
 _FOLDERS = re.compile(r'(?:mesh|texture|asset)dir\s*=\s*"([^"]+)"')
 
@@ -120,7 +123,8 @@ def _imported(path: Path, package: str) -> Iterator[str]:
     if path.suffix not in {".py", ".pyi"}:
         return
     with contextlib.suppress(SyntaxError, ValueError):
-        todo: list[Any] = [ast.parse(path.read_bytes())]
+        with _PARSING:
+            todo: list[Any] = [ast.parse(path.read_bytes())]
         while todo:  # statements only, which takes a third of the time of `ast.walk`
             node = todo.pop()
             for field in ("body", "orelse", "finalbody", "handlers", "cases"):

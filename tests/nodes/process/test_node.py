@@ -221,7 +221,7 @@ def test_what_is_on_its_way_at_the_end_is_not_lost(tmp_path: Path) -> None:
     assert summary.verdict is None or summary.verdict.passed
     assert "ended with exit code 3; its last output:\nbegan fails\nno disk" in (
         tmp_path / "log.txt"
-    ).read_text().replace("\n    ", "\n")
+    ).read_text().replace("\n    | ", "\n")
 
 
 class Heard(logging.Handler):
