@@ -376,6 +376,8 @@ class EstimatorAnnouncement(Announcement):
         eyes: Number of cameras whose images it takes together: 2 is a stereo rig.
         lenses: Distortion models that it can compute with, besides an ideal camera.
         rectifies: Whether it turns images of other lenses into those of a pinhole camera first.
+        vehicle: Whose pose it estimates, where neither `source` nor the camera that it follows
+            says so.
     """
 
     method: str
@@ -384,3 +386,4 @@ class EstimatorAnnouncement(Announcement):
     eyes: int = 1
     lenses: tuple[str, ...] = ()
     rectifies: bool = False
+    vehicle: str = ""

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from events import Announcement, CameraAnnouncement, TrackedFeatures, VehicleAnnouncement
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    EstimatorAnnouncement,
+    TrackedFeatures,
+    VehicleAnnouncement,
+)
 
 
 class Vehicles:
     """The vehicles of a run, and what belongs to each.
 
     A source belongs to the vehicle whose name it equals or begins with: ``drone/camera`` to
-    ``drone``. An estimator, whose name says nothing, belongs to the vehicle that carries the camera
-    in whose images it tracks features; what says nothing at all belongs to the first vehicle.
+    ``drone``. An estimator, whose name says nothing, belongs to the vehicle that it announces, or
+    that carries the camera in whose images it tracks features; what says nothing at all belongs to
+    the first vehicle.
     """
 
     def __init__(self) -> None:
@@ -20,13 +27,17 @@ class Vehicles:
         """Optical frame to source."""
         self._followed: dict[str, str] = {}
         """Estimator to the optical frame of its camera."""
+        self._estimated: dict[str, str] = {}
+        """Estimator to the vehicle that it announces."""
 
     def announced(self, announcement: Announcement) -> None:
-        """Note a vehicle or a camera."""
+        """Note a vehicle, a camera or an estimator."""
         if isinstance(announcement, VehicleAnnouncement):
             self.add(announcement.source)
         elif isinstance(announcement, CameraAnnouncement):
             self._cameras.setdefault(announcement.frame_id, announcement.source)
+        elif isinstance(announcement, EstimatorAnnouncement):
+            self._estimated[announcement.source] = announcement.vehicle
 
     def add(self, name: str) -> None:
         """Note a vehicle."""
@@ -45,4 +56,5 @@ class Vehicles:
     def of(self, source: str) -> str:
         """Return the vehicle that a source belongs to; empty if there are no vehicles."""
         camera = self._cameras.get(self._followed.get(source, ""), "")
-        return self.carrier(source) or self.carrier(camera) or next(iter(self.names), "")
+        said = self._estimated.get(source, "") or self.carrier(source)
+        return said or self.carrier(camera) or next(iter(self.names), "")

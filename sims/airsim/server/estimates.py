@@ -26,8 +26,7 @@ class ScriptEstimator(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     Attributes:
         name: Its name, by which the client publishes; source of its estimates.
         method: What it is, in a word or two, for the report.
-        vehicle: The vehicle whose pose it estimates, named before its own in the source
-            (``drone/odometry``); empty for the first one by name.
+        vehicle: The vehicle whose pose it estimates; empty for the first one by name.
         camera: The camera whose poses the client publishes, with AirSim's axes (x forward, y
             right, z down); they become those of the vehicle. Empty: the vehicle's poses.
         frame_id: ``odom``: poses are in a frame of the estimator's own, and aligned by the first
@@ -43,11 +42,6 @@ class ScriptEstimator(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     frame_id: Literal["odom", "map"] = "odom"
     scale_free: bool = False
     reads: tuple[str, ...] = ()
-
-    @property
-    def source(self) -> str:
-        """Source of its estimates."""
-        return f"{self.vehicle}/{self.name}" if self.vehicle else self.name
 
 
 class Estimates:
@@ -70,10 +64,11 @@ class Estimates:
         for each in self._estimators.values():
             yield EstimatorAnnouncement(
                 stamp=0,
-                source=each.source,
+                source=each.name,
                 method=each.method,
                 scale_free=each.scale_free,
                 reads=each.reads,
+                vehicle=each.vehicle,
             )
 
     @rpc("visnavPublishPose")
@@ -100,7 +95,7 @@ class Estimates:
             position = _sum(position, self._server.vehicles.find(found.vehicle).origin)
         estimate = PoseEstimate(
             stamp=stamp,
-            source=found.source,
+            source=found.name,
             frame_id=found.frame_id,
             position=position,
             orientation=orientation,

@@ -53,7 +53,8 @@ def test_the_local_frame_becomes_the_map(tiny_world: str) -> None:
     result = published(tiny_world, script, frame_id="map", vehicle="drone")
     (estimate,) = result.of(PoseEstimate)
     assert estimate.frame_id == "map"
-    assert estimate.source == "drone/odometry"
+    (said,) = result.of(EstimatorAnnouncement)
+    assert (estimate.source, said.vehicle) == ("odometry", "drone")
     assert estimate.position[:2] == pytest.approx((START[0] + 1, START[1] + 2))
 
 
