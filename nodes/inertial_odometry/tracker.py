@@ -240,7 +240,8 @@ class InertialTracker(FeatureTracker):
         if match is not None:
             seen = self._sighting(match, inverse_of)
             agrees = self._filter.update(seen)
-            self._judge(agrees and self._filter.misfit(seen) < _MISFIT)
+            if len(seen.places) >= self._enough:  # fewer may all be wrong
+                self._judge(agrees and self._filter.misfit(seen) < _MISFIT)
             match = match if agrees else None
         return None if self._is_doubted else self._corrected(match)
 
