@@ -25,6 +25,9 @@ from runtime.time_limits import real_time_limit
 
 log = logging.getLogger("visnav.runtime")
 
+_PARTS = msgspec.json.Decoder(Summary)
+"""Made once: msgspec crashes if two threads learn a type at the same time."""
+
 BUSY_EVERY = 2.0
 """Seconds between two messages that this process is still ending its nodes."""
 
@@ -94,7 +97,7 @@ class JointShutdown:
         if not isinstance(message, FinalSummary):
             return
         try:
-            member.final_summary = msgspec.json.decode(message.part, type=Summary)
+            member.final_summary = _PARTS.decode(message.part)
         except (msgspec.DecodeError, RecursionError) as error:
             raise WireError(f"expected a part of the summary, found: {error}") from None
         self._with_summary[member.number] = member

@@ -32,6 +32,8 @@ def flight(folder: Path) -> Path:
     table = tomllib.loads(CONFIG.read_text())
     left_out = {"odometry", "report"}
     table["nodes"] = [node for node in table["nodes"] if node["name"] not in left_out]
+    for node in table["nodes"]:
+        node.pop("thresholds", None)
     path = folder / "flight.toml"
     path.write_text(tomli_w.dumps(table))
     return path
