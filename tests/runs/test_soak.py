@@ -52,7 +52,7 @@ class Echo(Node):
     _last: Odometry | None = None
 
     def announce(self) -> Iterable[Announcement]:
-        yield EstimatorAnnouncement(stamp=0, source=self.name, method="the truth")
+        yield EstimatorAnnouncement(stamp=0, source=self.name, method="echo", reads=("truth",))
 
     @on(Odometry)
     def moved(self, event: Odometry) -> None:
