@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from events import PoseEstimate
+from runtime import Node, Output
 from tests.runtime.tools.samples_cli import ROOT, command
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -66,10 +68,18 @@ def test_a_threshold_that_is_missed_is_the_exit_code(tmp_path: Path) -> None:
     assert 'src="http' not in page
 
 
+class Mute(Node):
+    """Could estimate, and neither announces nor says anything."""
+
+    estimates = Output(PoseEstimate)
+
+
 def test_thresholds_that_nobody_meets_are_exit_code_1(tmp_path: Path) -> None:
     config = tmp_path / "nobody.toml"
     node = '[[nodes]]\nname = "evaluation"\ntype = "nodes.evaluation:Evaluation"\n'
-    config.write_text(f'[run]\nduration = "1s"\n{node}thresholds = {{ ate_percent = 1.0 }}\n')
+    mute = '[[nodes]]\nname = "mute"\ntype = "tests.runs.test_verdict:Mute"\n'
+    asked = "thresholds = { ate_percent = 1.0 }\n"
+    config.write_text(f'[run]\nduration = "1s"\n{node}{asked}{mute}')
     verdict = fly(tmp_path, config, code=1)["verdict"]
     assert verdict["passed"] is False
     assert "found none that announced itself" in verdict["estimators"]["evaluation"]["failed"][0]
