@@ -70,7 +70,7 @@ def test_two_cameras_have_rates_of_their_own(tmp_path: Path) -> None:
     assert summary["events"]["DepthImage"] == 30
     assert summary["events"]["Image"] == pytest.approx(30 + 140, abs=2)
     assert {path.name[:11] for path in (tmp_path / "frames").iterdir()} == {
-        "drone_front", "drone_down_"
+        "drone+front", "drone+down_"
     }  # fmt: skip
 
 
