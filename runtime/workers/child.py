@@ -3,8 +3,7 @@
 Started by `runtime.workers.worker` as ``python -m runtime.workers.child SOCKET IN OUT LIMIT``:
 inherited file descriptors, and the seconds that a call may take. The process ends with the run,
 however the run ends: in order if it waits for calls; after `_GRACE` if it is in one, and if that
-call does not even let go of Python's lock, once its limit is over (ten times as long as the run
-itself would wait for it on an idle machine).
+call does not even let go of Python's lock, once its limit is over.
 """
 
 from __future__ import annotations
@@ -27,6 +26,9 @@ _LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "p
 
 _GRACE = 5.0
 """Seconds in which a call may end, and the object close, once the run has gone."""
+
+_MOST_STARVED = 10
+"""How many times longer a call may take on a busy machine."""
 
 
 def main(socket_fd: int, in_fd: int, out_fd: int, limit: float) -> None:
@@ -57,7 +59,7 @@ def main(socket_fd: int, in_fd: int, out_fd: int, limit: float) -> None:
         pass  # the run closed the connection, or is gone
     finally:
         if made and hasattr(target, "close"):
-            signal.setitimer(signal.ITIMER_REAL, limit)
+            _limit(limit)
             target.close()
 
 
@@ -94,13 +96,23 @@ def _attempt(limit: float, do: Callable[..., Any], *args: Any) -> tuple[bool, An
 
     The run has its own eye on that: this is for when there is none any more, so the kernel does it.
     """
-    signal.setitimer(signal.ITIMER_REAL, limit)
+    _limit(limit)
     try:
         return True, do(*args)
     except Exception as error:
         return False, _portable(error)
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        _limit(0)
+
+
+def _limit(seconds: float) -> None:
+    """Let the kernel end this process after so many seconds with a processor; 0 for never.
+
+    Threads on all processors do not use that up sooner. One that only waits has ten times as long:
+    how busy the machine is, a clock does not tell.
+    """
+    signal.setitimer(signal.ITIMER_PROF, seconds * (os.cpu_count() or 1))
+    signal.setitimer(signal.ITIMER_REAL, seconds * _MOST_STARVED)
 
 
 def _answer(pipe: SharedPipe, succeeded: bool, result: Any, wall: int, cpu: int) -> None:

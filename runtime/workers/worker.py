@@ -46,9 +46,6 @@ Called = Callable[[str, str, concurrent.futures.Future[Any]], None]
 _GRACE = 2.0
 """Seconds a process gets to end by itself once its connection is closed."""
 
-_MOST_STARVED = 10
-"""How many times longer a call may take on a busy machine once the run has gone."""
-
 _LOOK = 0.25
 """Seconds after which a thread that receives nothing from a process looks whether there is one."""
 
@@ -261,7 +258,7 @@ class _Process:
         command = [sys.executable, "-m", "runtime.workers.child", *map(str, numbers)]
         try:
             self._child = subprocess.Popen(  # noqa: S603  # our own module
-                [*command, str(_MOST_STARVED * limit + _GRACE)],
+                [*command, str(limit + _GRACE)],
                 pass_fds=numbers,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
