@@ -79,8 +79,8 @@ class McapRecorder(Node[McapRecorderConfig]):
         self.after_run(self._finish)
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Record it."""
-        if self._process is not None:
+        """Record it, unless it says of a node of this run for whom it speaks and nothing else."""
+        if self._process is not None and type(announcement) is not Announcement:
             self._backlog.put(0, announcement)
 
     async def run(self) -> None:
