@@ -8,7 +8,6 @@ import logging
 import os
 import re
 import signal
-import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -105,22 +104,24 @@ def test_a_start_is_reported_only_if_it_had_a_processor(
 
 
 class Endless(Node):
-    """Never comes to the end of what it announces."""
+    """Never comes to the end of what it announces; the user may press Ctrl-C meanwhile."""
+
+    interrupted: ClassVar[bool]
 
     def announce(self) -> Iterable[Announcement]:
+        if self.interrupted:
+            os.kill(os.getpid(), signal.SIGINT)
         while True:
             time.sleep(0.01)  # that is the fault
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
 def test_a_node_that_blocks_the_start_up_is_named_and_a_first_ctrl_c_is_heard(
-    interrupted: bool, tmp_path: Path
+    interrupted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(Endless, "interrupted", interrupted, raising=False)
     limit = Duration(60 if interrupted else 0.2)
     run = RunConfig(startup_limit=limit, progress_limit=Duration(0.2))
-    ctrl_c = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
-    if interrupted:
-        ctrl_c.start()
     begin = time.monotonic()
     with pytest.raises(NodeTimeoutError, match=r"^endless: expected it to give back the loop"):
         execute(Config(run=run, nodes=(spec(Endless, "endless"),)), tmp_path)
