@@ -122,8 +122,8 @@ def _settings(port: int, seconds: float) -> dict[str, Any]:
         "run": {"clock": "real", "duration": seconds, "log": "error"},
         "nodes": [
             PROBE,
-            {"name": "drone", "type": "sims.multirotor:Multirotor"},
-            {"name": "airsim", "type": "sims.airsim.server:AirsimServer", "port": port},
+            {"name": "drone", "type": "Multirotor"},
+            {"name": "airsim", "type": "AirsimServer", "port": port},
         ],
     }
 

@@ -111,10 +111,10 @@ def _settings(port: int, seconds: float) -> dict[str, Any]:
         "run": {"clock": "real", "duration": seconds, "log": "error"},
         "nodes": [
             PROBE,
-            {"name": "drone", "type": "sims.multirotor:Multirotor"},
+            {"name": "drone", "type": "Multirotor"},
             {
                 "name": "ros2",
-                "type": "nodes.ros2_bridge:Ros2Bridge",
+                "type": "Ros2Bridge",
                 "connect": [],
                 "listen": [f"tcp/127.0.0.1:{port}"],
                 "subscriptions": [subscription],

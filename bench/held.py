@@ -77,9 +77,9 @@ def measure(
     ]
 
 
-_WORKER: dict[str, Any] = {"type": "nodes.visual_odometry:VisualOdometry"}
+_WORKER: dict[str, Any] = {"type": "VisualOdometry"}
 _OUTSIDE: dict[str, Any] = {
-    "type": "nodes.process:Process",
+    "type": "Process",
     "command": [sys.executable, "-m", "bench.held"],
     "environment": WORKER_ENVIRONMENT,
     "timeout": 120,
@@ -91,7 +91,7 @@ def _fly(seconds: float, estimator: dict[str, Any]) -> Summary:
     camera = {"name": "camera", "rate": 30, "noise": 2.0, "depth_noise": 0.0015}
     nodes = [
         {"name": "pilot", "type": "bench.lockstep:Pilot"},
-        {"name": "drone", "type": "sims.multirotor:Multirotor", "cameras": [camera]},
+        {"name": "drone", "type": "Multirotor", "cameras": [camera]},
         {"name": "odometry", "latency": "15ms", **estimator},
     ]
     return execute(parse({"run": run, "nodes": nodes}, "bench held"))

@@ -98,7 +98,7 @@ def _run(seconds: float, cameras: list[dict[str, Any]]) -> float:
                     {"name": "pilot", "type": f"{__name__}:Pilot"},
                     {
                         "name": "drone",
-                        "type": "sims.multirotor:Multirotor",
+                        "type": "Multirotor",
                         "cameras": cameras,
                         "control_rate": CONTROL,
                         "imu_rate": IMU,

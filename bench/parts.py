@@ -74,10 +74,10 @@ def _run(seconds: float) -> tuple[float, tuple[float, float]]:
     """Return the processor time of a run (s), and of a call of renderer and odometry (ms)."""
     camera = {"name": "camera", "rate": RATE, "noise": NOISE, "depth_noise": DEPTH_NOISE}
     nodes: list[dict[str, Any]] = [
-        {"name": "drone", "type": "sims.multirotor:Multirotor", "cameras": [camera]},
+        {"name": "drone", "type": "Multirotor", "cameras": [camera]},
         {"name": "pilot", "type": f"{__name__}:Pilot"},
-        {"name": "odometry", "type": "nodes.visual_odometry:VisualOdometry"},
-        {"name": "evaluation", "type": "nodes.evaluation:Evaluation"},
+        {"name": "odometry", "type": "VisualOdometry"},
+        {"name": "evaluation", "type": "Evaluation"},
     ]
     before = sum(os.times()[:4])
     run = {"duration": seconds, "log": "error", "stall": 1}

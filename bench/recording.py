@@ -100,11 +100,11 @@ def _measure(recorder: dict[str, object] | None, seconds: float, rate: float) ->
     BEATS.clear()
     camera = {"name": "camera", "images": ["rgb", "depth"], "rate": rate}
     nodes: list[dict[str, Any]] = [
-        {"name": "drone", "type": "sims.multirotor:Multirotor", "cameras": [camera]},
+        {"name": "drone", "type": "Multirotor", "cameras": [camera]},
         PROBE,
     ]
     if recorder is not None:
-        table = {"name": "recorder", "type": "nodes.mcap_recorder:McapRecorder"}
+        table = {"name": "recorder", "type": "McapRecorder"}
         nodes.insert(0, table | recorder)
     run = {"clock": "real", "duration": seconds, "stall": 0, "log": "fatal"}
     with tempfile.TemporaryDirectory() as folder:

@@ -234,7 +234,7 @@ def _settings(mode: Mode, seconds: float, rate: float, size: int, port: int) -> 
         "run": {"clock": "real", "duration": seconds + 1.0, "log": "error"},
         "nodes": [
             PROBE,
-            {"name": "drone", "type": "sims.multirotor:Multirotor"},
+            {"name": "drone", "type": "Multirotor"},
             {
                 "name": "camera",
                 "type": f"{__name__}:Camera",

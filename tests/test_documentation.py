@@ -132,12 +132,13 @@ def test_commands_name_what_there_is(words: str) -> None:
 
 
 def test_nodes_on_the_pages_exist() -> None:
-    """Whatever is named as `nodes.x:Y` can be put into a file."""
+    """Whatever a page names as a type of node can be put into a file."""
     named = {
         (page, name)
         for page in PAGES
         for name in re.findall(
-            r"\b(?:nodes|sims)(?:\.\w+)+:[A-Z]\w+", page.read_text(encoding="utf-8")
+            r"\b(?:nodes|sims)(?:\.\w+)+:[A-Z]\w+|(?<=type = \")[A-Z]\w+",
+            page.read_text(encoding="utf-8"),
         )
     }
     assert len(named) >= 12
@@ -167,7 +168,7 @@ def test_the_bridge_of_the_page_steers_and_answers(tmp_path: Path) -> None:
         clock = "real"
         [[nodes]]
         name = "drone"
-        type = "sims.multirotor:Multirotor"
+        type = "Multirotor"
         [[nodes]]
         name = "udp"
         type = "udp_bridge:UdpBridge"

@@ -19,11 +19,11 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 from runtime.config.model import NetworkConfig, RunConfig
+from runtime.config.reading import find_nodes
 from runtime.links import LinkConfig
 from runtime.node import Node
 from runtime.tools.cli import app
 from runtime.tools.describe import SettingDescription, describe, describe_settings
-from runtime.tools.plugins import find_nodes
 
 ROOT = Path(__file__).parents[1]
 

@@ -143,7 +143,7 @@ def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]
         {"name": entrant.name, **entrant.node},
         {
             "name": "evaluation",
-            "type": "nodes.evaluation:Evaluation",
+            "type": "Evaluation",
             "thresholds": dict(suite.thresholds),
             "image_count": 2,
         },

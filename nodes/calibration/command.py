@@ -32,10 +32,10 @@ def selftest(
     from nodes.calibration.page import write_page
     from nodes.calibration.selftest import TITLES, prove, subjects
     from nodes.report.style import number
+    from runtime.config.reading import load_configuration
     from runtime.errors import ConfigError
     from runtime.results import claim
     from runtime.tools.cli.run import leave_behind
-    from runtime.tools.plugins import load_configuration
     from runtime.units import Duration
 
     settings = load_configuration(config, overrides or [])
@@ -84,10 +84,10 @@ def lint(
     """
     import sys
 
+    from runtime.config.reading import load_configuration
     from runtime.tools import lint as rules
     from runtime.tools import preflight
     from runtime.tools.cli.run import leave_behind
-    from runtime.tools.plugins import load_configuration
 
     settings = load_configuration(config, overrides or [])
     brought_up = preflight.of_nodes(settings)

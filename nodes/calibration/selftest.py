@@ -196,7 +196,7 @@ def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
         return [table | {"trajectory": str(path)}, collector]
     pilot = {
         "name": "selftest_pilot",
-        "type": "nodes.pilots:WaypointFollower",
+        "type": "WaypointFollower",
         "start_delay": "0.1s",
         "waypoints": [[0.0, 0.0, float(CENTRE[2])], [0.4, 0.0, float(CENTRE[2])]],
         "heading": "fixed",

@@ -37,7 +37,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
 
         [[nodes]]
         name = "foxglove"
-        type = "nodes.foxglove_server:FoxgloveServer"
+        type = "FoxgloveServer"
 
     Topics, types and frames are those of ROS 2, as of `nodes.ros2_bridge` and of a recording;
     paths, bodies, features and the log are Foxglove's own. What is announced has its topics from

@@ -34,7 +34,7 @@ class McapRecorder(Node[McapRecorderConfig]):
 
         [[nodes]]
         name = "recorder"
-        type = "nodes.mcap_recorder:McapRecorder"
+        type = "McapRecorder"
 
     Put it first in the file: it then gets events before those that they cause, and those that
     another node handles. They are recorded in the order in which it gets them.

@@ -31,14 +31,15 @@ def vocabulary(
     import msgspec
     from rich.console import Console
 
+    from nodes.orb_slam3.node import OrbSlam3
     from nodes.orb_slam3.training import VocabularyTrainer, VocabularyTrainerConfig
     from runtime.config.model import Config, NodeSpec
+    from runtime.config.reading import load_configuration
     from runtime.errors import ConfigError
     from runtime.execute import execute
     from runtime.logs import terminal_handler
     from runtime.tools.cli.progress import progress
     from runtime.tools.cli.run import leave_behind
-    from runtime.tools.plugins import load_configuration
     from runtime.units import Duration
 
     if out is not None and out.suffix != ".txt":  # ORB-SLAM3 would read it as binary
@@ -47,14 +48,14 @@ def vocabulary(
     options = VocabularyTrainerConfig(path="" if out is None else str(out.resolve()))
     spec = NodeSpec(
         name="vocabulary_trainer",
-        type_name="nodes.orb_slam3.training:VocabularyTrainer",
+        type_name="VocabularyTrainer",
         on_error="stop",
         inputs={},
         links={},
         node=VocabularyTrainer,
         config=options,
     )
-    others = (s for s in settings.nodes if not s.type_name.startswith("nodes.orb_slam3"))
+    others = (s for s in settings.nodes if not issubclass(s.node, OrbSlam3 | VocabularyTrainer))
     run = msgspec.structs.replace(
         settings.run, shutdown_limit=Duration(_SHUTDOWN_LIMIT), digest=False
     )

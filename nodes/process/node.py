@@ -51,7 +51,7 @@ class Process(Estimator[ProcessConfig]):
 
         [[nodes]]
         name = "slam"
-        type = "nodes.process:Process"
+        type = "Process"
         command = ["./my_slam", "$VISNAV_FOLDER/settings.yaml"]
         folder = "."
         latency = "15ms"

@@ -132,7 +132,7 @@ class Replay(Node[ReplayConfig]):
 
         [[nodes]]
         name = "replay"
-        type = "nodes.replay:Replay"
+        type = "Replay"
         file = "../runs/record/recording.mcap"
 
     The run ends with the recording. While it goes on, ``python -m runtime set replay.paused=true``

@@ -45,7 +45,7 @@ class RerunView(Node[RerunConfig]):
 
         [[nodes]]
         name = "view"
-        type = "nodes.rerun_view:RerunView"
+        type = "RerunView"
 
     The world, vehicles, cameras with their images, paths, estimates, clouds, errors and IMU have
     their places in a layout that needs no arranging. First in the file, it also gets the events

@@ -58,7 +58,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
         [[nodes]]
         name = "ros2"
-        type = "nodes.ros2_bridge:Ros2Bridge"
+        type = "Ros2Bridge"
 
         [[nodes.subscriptions]]
         topic = "/cmd_vel"

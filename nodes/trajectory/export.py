@@ -167,7 +167,7 @@ def load(run: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:
         found = ", ".join(sorted(p.name for p in folder.glob("*.tum"))) or "no trajectories"
         raise ValueError(
             f"{folder / TRUTH}.tum: expected the run's true trajectory, found {found}: "
-            "a run leaves its trajectories if a node of type nodes.evaluation:Evaluation is in it"
+            "a run leaves its trajectories if a node of type Evaluation is in it"
         )
     truths, estimates = {TRUTH: read_tum(folder / f"{TRUTH}.tum")}, {}
     for path in sorted(folder.glob("*.tum")):

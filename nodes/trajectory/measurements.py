@@ -35,7 +35,7 @@ def export_measurements(run: Path, out: Path | None = None, epoch: int | str = E
     if not recordings:
         raise ValueError(
             f"{run}: expected a recording (*.mcap), found none: a run leaves one if a node of type "
-            "nodes.mcap_recorder:McapRecorder is in it"
+            "McapRecorder is in it"
         )
     folder = out or run / "export"
     folder.mkdir(parents=True, exist_ok=True)

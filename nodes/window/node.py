@@ -42,7 +42,7 @@ class ImageWindow(Node[ImageWindowConfig]):
 
         [[nodes]]
         name = "window"
-        type = "nodes.window:ImageWindow"
+        type = "ImageWindow"
         inputs = { images = "drone/front_center" }   # of one camera
 
     The window lives in a process of its own, so that a slow X server never delays the event loop.

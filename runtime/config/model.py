@@ -79,7 +79,7 @@ class NodeSpec(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         name: Unique in the file.
-        type_name: ``module:Class``.
+        type_name: As in the file: a listed node's name, or ``module:Class``.
         on_error: What an exception in the node does to the run.
         inputs: Port or handler to the source it is narrowed to.
         links: Port or handler to what the way there does to events.

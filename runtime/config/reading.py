@@ -7,7 +7,7 @@ clock = "lockstep"
 
 [[nodes]]                               # -> NodeSpec, one a node, in order
 name = "drone"
-type = "sims.multirotor:Multirotor"     # module:Class
+type = "Multirotor"                     # an entry point's name, or module:Class
 on_error = "stop"                       # optional, like `inputs`
 inputs = { setpoints = "pilot" }        # narrow a port to a source
 links = { setpoints = { delay = "80ms" } }  # make the way there worse than perfect
@@ -24,7 +24,9 @@ import re
 import sys
 import tomllib
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,6 +35,7 @@ import msgspec
 from runtime.config.messages import explain, show
 from runtime.config.model import Config, NetworkConfig, NodeSpec, OnError, RunConfig
 from runtime.config.override import override
+from runtime.config.plugins import CONFIGURATIONS, NODES, offers
 from runtime.errors import ConfigError, DeclarationError, VisnavError, suggest
 from runtime.links import LinkConfig
 from runtime.node import Node
@@ -49,6 +52,29 @@ class _NodeHead(msgspec.Struct, frozen=True, kw_only=True):
     on_error: OnError = "stop"
     inputs: dict[str, str] = {}
     links: dict[str, Any] = {}
+
+
+def load_configuration(path: Path, overrides: Sequence[str] = ()) -> Config:
+    """Read a file that says what to run: TOML, or what a package reads by its suffix.
+
+    Args:
+        path: The file.
+        overrides: As of `load`.
+
+    Raises:
+        ConfigError: Something in it is wrong.
+        CommandError: What reads it cannot be imported.
+    """
+    for offer in offers(CONFIGURATIONS):
+        if path.suffix.lower() == f".{offer.name}":
+            return load(path, overrides, partial(offer.load(), warn=_warn_once))
+    return load(path, overrides)
+
+
+@cache
+def _warn_once(warning: str) -> None:
+    """Print a warning, but not again if a file is read again, as for a sweep."""
+    print(f"warning: {warning}", file=sys.stderr)
 
 
 def load(
@@ -178,15 +204,46 @@ def _refuse_extremes(table: Mapping[str, Any], where: str) -> None:
 _DEEPEST = 32
 
 
+def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
+    """Return what a file calls it to class, for all nodes that packages offer, sorted.
+
+    Args:
+        warn: Called with a line for each that cannot be imported; it is left out.
+    """
+    found = {}
+    offered = Counter(offer.name for offer in offers(NODES))
+    for package, name, value in offers(NODES):
+        try:
+            found[name if offered[name] == 1 else value] = find_node(value, value)
+        except VisnavError as error:
+            warn(f"a node of the package {package}: {error}")
+    return dict(sorted(found.items()))
+
+
 def find_node(type_: str, where: str) -> type[Node[Any]]:
-    """Import the class that ``module:Class`` names.
+    """Import the class that an entry point's name, or ``module:Class``, names.
 
     Raises:
-        ConfigError: There is no such module or class, or it is not a node.
+        ConfigError: There is no such name, module or class, it is not a node, or several packages
+            offer a node of this name.
     """
+    if re.fullmatch(r"\w+", type_):
+        offered = {offer.value: offer.package for offer in offers(NODES) if offer.name == type_}
+        if not offered:
+            names = [offer.name for offer in offers(NODES)]
+            raise ConfigError(
+                f'{where}: expected the name of a node or "module:Class", found {show(type_)}'
+                + suggest(type_, names)
+            )
+        if len(offered) > 1:
+            whose = ", ".join(f"{value} of {package}" for value, package in offered.items())
+            raise ConfigError(f"{where}: expected one node named {type_}, found {whose}")
+        type_ = next(iter(offered))
     module_name, _, class_name = type_.partition(":")
     if not re.fullmatch(r"\w+(\.\w+)*:\w+", type_):
-        raise ConfigError(f'{where}: expected "module:Class", found {show(type_)}')
+        raise ConfigError(
+            f'{where}: expected the name of a node or "module:Class", found {show(type_)}'
+        )
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:

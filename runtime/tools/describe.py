@@ -22,6 +22,8 @@ from runtime.graph import input_types
 from runtime.node import Node
 from runtime.units import Duration, Latency, plain
 
+TYPE_DOC = "The class of the node: its name if a package lists it, else module:Class."
+
 
 class PortDescription(msgspec.Struct, frozen=True, kw_only=True):
     """One port of a node.
@@ -84,7 +86,7 @@ class NodeDescription(msgspec.Struct, frozen=True, kw_only=True):
     """A node, as a user sees it.
 
     Attributes:
-        type: ``module:Class``, as in the file.
+        type: Its name or ``module:Class``, as in the file.
         doc: Its docstring.
         inputs: What it listens to: inputs, fields of bundles and handlers.
         outputs: What it sends.
@@ -105,7 +107,7 @@ def describe(cls: type[Node[Any]], type_name: str = "") -> NodeDescription:
 
     Args:
         cls: The class.
-        type_name: ``module:Class`` by which a file names it; where it is defined if empty.
+        type_name: How a file names it; ``module:Class`` if empty.
     """
     declared, docs = cls.declared, attribute_docs(cls)
     inputs = tuple(_inputs(cls, docs))
@@ -184,7 +186,7 @@ def _head(name: str, type_: str, doc: str, default: str = "") -> SettingDescript
 
 NODE_SETTINGS = (
     _head("name", "string", "Letters, digits, _ and -, unique in the file; events bear it."),
-    _head("type", "string", "The class of the node, as module:Class."),
+    _head("type", "string", TYPE_DOC),
     _head(
         "on_error",
         " or ".join(json.dumps(each) for each in get_args(OnError)),

@@ -17,9 +17,9 @@ import msgspec
 
 from events import Announcement, EstimatorAnnouncement, Shutdown, WindowClosed
 from runtime.config.model import Config, NodeSpec
+from runtime.config.plugins import offers
 from runtime.errors import suggest
 from runtime.graph import edges
-from runtime.tools.plugins import offers
 from runtime.tools.preflight import mentioned_in
 
 GROUP = "visnav.lint"

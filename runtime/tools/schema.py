@@ -19,7 +19,7 @@ from runtime.config.model import NetworkConfig, OnError, RunConfig
 from runtime.config.parameters import is_marked
 from runtime.links import LinkConfig
 from runtime.node import Node
-from runtime.tools.describe import attribute_docs, summary
+from runtime.tools.describe import TYPE_DOC, attribute_docs, summary
 from runtime.units import Duration, plain
 
 Schema = dict[str, Any]
@@ -37,8 +37,8 @@ def schema(nodes: Mapping[str, type[Node[Any]]]) -> Schema:
     """Return the schema of a configuration file.
 
     Args:
-        nodes: ``module:Class`` to class: the nodes whose settings it checks. Those of other types
-            may have any settings.
+        nodes: Name to class: the nodes whose settings it checks. Those that a file names as
+            ``module:Class`` may have any settings.
     """
     maker = _Maker()
     by_type = [
@@ -73,7 +73,7 @@ def _head() -> Schema:
     """Return what every ``[[nodes]]`` table may have."""
     return {
         "name": {**_NAME, "description": "Unique in the file."},
-        "type": {**_TYPE, "description": "The class of the node, as module:Class."},
+        "type": {"type": "string", "description": TYPE_DOC},
         "on_error": {
             "enum": list(get_args(OnError)),
             "default": "stop",

@@ -30,7 +30,7 @@ FILE = """
 name = "check"
 [[nodes]]
 name = "drone"
-type = "sims.multirotor:Multirotor"
+type = "Multirotor"
 world = "room.xml"
 [[nodes.cameras]]
 name = "front"
@@ -39,11 +39,11 @@ name = "down"
 images = ["grey"]
 [[nodes]]
 name = "pilot"
-type = "nodes.pilots:WaypointFollower"
+type = "WaypointFollower"
 waypoints = [[0, 0, -1], [-3, 0, -1], [-3, 3, -1]]
 [[nodes]]
 name = "odometry"
-type = "nodes.visual_odometry:VisualOdometry"
+type = "VisualOdometry"
 [[nodes]]
 name = "log"
 type = "tests.runs.test_check:Log"
@@ -152,8 +152,8 @@ def test_each_mistake_is_one_line(room: Path, change: str, expected: str, found:
 
 
 LACKING = [
-    ("nodes.svo:Svo", "svo_cpp", "make svo, or: pip install --no-deps 'svo-cpp>=1.5'"),
-    ("nodes.orb_slam3:OrbSlam3", "pyorbslam3", "make orbslam3, or: pip install -e '.[orbslam3]'"),
+    ("Svo", "svo_cpp", "make svo, or: pip install --no-deps 'svo-cpp>=1.5'"),
+    ("OrbSlam3", "pyorbslam3", "make orbslam3, or: pip install -e '.[orbslam3]'"),
 ]
 
 
@@ -178,8 +178,8 @@ def test_a_library_that_its_system_lacks_is_missing(
     assert why_missing("json") == ""
 
 
-PILOT = '[[nodes]]\nname = "p"\ntype = "nodes.pilots:WaypointFollower"\nwaypoints = [[0, 0, -1]]\n'
-JUDGE = '[[nodes]]\nname = "e"\ntype = "nodes.evaluation:Evaluation"\n'
+PILOT = '[[nodes]]\nname = "p"\ntype = "WaypointFollower"\nwaypoints = [[0, 0, -1]]\n'
+JUDGE = '[[nodes]]\nname = "e"\ntype = "Evaluation"\n'
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_a_vehicle_that_starts_in_the_air_is_odd(room: Path) -> None:
 
 def test_a_recording_is_looked_for_beside_the_file(tmp_path: Path) -> None:
     path = tmp_path / "again.toml"
-    path.write_text('[[nodes]]\nname = "r"\ntype = "nodes.replay:Replay"\nfile = "flight.mcap"\n')
+    path.write_text('[[nodes]]\nname = "r"\ntype = "Replay"\nfile = "flight.mcap"\n')
     code, lines = check(path)
     file = tmp_path / "flight.mcap"
     assert code == 2

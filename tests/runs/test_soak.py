@@ -27,7 +27,7 @@ digest = true
 
 [[nodes]]
 name = "drone"
-type = "sims.multirotor:Multirotor"
+type = "Multirotor"
 control_rate = 100
 
 [[nodes]]
@@ -36,7 +36,7 @@ type = "tests.runs.test_soak:Echo"
 
 [[nodes]]
 name = "evaluation"
-type = "nodes.evaluation:Evaluation"
+type = "Evaluation"
 
 [[nodes]]
 name = "scale"

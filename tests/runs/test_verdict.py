@@ -76,7 +76,7 @@ class Mute(Node):
 
 def test_thresholds_that_nobody_meets_are_exit_code_1(tmp_path: Path) -> None:
     config = tmp_path / "nobody.toml"
-    node = '[[nodes]]\nname = "evaluation"\ntype = "nodes.evaluation:Evaluation"\n'
+    node = '[[nodes]]\nname = "evaluation"\ntype = "Evaluation"\n'
     mute = '[[nodes]]\nname = "mute"\ntype = "tests.runs.test_verdict:Mute"\n'
     asked = "thresholds = { ate_percent = 1.0 }\n"
     config.write_text(f'[run]\nduration = "1s"\n{node}{asked}{mute}')

@@ -17,11 +17,11 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     and that start and waypoints are in free space. Nothing is rendered, written or sent. Ends
     with 0, or with 2 if there is a mistake; what may be meant, as what lint finds, is a warning.
     """
+    from runtime.config.reading import load_configuration
     from runtime.graph import edges
     from runtime.tools import preflight
     from runtime.tools.cli.run import leave_behind
     from runtime.tools.lint import lint
-    from runtime.tools.plugins import load_configuration
 
     settings = load_configuration(config, overrides or [])
     found = preflight.of_file(settings)

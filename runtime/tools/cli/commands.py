@@ -17,9 +17,9 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from runtime.config.plugins import COMMANDS, OURS, Offer, offers
 from runtime.errors import CommandError, ConfigError, suggest
 from runtime.tools.cli.common import warn
-from runtime.tools.plugins import COMMANDS, OURS, Offer, offers
 
 
 class Commands(TyperGroup):

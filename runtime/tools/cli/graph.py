@@ -20,8 +20,8 @@ def graph(
     ] = None,
 ) -> None:
     """Show which node sends which events to which."""
+    from runtime.config.reading import load_configuration
     from runtime.graph import edges
-    from runtime.tools.plugins import load_configuration
 
     settings = load_configuration(config, overrides or [])
     names = [spec.name for spec in settings.nodes]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def nodes(
     which: Annotated[
-        str | None, typer.Argument(help='Only this one: "module:Class", or a part of its name.')
+        str | None, typer.Argument(help='Only this one: a part of its name, or "module:Class".')
     ] = None,
 ) -> None:
     """Describe nodes: their ports, and their settings with meaning, range and default.
@@ -26,23 +26,23 @@ def nodes(
     """
     from rich.console import Console
 
-    from runtime.config.reading import find_modules_in, find_node
+    from runtime.config.reading import find_modules_in, find_node, find_nodes
     from runtime.errors import ConfigError, suggest
     from runtime.tools.cli.common import warn
     from runtime.tools.describe import describe
-    from runtime.tools.plugins import find_nodes
 
     found = find_nodes(warn)
     shown = {
-        name: cls for name, cls in found.items() if which is None or which.lower() in name.lower()
+        name: cls
+        for name, cls in found.items()
+        if which is None or which.lower() in f"{name} {cls.__module__}".lower()
     }
     if not shown and which is not None and ":" in which:
         find_modules_in(Path.cwd())
         shown = {which: find_node(which, "nodes")}
     if not shown:
         raise ConfigError(
-            f"expected the name of a node, found {which!r}"
-            + suggest(str(which), [*found, *(name.partition(":")[2] for name in found)])
+            f"expected the name of a node, found {which!r}" + suggest(str(which), found)
         )
     console = Console()
     for name, cls in shown.items():

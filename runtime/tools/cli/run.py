@@ -98,9 +98,9 @@ def run(
     immediate); with 1 if a threshold of the run was not met, or it was run twice and differed;
     with 2 if something failed.
     """
+    from runtime.config.reading import load_configuration
     from runtime.execute import execute
     from runtime.tools.cli.observers import Observers
-    from runtime.tools.plugins import load_configuration
     from runtime.tools.twice import run_twice
 
     if "VISNAV_LIFELINE" in os.environ:

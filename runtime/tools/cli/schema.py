@@ -20,8 +20,8 @@ def schema(
     """
     import json
 
+    from runtime.config.reading import find_nodes
     from runtime.tools.cli.common import warn
-    from runtime.tools.plugins import find_nodes
     from runtime.tools.schema import schema as schema_of
 
     text = json.dumps(schema_of(find_nodes(warn)), indent=1, ensure_ascii=False) + "\n"

@@ -75,9 +75,9 @@ def sweep(
     """
     from rich.console import Console
 
+    from runtime.config.reading import load_configuration
     from runtime.tools import sweep as sweeping
     from runtime.tools.cli.run import look_at
-    from runtime.tools.plugins import load_configuration
     from runtime.tools.sweep.console import summary_table
 
     plan = sweeping.make_plan(

@@ -40,7 +40,7 @@ class NodeState(_Data, frozen=True):
 
     Attributes:
         name: Its name.
-        type: ``module:Class``.
+        type: As in the file.
         condition: Of starting, running and ending.
         failures: How often it was restarted.
         share: Share of the loop's time that it took, 0 to 1.

@@ -12,9 +12,9 @@ import msgspec
 import tomli_w
 
 from runtime.config.model import Config, to_builtins
+from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
 from runtime.tools.flights.part import flight_of, settings_key
-from runtime.tools.plugins import load_configuration
 from runtime.tools.sweep.values import Parameter, parameter
 
 LEAST_LIMIT, SLOWEST, USUAL = 600.0, 30.0, 120.0

@@ -49,7 +49,7 @@ def interpret(keys: Keys, text: str, world: str) -> Table:
         keys.note("ClockSpeed", f"AirSim takes {speed:g} as {int(speed)}; here it is {speed:g}")
     server: Table = {
         "name": "airsim",
-        "type": "sims.airsim.server:AirsimServer",
+        "type": "AirsimServer",
         "host": keys.text("LocalHostIp") or "127.0.0.1",
         "port": keys.whole("ApiServerPort", 41451),
         "settings": text,
@@ -61,7 +61,7 @@ def interpret(keys: Keys, text: str, world: str) -> Table:
     nodes = [*_vehicles(keys, mode, world, server), server]
     wind = keys.table("Wind")
     if any(velocity := wind.numbers("X Y Z")):
-        nodes.append({"name": "world", "type": "sims.world:World", "wind": {"velocity": velocity}})
+        nodes.append({"name": "world", "type": "World", "wind": {"velocity": velocity}})
     wind.done()
     keys.done()
     names = {name: ours for name, ours in server["sensor_names"].items() if name not in {"", ours}}
@@ -128,10 +128,10 @@ def _place(vehicle: Keys, camera: bool) -> Table:
     roll, pitch, yaw = vehicle.numbers("Roll Pitch Yaw")
     if camera:
         position = [x, y, vehicle.number("Z", -_EYE_HEIGHT)]
-        type_ = "sims.computer_vision:FreeCamera"
+        type_ = "FreeCamera"
         return {"type": type_, "position": position, "orientation": [roll, pitch, yaw]}
     height = 0.0 - vehicle.number("Z", 0.0)
-    return {"type": "sims.multirotor:Multirotor", "position": [x, y], "height": height, "yaw": yaw}
+    return {"type": "Multirotor", "position": [x, y], "height": height, "yaw": yaw}
 
 
 def _recording(keys: Keys) -> Table:

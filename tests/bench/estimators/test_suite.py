@@ -34,19 +34,19 @@ set = ["pilot.speed=2"]
 [[estimators]]
 name = "good"
 reads = "truth"
-node = { type = "nodes.synthetic_odometry:SyntheticOdometry", drift = 0.5 }
+node = { type = "SyntheticOdometry", drift = 0.5 }
 
 [[estimators]]
 name = "bad"
 reads = "truth"
-node = { type = "nodes.synthetic_odometry:SyntheticOdometry", drift = 9.0 }
+node = { type = "SyntheticOdometry", drift = 9.0 }
 
 [[estimators]]
 name = "elsewhere"
 reads = "nothing"
 module = "a_module_that_is_not_there"
 install = "make elsewhere"
-node = { type = "nodes.synthetic_odometry:SyntheticOdometry" }
+node = { type = "SyntheticOdometry" }
 """
 
 RIG = """
@@ -56,11 +56,11 @@ duration = "20s"
 
 [[nodes]]
 name = "drone"
-type = "sims.multirotor:Multirotor"
+type = "Multirotor"
 
 [[nodes]]
 name = "pilot"
-type = "nodes.pilots:WaypointFollower"
+type = "WaypointFollower"
 start_delay = "0s"
 waypoints = [[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]
 """

@@ -22,10 +22,10 @@ from tests.nodes.calibration.samples import stereo
 RECORDED = {
     "run": {"duration": "1s"},
     "nodes": [
-        {"name": "recorder", "type": "nodes.mcap_recorder:McapRecorder"},
+        {"name": "recorder", "type": "McapRecorder"},
         {
             "name": "drone",
-            "type": "sims.multirotor:Multirotor",
+            "type": "Multirotor",
             "cameras": [{"name": "camera", "width": 32, "height": 24, "rate": 10}],
         },
     ],

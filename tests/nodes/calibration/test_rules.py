@@ -18,7 +18,7 @@ from tests.nodes.calibration.samples import IMU, camera, stereo
 from tests.nodes.kiss_icp.test_node import lidar
 from tests.runtime.tools.samples_cli import command
 
-SLAM: dict[str, Any] = {"name": "slam", "type": "nodes.orb_slam3:OrbSlam3"}
+SLAM: dict[str, Any] = {"name": "slam", "type": "OrbSlam3"}
 ESTIMATES = EstimatorAnnouncement(stamp=0, source="slam", method="test")
 RIGHT, LEFT = stereo(noise=2.0).cameras[::-1]
 
@@ -26,7 +26,7 @@ RIGHT, LEFT = stereo(noise=2.0).cameras[::-1]
 def file(mode: str = "rgbd_inertial", latency: str = "15ms", accept: Sequence[str] = ()) -> Config:
     """Return a file in which ORB-SLAM3 is judged."""
     nodes = [SLAM | {"mode": mode, "latency": latency}]
-    nodes.append({"name": "evaluation", "type": "nodes.evaluation:Evaluation"})
+    nodes.append({"name": "evaluation", "type": "Evaluation"})
     return parse({"run": {"accept": list(accept), "duration": 1}, "nodes": nodes}, "test")
 
 
@@ -37,9 +37,9 @@ def nodes_of(*types: str, duration: float = 1.0, **settings: Any) -> Config:
     return parse({"run": {"duration": duration}, "nodes": nodes}, "test")
 
 
-DRONE, EVALUATION = "sims.multirotor:Multirotor", "nodes.evaluation:Evaluation"
-PILOT = "nodes.pilots:WaypointFollower"
-ON_A_LIDAR = nodes_of("nodes.kiss_icp:KissIcp")
+DRONE, EVALUATION = "Multirotor", "Evaluation"
+PILOT = "WaypointFollower"
+ON_A_LIDAR = nodes_of("KissIcp")
 
 
 def square(**more: Any) -> CameraAnnouncement:
@@ -106,7 +106,7 @@ ODD: list[tuple[str, Config, list[Announcement], str]] = [
     ("stamps", file(), [LEFT, msgspec.structs.replace(RIGHT, time_jitter=1e-3)], "have a jitter"),
     ("needs", file(), [square()], "it needs an IMU, which nobody announces"),
     ("needs", ON_A_LIDAR, [square(), IMU], "it needs lidar, which no sensor gives"),
-    ("needs", nodes_of(DRONE, "nodes.window:ImageWindow"), [], "no camera is announced"),
+    ("needs", nodes_of(DRONE, "ImageWindow"), [], "no camera is announced"),
     ("no-end", nodes_of(DRONE, EVALUATION, duration=0.0), [], "it has no duration, and no node"),
     (
         "no-end",
@@ -150,7 +150,7 @@ def test_nothing_is_said_of_a_sound_rig() -> None:
 
 def test_of_a_recording_no_noise_is_known() -> None:
     config = file()
-    replay = {"name": "drone", "type": "nodes.replay:Replay", "file": "flight.mcap"}
+    replay = {"name": "drone", "type": "Replay", "file": "flight.mcap"}
     recorded = msgspec.structs.replace(
         config, nodes=(*config.nodes, *parse({"nodes": [replay]}, "test").nodes)
     )
@@ -174,10 +174,10 @@ def test_what_a_file_accepts_is_left_out_and_a_wrong_name_is_said() -> None:
 def test_the_command_ends_with_1_on_findings_and_check_warns(tmp_path: Path) -> None:
     text = (
         '[run]\naccept = ["no-end", "idle"]\n[[nodes]]\nname = "drone"\n'
-        'type = "sims.multirotor:Multirotor"\n'
+        'type = "Multirotor"\n'
         '[[nodes.cameras]]\nname = "camera"\n'
-        '[[nodes]]\nname = "odometry"\ntype = "nodes.visual_odometry:VisualOdometry"\n'
-        '[[nodes]]\nname = "evaluation"\ntype = "nodes.evaluation:Evaluation"\n'
+        '[[nodes]]\nname = "odometry"\ntype = "VisualOdometry"\n'
+        '[[nodes]]\nname = "evaluation"\ntype = "Evaluation"\n'
     )
     (tmp_path / "rig.toml").write_text(text)
     done = command("lint", "rig.toml", folder=tmp_path)

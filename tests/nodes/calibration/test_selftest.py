@@ -73,7 +73,7 @@ def missed(result: Result) -> dict[int, list[str]]:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("camera", [STEREO, RADTAN], ids=["stereo kb4 rolling", "radtan"])
 def test_a_true_rig_passes(camera: dict[str, Any], tmp_path: Path) -> None:
-    result = proven({"type": "sims.multirotor:Multirotor", "cameras": [camera]}, tmp_path)
+    result = proven({"type": "Multirotor", "cameras": [camera]}, tmp_path)
     assert missed(result) == {}
     assert all(result.figures.values())
     assert (tmp_path / "calibration" / "kalibr" / "imu.yaml").is_file()
@@ -118,7 +118,7 @@ def test_the_command_passes_on_the_standard_tour(tmp_path: Path) -> None:
 
 def test_a_file_without_a_simulator_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "none.toml"
-    path.write_text('[[nodes]]\nname = "log"\ntype = "nodes.evaluation:Evaluation"\n')
+    path.write_text('[[nodes]]\nname = "log"\ntype = "Evaluation"\n')
     with pytest.raises(ConfigError, match="expected a node that simulates a vehicle"):
         subjects(load(path))
 

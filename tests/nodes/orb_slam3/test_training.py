@@ -26,7 +26,7 @@ type = "tests.nodes.orb_slam3.still:Still"
 
 [[nodes]]
 name = "slam"
-type = "nodes.orb_slam3:OrbSlam3"
+type = "OrbSlam3"
 """
 
 

@@ -341,12 +341,12 @@ def test_a_template_gets_what_was_announced(tmp_path: Path) -> None:
 CHECKED = """
 [[nodes]]
 name = "drone"
-type = "sims.multirotor:Multirotor"
+type = "Multirotor"
 [[nodes.cameras]]
 name = "camera"
 [[nodes]]
 name = "slam"
-type = "nodes.process:Process"
+type = "Process"
 folder = "mine"
 build = ["touch", "built"]
 command = ["./made_by_the_build"]

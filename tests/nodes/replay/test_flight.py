@@ -48,8 +48,8 @@ def test_an_estimator_says_of_a_recording_what_it_said_in_flight(tmp_path: Path)
     assert (live / name).read_text().count("\n") > 70
     copy = tmp_path / "copy.toml"
     copy.write_text(
-        '[[nodes]]\nname = "recorder"\ntype = "nodes.mcap_recorder:McapRecorder"\n'
-        '[[nodes]]\nname = "replay"\ntype = "nodes.replay:Replay"\nonly = ["Event"]\n'
+        '[[nodes]]\nname = "recorder"\ntype = "McapRecorder"\n'
+        '[[nodes]]\nname = "replay"\ntype = "Replay"\nonly = ["Event"]\n'
         f'file = "{file}"\n'
     )
     done = subprocess.run(command("run", str(copy), "--quiet", "--out", str(told)), cwd=ROOT)

@@ -27,7 +27,7 @@ enough = {enough}
 
 [[nodes]]
 name = "ros2"
-type = "nodes.ros2_bridge:Ros2Bridge"
+type = "Ros2Bridge"
 connect = {connect}
 listen = ["tcp/127.0.0.1:{port}"]
 {more}

@@ -39,12 +39,12 @@ startup_limit = "5min"
 
 [[nodes]]
 name = "drone"
-type = "sims.multirotor:Multirotor"
+type = "Multirotor"
 world = "hall"
 
 [[nodes]]
 name = "ros2"
-type = "nodes.ros2_bridge:Ros2Bridge"
+type = "Ros2Bridge"
 connect = []
 listen = ["tcp/127.0.0.1:{port}"]
 {more}
@@ -52,7 +52,7 @@ listen = ["tcp/127.0.0.1:{port}"]
 PILOT = """
 [[nodes]]
 name = "pilot"
-type = "nodes.pilots:WaypointFollower"
+type = "WaypointFollower"
 waypoints = [[0.0, 0.0, -1.5], [1.0, 0.2, -1.5]]
 """
 PAUSED = 'paused = true\nservices = ["simulation", "vehicle"]'

@@ -29,7 +29,7 @@ MISSING = [program for program in ("Xvfb", "xdotool") if shutil.which(program) i
 
 Message = dict[str, Any]
 
-KEYBOARD: Message = {"name": "keyboard", "type": "nodes.window:ImageWindow"}
+KEYBOARD: Message = {"name": "keyboard", "type": "ImageWindow"}
 
 
 class Display:

@@ -13,7 +13,7 @@ from runtime.errors import ConfigError
 DRONE = """
 [[nodes]]
 name = "drone"
-type = "sims.multirotor:Multirotor"
+type = "Multirotor"
 """
 CAMERAS = """
 [[nodes.cameras]]
@@ -103,8 +103,9 @@ OF_NODES = [
     ("name = 3", "nodes[0].name: expected a text, found 3"),
     ('name = "a b"\ntype = "a:B"', "nodes[0].name: expected a letter, then letters, digits,"),
     ('name = "run"\ntype = "a:B"', "nodes[0].name: expected any name but those"),
-    ('name = "x"\ntype = "a"', 'nodes[0] (x): type: expected "module:Class", found "a"'),
-    ('name = "x"\ntype = "..a:B"', 'nodes[0] (x): type: expected "module:Class", found "..a:B"'),
+    ('name = "x"\ntype = "a"', 'type: expected the name of a node or "module:Class", found "a"'),
+    ('name = "x"\ntype = "Multirotr"', "found \"Multirotr\" (did you mean 'Multirotor'?)"),
+    ('name = "x"\ntype = "..a:B"', 'the name of a node or "module:Class", found "..a:B"'),
     ('name = "x"\ntype = "nodes.rerunview:A"', '"nodes.rerunview" (did you mean \'nodes.rerun_'),
     ('name = "x"\ntype = "nodes.pilots:Teleob"', "found \"Teleob\" (did you mean 'Teleop'?)"),
     (

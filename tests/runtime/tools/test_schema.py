@@ -12,8 +12,8 @@ import pytest
 
 from events import Image
 from runtime import Changeable, Duration, Input, Node, NodeConfig
+from runtime.config.reading import find_nodes
 from runtime.tools.describe import attribute_docs
-from runtime.tools.plugins import find_nodes
 from runtime.tools.schema import schema
 
 ROOT = Path(__file__).parents[3]

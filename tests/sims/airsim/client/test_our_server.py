@@ -26,12 +26,12 @@ duration = "1h"
 
 [[nodes]]
 name = "drone"
-type = "sims.multirotor:Multirotor"
+type = "Multirotor"
 world = "{world}"
 
 [[nodes]]
 name = "airsim"
-type = "sims.airsim.server:AirsimServer"
+type = "AirsimServer"
 port = {port}
 time = "paused"
 """
@@ -43,14 +43,14 @@ duration = "9s"
 
 [[nodes]]
 name = "drone"
-type = "sims.airsim.client:AirsimClient"
+type = "AirsimClient"
 port = {port}
 image_rate = 10
 on_loss = "{on_loss}"
 
 [[nodes]]
 name = "pilot"
-type = "nodes.pilots:WaypointFollower"
+type = "WaypointFollower"
 waypoints = [[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]
 """
 

@@ -21,7 +21,7 @@ duration = "{seconds}s"
 
 [[nodes]]
 name = "drone"
-type = "sims.airsim.client:AirsimClient"
+type = "AirsimClient"
 port = {port}
 image_rate = {image_rate}
 imu_rate = 100

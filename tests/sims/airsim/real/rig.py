@@ -39,7 +39,7 @@ duration = "300s"
 
 [[nodes]]
 name = "drone"
-type = "sims.multirotor:Multirotor"
+type = "Multirotor"
 world = "{world}"
 camera_processes = 1
 {drone}
@@ -48,7 +48,7 @@ camera_processes = 1
 SERVER = """
 [[nodes]]
 name = "airsim"
-type = "sims.airsim.server:AirsimServer"
+type = "AirsimServer"
 port = 0
 {settings}
 """

@@ -53,7 +53,7 @@ def test_a_newer_task_ends_the_older_one(client: str, tmp_path: Path) -> None:
 
 @BOTH
 def test_two_drones_fly_at_a_time(client: str, tmp_path: Path) -> None:
-    other = "[[nodes]]\nname = 'another'\ntype = 'sims.multirotor:Multirotor'\nposition = [0, 3]\n"
+    other = "[[nodes]]\nname = 'another'\ntype = 'Multirotor'\nposition = [0, 3]\n"
     found = fly(client, "two", tmp_path, nodes=other)
     assert found["names"] == ["another", "drone"]
     assert found["where"]["another"] == pytest.approx([1.0, 0.0, -2.0], abs=0.6)

@@ -71,7 +71,7 @@ def test_images_are_the_runs_own(client: str, tmp_path: Path) -> None:
 @BOTH
 def test_a_camera_is_put_where_a_script_says(client: str, tmp_path: Path) -> None:
     """In computer-vision mode the images after a pose are taken from it."""
-    camera = "[[nodes]]\nname = 'camera'\ntype = 'sims.computer_vision:FreeCamera'\nworld = {}\n"
+    camera = "[[nodes]]\nname = 'camera'\ntype = 'FreeCamera'\nworld = {}\n"
     world = tmp_path / "small.xml"
     world.write_text(WORLD)
     free = camera.format(f"'{world}'") + "rate = 20\n"

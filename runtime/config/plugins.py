@@ -1,4 +1,4 @@
-"""What installed packages offer to the command line: commands, nodes to be listed, configurations.
+"""Entry points of installed packages: commands, nodes, and readers of configurations.
 
 A package names them in its ``pyproject.toml``; this project does the same for its own:
 
@@ -11,23 +11,18 @@ A package names them in its ``pyproject.toml``; this project does the same for i
     [project.entry-points."visnav.configurations"]
     json = "my_package.settings:read"     # read(text, path, warn): the table of a TOML file of ours
 
-A file may name any node as ``module:Class``; it need not be listed here to run.
+A file names a node that is listed here by its name, ``type = "MyNode"``, and any other as
+``module:Class``.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from runtime.errors import CommandError, VisnavError
-from runtime.node import Node
-
-if TYPE_CHECKING:
-    from runtime.config.model import Config
+from runtime.errors import CommandError
 
 COMMANDS = "visnav.commands"
 NODES = "visnav.nodes"
@@ -87,48 +82,6 @@ def offers(group: str) -> tuple[Offer, ...]:
             '"pip install ." in its folder installs it'
         )
     return (*ours, *(offer for offer in found if offer.package != OURS))
-
-
-def find_nodes(warn: Callable[[str], None]) -> dict[str, type[Node[Any]]]:
-    """Return ``module:Class`` to class, for all nodes that packages offer, sorted.
-
-    Args:
-        warn: Called with a line for each that cannot be imported; it is left out.
-    """
-    from runtime.config.reading import find_node
-
-    found = {}
-    for package, _, value in offers(NODES):
-        try:
-            found[value] = find_node(value, value)
-        except VisnavError as error:
-            warn(f"a node of the package {package}: {error}")
-    return dict(sorted(found.items()))
-
-
-def load_configuration(path: Path, overrides: Sequence[str] = ()) -> Config:
-    """Read a file that says what to run: TOML, or what a package reads by its suffix.
-
-    Args:
-        path: The file.
-        overrides: As of `runtime.config.reading.load`.
-
-    Raises:
-        ConfigError: Something in it is wrong.
-        CommandError: What reads it cannot be imported.
-    """
-    from runtime.config.reading import load
-
-    for offer in offers(CONFIGURATIONS):
-        if path.suffix.lower() == f".{offer.name}":
-            return load(path, overrides, partial(offer.load(), warn=_warn_once))
-    return load(path, overrides)
-
-
-@cache
-def _warn_once(warning: str) -> None:
-    """Print a warning, but not again if a file is read again, as for a sweep."""
-    print(f"warning: {warning}", file=sys.stderr)
 
 
 def _declared(group: str) -> list[Offer]:
