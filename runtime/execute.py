@@ -30,10 +30,11 @@ from runtime.node import Node
 from runtime.node_runner import log_error, with_place, wrap
 from runtime.private_results import private_results
 from runtime.real_clock import RealClock
+from runtime.run.summarise import summarise
 from runtime.sender import Sender, Tap
-from runtime.summary import Summary, summarise
+from runtime.summary import Stall, Summary
 from runtime.supervisor import Supervisor
-from runtime.watchdogs.loop import LoopWatchdog, Stall
+from runtime.watchdogs.loop import LoopWatchdog
 from runtime.watchdogs.progress import ProgressWatchdog
 
 if TYPE_CHECKING:

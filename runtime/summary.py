@@ -1,30 +1,237 @@
-"""What a run reports of itself: ``summary.json`` and the table at its end."""
+"""``summary.json``: what a run reports of itself and of its parts."""
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 
-from runtime.answers import Answers
-from runtime.digest import Digest, combined
-from runtime.environment import command_line, commit, environment
-from runtime.json_values import plain
-from runtime.node import matchers, senders, streams
-from runtime.part_summaries import (
-    LinkSummary,
-    OutsideSummary,
-    StreamSummary,
-    TickSummary,
-    TwiceSummary,
-    WorkerSummary,
+from runtime.answers import Answers, Outcome, Wrong
+from runtime.digest import combined
+from runtime.workers.costs import Costs
+
+
+class Stall(msgspec.Struct, frozen=True):
+    """One time the loop did not turn.
+
+    Attributes:
+        node: The node that ran, or ``runtime``.
+        line: ``file:line in function``, the innermost line of the node.
+        seconds: How long, in real time.
+    """
+
+    node: str
+    line: str
+    seconds: float
+
+
+class TickSummary(msgspec.Struct, frozen=True):
+    """How punctual one ticker was; microseconds of the run's clock."""
+
+    hz: float
+    calls: int
+    late_p50_us: float
+    late_p99_us: float
+    late_max_us: float
+    missed: int
+
+
+class StreamSummary(msgspec.Struct, frozen=True):
+    """How full one input got, and what it dropped.
+
+    For a bundle, `missed` says how often a set did not come about, by the field that was missing.
+    """
+
+    bound: int
+    peak: int
+    dropped: int
+    missed: dict[str, int] = {}
+
+
+class LinkSummary(msgspec.Struct, frozen=True):
+    """How many events a link lost, and how many it left out to keep to its rate."""
+
+    lost: int
+    thinned: int
+
+
+class WorkerSummary(msgspec.Struct, frozen=True):
+    """What the calls of a worker cost this machine.
+
+    Attributes:
+        latency_ms: That the file declares, on the run's clock; `None` if it differs by call.
+        calls: That were answered.
+        wall_p50_ms: Real time of a call in the worker's process: median.
+        wall_p95_ms: 95th percentile.
+        wall_max_ms: Longest.
+        cpu_p50_ms: Processor time of all threads of that process from one call's end to the
+            next one's: median.
+        cpu_p95_ms: 95th percentile.
+        cpu_max_ms: Most.
+        peak_rss_mb: Most memory that one of the processes has had; `None` if unknown.
+        processes: How many there were at once.
+    """
+
+    latency_ms: float | None
+    calls: int
+    wall_p50_ms: float
+    wall_p95_ms: float
+    wall_max_ms: float
+    cpu_p50_ms: float
+    cpu_p95_ms: float
+    cpu_max_ms: float
+    peak_rss_mb: float | None
+    processes: int
+
+    @classmethod
+    def of(cls, costs: Costs) -> WorkerSummary:
+        """Sum up what there is."""
+        return cls(
+            latency_ms=None if costs.latency is None else round(costs.latency * 1e3, 6),
+            calls=costs.calls,
+            wall_p50_ms=costs.wall.quantile(0.5) / 1e6,
+            wall_p95_ms=costs.wall.quantile(0.95) / 1e6,
+            wall_max_ms=costs.wall.maximum / 1e6,
+            cpu_p50_ms=costs.cpu.quantile(0.5) / 1e6,
+            cpu_p95_ms=costs.cpu.quantile(0.95) / 1e6,
+            cpu_max_ms=costs.cpu.maximum / 1e6,
+            peak_rss_mb=costs.peak / 1e6 or None,
+            processes=costs.processes,
+        )
+
+    def row(self) -> list[str]:
+        """Return it as a table shows it, under `WORKER_COLUMNS`."""
+        wall = (self.wall_p50_ms, self.wall_p95_ms, self.wall_max_ms)
+        cpu = (self.cpu_p50_ms, self.cpu_p95_ms, self.cpu_max_ms)
+        return [
+            "varies" if self.latency_ms is None else f"{self.latency_ms:g}",
+            f"{self.calls}",
+            *(f"{each:.3g}" if each < 100 else f"{each:.0f}" for each in wall + cpu),
+            "" if self.peak_rss_mb is None else f"{self.peak_rss_mb:.0f}",
+            f"{self.processes}",
+        ]
+
+
+WORKER_COLUMNS = (
+    *("latency ms", "calls", "real p50 ms", "p95 ms", "max ms"),
+    *("CPU p50 ms", "p95 ms", "max ms", "peak MB", "processes"),
 )
-from runtime.run_state import RunState
-from runtime.schedule import SECOND
-from runtime.watchdogs.loop import Stall
+
+
+class OutsideSummary(msgspec.Struct, frozen=True):
+    """How a system outside the process answered what it was sent.
+
+    Attributes:
+        latency_ms: Declared, on the run's clock; `None` if it differs by frame.
+        sent: Frames that went out.
+        received: Frames that the system confirmed; `None` if it cannot say.
+        answered: Frames with an answer.
+        says_lost: Answers that say that tracking is lost, among those and the empty ones.
+        empty: Frames with an answer that held nothing, such as no pose.
+        initialising: Frames for which the system was still initialising: it said so, or had not
+            yet answered any, as was allowed.
+        skipped: Frames that the system left out, as a later answer says.
+        lost: Frames for which none came in time.
+        open: Frames on their way when the run ended. `sent` is the sum of `answered`, `empty`,
+            `initialising`, `skipped`, `lost` and `open`.
+        late: Answers to frames that were given up.
+        repeated: Second answers to a frame that say the same.
+        contradicting: Second answers to a frame that say something else.
+        unknown: Answers whose stamp is no frame's.
+        initialisation_s: From the first frame to the first that was answered.
+        wall_p50_ms: Real time from a frame to its answer: median.
+        wall_p99_ms: 99th percentile.
+        inputs: Digest of all that the system was sent; equal if it got the same.
+        answers: Digest of all that it answered, each to its frame.
+        reproducible: Whether an equal run gives the same, if the system answers the same.
+        why_not: Why it may not.
+        repeats: Whether it has answered the same when run twice (``run --twice``); `None` if that
+            is unknown.
+    """
+
+    latency_ms: float | None
+    sent: int
+    received: int | None
+    answered: int
+    empty: int
+    initialising: int
+    skipped: int
+    lost: int
+    open: int
+    late: int
+    repeated: int
+    unknown: int
+    initialisation_s: float | None
+    wall_p50_ms: float | None
+    wall_p99_ms: float | None
+    inputs: str | None
+    reproducible: bool
+    why_not: list[str]
+    says_lost: int = 0
+    contradicting: int = 0
+    answers: str | None = None
+    repeats: bool | None = None
+
+    @classmethod
+    def of(cls, answers: Answers) -> OutsideSummary:
+        """Sum up what there is."""
+        counts: dict[str, Any] = {
+            name: answers.counts[name] for name in (*get_args(Outcome), *get_args(Wrong))
+        }
+        p50, p99 = answers.latency_quantiles(0.5, 0.99)
+        return cls(
+            latency_ms=None if answers.latency is None else round(answers.latency * 1e3, 6),
+            sent=answers.sent,
+            received=answers.received,
+            says_lost=answers.says_lost,
+            open=answers.sent - sum(counts[name] for name in get_args(Outcome)),
+            initialisation_s=answers.initialisation,
+            wall_p50_ms=None if p50 is None else p50 * 1e3,
+            wall_p99_ms=None if p99 is None else p99 * 1e3,
+            inputs=answers.inputs(),
+            answers=answers.outputs(),
+            reproducible=not answers.why_not,
+            why_not=list(answers.why_not),
+            **counts,
+        )
+
+    def row(self) -> list[str]:
+        """Return it as a table shows it, under `OUTSIDE_COLUMNS`."""
+        return [
+            *(f"{self.sent}", "–" if self.received is None else f"{self.received}"),
+            *(str(each) for each in (self.answered, self.empty, self.initialising, self.skipped)),
+            *(str(each) for each in (self.lost, self.open, self.says_lost, self.late)),
+            *(str(each) for each in (self.repeated, self.contradicting, self.unknown)),
+            *(
+                "–" if each is None else f"{each:.3g}"
+                for each in (self.initialisation_s, self.latency_ms, self.wall_p50_ms)
+            ),
+            "yes" if self.reproducible else f"no: {'; '.join(self.why_not)}",
+            {True: "yes", False: "no", None: "unknown until run --twice"}[self.repeats],
+        ]
+
+
+class TwiceSummary(msgspec.Struct, frozen=True):
+    """How a run compares with an equal one before; see `runtime.tools.twice`.
+
+    Attributes:
+        repeats: Whether all was the same.
+        first: Who differed first, the rig or a system outside, when, and by how much.
+        outputs: Those whose events differed.
+    """
+
+    repeats: bool
+    first: str = ""
+    outputs: list[str] = []
+
+
+OUTSIDE_COLUMNS = (
+    *("sent", "received", "answered", "empty", "initialising", "skipped"),
+    *("no answer", "open", "says lost", "late", "repeated", "contradicting", "of no frame"),
+    *("initialised s", "latency ms", "real p50 ms", "inputs repeat", "answers repeat"),
+)
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -124,122 +331,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     twice: TwiceSummary | None = None
 
 
-def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
-    """Count what was sent so far, by type of event and by output."""
-    by_type: Counter[str] = Counter()
-    by_output: Counter[str] = Counter()
-    for node in state.all_nodes:
-        for sender in senders(node).values():
-            for event, count in sender.sent().items():
-                by_type[event.__name__] += count
-                by_output[sender.name] += count
-    return by_type, by_output
-
-
-def count_drops(state: RunState) -> dict[str, StreamSummary]:
-    """Return how full each input got and what it dropped."""
-    found: dict[str, StreamSummary] = {}
-    for node in state.all_nodes:
-        missed = {port: matcher.missed for port, matcher in matchers(node).items()}
-        for port, stream in streams(node).items():
-            before = found.get(stream.name, StreamSummary(stream.bound, 0, 0))
-            now = stream.statistics()
-            found[stream.name] = StreamSummary(
-                stream.bound,
-                max(before.peak, now.peak),
-                before.dropped + now.dropped,
-                dict(Counter(before.missed) + Counter(missed.get(port, {}))),
-            )
-    return found
-
-
-def tick_summaries(state: RunState) -> dict[str, TickSummary]:
-    """Return how punctual each ticker was."""
-    return {
-        name: TickSummary(
-            hz=ticker.hz,
-            calls=ticker.calls,
-            late_p50_us=ticker.late.quantile(0.5) / 1e3,
-            late_p99_us=ticker.late.quantile(0.99) / 1e3,
-            late_max_us=ticker.late.maximum / 1e3,
-            missed=ticker.missed,
-        )
-        for name, ticker in state.tickers.items()
-    }
-
-
-def summarise(
-    state: RunState,
-    *,
-    digest: Digest | None,
-    stalls: Counter[str],
-    longest_stalls: dict[str, Stall],
-) -> Summary:
-    """Put together what is known at the end of a run."""
-    by_type, by_output = count_events(state)
-    by_input = count_drops(state)
-    ended = state.stopped or time.monotonic()
-    return Summary(
-        name=state.config.run.name,
-        clock=state.clock.kind,
-        seed=state.config.run.seed,
-        reason=state.reason,
-        ended_by=state.end.by if state.end is not None else "",
-        error=None if state.error is None else str(state.error),
-        sim_seconds=(state.clock.now() if state.stopped_at is None else state.stopped_at) / SECOND,
-        wall_seconds=round(ended - (state.first_update or ended), 6),
-        digest=digest.hexdigest() if digest else None,
-        digests=digest.outputs() if digest else {},
-        not_deterministic=_not_deterministic(state),
-        verdict=_verdict(state.conclusions | _losses(state.outside)),
-        events=dict(sorted(by_type.items())),
-        outputs=dict(by_output),
-        drops={port: s.dropped for port, s in by_input.items()},
-        streams=by_input,
-        links={link.name: LinkSummary(link.lost, link.thinned) for link in state.links.values()},
-        ticks=tick_summaries(state),
-        stalls=dict(stalls),
-        longest_stalls=longest_stalls,
-        truth_readers=sorted(state.truth_readers),
-        announcements=[
-            {"type": type(a).__name__, **plain(a, a.source)} for a in state.announcements
-        ],
-        environment={
-            **environment(),
-            **state.environment,
-            "command": command_line(),
-            "commit": commit(),
-        },
-        workers={
-            name: WorkerSummary.of(each)
-            for name, each in (
-                state.costs | {k: a.costs for k, a in state.outside.items() if a.costs.calls}
-            ).items()
-        },
-        outside={name: OutsideSummary.of(each) for name, each in state.outside.items()},
-    )
-
-
-def _not_deterministic(state: RunState) -> list[str]:
-    nodes = {node.name for node in state.all_nodes if not node.deterministic}
-    held = state.outside.items() if state.clock.kind == "lockstep" else ()
-    return sorted(nodes | {name for name, answers in held if answers.why_not})
-
-
-def _losses(outside: dict[str, Answers]) -> dict[str, dict[str, Any]]:
-    """Return a verdict on each system that has lost more frames than it may."""
-    return {
-        f"{name} (answers)": {
-            "passed": False,
-            "lost_frames": lost,
-            "failed": [f"lost_frames: expected at most {most}, found {lost}"],
-        }
-        for name, answers in outside.items()
-        if (lost := answers.counts["lost"]) > (most := answers.lost_allowed)
-    }
-
-
-def _verdict(found: dict[str, dict[str, Any]]) -> Verdict | None:
+def verdict_of(found: dict[str, dict[str, Any]]) -> Verdict | None:
+    """Return what several conclusions are together; `None` if there are none."""
     if not found:
         return None
     return Verdict(overall(each["passed"] for each in found.values()), found)
@@ -273,7 +366,7 @@ def merged(parts: list[Summary], processes: list[ProcessSummary]) -> Summary:
         digest=combined(digests) if all(part.digest for part in parts) else None,
         digests=dict(sorted(digests.items())),
         not_deterministic=sorted({node for part in parts for node in part.not_deterministic}),
-        verdict=_verdict({k: f for v in verdicts for k, f in v.estimators.items()}),
+        verdict=verdict_of({k: f for v in verdicts for k, f in v.estimators.items()}),
         events=dict(sorted(events.items())),
         stalls=dict(stalls),
         longest_stalls=of_all("longest_stalls"),

@@ -24,10 +24,10 @@ from runtime.config.reading import convert
 from runtime.links import LinkConfig
 from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.node import Node
-from runtime.part_summaries import StreamSummary, TickSummary
 from runtime.ports import Output
+from runtime.run.summarise import count_drops, tick_summaries
 from runtime.sender import Sender
-from runtime.summary import count_drops, tick_summaries
+from runtime.summary import StreamSummary, TickSummary
 from runtime.supervisor import Supervisor
 from runtime.units import Duration
 

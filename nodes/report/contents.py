@@ -13,7 +13,7 @@ from nodes.evaluation.coverage import Interval
 from nodes.evaluation.judging import Errors
 from nodes.trajectory import Trajectory
 from runtime import summary
-from runtime.part_summaries import (
+from runtime.summary import (
     LinkSummary,
     OutsideSummary,
     StreamSummary,

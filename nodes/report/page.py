@@ -25,7 +25,7 @@ from nodes.report.folder import read_run
 from nodes.report.frames import draw_frames
 from nodes.report.style import Plot, drawing
 from nodes.report.trajectories import draw_trajectories
-from runtime.part_summaries import OUTSIDE_COLUMNS, WORKER_COLUMNS
+from runtime.summary import OUTSIDE_COLUMNS, WORKER_COLUMNS
 
 PAGE = "report.html"
 PLOTS = "plots"

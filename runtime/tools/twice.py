@@ -19,9 +19,8 @@ from runtime.config.model import Config
 from runtime.digest import Digest
 from runtime.errors import ConfigError
 from runtime.execute import execute
-from runtime.part_summaries import OutsideSummary, TwiceSummary
 from runtime.sender import Sender
-from runtime.summary import Summary
+from runtime.summary import OutsideSummary, Summary, TwiceSummary
 
 log = logging.getLogger("visnav.runtime")
 

@@ -16,10 +16,9 @@ from collections import Counter
 from collections.abc import Callable
 from types import FrameType
 
-import msgspec
-
 from runtime import code_location, lockstep
 from runtime.frames import frame_of
+from runtime.summary import Stall
 
 _LONGEST_PAUSE = 0.05
 """Seconds between two looks at most; a run's end waits for the last of them."""
@@ -30,20 +29,6 @@ _WAITING = {selectors.__file__, lockstep.__file__}
 _LOOPS = {asyncio.base_events.__file__, asyncio.runners.__file__}
 """…when called from these. (uvloop, being compiled, shows nothing but `Runner.run`.) A node that
 waits for a lock or a child's output is not idle: it blocks the loop."""
-
-
-class Stall(msgspec.Struct, frozen=True):
-    """One time the loop did not turn.
-
-    Attributes:
-        node: The node that ran, or ``runtime``.
-        line: ``file:line in function``, the innermost line of the node.
-        seconds: How long, in real time.
-    """
-
-    node: str
-    line: str
-    seconds: float
 
 
 class LoopWatchdog:

@@ -19,8 +19,8 @@ from runtime.answers import Answers
 from runtime.errors import MissingAnswerError
 from runtime.hold import BEHIND, IN_A_ROW, Hold, HoldConfig
 from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.part_summaries import OUTSIDE_COLUMNS, OutsideSummary
 from runtime.real_clock import RealClock
+from runtime.summary import OUTSIDE_COLUMNS, OutsideSummary
 from runtime.testing import run_in_lockstep
 from runtime.units import Duration
 

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from runtime.config.model import RunConfig
+from runtime.run.summarise import count_events
 from runtime.schedule import SECOND
-from runtime.summary import count_events
 from runtime.supervisor import Supervisor
 
 _PERIOD = 0.2

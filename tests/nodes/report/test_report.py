@@ -18,7 +18,7 @@ from nodes.report.page import write_report
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
 from runtime.answers import Answers
-from runtime.part_summaries import OutsideSummary
+from runtime.summary import OutsideSummary
 from tests.nodes.report.folders import evaluated, frame, ply, recorded, summary, walk
 
 LIMITS = Thresholds(ate_rmse_m=1e-4, lost_seconds=100.0)

@@ -12,8 +12,7 @@ import msgspec
 import pytest
 
 from runtime import Node
-from runtime.part_summaries import TickSummary
-from runtime.summary import Summary
+from runtime.summary import Summary, TickSummary
 from runtime.tools.cli.graph import layers
 from tests.runtime.tools.samples_cli import ROOT, command, command_here, config_file, summary
 

@@ -19,10 +19,11 @@ from runtime import Node, Tick, every, task_factory
 from runtime.config.model import Config, RunConfig
 from runtime.execute import make_clock, make_loop
 from runtime.lockstep import LockstepLoop
+from runtime.summary import Stall
 from runtime.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.units import Duration
-from runtime.watchdogs.loop import LoopWatchdog, Stall
+from runtime.watchdogs.loop import LoopWatchdog
 
 pytestmark = pytest.mark.timeout(20)
 LOOPS: dict[str, Callable[[], asyncio.AbstractEventLoop]] = {

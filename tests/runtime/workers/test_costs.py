@@ -16,8 +16,7 @@ from nodes.report.contents import Facts
 from runtime import Duration, Node
 from runtime.config.model import Config, RunConfig
 from runtime.execute import execute
-from runtime.part_summaries import WORKER_COLUMNS, WorkerSummary
-from runtime.summary import Summary
+from runtime.summary import WORKER_COLUMNS, Summary, WorkerSummary
 from runtime.testing import spec
 from runtime.tools.cli.tables import run_tables
 from runtime.tools.sweep import write_tables

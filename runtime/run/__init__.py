@@ -1,0 +1,1 @@
+"""One run: its nodes started, watched and ended, and what it leaves."""

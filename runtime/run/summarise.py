@@ -1,0 +1,140 @@
+"""The summary of a run, from its state."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from typing import Any
+
+from runtime.answers import Answers
+from runtime.digest import Digest
+from runtime.environment import command_line, commit, environment
+from runtime.json_values import plain
+from runtime.node import matchers, senders, streams
+from runtime.run_state import RunState
+from runtime.schedule import SECOND
+from runtime.summary import (
+    LinkSummary,
+    OutsideSummary,
+    Stall,
+    StreamSummary,
+    Summary,
+    TickSummary,
+    WorkerSummary,
+    verdict_of,
+)
+
+
+def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:
+    """Count what was sent so far, by type of event and by output."""
+    by_type: Counter[str] = Counter()
+    by_output: Counter[str] = Counter()
+    for node in state.all_nodes:
+        for sender in senders(node).values():
+            for event, count in sender.sent().items():
+                by_type[event.__name__] += count
+                by_output[sender.name] += count
+    return by_type, by_output
+
+
+def count_drops(state: RunState) -> dict[str, StreamSummary]:
+    """Return how full each input got and what it dropped."""
+    found: dict[str, StreamSummary] = {}
+    for node in state.all_nodes:
+        missed = {port: matcher.missed for port, matcher in matchers(node).items()}
+        for port, stream in streams(node).items():
+            before = found.get(stream.name, StreamSummary(stream.bound, 0, 0))
+            now = stream.statistics()
+            found[stream.name] = StreamSummary(
+                stream.bound,
+                max(before.peak, now.peak),
+                before.dropped + now.dropped,
+                dict(Counter(before.missed) + Counter(missed.get(port, {}))),
+            )
+    return found
+
+
+def tick_summaries(state: RunState) -> dict[str, TickSummary]:
+    """Return how punctual each ticker was."""
+    return {
+        name: TickSummary(
+            hz=ticker.hz,
+            calls=ticker.calls,
+            late_p50_us=ticker.late.quantile(0.5) / 1e3,
+            late_p99_us=ticker.late.quantile(0.99) / 1e3,
+            late_max_us=ticker.late.maximum / 1e3,
+            missed=ticker.missed,
+        )
+        for name, ticker in state.tickers.items()
+    }
+
+
+def summarise(
+    state: RunState,
+    *,
+    digest: Digest | None,
+    stalls: Counter[str],
+    longest_stalls: dict[str, Stall],
+) -> Summary:
+    """Put together what is known at the end of a run."""
+    by_type, by_output = count_events(state)
+    by_input = count_drops(state)
+    ended = state.stopped or time.monotonic()
+    return Summary(
+        name=state.config.run.name,
+        clock=state.clock.kind,
+        seed=state.config.run.seed,
+        reason=state.reason,
+        ended_by=state.end.by if state.end is not None else "",
+        error=None if state.error is None else str(state.error),
+        sim_seconds=(state.clock.now() if state.stopped_at is None else state.stopped_at) / SECOND,
+        wall_seconds=round(ended - (state.first_update or ended), 6),
+        digest=digest.hexdigest() if digest else None,
+        digests=digest.outputs() if digest else {},
+        not_deterministic=_not_deterministic(state),
+        verdict=verdict_of(state.conclusions | _losses(state.outside)),
+        events=dict(sorted(by_type.items())),
+        outputs=dict(by_output),
+        drops={port: s.dropped for port, s in by_input.items()},
+        streams=by_input,
+        links={link.name: LinkSummary(link.lost, link.thinned) for link in state.links.values()},
+        ticks=tick_summaries(state),
+        stalls=dict(stalls),
+        longest_stalls=longest_stalls,
+        truth_readers=sorted(state.truth_readers),
+        announcements=[
+            {"type": type(a).__name__, **plain(a, a.source)} for a in state.announcements
+        ],
+        environment={
+            **environment(),
+            **state.environment,
+            "command": command_line(),
+            "commit": commit(),
+        },
+        workers={
+            name: WorkerSummary.of(each)
+            for name, each in (
+                state.costs | {k: a.costs for k, a in state.outside.items() if a.costs.calls}
+            ).items()
+        },
+        outside={name: OutsideSummary.of(each) for name, each in state.outside.items()},
+    )
+
+
+def _not_deterministic(state: RunState) -> list[str]:
+    nodes = {node.name for node in state.all_nodes if not node.deterministic}
+    held = state.outside.items() if state.clock.kind == "lockstep" else ()
+    return sorted(nodes | {name for name, answers in held if answers.why_not})
+
+
+def _losses(outside: dict[str, Answers]) -> dict[str, dict[str, Any]]:
+    """Return a verdict on each system that has lost more frames than it may."""
+    return {
+        f"{name} (answers)": {
+            "passed": False,
+            "lost_frames": lost,
+            "failed": [f"lost_frames: expected at most {most}, found {lost}"],
+        }
+        for name, answers in outside.items()
+        if (lost := answers.counts["lost"]) > (most := answers.lost_allowed)
+    }
