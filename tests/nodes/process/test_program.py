@@ -254,9 +254,15 @@ def test_lines_are_the_same_however_they_arrive(pieces: list[bytes]) -> None:
         output.end()
         return found
 
-    whole = b"".join(pieces)
-    assert lines(pieces) == lines([whole])
-    assert "".join(lines(pieces)) or not whole.strip()
+    assert lines(pieces) == lines([b"".join(pieces)])
+
+
+@given(st.lists(st.text(st.characters(codec="ascii", exclude_categories=["C"]))))
+def test_what_controls_no_terminal_is_told_as_it_is(lines: list[str]) -> None:
+    found: list[str] = []
+    output = Output(found.append)
+    output.take("".join(f"{line}\n" for line in lines).encode())
+    assert found == lines
 
 
 def test_a_line_without_end_takes_no_more_memory_than_a_long_one() -> None:
