@@ -34,7 +34,7 @@ def _check_runtime() -> None:
             f"expected the package runtime in {expected}, found {found or 'none'}: "
             "another package of this name stands in the way"
         )
-    if not (expected / "sender.py").is_file():
+    if not (expected / "node.py").is_file():
         raise ImportError(
             f"expected the package runtime of visnav-runtime in {expected}, found another one "
             "installed over it: remove that one and install visnav-runtime again"

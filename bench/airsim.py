@@ -25,7 +25,7 @@ import numpy as np
 
 from bench.lateness import BEATS, PROBE, LateRow, figures, lateness
 from runtime.config.reading import parse
-from runtime.execute import execute
+from runtime.run.execute import execute
 from sims.airsim.client.rpc import RpcClient
 from sims.airsim.structures import ImageRequest
 

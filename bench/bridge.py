@@ -27,7 +27,7 @@ from events import Event, Image
 from runtime import Input, Node, Output
 from runtime.config.model import Config
 from runtime.config.reading import parse
-from runtime.execute import execute
+from runtime.run.execute import execute
 
 BLOCK = 50
 """Round trips of one side before it may be the other's turn."""

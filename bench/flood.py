@@ -22,11 +22,11 @@ import numpy as np
 
 from bench.flooder import TWIST
 from bench.lateness import BEATS, PROBE, LateRow, figures, lateness
-from nodes.ros2_bridge.keys import data_key
-from nodes.ros_messages.topics import Topic
-from nodes.ros_messages.typestore import TypeStore
+from nodes.ros2.bridge.keys import data_key
+from nodes.ros2.messages.topics import Topic
+from nodes.ros2.messages.typestore import TypeStore
 from runtime.config.reading import parse
-from runtime.execute import execute
+from runtime.run.execute import execute
 
 RATE = 10_000.0
 WINDOW = 1.0

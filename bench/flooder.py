@@ -15,7 +15,7 @@ from typing import Any
 
 import zenoh
 
-from nodes.ros_messages.typestore import TypeStore
+from nodes.ros2.messages.typestore import TypeStore
 
 TWIST = "geometry_msgs/msg/Twist"
 BURST = 0.001

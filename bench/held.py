@@ -16,11 +16,11 @@ from typing import Any
 import msgspec
 
 from events import CameraInfo
-from nodes.estimation import WORKER_ENVIRONMENT
-from nodes.link.client import Link
-from nodes.visual_odometry.node import VisualOdometryConfig, make_tracker
+from nodes.estimators import WORKER_ENVIRONMENT
+from nodes.estimators.visual_odometry.node import VisualOdometryConfig, make_tracker
+from nodes.outside.native.client import Link
 from runtime.config.reading import parse
-from runtime.execute import execute
+from runtime.run.execute import execute
 from runtime.summary import Summary
 
 ESTIMATES = "odometry.estimates"

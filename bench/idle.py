@@ -8,7 +8,7 @@ import msgspec
 
 from runtime import Node, Tick, every
 from runtime.config.reading import parse
-from runtime.execute import execute
+from runtime.run.execute import execute
 
 
 class IdleRow(msgspec.Struct, frozen=True, kw_only=True):

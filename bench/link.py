@@ -25,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 
-from nodes.link import Endpoint, LinkAnswer
-from nodes.link.client import Link
-from runtime.real_clock import RealClock
+from nodes.outside.native import Endpoint, LinkAnswer
+from nodes.outside.native.client import Link
+from runtime.time.real_clock import RealClock
 from runtime.workers.worker import Worker
 
 WARM_UP = 30

@@ -20,7 +20,7 @@ from bench.lateness import TakeoffNode
 from events import Takeoff, VelocitySetpoint
 from runtime import NodeConfig, Output, Tick, every
 from runtime.config.reading import parse
-from runtime.execute import execute
+from runtime.run.execute import execute
 from sims.sensors import ImuNoise, ImuParameters
 from sims.vehicle import (
     STANDING_HEIGHT,

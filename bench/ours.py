@@ -14,12 +14,13 @@ import uvloop
 
 from bench.system import Case, Ping, Pong, Samples, System
 from bench.systems.parts import payloads
-from runtime import Input, Node, NodeConfig, Output, on, task_factory
+from runtime import Input, Node, NodeConfig, Output, on
+from runtime.channels.digest import Digest
 from runtime.config.model import Config, RunConfig
-from runtime.digest import Digest
-from runtime.real_clock import RealClock
-from runtime.supervisor import Supervisor
+from runtime.run import task_factory
+from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
+from runtime.time.real_clock import RealClock
 
 
 class OneConfig(NodeConfig):

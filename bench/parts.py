@@ -20,9 +20,9 @@ import numpy as np
 from bench.lateness import TakeoffNode
 from events import DepthImage, Image
 from runtime import NodeConfig
+from runtime.channels.digest import Digest
 from runtime.config.reading import parse
-from runtime.digest import Digest
-from runtime.execute import execute
+from runtime.run.execute import execute
 from runtime.workers.shared_memory import SharedPipe, anonymous_file
 from sims.cameras.noise import generator, noisy_depth, noisy_image
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from bench.lateness import BEATS, PROBE, LateRow, figures
 from runtime.config.reading import parse
-from runtime.execute import execute
+from runtime.run.execute import execute
 
 
 class RecordingRow(LateRow, frozen=True, kw_only=True):

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 
-from nodes.ros_messages.images import ImageWriter
-from nodes.ros_messages.typestore import TypeStore
+from nodes.ros2.messages.images import ImageWriter
+from nodes.ros2.messages.typestore import TypeStore
 
 IMAGE = "sensor_msgs/msg/Image"
 FRAME = "camera_optical_frame"

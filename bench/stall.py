@@ -33,7 +33,7 @@ from bench.slow_server import slow_server
 from events import Odometry
 from runtime import Input, Node, NodeConfig, Tick, Worker, every
 from runtime.config.reading import parse
-from runtime.execute import execute
+from runtime.run.execute import execute
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.worlds import load_world
 

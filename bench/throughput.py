@@ -15,10 +15,10 @@ import uvloop
 
 from bench.system import Ping
 from events import Event, Image, PoseEstimate, Quaternion, Vector3
-from runtime import task_factory
-from runtime.real_clock import RealClock
-from runtime.sender import Listener, Sender
-from runtime.streams import Stream
+from runtime.channels.sender import Listener, Sender
+from runtime.channels.streams import Stream
+from runtime.run import task_factory
+from runtime.time.real_clock import RealClock
 from runtime.workers.worker import Worker
 
 

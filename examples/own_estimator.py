@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from nodes.estimation import (
+from nodes.estimators import (
     WORKER_ENVIRONMENT,
     Estimator,
     EstimatorConfig,

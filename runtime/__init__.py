@@ -27,14 +27,14 @@ if _sys.argv[:1] == ["-m"] and _signal.getsignal(_signal.SIGINT) is _signal.defa
     _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
 from runtime import neighbours as _neighbours  # noqa: F401  # first, as it checks `events`
-from runtime.bundles import Bundle
-from runtime.clock import Clock
+from runtime.channels.bundles import Bundle
+from runtime.channels.ports import Input, Output, every, on
+from runtime.channels.streams import Stream
 from runtime.config.parameters import Changeable
 from runtime.errors import RefusedError, VisnavError
 from runtime.node import Node, NodeConfig
-from runtime.ports import Input, Output, every, on
-from runtime.schedule import Tick
-from runtime.streams import Stream
+from runtime.time.clock import Clock
+from runtime.time.schedule import Tick
 from runtime.units import Duration
 from runtime.workers.worker import Worker
 

@@ -1,7 +1,7 @@
 """Where code stands or has failed: the node, and the line of it.
 
 Of a thread (by its frame), of a task that waits, of an exception. Not here: watching over a loop
-(`runtime.watchdogs.loop`) or a run (`runtime.watchdogs.progress`).
+(`runtime.run.watchdogs`) or a run (`runtime.run.watchdogs`).
 """
 
 from __future__ import annotations

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 from typing_extensions import TypeVar
 
-from runtime.clock import Clock
-from runtime.hold import Hold, HoldConfig
-from runtime.schedule import Tick, Ticker
-from runtime.stepping import Stepping
+from runtime.channels.hold import Hold, HoldConfig
+from runtime.time.clock import Clock
+from runtime.time.schedule import Tick, Ticker
+from runtime.time.stepping import Stepping
 from runtime.workers.worker import Worker
 
 W = TypeVar("W")

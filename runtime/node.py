@@ -28,19 +28,19 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from events import Announcement, Event
-from runtime.bundles import Matcher
-from runtime.clock import Clock
-from runtime.declarations import Declared, read_declarations
+from runtime.channels.bundles import Matcher
+from runtime.channels.declarations import Declared, read_declarations
+from runtime.channels.hold import Hold, HoldConfig
+from runtime.channels.ports import MAX_HZ
+from runtime.channels.sender import Listener, Sender
+from runtime.channels.streams import Stream
 from runtime.errors import DeclarationError, suggest
-from runtime.hold import Hold, HoldConfig
 from runtime.host import Host, RunEnd, Sibling
 from runtime.json_values import plain
 from runtime.logs import NodeLogger
-from runtime.ports import MAX_HZ
-from runtime.schedule import SECOND, Tick, Ticker
-from runtime.sender import Listener, Sender
-from runtime.stepping import Stepping
-from runtime.streams import Stream
+from runtime.time.clock import Clock
+from runtime.time.schedule import SECOND, Tick, Ticker
+from runtime.time.stepping import Stepping
 from runtime.workers.worker import Worker
 
 P = ParamSpec("P")
@@ -109,7 +109,7 @@ class Node(Generic[C]):
     other node, the run ends early."""
     starts_programs: ClassVar[bool] = False
     """Whether it starts programs, which are judged: what other nodes write is not in the run's
-    folder before its end then (`runtime.private_results`)."""
+    folder before its end then (`runtime.run.private_results`)."""
     reads_truth: ClassVar[str] = ""
     """What it receives true poses for, if not to fly or to estimate: ``judging``, ``recording``,
     ``showing``. All others that do are named in the summary."""
@@ -282,7 +282,7 @@ class Node(Generic[C]):
         return await self._host.worker(self, factory, args, **options)
 
     def hold(self, name: str, config: HoldConfig, latency: float) -> Hold[Any]:
-        """Hold simulated time for the answers of a system outside the process; see `runtime.hold`.
+        """Hold simulated time for the answers of a system outside the process.
 
         Args:
             name: Of the system, in summary and report.

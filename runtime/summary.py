@@ -8,8 +8,8 @@ from typing import Any, get_args
 
 import msgspec
 
-from runtime.answers import Answers, Outcome, Wrong
-from runtime.digest import combined
+from runtime.channels.answers import Answers, Outcome, Wrong
+from runtime.channels.digest import combined
 from runtime.workers.costs import Costs
 
 

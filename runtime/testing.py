@@ -17,18 +17,18 @@ from typing import Any, TypeVar
 import msgspec
 
 from events import Announcement, Event
-from runtime import task_factory
-from runtime.answers import Answers
+from runtime.channels.answers import Answers
+from runtime.channels.links import LinkConfig
+from runtime.channels.ports import Output
+from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, OnError, RunConfig
 from runtime.config.reading import convert
-from runtime.links import LinkConfig
-from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.node import Node
-from runtime.ports import Output
+from runtime.run import task_factory
 from runtime.run.summarise import count_drops, tick_summaries
-from runtime.sender import Sender
+from runtime.run.supervisor import Supervisor
 from runtime.summary import StreamSummary, TickSummary
-from runtime.supervisor import Supervisor
+from runtime.time.lockstep import LockstepClock, LockstepLoop
 from runtime.units import Duration
 
 R = TypeVar("R")

@@ -18,9 +18,9 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
+from runtime.channels.links import LinkConfig
 from runtime.config.model import NetworkConfig, RunConfig
 from runtime.config.reading import find_nodes
-from runtime.links import LinkConfig
 from runtime.node import Node
 from runtime.tools.cli import app
 from runtime.tools.describe import SettingDescription, describe, describe_settings

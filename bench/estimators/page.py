@@ -12,8 +12,8 @@ import jinja2
 from bench.estimators.cells import COLUMNS, cells
 from bench.estimators.pictures import draw, pictures
 from bench.estimators.plan import Suite
-from runtime.environment import commit, environment
-from runtime.results import write
+from runtime.run.environment import commit, environment
+from runtime.run.results import write
 from runtime.tools.sweep.plan import Plan
 from runtime.tools.sweep.rows import Row
 

@@ -1,6 +1,6 @@
 // An RGB-D odometry in a program of its own: dense alignment of grey images with a key frame.
 //
-//     c++ -std=c++17 -O2 -I"$(python -m nodes.link)" odometry.cpp -o odometry
+//     c++ -std=c++17 -O2 -I"$(python -m nodes.outside.native)" odometry.cpp -o odometry
 //
 // Inverse compositional Gauss-Newton on the grey levels, from coarse to fine (S. Baker and
 // I. Matthews, "Lucas-Kanade 20 years on", 2004). One thread: equal images give equal poses.

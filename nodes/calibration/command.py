@@ -31,10 +31,10 @@ def selftest(
     """
     from nodes.calibration.page import write_page
     from nodes.calibration.selftest import TITLES, prove, subjects
-    from nodes.report.style import number
+    from nodes.judging.report.style import number
     from runtime.config.reading import load_configuration
     from runtime.errors import ConfigError
-    from runtime.results import claim
+    from runtime.run.results import claim
     from runtime.tools.cli.run import leave_behind
     from runtime.units import Duration
 

@@ -25,11 +25,11 @@ from events import (
 )
 from events.frames import flip_yz, rotation_to_nwu
 from nodes.calibration.formats import DEPTH_FACTOR, write_files
-from nodes.dataset.recording import ImageFile, Recording, in_colour
-from nodes.dataset.rig import Rig, choose
+from nodes.data.dataset.recording import ImageFile, Recording, in_colour
+from nodes.data.dataset.rig import Rig, choose
+from nodes.ros2.messages.encoding import depth_in_steps
 from nodes.trajectory.table import EPOCH, epoch_of
-from nodes.viewing.encoding import depth_in_steps
-from runtime.results import claim
+from runtime.run.results import claim
 
 
 def export_calibration(
@@ -72,7 +72,7 @@ def export_calibration(
     written = [folder / name for name in files]
     if form != "vslamlab" or not recording.is_file():
         return written
-    from nodes.replay.recorded import Recorded  # which wants what reads MCAP
+    from nodes.data.replay.recorded import Recorded  # which wants what reads MCAP
 
     for number in range(len(rig.cameras)):
         for kind in ("rgb", "depth"):

@@ -27,10 +27,10 @@ import numpy.typing as npt
 from events import CameraAnnouncement
 from events.frames import axes_of
 from events.poses import inverse, pose_matrix, pose_tuples
-from nodes.dataset.recording import real, templates
-from nodes.dataset.rig import Rig
-from nodes.ros_messages.publications import TopicKind, publication
-from nodes.ros_messages.settings import PublishingConfig
+from nodes.data.dataset.recording import real, templates
+from nodes.data.dataset.rig import Rig
+from nodes.ros2.messages.publications import TopicKind, publication
+from nodes.ros2.messages.settings import PublishingConfig
 
 DEPTH_FACTOR = 5000.0
 """Steps of an exported depth image per metre, as TUM's."""

@@ -9,8 +9,8 @@ import jinja2
 import numpy as np
 
 from nodes.calibration.selftest import TITLES, Result
-from nodes.report import style
-from nodes.report.page import embedded
+from nodes.judging.report import style
+from nodes.judging.report.page import embedded
 from runtime.paths import source_file
 
 

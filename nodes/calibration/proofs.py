@@ -22,7 +22,7 @@ from nodes.calibration.collector import Floats, Motion, _Collector
 from nodes.calibration.formats import FORMATS, GRAVITY, imu_axes, write_files
 from nodes.calibration.readers import read
 from nodes.calibration.room import NEAREST, hits, spheres
-from nodes.dataset.rig import Rig
+from nodes.data.dataset.rig import Rig
 
 INTEGRATED = 5.0
 """Seconds over which the IMU is integrated."""

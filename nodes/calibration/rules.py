@@ -234,7 +234,7 @@ def body_of(source: str) -> str:
 
 def _recorded(config: Config, source: str) -> bool:
     """Return whether a sensor is in a file's recording, and of no other node of the file."""
-    from nodes.replay import Replay
+    from nodes.data.replay import Replay
 
     replays = {spec.name for spec in config.nodes if issubclass(spec.node, Replay)}
     others = {spec.name for spec in config.nodes} - replays
@@ -242,6 +242,6 @@ def _recorded(config: Config, source: str) -> bool:
 
 
 def _reads_imu(spec: NodeSpec) -> bool:
-    from runtime.graph import input_types
+    from runtime.run.graph import input_types
 
     return any(Imu in events for events in input_types(spec.node).values())

@@ -18,13 +18,13 @@ from nodes.calibration.allan import Curve, needed, noise
 from nodes.calibration.collector import Motion, _Collector
 from nodes.calibration.proofs import Figure, Points
 from nodes.calibration.room import CENTRE, mjcf
-from nodes.dataset.rig import choose
+from nodes.data.dataset.rig import choose
 from nodes.trajectory.formats import tum_row
 from runtime.config.model import Config, NodeSpec, to_builtins
 from runtime.config.reading import parse
 from runtime.errors import ConfigError
-from runtime.execute import execute
-from runtime.supervisor import Supervisor
+from runtime.run.execute import execute
+from runtime.run.supervisor import Supervisor
 from runtime.tools import preflight
 
 TITLES = {

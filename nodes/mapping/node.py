@@ -21,7 +21,7 @@ from events import (
     TransformStamped,
 )
 from events.poses import pose_matrix
-from nodes.estimation import WORKER_ENVIRONMENT
+from nodes.estimators import WORKER_ENVIRONMENT
 from nodes.mapping.cloud import Mapper
 from nodes.mapping.transforms import TransformError, TransformTree
 from nodes.trajectory.growing import part_name

@@ -1,6 +1,6 @@
 """Flying by hand: held keys become velocities, single keys become commands.
 
-Keys are events, whoever sends them; `nodes.window` is one node that does.
+Keys are events, whoever sends them; `nodes.viewers.window` is one node that does.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from nodes.window.keys import KEYS
+from nodes.viewers.window.keys import KEYS
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from runtime.config.parameters import Changeable
 from runtime.errors import suggest

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NoReturn
 
-from runtime.schedule import SECOND
+from runtime.time.schedule import SECOND
 
 _TOO_LATE = 1 << 63
 """The first number of nanoseconds that 64 bits do not hold."""

@@ -1,7 +1,7 @@
 """Poses in time: checked arrays, interpolation, matrices; and rows for nodes that collect them.
 
 Pure numpy and scipy. Files are in `nodes.trajectory.formats`; errors between two trajectories in
-`nodes.evaluation.metrics`.
+`nodes.judging.evaluation.metrics`.
 """
 
 from __future__ import annotations

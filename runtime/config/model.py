@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from runtime.links import LinkConfig
+from runtime.channels.links import LinkConfig
 from runtime.node import Node, NodeConfig
 from runtime.paths import InputPath, Secret
 from runtime.units import Duration, plain

@@ -7,7 +7,7 @@
 A node finds the new value in `self.config`, and may say in `on_change` what is to be done about
 it. Whatever the file accepts there is accepted, and nothing else. Here is only what becomes of
 the settings; who asks for it is in `runtime.tools.monitor`, and who does it in
-`runtime.supervisor`.
+`runtime.run.supervisor`.
 """
 
 from __future__ import annotations

@@ -32,15 +32,15 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from runtime.channels.links import LinkConfig
+from runtime.channels.ports import MAX_HZ
 from runtime.config.messages import explain, show
 from runtime.config.model import Config, NetworkConfig, NodeSpec, OnError, RunConfig
 from runtime.config.override import override
 from runtime.config.plugins import CONFIGURATIONS, NODES, offers
 from runtime.errors import ConfigError, DeclarationError, VisnavError, suggest
-from runtime.links import LinkConfig
 from runtime.node import Node
 from runtime.paths import resolve, unmarked
-from runtime.ports import MAX_HZ
 from runtime.units import Duration
 
 S = TypeVar("S", bound=msgspec.Struct)

@@ -14,8 +14,8 @@ from typing import Any
 from runtime.peers.clock_offsets import KEPT
 from runtime.peers.member import Member
 from runtime.peers.messages import Ping
-from runtime.real_clock import RealClock
-from runtime.schedule import SECOND
+from runtime.time.real_clock import RealClock
+from runtime.time.schedule import SECOND
 
 PERIOD = 0.1
 """Seconds between two exchanges."""

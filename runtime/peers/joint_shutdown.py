@@ -21,7 +21,7 @@ from runtime.peers.member import Member
 from runtime.peers.membership import Membership
 from runtime.peers.messages import FinalSummary, StillWorking, SummaryReceived
 from runtime.summary import ProcessSummary, Summary, merged
-from runtime.time_limits import real_time_limit
+from runtime.time.time_limits import real_time_limit
 
 log = logging.getLogger("visnav.runtime")
 

@@ -28,15 +28,15 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 
 from events import Announcement
-from runtime.clock import Clock
 from runtime.errors import PeerError, WireError
-from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.peers.clock_sync import compare
 from runtime.peers.compatibility import name_of
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
 from runtime.peers.messages import Announcements, FirstUpdate, Message, Ready
-from runtime.real_clock import RealClock
+from runtime.time.clock import Clock
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.real_clock import RealClock
 from runtime.wire import pack, unpack
 
 LEAD = 50_000_000

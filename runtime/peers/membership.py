@@ -48,7 +48,7 @@ from runtime.peers.secret import secret_of
 from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.peers.waiting import Waiting
 from runtime.peers.zenoh_session import Session, certified
-from runtime.time_limits import real_time_limit
+from runtime.time.time_limits import real_time_limit
 
 log = logging.getLogger("visnav.runtime")
 

@@ -11,10 +11,10 @@ from typing import Protocol
 import msgspec
 
 from events import Announcement, Event
-from runtime.clock import Clock
+from runtime.channels.sender import Listener
+from runtime.channels.tasks import Fault
 from runtime.config.model import Config
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
-from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.peers.clock_sync import ClockFollower
 from runtime.peers.compatibility import name_of
 from runtime.peers.joint_shutdown import JointShutdown
@@ -41,9 +41,9 @@ from runtime.peers.messages import (
 )
 from runtime.peers.remote_events import RemoteEvents, subscriptions
 from runtime.peers.time_token import TimeTokenHolder
-from runtime.real_clock import RealClock
-from runtime.sender import Listener
-from runtime.tasks import Fault
+from runtime.time.clock import Clock
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.real_clock import RealClock
 
 log = logging.getLogger("visnav.runtime")
 

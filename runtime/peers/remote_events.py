@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from events import Event
+from runtime.channels.sender import Listener, Sender
+from runtime.channels.tasks import Fault
 from runtime.config.model import NodeSpec
 from runtime.errors import WireError
 from runtime.peers.messages import Subscription
-from runtime.sender import Listener, Sender
-from runtime.tasks import Fault
 from runtime.wire import event_type, kind_of
 
 Leave = Callable[[int, str, Event, bool], None]

@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 
 from runtime.errors import PeerError, VisnavError
-from runtime.lockstep import LockstepLoop
 from runtime.peers.compatibility import name_of
 from runtime.peers.member import Member
 from runtime.peers.messages import Key
-from runtime.time_limits import real_time_limit
+from runtime.time.lockstep import LockstepLoop
+from runtime.time.time_limits import real_time_limit
 
 log = logging.getLogger("visnav.runtime")
 

@@ -6,13 +6,12 @@ import time
 from collections import Counter
 from typing import Any
 
-from runtime.answers import Answers
-from runtime.digest import Digest
-from runtime.environment import command_line, commit, environment
+from runtime.channels.answers import Answers
+from runtime.channels.digest import Digest
 from runtime.json_values import plain
 from runtime.node import matchers, senders, streams
-from runtime.run_state import RunState
-from runtime.schedule import SECOND
+from runtime.run.environment import command_line, commit, environment
+from runtime.run.run_state import RunState
 from runtime.summary import (
     LinkSummary,
     OutsideSummary,
@@ -23,6 +22,7 @@ from runtime.summary import (
     WorkerSummary,
     verdict_of,
 )
+from runtime.time.schedule import SECOND
 
 
 def count_events(state: RunState) -> tuple[Counter[str], Counter[str]]:

@@ -18,8 +18,8 @@ from msgspec import inspect as types
 
 from runtime.config.model import OnError
 from runtime.config.parameters import is_marked
-from runtime.graph import input_types
 from runtime.node import Node
+from runtime.run.graph import input_types
 from runtime.units import Duration, Latency, plain
 
 TYPE_DOC = "The class of the node: its name if a package lists it, else module:Class."

@@ -19,7 +19,7 @@ from events import Announcement, EstimatorAnnouncement, Shutdown, WindowClosed
 from runtime.config.model import Config, NodeSpec
 from runtime.config.plugins import offers
 from runtime.errors import suggest
-from runtime.graph import edges
+from runtime.run.graph import edges
 from runtime.tools.preflight import mentioned_in
 
 GROUP = "visnav.lint"

@@ -25,21 +25,21 @@ from typing import Any, NoReturn
 import msgspec
 
 from events import Announcement
-from runtime import task_factory
-from runtime.clock import Clock
+from runtime.channels.hold import Hold, HoldConfig
+from runtime.channels.sender import Listener, Voices
 from runtime.config.model import Config, NodeSpec
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
-from runtime.execute import make_clock, make_loop
-from runtime.graph import circles, input_types, unconnected
-from runtime.hold import Hold, HoldConfig
 from runtime.node import Node
-from runtime.node_host import siblings
-from runtime.node_runner import NodeRunner
 from runtime.paths import written
-from runtime.schedule import Tick, Ticker
-from runtime.sender import Listener, Voices
-from runtime.startup import Announced, Phase, start_up
-from runtime.stepping import Stepping
+from runtime.run import task_factory
+from runtime.run.execute import make_clock, make_loop
+from runtime.run.graph import circles, input_types, unconnected
+from runtime.run.node_host import siblings
+from runtime.run.node_runner import NodeRunner
+from runtime.run.startup import Announced, Phase, start_up
+from runtime.time.clock import Clock
+from runtime.time.schedule import Tick, Ticker
+from runtime.time.stepping import Stepping
 
 RUN_FILES = ("config.toml", "log.txt", "summary.json")
 """What the run itself writes into its folder."""

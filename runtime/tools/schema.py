@@ -15,9 +15,9 @@ from typing import Any, Literal, get_args
 import msgspec
 from msgspec import inspect as types
 
+from runtime.channels.links import LinkConfig
 from runtime.config.model import NetworkConfig, OnError, RunConfig
 from runtime.config.parameters import is_marked
-from runtime.links import LinkConfig
 from runtime.node import Node
 from runtime.tools.describe import TYPE_DOC, attribute_docs, summary
 from runtime.units import Duration, plain

@@ -15,11 +15,11 @@ from typing import Any
 from msgspec.structs import replace
 
 from events import Event
+from runtime.channels.digest import Digest
+from runtime.channels.sender import Sender
 from runtime.config.model import Config
-from runtime.digest import Digest
 from runtime.errors import ConfigError
-from runtime.execute import execute
-from runtime.sender import Sender
+from runtime.run.execute import execute
 from runtime.summary import OutsideSummary, Summary, TwiceSummary
 
 log = logging.getLogger("visnav.runtime")

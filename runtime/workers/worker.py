@@ -28,10 +28,10 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
-from runtime.clock import Clock
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
-from runtime.schedule import SECOND
-from runtime.time_limits import Starvation
+from runtime.time.clock import Clock
+from runtime.time.schedule import SECOND
+from runtime.time.time_limits import Starvation
 from runtime.workers.costs import Costs
 from runtime.workers.output import Output, how_it_ended
 from runtime.workers.shared_memory import SharedPipe, anonymous_file

@@ -24,7 +24,7 @@ from events import (
 )
 from events.base import Quaternion, Vector3
 from runtime import Node, Worker
-from runtime.sender import Sender
+from runtime.channels.sender import Sender
 from sims.cameras.exposure import ExposureControl
 from sims.cameras.frame import Frame, Motion, Shot, delay_of, stamp_error
 from sims.cameras.lens import undistorted

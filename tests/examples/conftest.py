@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from tests.nodes.window.conftest import display
+from tests.nodes.viewers.window.conftest import display
 
 __all__ = ["display"]

@@ -12,7 +12,7 @@ import pytest
 
 from runtime.config.reading import load
 from sims.worlds import load_world
-from tests.nodes.replay import downloads
+from tests.nodes.data.replay import downloads
 from tests.runtime.peers.samples import free_port
 
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.nodes.window.display import DEADLINE, Display, eventually
+from tests.nodes.viewers.window.display import DEADLINE, Display, eventually
 
 ROOT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "runtime", "run", "examples/manual_flight.toml", "--log", "events"]

@@ -20,7 +20,7 @@ from events import (
     TrackingRegained,
 )
 from events.poses import pose_matrix
-from nodes.estimation import Estimator, TrackingResult
+from nodes.estimators import Estimator, TrackingResult
 from nodes.pilots import VisualPilot
 from runtime import Input
 from runtime.testing import NodeResult, run_nodes, spec

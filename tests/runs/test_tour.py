@@ -15,7 +15,7 @@ import pytest
 import tomli_w
 
 from runtime.config.reading import load
-from runtime.execute import execute
+from runtime.run.execute import execute
 from runtime.testing import spec
 from tests.runs.witness import Witness
 from tests.runtime.tools.samples_cli import ROOT, command, start, summary

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import uvloop
 
-from runtime import task_factory
-from runtime.lockstep import LockstepLoop
+from runtime.run import task_factory
+from runtime.time.lockstep import LockstepLoop
 
 R = TypeVar("R")
 

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from events import Event, Image, ParameterChanged, PoseEstimate, VelocitySetpoint
-from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on, task_factory
+from runtime import Duration, Input, Node, NodeConfig, Output, Tick, every, on
+from runtime.channels.digest import Digest
+from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.config.parameters import Changeable
-from runtime.digest import Digest
-from runtime.execute import make_clock, make_loop
 from runtime.node import senders
-from runtime.sender import Sender
-from runtime.supervisor import Supervisor
+from runtime.run import task_factory
+from runtime.run.execute import make_clock, make_loop
+from runtime.run.supervisor import Supervisor
 
 MS = 1_000_000
 

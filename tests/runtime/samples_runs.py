@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from events import Event
-from runtime import Duration, task_factory
+from runtime import Duration
+from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, RunConfig
-from runtime.execute import make_clock, make_loop
-from runtime.sender import Sender
-from runtime.supervisor import Supervisor
+from runtime.run import task_factory
+from runtime.run.execute import make_clock, make_loop
+from runtime.run.supervisor import Supervisor
 
 
 class Outcome:

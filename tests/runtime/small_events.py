@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from events import Event
-from runtime.clock import Clock
-from runtime.hold import Hold, HoldConfig
+from runtime.channels.hold import Hold, HoldConfig
 from runtime.host import Sibling
-from runtime.lockstep import LockstepClock, LockstepLoop
 from runtime.node import Node, NodeConfig, make_node
-from runtime.schedule import Tick, Ticker
-from runtime.stepping import Stepping
+from runtime.time.clock import Clock
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.schedule import Tick, Ticker
+from runtime.time.stepping import Stepping
 from runtime.workers.worker import Worker
 
 N = TypeVar("N", bound=Node[Any])

@@ -14,8 +14,8 @@ from rich.console import Console
 from runtime import Duration, Node, NodeConfig, Tick, every, logs
 from runtime.config.model import Config, RunConfig
 from runtime.errors import FatalError
-from runtime.execute import execute
 from runtime.logs import LEVELS, NodeLogger, file_handler, logging_to, terminal_handler
+from runtime.run.execute import execute
 from runtime.testing import run_node, spec
 
 

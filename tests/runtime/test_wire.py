@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from events import Event, Image, PointCloud, PositionSetpoint
-from runtime.digest import Digest
+from runtime.channels.digest import Digest
 from runtime.errors import WireError
 from runtime.wire import ALIGNED, event_type, kind_of, pack, unpack
 

@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol, TypeVar
 
-from runtime import task_factory
-from runtime.clock import Clock
-from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.real_clock import RealClock
-from runtime.schedule import SECOND
+from runtime.run import task_factory
+from runtime.time.clock import Clock
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.real_clock import RealClock
+from runtime.time.schedule import SECOND
 from tests.runtime.loops import turns
 
 R = TypeVar("R")

@@ -90,7 +90,7 @@ def interrupted() -> NoReturn:
 
 def _described(error: Exception) -> str:
     """Return an error as a line: one of ours says all; of others, type and place, too."""
-    from runtime.node_runner import with_place, wrap
+    from runtime.run.node_runner import with_place, wrap
 
     if isinstance(error, VisnavError):
         return with_place(error)

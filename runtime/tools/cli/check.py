@@ -18,7 +18,7 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     with 0, or with 2 if there is a mistake; what may be meant, as what lint finds, is a warning.
     """
     from runtime.config.reading import load_configuration
-    from runtime.graph import edges
+    from runtime.run.graph import edges
     from runtime.tools import preflight
     from runtime.tools.cli.run import leave_behind
     from runtime.tools.lint import lint

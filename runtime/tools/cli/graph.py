@@ -21,7 +21,7 @@ def graph(
 ) -> None:
     """Show which node sends which events to which."""
     from runtime.config.reading import load_configuration
-    from runtime.graph import edges
+    from runtime.run.graph import edges
 
     settings = load_configuration(config, overrides or [])
     names = [spec.name for spec in settings.nodes]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from runtime.config.model import Config
-    from runtime.supervisor import Supervisor
+    from runtime.run.supervisor import Supervisor
     from runtime.tools.monitor.observer import LastRecords
 
 Watch = Callable[["Supervisor"], contextlib.AbstractContextManager[None]]

@@ -12,8 +12,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from runtime.config.model import RunConfig
 from runtime.run.summarise import count_events
-from runtime.schedule import SECOND
-from runtime.supervisor import Supervisor
+from runtime.run.supervisor import Supervisor
+from runtime.time.schedule import SECOND
 
 _PERIOD = 0.2
 _LINE_PERIOD = 10.0

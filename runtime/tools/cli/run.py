@@ -99,7 +99,7 @@ def run(
     with 2 if something failed.
     """
     from runtime.config.reading import load_configuration
-    from runtime.execute import execute
+    from runtime.run.execute import execute
     from runtime.tools.cli.observers import Observers
     from runtime.tools.twice import run_twice
 
@@ -224,7 +224,7 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
         code: The exit code.
         last: Printed at the end, to standard error.
     """
-    from runtime import event_loop
+    from runtime.run import event_loop
 
     threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node", "zenoh"))]
     until = time.monotonic() + _LAST_WAIT

@@ -9,8 +9,8 @@ def settings() -> None:
     from rich.markup import escape
     from rich.tree import Tree
 
+    from runtime.channels.links import LinkConfig
     from runtime.config.model import NetworkConfig, RunConfig
-    from runtime.links import LinkConfig
     from runtime.tools.cli.nodes import add_settings
     from runtime.tools.describe import NODE_SETTINGS, describe_settings, summary
 

@@ -19,9 +19,9 @@ import msgspec
 import xxhash
 
 from runtime.config.model import Config, NodeSpec, to_builtins
-from runtime.environment import environment
-from runtime.graph import edges
 from runtime.paths import written
+from runtime.run.environment import environment
+from runtime.run.graph import edges
 
 _DRIVERS = (
     *("/usr/lib/*/libEGL*", "/usr/lib/*/libgallium*", "/usr/lib/*/libLLVM*", "/usr/lib/*/dri/*"),

@@ -12,11 +12,11 @@ import functools
 from typing import Any, ClassVar
 
 from events import Announcement, Event
+from runtime.channels.ports import Output, on
 from runtime.config.model import Config
-from runtime.lockstep import LockstepLoop
 from runtime.node import Node, senders
-from runtime.ports import Output, on
-from runtime.schedule import Once, Tick
+from runtime.time.lockstep import LockstepLoop
+from runtime.time.schedule import Once, Tick
 from runtime.tools.flights.layout import Action, Flight, Flown, event_at
 
 _DONE: concurrent.futures.Future[None] = concurrent.futures.Future()

@@ -13,14 +13,14 @@ from typing import Any
 import msgspec
 
 from events import Event
+from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec
-from runtime.execute import execute
-from runtime.instruments import Call, Instrument
-from runtime.lockstep import LockstepLoop
 from runtime.node import Node, NodeConfig
-from runtime.schedule import Once, Tick, Ticker
-from runtime.sender import Sender
-from runtime.supervisor import Supervisor
+from runtime.run.execute import execute
+from runtime.run.instruments import Call, Instrument
+from runtime.run.supervisor import Supervisor
+from runtime.time.lockstep import LockstepLoop
+from runtime.time.schedule import Once, Tick, Ticker
 from runtime.tools.flights.layout import Action, Flight, Flown, Writer, prune
 
 _REST = 10.0

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from events import Event, Image
-from runtime.clock import Clock
-from runtime.instruments import Call, Instrument
-from runtime.schedule import SECOND
-from runtime.sender import Sender
+from runtime.channels.sender import Sender
+from runtime.run.instruments import Call, Instrument
+from runtime.time.clock import Clock
+from runtime.time.schedule import SECOND
 
 KEPT = 5
 """How many intervals between snapshots figures cover."""

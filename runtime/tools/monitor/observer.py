@@ -20,10 +20,10 @@ from runtime.config.model import Config
 from runtime.config.parameters import settings
 from runtime.errors import CommandError, suggest
 from runtime.node import NodeConfig, senders, streams
-from runtime.node_runner import NodeRunner
+from runtime.run.node_runner import NodeRunner
 from runtime.run.summarise import count_drops
-from runtime.schedule import SECOND
-from runtime.supervisor import Supervisor
+from runtime.run.supervisor import Supervisor
+from runtime.time.schedule import SECOND
 from runtime.tools.monitor.command import Command, Pause, Restart, Resume, Set, Speed, Step, Stop
 from runtime.tools.monitor.meter import Meter, RecentSamples, Sample
 from runtime.tools.monitor.snapshot import (

@@ -84,7 +84,7 @@ class OutputState(_Data, frozen=True):
 
 
 class InputState(_Data, frozen=True):
-    """One input, since the beginning of the run; see `runtime.streams.StreamStatistics`."""
+    """One input, since the beginning of the run; see `StreamStatistics`."""
 
     name: str
     buffered: int

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jinja2
 
-from runtime.results import write
+from runtime.run.results import write
 from runtime.tools.sweep.plan import Plan
 from runtime.tools.sweep.rows import Row
 from runtime.tools.sweep.tables import MAIN_FIGURES, in_order, summarise

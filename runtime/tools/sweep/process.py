@@ -18,13 +18,13 @@ from typing import Any
 
 import msgspec
 
-from runtime.digest import combined
-from runtime.results import clear
+from runtime.channels.digest import combined
+from runtime.run.results import clear
 from runtime.tools.sweep.plan import Job
 from runtime.tools.sweep.rows import Row, failed
 
 _STOPPED = {"Ctrl-C", "SIGTERM", "SIGHUP"}
-"""Reasons for a run's end that are no end of its own; see `runtime.execute`."""
+"""Reasons for a run's end that are no end of its own; see `runtime.run.execute`."""
 
 _LONGEST_ERROR = 300
 

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from events import Event
-from runtime.clock import Clock
+from runtime.channels.sender import Sender, Tap
 from runtime.errors import ConfigError
-from runtime.instruments import Call, Instrument
-from runtime.real_clock import RealClock
-from runtime.sender import Sender, Tap
-from runtime.supervisor import Supervisor
+from runtime.run.instruments import Call, Instrument
+from runtime.run.supervisor import Supervisor
+from runtime.time.clock import Clock
+from runtime.time.real_clock import RealClock
 from runtime.tools.tracing.spool import CHUNK, ClockRate, Spool
 from runtime.tools.tracing.write import write_trace
 

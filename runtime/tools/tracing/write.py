@@ -14,7 +14,7 @@ from typing import IO, Any
 
 import msgspec
 
-from runtime.results import replacing
+from runtime.run.results import replacing
 from runtime.tools.tracing.causes import Causes, SentEvent
 from runtime.tools.tracing.spool import ClockRate, Spool
 

@@ -14,7 +14,7 @@ import msgspec
 import events as ev
 from runtime import Node, Output, Worker, on
 from runtime.errors import UncheckableError
-from runtime.schedule import SECOND
+from runtime.time.schedule import SECOND
 from sims.addressing import Addressee
 from sims.airsim.client import conversion
 from sims.airsim.client.calls import Calls

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import numpy as np
 
-from runtime.schedule import SECOND
+from runtime.time.schedule import SECOND
 from runtime.units import Duration
 from sims.airsim.server.methods import RpcError, rpc
 from sims.airsim.structures import ImageRequest, ImageResponse, Pose, Vector3r

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from events import Arm, Armed, Command, Disarmed, Hover, Land, Setpoint, VehicleEvent
-from runtime.schedule import SECOND
+from runtime.time.schedule import SECOND
 from sims.airsim.server.methods import RpcError
 from sims.airsim.server.vehicles import ServedMultirotor
 from sims.vehicle import State

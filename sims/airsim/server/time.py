@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import msgspec
 
-from runtime.schedule import SECOND, Once
+from runtime.time.schedule import SECOND, Once
 from sims.airsim.server.methods import rpc
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor

@@ -8,7 +8,7 @@ from events import CameraAnnouncement, CameraInfo, ImuAnnouncement, Vector3
 from events.camera_info import DistortionModel
 from events.frames import OPTICAL_TO_FRD
 from events.rotations import from_rpy, multiply
-from nodes.dataset.rig import Rig
+from nodes.data.dataset.rig import Rig
 
 IMU = ImuAnnouncement(
     stamp=0,

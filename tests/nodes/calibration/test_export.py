@@ -15,8 +15,8 @@ import pytest
 from events import Announcement
 from nodes.calibration.export import export_calibration
 from runtime.config.reading import parse
-from runtime.execute import execute
 from runtime.json_values import plain
+from runtime.run.execute import execute
 from tests.nodes.calibration.samples import stereo
 
 RECORDED = {

@@ -21,7 +21,7 @@ from events.poses import pose_matrix
 from events.rotations import from_rpy
 from nodes.calibration.formats import FORMATS, write_files
 from nodes.calibration.readers import READERS, ReadCamera, read
-from nodes.dataset.rig import Rig
+from nodes.data.dataset.rig import Rig
 from tests.nodes.calibration.samples import IMU, LENSES, camera, stereo
 
 SAYS = {

@@ -19,7 +19,7 @@ from nodes.calibration import proofs
 from nodes.calibration.allan import noise, trials, variances
 from nodes.calibration.collector import Motion, _Collector
 from nodes.calibration.room import HIGH, LOW, hits, mjcf, spheres
-from nodes.dataset.rig import Rig
+from nodes.data.dataset.rig import Rig
 from tests.nodes.calibration.flights import ANGLE, flown, true_motion, twist
 from tests.nodes.calibration.samples import IMU, camera
 

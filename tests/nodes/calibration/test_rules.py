@@ -15,7 +15,7 @@ from runtime.config.reading import parse
 from runtime.tools.lint import Finding, lint
 from runtime.tools.lint import rules as all_rules
 from tests.nodes.calibration.samples import IMU, camera, stereo
-from tests.nodes.kiss_icp.test_node import lidar
+from tests.nodes.estimators.kiss_icp.test_node import lidar
 from tests.runtime.tools.samples_cli import command
 
 SLAM: dict[str, Any] = {"name": "slam", "type": "OrbSlam3"}

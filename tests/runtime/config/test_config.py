@@ -106,7 +106,7 @@ OF_NODES = [
     ('name = "x"\ntype = "a"', 'type: expected the name of a node or "module:Class", found "a"'),
     ('name = "x"\ntype = "Multirotr"', "found \"Multirotr\" (did you mean 'Multirotor'?)"),
     ('name = "x"\ntype = "..a:B"', 'the name of a node or "module:Class", found "..a:B"'),
-    ('name = "x"\ntype = "nodes.rerunview:A"', '"nodes.rerunview" (did you mean \'nodes.rerun_'),
+    ('name = "x"\ntype = "nodes.replay:A"', "\"nodes.replay\" (did you mean 'nodes.data.replay'?)"),
     ('name = "x"\ntype = "nodes.pilots:Teleob"', "found \"Teleob\" (did you mean 'Teleop'?)"),
     (
         'name = "x"\ntype = "nodes.pilots.pilot:Node"',

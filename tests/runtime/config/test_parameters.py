@@ -11,7 +11,7 @@ from events import ParameterChanged, VelocitySetpoint
 from runtime import Duration, Node, NodeConfig
 from runtime.config.parameters import Changeable, change, changeable, settings
 from runtime.errors import ConfigError
-from runtime.supervisor import Supervisor
+from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from tests.runtime.samples_loop import Camera, Estimator, Listener, Pilot, look, until_sent
 

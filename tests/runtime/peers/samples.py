@@ -15,12 +15,12 @@ import numpy as np
 
 from events import Announcement, Event, Image
 from runtime import Input, Node, NodeConfig, Output, RefusedError, Tick, every, on
+from runtime.channels.hold import Hold, HoldConfig
 from runtime.config.model import Config
 from runtime.config.reading import parse
-from runtime.execute import execute
-from runtime.hold import Hold, HoldConfig
+from runtime.run.execute import execute
+from runtime.run.supervisor import Supervisor
 from runtime.summary import Summary
-from runtime.supervisor import Supervisor
 
 
 class Asked(Event):

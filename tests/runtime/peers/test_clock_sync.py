@@ -12,12 +12,12 @@ from typing import Any, cast
 
 import pytest
 
-from runtime.lockstep import LockstepLoop
 from runtime.peers.clock_offsets import KEPT, Exchange, Exchanges
 from runtime.peers.clock_sync import LIMIT, ClockFollower, PhaseLockedLoop
 from runtime.peers.member import Member
-from runtime.real_clock import RealClock
-from runtime.schedule import SECOND
+from runtime.time.lockstep import LockstepLoop
+from runtime.time.real_clock import RealClock
+from runtime.time.schedule import SECOND
 from tests.runtime.peers.test_losses import Rig
 
 MICRO = 1e-6
@@ -65,8 +65,8 @@ def followed(
     def ours() -> int:
         return 5 * SECOND + round(loop.now / (1 + ppm * MICRO))
 
-    monkeypatch.setattr("runtime.real_clock.time", types.SimpleNamespace(monotonic_ns=ours))
-    monkeypatch.setattr("runtime.real_clock.TimerFd", Alarm)
+    monkeypatch.setattr("runtime.time.real_clock.time", types.SimpleNamespace(monotonic_ns=ours))
+    monkeypatch.setattr("runtime.time.real_clock.TimerFd", Alarm)
 
     async def main() -> tuple[list[float], float]:
         clock = RealClock(loop)
@@ -111,9 +111,9 @@ def test_what_is_out_of_reach_is_followed_as_quickly_as_may_be(
 def test_a_clock_that_is_steered_goes_on_from_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     real = [1000]
     monkeypatch.setattr(
-        "runtime.real_clock.time", types.SimpleNamespace(monotonic_ns=lambda: real[0])
+        "runtime.time.real_clock.time", types.SimpleNamespace(monotonic_ns=lambda: real[0])
     )
-    monkeypatch.setattr("runtime.real_clock.TimerFd", Alarm)
+    monkeypatch.setattr("runtime.time.real_clock.TimerFd", Alarm)
     clock = RealClock(cast("asyncio.AbstractEventLoop", None), speed=2.0)  # the alarm is ours
     clock.start_at(1000)
     real[0] += SECOND

@@ -13,13 +13,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from events import Image
+from runtime.channels.sender import Listener
 from runtime.peers.authentication import derive
 from runtime.peers.handshake import Handshakes
 from runtime.peers.joint_start import JointStart
 from runtime.peers.messages import FirstUpdate
 from runtime.peers.peers import Peers
 from runtime.peers.waiting import Waiting
-from runtime.sender import Listener
 from tests.runtime.peers import samples
 
 NODES = ("asker", "one", "other")

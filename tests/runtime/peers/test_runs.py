@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from runtime.errors import PeerError
-from runtime.execute import execute
 from runtime.peers.messages import FinalSummary, Message
 from runtime.peers.outbox import Outbox
+from runtime.run.execute import execute
 from tests.runtime.peers.samples import Process, apart, settings
 
 THREE: tuple[tuple[str, str, dict[str, Any]], ...] = (

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from runtime.errors import PeerError, WireError
-from runtime.execute import execute
 from runtime.peers.joint_start import JointStart
 from runtime.peers.membership import Membership
 from runtime.peers.messages import Message
+from runtime.run.execute import execute
 from tests.runtime.peers.samples import Offer, Process, settings
 from tests.runtime.peers.test_losses import Rig
 from tests.runtime.peers.test_runs import THREE

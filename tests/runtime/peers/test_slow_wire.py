@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from runtime.config.model import Config
-from runtime.execute import execute
+from runtime.run.execute import execute
 from tests.runtime.peers.relay import slow_wire
 from tests.runtime.peers.samples import Process, settings
 from tests.runtime.peers.test_runs import THREE

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from events import Odometry
-from nodes.process import Process
+from nodes.outside.process import Process
 from runtime import Node, NodeConfig, Output, Tick, every
 from runtime.config.model import Config, RunConfig
 from runtime.errors import ConfigError
@@ -18,7 +18,7 @@ from runtime.summary import Summary
 from runtime.testing import spec
 from runtime.tools.twice import run_twice
 from runtime.units import Duration
-from tests.nodes.process.rig import Eyes, program
+from tests.nodes.outside.process.rig import Eyes, program
 from tests.runtime.tools.samples_cli import command_here
 
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.report.contents import Facts
+from nodes.judging.report.contents import Facts
 from runtime import Duration, Node
 from runtime.config.model import Config, RunConfig
-from runtime.execute import execute
+from runtime.run.execute import execute
 from runtime.summary import WORKER_COLUMNS, Summary, WorkerSummary
 from runtime.testing import spec
 from runtime.tools.cli.tables import run_tables

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime import Worker, task_factory
+from runtime import Worker
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
-from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.node_runner import with_place, wrap
-from runtime.real_clock import RealClock
+from runtime.run import task_factory
+from runtime.run.node_runner import with_place, wrap
 from runtime.testing import run_in_lockstep
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.real_clock import RealClock
 from tests.runtime.samples_workers import Plant, plain
 
 pytestmark = pytest.mark.timeout(30)

@@ -18,7 +18,7 @@ from events import Announcement, Event, VehicleAnnouncement
 from runtime import Bundle, Duration, Input, Node, NodeConfig, Output, Tick, every, on
 from runtime.config.model import Config
 from runtime.config.reading import load
-from runtime.execute import execute
+from runtime.run.execute import execute
 from runtime.summary import Summary
 
 

@@ -15,9 +15,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
+from runtime.channels.digest import Digest
 from runtime.config.model import Config
 from runtime.config.reading import load
-from runtime.digest import Digest
 from runtime.errors import NodeError
 from runtime.tools.flights.cache import home, kept, recorded, remove_beyond
 from runtime.tools.flights.layout import Action, Writer, event_at

@@ -11,7 +11,7 @@ import pytest
 
 from events import Image
 from runtime.errors import VisnavError
-from runtime.supervisor import Supervisor
+from runtime.run.supervisor import Supervisor
 from runtime.tools.monitor import images
 from runtime.tools.monitor.images import MAX_SIDE, ImageEncoder, small_jpeg
 from runtime.tools.monitor.observer import Observer

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from runtime.lockstep import LockstepClock, LockstepLoop
+from runtime.time.lockstep import LockstepClock, LockstepLoop
 from runtime.tools.monitor import meter
 from runtime.tools.monitor.meter import Amount
 

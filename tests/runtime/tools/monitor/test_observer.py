@@ -10,7 +10,7 @@ import pytest
 from runtime import Duration
 from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
-from runtime.supervisor import Supervisor
+from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.monitor.command import Pause, Restart, Set, Speed, Step, Stop
 from runtime.tools.monitor.observer import LastRecords, Observer, describe

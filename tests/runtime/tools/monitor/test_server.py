@@ -14,7 +14,7 @@ import pytest
 
 from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
-from runtime.supervisor import Supervisor
+from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.monitor import client, server
 from runtime.tools.monitor.address import find, runs

@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from runtime.lockstep import LockstepClock, LockstepLoop
-from runtime.schedule import Tick
-from runtime.sender import Sender
+from runtime.channels.sender import Sender
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.schedule import Tick
 from runtime.tools.tracing.record import TraceInstrument
 from runtime.tools.tracing.spool import CHUNK, Spool
 from tests.runtime.samples import Ping

@@ -14,7 +14,7 @@ import pytest
 from events import PoseEstimate
 from runtime import on
 from runtime.errors import ConfigError
-from runtime.supervisor import Supervisor
+from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.cli.trace import tables
 from runtime.tools.tracing import spool, write

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from runtime.digest import Digest
+from runtime.channels.digest import Digest
 from tests.sims.airsim.scripts import Caller, drone, with_script
 
 YAW = {"is_rate": True, "yaw_or_rate": 0.0}

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from runtime.node import Node
-from runtime.schedule import SECOND, Once
 from runtime.testing import run_nodes, spec
+from runtime.time.schedule import SECOND, Once
 from sims.airsim import wire
 from sims.airsim.client.rpc import RpcCallError, RpcClient
 from sims.airsim.server import AirsimServer

@@ -1,0 +1,1 @@
+"""Data: recordings and data sets, written and replayed."""

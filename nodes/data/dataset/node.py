@@ -1,0 +1,195 @@
+"""Records a run's sensors and ground truth as a data set, beside the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+
+from events import Announcement, DepthImage, Image, Imu, Odometry, PoseStamped
+from nodes.data.dataset.euroc import Euroc
+from nodes.data.dataset.recording import ImageFile, Recording
+from nodes.data.dataset.rig import choose
+from nodes.data.dataset.tum_mono import TumMono
+from nodes.data.dataset.tum_rgbd import TumRgbd
+from nodes.trajectory.growing import part_name
+from nodes.trajectory.table import EPOCH, epoch_of
+from runtime import Input, Node, NodeConfig, on
+from runtime.errors import ConfigError
+from runtime.paths import OutputPath
+
+_LAYOUTS: dict[str, type[Recording]] = {
+    "euroc": Euroc,
+    "tum_rgbd": TumRgbd,
+    "tum_mono": TumMono,
+}
+_AT_ONCE = 4
+"""Images that are being written."""
+
+_WAITING = 64
+"""Images of a kind that wait for that. In lockstep, time waits for the files, and none ever has
+to be dropped; in real time the oldest is, and the run's summary counts it."""
+
+
+class DatasetConfig(NodeConfig):
+    """Settings of a recorded data set.
+
+    Attributes:
+        format: ``euroc``: grey images of all cameras of the first camera's vehicle (and depth),
+            IMU, the vehicle's poses. ``tum_rgbd``: colour and depth images of the first camera
+            and its poses. ``tum_mono``: grey images of the first camera with its photometric
+            calibration and poses, as TUM's monoVO data set has them and DSO reads them.
+        folder: Its name in the run's folder. A data set that was there is removed.
+        depth_factor: Steps of a depth image per metre; 65535 of them are the limit, so 5000
+            reach 13.1 m, and depth beyond that is written as none.
+        epoch: The run's time 0 in the files: a date (ISO 8601), or nanoseconds of Unix time. It
+            is noted in them (``epoch_ns``), and `nodes.data.replay` counts from there.
+    """
+
+    format: Literal["euroc", "tum_rgbd", "tum_mono"] = "euroc"
+    folder: Annotated[OutputPath, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")] = "dataset"
+    depth_factor: Annotated[float, msgspec.Meta(gt=0)] = 5000.0
+    epoch: int | str = EPOCH
+
+    def __post_init__(self) -> None:
+        epoch_of(self.epoch)
+
+
+class DatasetWriter(Node[DatasetConfig]):
+    """Writes images, IMU measurements and the ground truth in the layout of EuRoC or of TUM.
+
+    Which camera (or vehicle) can be chosen by ``inputs = { images = "drone/front" }``. The world
+    of the files is z up: north, west, up. After a restart a numbered folder (``dataset-2``) holds
+    what came then.
+    """
+
+    reads_truth = "recording"
+    images = Input(Image, bound=_WAITING, overflow="drop_oldest")
+    depth_images = Input(DepthImage, bound=_WAITING, overflow="drop_oldest")
+
+    async def on_startup(self) -> None:
+        """Make room."""
+        self._announcements: list[Announcement] = []
+        self._recording: Recording | None = None
+        self._unwritten: set[ImageFile] = set()
+        self._queue: asyncio.Queue[ImageFile] = asyncio.Queue(maxsize=1)
+        if self.out is not None:
+            self._folder = self.out / part_name(self, self.config.folder)
+            await self.offload(_make_empty, self._folder)
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Note what sensors there are."""
+        self._announcements.append(announcement)
+
+    async def run(self) -> None:
+        """Have images written as they come."""
+        self._open()
+        for _ in range(_AT_ONCE):
+            self.start(self._write())
+        self.start(self._take_depth_images())
+        async for image in self.images:
+            if (file := self._image(image)) is not None:
+                await self._queue.put(file)
+
+    async def _take_depth_images(self) -> None:
+        async for depth in self.depth_images:
+            if (file := self._depth(depth)) is not None:
+                await self._queue.put(file)
+
+    async def _write(self) -> None:
+        """Write one image after the other, beside the loop."""
+        while True:
+            file = await self._queue.get()
+            await self.offload(file)
+            self._unwritten.discard(file)
+
+    @on(PoseStamped)
+    def camera_poses(self, event: PoseStamped) -> None:
+        """Note where a camera is."""
+        if (recording := self._open()) is not None:
+            recording.pose(event)
+
+    @on(Odometry)
+    def odometry(self, event: Odometry) -> None:
+        """Note where the vehicle is."""
+        if (recording := self._open()) is not None:
+            recording.odometry(event)
+
+    @on(Imu)
+    def imu(self, event: Imu) -> None:
+        """Note a measurement."""
+        if (recording := self._open()) is not None:
+            recording.imu(event)
+
+    async def on_shutdown(self) -> None:
+        """Write what has come and is not written yet, and say what is missing."""
+        if self._recording is None:
+            return
+        for _ in range(self.images.statistics().buffered):
+            self._image(self.images.receive_nowait())
+        for _ in range(self.depth_images.statistics().buffered):
+            self._depth(self.depth_images.receive_nowait())
+        await self.offload(_finish, self._recording, list(self._unwritten))
+        for each in self._recording.warnings():
+            self.log.warning("%s", each)
+        dropped = self.images.statistics().dropped + self.depth_images.statistics().dropped
+        if dropped:
+            self.log.warning("%d images are missing: writing was too slow for them", dropped)
+        if left_out := self._recording.left_out():
+            self.log.warning("%d events came out of order and are left out", left_out)
+        if empty := self._recording.empty():
+            self.log.warning("nothing came for %s", ", ".join(empty))
+
+    def _open(self) -> Recording | None:
+        """Return the recording, begun at the first event: all announcements have come by then."""
+        if self._recording is None and self.out is not None:
+            layout = _LAYOUTS[self.config.format]
+            try:
+                rig = choose(self._announcements, self.sources.get("images"))
+                epoch = epoch_of(self.config.epoch)
+                self._recording = layout(self._folder, rig, self.config.depth_factor, epoch)
+            except ValueError as error:
+                self.log.fatal("%s", error)
+        return self._recording
+
+    def _image(self, event: Image) -> ImageFile | None:
+        recording = self._open()
+        return self._keep(recording.image(event) if recording is not None else None)
+
+    def _depth(self, event: DepthImage) -> ImageFile | None:
+        recording = self._open()
+        return self._keep(recording.depth(event) if recording is not None else None)
+
+    def _keep(self, file: ImageFile | None) -> ImageFile | None:
+        """Remember an image until it is written, should the run end before."""
+        if file is not None:
+            self._unwritten.add(file)
+        return file
+
+
+def _make_empty(folder: Path) -> None:
+    """Make a folder that holds nothing of an earlier run.
+
+    Raises:
+        ConfigError: It holds something else.
+    """
+    if folder.is_dir() and any(folder.iterdir()):
+        if not any((folder / sign).exists() for sign in ("mav0", "rgb.txt", "times.txt")):
+            raise ConfigError(
+                f"folder: expected the name of a new folder, or of an earlier data set, "
+                f"found {folder} with other files"
+            )
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _finish(recording: Recording, files: list[ImageFile]) -> None:
+    """Write the rest; images that another thread is writing are waited for."""
+    try:
+        for file in files:
+            file()
+    finally:
+        recording.close()

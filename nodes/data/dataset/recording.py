@@ -1,0 +1,193 @@
+"""What recordings of all layouts have in common: events in, rows and images out.
+
+Rows are written at once; an image is returned as a `ImageFile`, for whoever has time to write
+it. Nothing here waits or knows a clock.
+"""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
+import numpy.typing as npt
+
+from events import DepthImage, Image, Imu, Odometry, PoseStamped
+from nodes.data.dataset.rig import Rig
+
+Pixels = npt.NDArray[Any]
+
+_DEPTH = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+"""A third of the default's size, at half as much time again; colours gain nothing by it."""
+
+
+class ImageFile:
+    """An image on its way to a file: call it to write it, from any thread, as often as need be."""
+
+    def __init__(self, path: Path, data: Pixels, convert: Callable[[Pixels], Pixels]) -> None:
+        self._path = path
+        self._data: Pixels | None = data
+        self._convert = convert
+        self._lock = threading.Lock()
+
+    def __call__(self) -> None:
+        """Write the file, unless that is done; if it is being done, wait until it is.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        with self._lock:
+            if self._data is not None:
+                image = self._convert(self._data)
+                flags = _DEPTH if image.dtype == np.uint16 else ()
+                _, code = cv2.imencode(".png", image, flags)
+                self._path.write_bytes(code.tobytes())
+                self._data = None
+
+
+def in_colour(data: Pixels) -> Pixels:
+    """Return an ``rgb8`` or ``mono8`` image as OpenCV writes it."""
+    return cv2.cvtColor(data, cv2.COLOR_RGB2BGR) if data.ndim == 3 else data
+
+
+def in_grey(data: Pixels) -> Pixels:
+    """Return an ``rgb8`` or ``mono8`` image in grey (ITU-R BT.601)."""
+    return cv2.cvtColor(data, cv2.COLOR_RGB2GRAY) if data.ndim == 3 else data
+
+
+class RowFile:
+    """A text file of rows with rising stamps.
+
+    Args:
+        path: The file; made anew.
+        header: Its first lines, each with its end.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+
+    def __init__(self, path: Path, header: str) -> None:
+        self.path = path
+        self.count = 0
+        """Rows so far."""
+        self.left_out = 0
+        """Rows that came with a stamp not above the last one: readers expect them to rise."""
+        self._last: int | None = None
+        self._file = path.open("w", encoding="utf-8", newline="\n")
+        self._file.write(header)
+
+    def add(self, stamp: int, row: str) -> bool:
+        """Add a row, which ends its own line; tell whether it was in order and is in."""
+        if self._last is not None and stamp <= self._last:
+            self.left_out += 1
+            return False
+        self._last = stamp
+        self.count += 1
+        self._file.write(row)
+        return True
+
+    def close(self) -> None:
+        """Write out what is left."""
+        self._file.close()
+
+
+class Recording(ABC):
+    """A data set that is being written.
+
+    Args:
+        folder: Where; it exists and is empty.
+        rig: The sensors. Events of others are passed over.
+        depth_factor: Steps of a depth image per metre.
+        epoch: The run's time 0 in the files, nanoseconds of Unix time.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, depth_factor: float, epoch: int) -> None:
+        self.folder = folder
+        self.rig = rig
+        self.depth_factor = depth_factor
+        self.epoch = epoch
+        self.files: list[RowFile] = []
+
+    @abstractmethod
+    def image(self, event: Image) -> ImageFile | None:
+        """Note an image, and return what is left to write."""
+
+    # What a layout has no place for is passed over.
+
+    def depth(self, event: DepthImage) -> ImageFile | None:  # noqa: ARG002
+        """Note a depth image, and return what is left to write."""
+        return None
+
+    def pose(self, event: PoseStamped) -> None:  # noqa: B027
+        """Note where a camera is."""
+
+    def odometry(self, event: Odometry) -> None:  # noqa: B027
+        """Note where the body is."""
+
+    def imu(self, event: Imu) -> None:  # noqa: B027
+        """Note what the IMU measures."""
+
+    def close(self) -> None:
+        """Write out what is left."""
+        for file in self.files:
+            file.close()
+
+    def rows(self, name: str, header: str) -> RowFile:
+        """Open a file of rows in the folder; its folder is made if need be."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = RowFile(path, header)
+        self.files.append(file)
+        return file
+
+    def write(self, name: str, text: str) -> None:
+        """Write a whole text file."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+    def describe(self, name: str, template: str, **values: Any) -> None:
+        """Write a file from a template beside this module, which also knows ``epoch``."""
+        found = templates(Path(__file__).parent).get_template(f"{template}.jinja")
+        self.write(name, found.render(values, epoch=self.epoch))
+
+    def empty(self) -> list[str]:
+        """Return the files that have no rows yet."""
+        return [str(f.path.relative_to(self.folder)) for f in self.files if not f.count]
+
+    def warnings(self) -> list[str]:
+        """Return what else a reader should know."""
+        return []
+
+    def left_out(self) -> int:
+        """Return how many events came out of order and are in no file."""
+        return sum(file.left_out for file in self.files)
+
+
+def real(value: float) -> str:
+    """Return a number as YAML 1.1 has it: ``2e-05`` would be a text, ``2.0e-05`` is none."""
+    digits, e, exponent = repr(value).partition("e")
+    return f"{digits if '.' in digits else digits + '.0'}{e}{exponent}"
+
+
+def templates(folder: Path) -> jinja2.Environment:
+    """Return what reads the templates of a folder; they have the filters ``real`` and ``row``."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(folder),
+        autoescape=False,  # noqa: S701  # neither YAML nor JSON is HTML
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {"real": real, "row": _row}
+    return environment
+
+
+def _row(values: Iterable[float]) -> str:
+    return f"[{', '.join(real(float(value)) for value in values)}]"

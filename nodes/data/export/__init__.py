@@ -1,0 +1,1 @@
+"""``export``: the data of a recording as text files."""

@@ -1,0 +1,216 @@
+"""Records a run: all its events, as MCAP, beside the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from pathlib import Path
+
+from events import Announcement, Event
+from nodes.data.mcap.disk import RecordingError
+from nodes.data.recorder.backlog import Backlog
+from nodes.data.recorder.pipe import WriteRequest
+from nodes.data.recorder.settings import McapRecorderConfig
+from nodes.data.recorder.writer_process import STANDSTILL, WriterProcess
+from nodes.trajectory.growing import part_name
+from runtime import Input, Node
+from runtime.workers.worker import spare_cores
+
+_WAITING = 1 << 16
+"""Events that may come while simulated time waits: more than are ever sent at one moment."""
+
+_LOOK = 0.5
+"""Real seconds between two looks at a process that simulated time waits for."""
+
+_END_TIMEOUT = 8.0
+"""Real seconds that the run's end may take; `run.shutdown_limit` is 10 unless changed."""
+
+
+class McapRecorder(Node[McapRecorderConfig]):
+    """Writes all events to a file that ROS 2's tools, Foxglove and `nodes.data.replay` read.
+
+    ::
+
+        [[nodes]]
+        name = "recorder"
+        type = "McapRecorder"
+
+    Put it first in the file: it then gets events before those that they cause, and those that
+    another node handles. They are recorded in the order in which it gets them.
+    """
+
+    reads_truth = "recording"
+    events = Input(Event, bound=_WAITING, overflow="drop_oldest")
+
+    def __init__(self) -> None:
+        self._process: WriterProcess | None = None
+        self._backlog = Backlog(self.config.memory, self.config.when_full)
+        self._failed: asyncio.Future[RecordingError] | None = None
+        self._ended_run = False
+        self._unfinished: int | None = None
+        """When the run ended (ns), while its end is yet to be written."""
+        self._warned_at = 1
+        self._waits = 0
+        self._waited = 0.0
+
+    async def on_startup(self) -> None:
+        """Open the file.
+
+        Raises:
+            MissingDependencyError: mcap or rosbags is not installed.
+            FatalError: It cannot be written.
+        """
+        if self.out is None:
+            if not self.checking:
+                self.log.warning("the run writes no files, so nothing is recorded")
+            return
+        config = self.config
+        if config.when_full == "wait" and self.clock.kind == "real":
+            self._backlog.when_full = "drop_images"
+        loop = asyncio.get_running_loop()
+        self._failed = loop.create_future()
+        try:
+            self._process = await self.offload(self._open, loop)
+        except RecordingError as error:
+            self.log.fatal("%s", error)
+        assert self._process is not None
+        self._process.start()
+        self.after_run(self._finish)
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Record it, unless it says of a node of this run for whom it speaks and nothing else."""
+        if self._process is not None and type(announcement) is not Announcement:
+            self._backlog.put(0, announcement)
+
+    async def run(self) -> None:
+        """Hand all events to the thread that passes them to the writing process."""
+        if self._process is None:
+            return
+        self.start(self._watch())
+        clock, backlog, put = self.clock, self._backlog, self._backlog.put
+        waits = backlog.when_full == "wait"
+        async for event in self.events:
+            put(clock.now(), event)
+            if backlog.dropped >= self._warned_at:
+                self._warn()
+            if waits and backlog.is_full:
+                await self._wait()
+
+    async def on_shutdown(self) -> None:
+        """Write what still waits, and the index; if that takes long, it goes on after the run.
+
+        Raises:
+            FatalError: The disk is full, or the like.
+        """
+        process, backlog = self._process, self._backlog
+        if process is None:
+            return
+        while self.events.statistics().buffered:
+            backlog.put(self.clock.now(), self.events.receive_nowait())
+        self._unfinished = self.clock.now()
+        if not await self.offload(process.close, self._unfinished, _END_TIMEOUT):
+            waits = backlog.bytes / 1e6
+            self.log.warning("%.1f MB are yet to be written: that goes on after the run", waits)
+            return
+        self._unfinished = None
+        self._log_result(process)
+        if process.error is not None and not self._ended_run:
+            self.log.fatal("%s", process.error)
+
+    def _finish(self, _: Path) -> None:
+        """Give a slow disk the time that it needs, when the run is over and nobody waits for it.
+
+        Raises:
+            RecordingError: The disk is full, or the like.
+        """
+        process = self._process
+        if process is None or self._unfinished is None:
+            return
+        process.close(self._unfinished)
+        if process.error is not None:
+            raise process.error
+
+    def _log_result(self, process: WriterProcess) -> None:
+        """Log how much was written, and count what was not."""
+        backlog, result = self._backlog, process.result
+        lost = backlog.dropped + process.unwritten
+        self.events.dropped += lost
+        if result.what != "gone":  # it did not report how many there are
+            waits = f"{self._waits} times for the disk, {self._waited:.1f} s in all"
+            self.log.info(
+                "%s: %d events, %.1f MB; at most %.1f MB waited%s",
+                Path(process.path).name,
+                result.written,
+                result.size / 1e6,
+                backlog.peak / 1e6,
+                f", and simulated time {waits}" if self._waits else "",
+            )
+        if lost:
+            self.log.warning(
+                "%d events are not in the recording%s",
+                lost,
+                ", nor is what its process had yet to write" if result.what == "gone" else "",
+            )
+
+    def _open(self, loop: asyncio.AbstractEventLoop) -> WriterProcess:
+        assert self.out is not None
+
+        def complain(what: str) -> None:
+            with contextlib.suppress(RuntimeError):  # the run is over
+                loop.call_soon_threadsafe(self.log.warning, "%s", what)
+
+        def failed(error: RecordingError) -> None:
+            with contextlib.suppress(RuntimeError):  # the run is over, and `_finish` raises it
+                loop.call_soon_threadsafe(self._fail, error)
+
+        path = self.out / part_name(self, self.config.file)
+        is_first = self.name == self.siblings(McapRecorder)[0].name  # of a bag there is one
+        request = WriteRequest(
+            path=str(path),
+            config=self.config,
+            attachment=str(self.out / "config.toml"),
+            niceness=5,
+            cores=spare_cores() if self.clock.kind == "real" else (),
+            metadata=str(path.with_name("metadata.yaml")) if is_first else "",
+        )
+        return WriterProcess(request, self._backlog, failed, complain)
+
+    def _fail(self, error: RecordingError) -> None:
+        if self._failed is not None and not self._failed.done():
+            self._failed.set_result(error)
+
+    async def _watch(self) -> None:
+        """End the run when nothing can be recorded any more."""
+        assert self._failed is not None
+        error = await self._failed
+        self._ended_run = True
+        self.log.fatal("%s", error)
+
+    async def _wait(self) -> None:
+        """Have simulated time wait until there is room.
+
+        Raises:
+            FatalError: The process that writes shows no sign of life.
+        """
+        if not self._waits:
+            self.log.info(
+                "the disk is slower than the run: simulated time waits, now and again, with "
+                "%.0f MB to write",
+                self._backlog.bytes / 1e6,
+            )
+        began = time.monotonic()
+        assert self._process is not None
+        self._process.still_for()  # from now on
+        while not await self.offload(self._backlog.wait_for_room, _LOOK):
+            if self._process.still_for() >= STANDSTILL:
+                self.log.fatal("%s", self._process.standstill())
+        self._waits += 1
+        self._waited += time.monotonic() - began
+
+    def _warn(self) -> None:
+        dropped = self._backlog.dropped
+        self._warned_at = 10 * dropped
+        self.log.warning(
+            "the disk is too slow: %d events dropped so far (%s)", dropped, self._backlog.when_full
+        )

@@ -1,0 +1,130 @@
+"""Mends recordings of runs that were killed, or whose disk was full."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from nodes.data.mcap import layout, records
+from nodes.data.mcap.disk import RecordingError, is_being_written, unwritable
+from nodes.data.mcap.mcap_file import contents
+
+MENDED = "visnav_mended"
+"""Metadata of a file in which something could not be mended: what, by number."""
+
+
+class Recovery(msgspec.Struct, frozen=True):
+    """What came of it.
+
+    Attributes:
+        path: The whole file.
+        messages: How many it has.
+        trouble: What could not be read, now or when it was mended before; empty if the file was
+            whole.
+        mended: Whether there was anything to do.
+        partial: Whether messages are missing between others, and not just after the last one.
+    """
+
+    path: Path
+    messages: int
+    trouble: list[str]
+    mended: bool
+    partial: bool
+
+
+def recover_file(path: Path, out: Path | None = None) -> Recovery:
+    """Write a whole, indexed file from what can be read of a torn one.
+
+    Args:
+        path: The torn file.
+        out: The whole one; if `None`, it takes the place of the torn one when it is complete, and
+            the torn one is gone: all that could be read of it is in the new one. A file that has
+            its index is left alone then, for what is damaged in it may yet be of use.
+
+    Raises:
+        RecordingError: The file is no MCAP file or is being written, nothing can be read of it, or
+            the other cannot be written.
+    """
+    found = contents(path)
+    with records.open_file(path) as file:
+        if is_being_written(file):
+            raise RecordingError(f"{path}: expected a file that is done, found one being written")
+    if found.complete and out is None:
+        trouble: list[str] = []
+        messages = sum(isinstance(r, records.Message) for r in _all_of(path, trouble))
+        trouble += found.metadata.get(MENDED, {}).values()
+        return Recovery(path, messages, trouble, mended=False, partial=bool(trouble))
+    if out is not None and out.exists():
+        raise RecordingError(f"{out}: expected the name of a new file, found one that is there")
+    place = out or path.with_name(f"{path.name}.mended")
+    try:
+        messages, trouble = _write_anew(path, place)
+        if not messages:
+            raise RecordingError(f"{path}: expected messages, found none that can be read")
+    except BaseException:
+        place.unlink(missing_ok=True)
+        raise
+    if out is None:
+        place.replace(path)
+    partial = any(each != layout.NOT_CLOSED for each in trouble)
+    return Recovery(out or path, messages, trouble, mended=True, partial=partial)
+
+
+def _all_of(path: Path, trouble: list[str]) -> Iterator[Any]:
+    return records.records(path, 0, None, trouble.append, everything=True)
+
+
+def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
+    """Write all that can be read of a file to another, complete and with an index.
+
+    Returns:
+        How many messages there were, and what could not be read.
+    """
+    trouble: list[str] = []
+    messages = 0
+    with records.open_file(path) as torn:
+        header = records.header_of(torn)
+    try:
+        with out.open("wb") as file:
+            writer = records.writer(
+                file,
+                compression="zstd",
+                chunk_size=4 << 20,
+                profile=header.profile,
+                library=header.library,
+            )
+            schemas: dict[int, int] = {0: 0}
+            channels: dict[int, int] = {}
+            for record in _all_of(path, trouble):
+                match record:
+                    case records.Schema():
+                        if record.id not in schemas:
+                            schema = record.name, record.encoding, record.data
+                            schemas[record.id] = writer.register_schema(*schema)
+                    case records.Channel(topic=topic, message_encoding=how, metadata=metadata):
+                        if record.id not in channels:
+                            schema_id = schemas.get(record.schema_id, 0)  # a damaged chunk's
+                            number = writer.register_channel(topic, how, schema_id, metadata)
+                            channels[record.id] = number
+                    case records.Metadata():
+                        writer.add_metadata(record.name, record.metadata)
+                    case records.Attachment(create_time=made, log_time=time):
+                        file_ = record.name, record.media_type, record.data
+                        writer.add_attachment(made, time, *file_)
+                    case records.Message(log_time=time, publish_time=published):
+                        number = channels[record.channel_id]
+                        writer.add_message(number, time, record.data, published, record.sequence)
+                        messages += 1
+            lost = [each for each in trouble if each != layout.NOT_CLOSED]
+            if lost:  # so that nobody takes it for whole, now that it has an index
+                writer.add_metadata(MENDED, {str(n): each for n, each in enumerate(lost, 1)})
+            writer.finish()  # type: ignore[no-untyped-call]
+            file.flush()
+            os.fsync(file.fileno())  # it may take the place of the only other one there is
+    except OSError as error:
+        raise unwritable(out, error) from error
+    return messages, trouble

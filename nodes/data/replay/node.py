@@ -1,0 +1,334 @@
+"""A recording in the place of the simulator: the same announcements, events, stamps and sources."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import Announcement, Event, Odometry, TrajectoryEstimate, VehicleAnnouncement
+from nodes.data.replay.ahead import ReadAhead
+from nodes.data.replay.choice import Choice
+from nodes.data.replay.reader import Reader, ReplayError
+from nodes.data.replay.recorded import Recorded, is_ours
+from nodes.data.replay.settings import ReplayConfig
+from runtime import Node, Output
+from runtime.time.schedule import SECOND
+
+
+def open_reader(config: ReplayConfig, name: str) -> Reader:
+    """Return a reader of a recording.
+
+    Raises:
+        ReplayError: There is nothing there that can be read.
+        MissingDependencyError: A library is not installed.
+    """
+    path = Path(config.file)
+    vehicle = config.vehicle or name
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            from nodes.data.replay.rosbag import RosBag
+
+            return RosBag(path, config.topics, vehicle)
+        for folder in (path, path / "mav0"):
+            if (folder / "cam0").is_dir() or (folder / "imu0").is_dir():
+                from nodes.data.replay.euroc import Euroc
+
+                return Euroc(folder, vehicle)
+        if (path / "rgb.txt").is_file():
+            from nodes.data.replay.tum_rgbd import TumRgbd
+
+            return TumRgbd(path, vehicle, config.camera, config.depth_factor)
+        if (path / "times.txt").is_file() and (path / "calib.txt").is_file():
+            from nodes.data.replay.kitti import Kitti
+
+            return Kitti(path, vehicle)
+        raise ReplayError(
+            f"{path}: expected a ROS 2 bag (metadata.yaml), or a data set of EuRoC's (mav0), TUM's "
+            "(rgb.txt) or KITTI's (times.txt and calib.txt), found a folder with none of these"
+        )
+    if not path.is_file():
+        raise ReplayError(
+            f"{path}: expected a recording or the folder of a data set, found nothing there; "
+            "docs/how-to/datasets.md says where to download those of EuRoC, TUM and KITTI"
+        )
+    if path.suffix not in {".db3", ".bag"} and is_ours(path):
+        return Recorded(path)
+    from nodes.data.replay.rosbag import RosBag
+
+    return RosBag(path, config.topics, vehicle)
+
+
+class Timeline:
+    """Where the times of a recording lie on the run's clock, by the stretches that were played."""
+
+    def __init__(self) -> None:
+        self._stretches: list[tuple[int, int, bool]] = []
+        """Begin (recording), begin (run), and whether it goes on from the one before."""
+        self.shift = 0
+        """The run's clock less the recording's time now (ns)."""
+
+    def go_on(self, position: int, now: int, *, pause: bool = False) -> None:
+        """Note that from now on (ns of the run) the recording is played from this position."""
+        self._stretches.append((position, now, pause))
+        self.shift = now - position
+
+    def moved(self, event: Event) -> Event | None:
+        """Return an event on the run's clock; `None` if it was true before the run.
+
+        A stamp of before a pause stays where it was then; of a trajectory those poses are left out
+        that were not played.
+        """
+        if not self.shift and len(self._stretches) < 2:
+            return event
+        stamp = self._stamp(event.stamp)
+        if stamp < 0:
+            return None
+        if isinstance(event, TrajectoryEstimate):
+            known, stamps = self._stamps(event.stamps)
+            return msgspec.structs.replace(
+                event,
+                stamp=stamp,
+                stamps=stamps[known],
+                positions=event.positions[known],
+                orientations=event.orientations[known],
+            )
+        return msgspec.structs.replace(event, stamp=stamp)
+
+    def _stamp(self, time: int) -> int:
+        shift = 0
+        for position, now, pause in reversed(self._stretches):
+            shift = now - position
+            if time >= position or not pause:
+                break
+        return time + shift
+
+    def _stamps(
+        self, times: npt.NDArray[np.int64]
+    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+        """Return which times were played, and when they last were."""
+        known, found = np.zeros(times.shape, np.bool_), times.copy()
+        first = last = np.iinfo(np.int64).max  # of what was played later: on recording and run
+        for position, now, _ in reversed(self._stretches):
+            here = (times >= position) & (times < min(first, last - now + position))
+            found[here] += now - position
+            known |= here
+            first, last = min(first, position), now
+        return known, found
+
+
+_SLICE = SECOND // 10
+"""In real time, how long a sleep may keep `seek` waiting (ns)."""
+
+
+class Replay(Node[ReplayConfig]):
+    """Sends recorded events again, each at its time, on either clock.
+
+    ::
+
+        [[nodes]]
+        name = "replay"
+        type = "Replay"
+        file = "../runs/record/recording.mcap"
+
+    The run ends with the recording. While it goes on, ``python -m runtime set replay.paused=true``
+    and ``replay.position=12s`` do what `pause` and `seek` do; these are for the loop's thread.
+    """
+
+    ends_run = "plan"
+
+    events = Output(Event)
+
+    def __init__(self) -> None:
+        self._reader: Reader | None = None
+        self._ahead: ReadAhead | None = None
+        self._announcements: list[Announcement] = []
+        self._timeline = Timeline()
+        self._paused_at: int | None = None
+        self._resumed = asyncio.Event()
+        self._target: int | None = None
+        self._logged = 0
+        self._logged_left_out = 0
+        self.sent = 0
+        if self.config.paused:
+            self.pause()
+
+    async def on_startup(self) -> None:
+        """Open the recording.
+
+        Raises:
+            FatalError: It cannot be read.
+            MissingDependencyError: A library is not installed.
+        """
+        try:
+            await self.offload(self._open)
+        except ReplayError as error:
+            self.log.fatal("%s", error)
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce what was announced, and that others' events come from here."""
+        return [*self._announcements, Announcement(stamp=0, source="*")]
+
+    async def run(self) -> None:
+        """Send all events, from start to end, and again if that is wanted."""
+        assert self._reader is not None
+        begin = round(self.config.start * SECOND)
+        end = round(self.config.end * SECOND) or None
+        position = begin
+        while True:
+            self._timeline.go_on(position, self.clock.now())
+            last = await self._play(position, end)
+            if last is None and not self.sent and self._target is None:
+                self.log.fatal("%s", self._nothing())
+            last = position if last is None else last
+            over = end or self._reader.end() or last + round(self.config.linger * SECOND)
+            over = max(over, last)
+            await self._sleep_until(over)
+            if self._target is not None:
+                position, self._target = self._target, None
+            elif self.config.loop:
+                if over <= begin:
+                    self.log.fatal(
+                        "loop: expected a recording that takes some time, found one moment"
+                    )
+                position = begin
+            else:
+                break
+        self._log_trouble()
+        if named := ", ".join(sorted(self._choice.unmatched)):
+            self.log.warning("only, skip: nothing in the recording is of %s", named)
+        self.stop("the recording ended")
+
+    async def on_shutdown(self) -> None:
+        """Close the recording."""
+        await self._close_ahead()
+        self._log_trouble()
+        if self._reader is not None:
+            await self.offload(self._reader.close)
+
+    def on_change(self, before: ReplayConfig) -> None:
+        """Pause, go on, or go elsewhere."""
+        if self.config.paused != before.paused:
+            (self.pause if self.config.paused else self.resume)()
+        if self.config.position != before.position:
+            self.seek(self.config.position)
+
+    def pause(self) -> None:
+        """Send nothing until `resume`; the clock goes on."""
+        if self._paused_at is None:
+            self._paused_at = self.clock.now()
+            self._resumed.clear()
+
+    def resume(self) -> None:
+        """Go on where `pause` came."""
+        if self._paused_at is not None:
+            position = self._paused_at - self._timeline.shift
+            self._timeline.go_on(position, self.clock.now(), pause=True)
+            self._paused_at = None
+            self._resumed.set()
+
+    def seek(self, seconds: float) -> None:
+        """Go on at another time of the recording; stamps stay on the run's clock."""
+        self._target = max(round(seconds * SECOND), 0)
+
+    @property
+    def position(self) -> float:
+        """Return which time of the recording it is, or will be on resuming, seconds."""
+        if self._target is not None:
+            return self._target / SECOND
+        now = self.clock.now() if self._paused_at is None else self._paused_at
+        return (now - self._timeline.shift) / SECOND
+
+    async def _play(self, start: int, end: int | None) -> int | None:
+        """Send the events from one time to another; return the last time, if there was any."""
+        assert self._reader is not None
+        await self._close_ahead()
+        events = self._reader.events(start, end, self._choice)
+        self._ahead = ahead = ReadAhead(events, self.config.memory)
+        send, now, timeline = self.events.send, self.clock.now, self._timeline
+        last = None
+        try:
+            while (batch := await self.offload(ahead.take)) is not None:
+                for last, event in batch:
+                    if last + timeline.shift > now() or self._paused_at is not None:
+                        await self._sleep_until(last)
+                    if self._target is not None:
+                        return last
+                    if (moved := timeline.moved(event)) is not None:
+                        self.sent += 1
+                        send(moved)
+        except ReplayError as error:
+            self.log.fatal("%s", error)
+        return last
+
+    async def _sleep_until(self, time: int) -> None:
+        """Wait for a time of the recording; come back early if `seek` was called."""
+        real = self.clock.kind == "real"
+        while self._target is None:
+            if self._paused_at is not None:
+                await self._resumed.wait()
+                continue
+            now, due = self.clock.now(), time + self._timeline.shift
+            if due <= now:
+                return
+            await self.clock.sleep_until(min(due, now + _SLICE) if real else due)
+
+    def _open(self) -> None:
+        config = self.config
+        self._reader = reader = open_reader(config, self.name)
+        announced = reader.announcements()
+        self._choice = Choice(config.only, config.skip, announced)
+        self._announcements = [each for each in announced if self._choice.announced(each)]
+        if config.start:
+            self._announcements = [self._starting(reader, each) for each in self._announcements]
+
+    def _starting(self, reader: Reader, announcement: Announcement) -> Announcement:
+        """Return a vehicle's announcement with the pose that it has at the start."""
+        if not isinstance(announcement, VehicleAnnouncement):
+            return announcement
+
+        def wants(kind: type[Event], source: str) -> bool:
+            return issubclass(kind, Odometry) and source == announcement.source
+
+        found = reader.events(round(self.config.start * SECOND), None, wants)
+        event = next((each.event for each in found), None)
+        if not isinstance(event, Odometry):
+            return announcement
+        return msgspec.structs.replace(
+            announcement,
+            stamp=event.stamp - round(self.config.start * SECOND),
+            control_rate=0.0,  # in mid-recording, it may be moving
+            position=event.position,
+            orientation=event.orientation,
+        )
+
+    def _nothing(self) -> str:
+        config, named = self.config, ", ".join(sorted(self._choice.unmatched))
+        return (
+            f"{config.file}: expected events that are wanted, found none"
+            + (f" from {config.start:g} s on" if config.start else "")
+            + (f" to {config.end:g} s" if config.end else "")
+            + (f" of {named}" if named else "")
+            + "".join(f"; {each}" for each in (self._reader.trouble if self._reader else []))
+        )
+
+    def _log_trouble(self) -> None:
+        if self._reader is None:
+            return
+        for each in self._reader.trouble[self._logged :]:
+            self.log.warning("%s: %s", self.config.file, each)
+        self._logged = len(self._reader.trouble)
+        if (left_out := self._reader.left_out - self._logged_left_out) > 0:
+            self.log.warning(
+                "%s: %d events cannot be read, and are left out", self.config.file, left_out
+            )
+            self._logged_left_out += left_out
+
+    async def _close_ahead(self) -> None:
+        if self._ahead is not None:
+            ahead, self._ahead = self._ahead, None
+            await self.offload(ahead.close)

@@ -1,0 +1,284 @@
+"""Bags of ROS that others made: their messages as events, in our frames (`ros_messages.incoming`).
+
+Messages with a header keep its stamp, unless that is zero; they are sent at their time of receipt.
+Where the two are of different clocks (a simulator's and the recording machine's), each counts
+from its own first. Cameras sit where ``/tf_static`` puts their optical frames in ``base_link``; one
+that it does not know looks ahead from the body's origin.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    Odometry,
+    PoseEstimate,
+)
+from nodes.data.mcap import layout
+from nodes.data.replay.bag_topics import Mountings, chosen
+from nodes.data.replay.folders import vehicle_at
+from nodes.data.replay.reader import Reader, ReplayError, Timed, Wants
+from nodes.data.replay.settings import BagTopic, Use
+from nodes.ros2.messages.calibration import camera_announcement
+from nodes.ros2.messages.depth import decode_compressed
+from nodes.ros2.messages.incoming import READERS, MessageContext, estimate
+from nodes.ros2.messages.stamps import Stamps
+from nodes.ros2.messages.typestore import Bag
+from runtime.errors import VisnavError
+from runtime.time.schedule import SECOND
+
+_SAME_CLOCK = 60 * SECOND
+"""Nanoseconds between stamp and receipt above which they are of different clocks."""
+
+_EVENTS: dict[Use, type[Event]] = {
+    "image": Image,
+    "depth": DepthImage,
+    "imu": Imu,
+    "odometry": Odometry,
+    "truth": Odometry,
+    "estimate": PoseEstimate,
+}
+
+_LATER = 1 << 62
+"""Stands for the stamp of a message that has none."""
+
+
+class RosBag(Reader):
+    """Reads a bag.
+
+    Args:
+        path: A folder, or an MCAP or SQLite file.
+        topics: What to read; if empty, by types and names.
+        vehicle: Source of the true poses.
+
+    Raises:
+        ReplayError: It cannot be read, or a topic is not there.
+    """
+
+    def __init__(self, path: Path, topics: tuple[BagTopic, ...], vehicle: str) -> None:
+        super().__init__()
+        self._path = path
+        self._vehicle = vehicle
+        with readable(path):
+            self._bag = open_bag(path)
+        try:
+            with readable(path):
+                found = self._bag.topics()
+                self._topics = chosen(found, topics, vehicle)
+                self._firsts = self._first_messages()
+                self._times, self._stamps = self._origins()
+                self._announcements = list(self._announced(found))
+        except ReplayError:
+            self._bag.close()
+            raise
+
+    def announcements(self) -> Sequence[Announcement]:
+        """Return the vehicle where it begins, cameras, IMUs and estimators."""
+        return self._announcements
+
+    def events(self, start: int, end: int | None, wants: Wants) -> Iterator[Timed]:
+        """Yield what the topics' messages become; one that makes no sense is left out."""
+        names = [
+            name
+            for name, topic in self._topics.items()
+            if topic.use != "camera" and wants(_EVENTS[topic.use], topic.source)
+        ]
+        stop = None if end is None else end + self._times
+        wrong: set[str] = set()
+        with readable(self._path):
+            for name, type_, time, message in self._bag.messages(names, start + self._times, stop):
+                try:
+                    event = self._event(self._topics[name], type_, message)
+                except (ValueError, TypeError, ArithmeticError, AttributeError) as error:
+                    self.left_out += 1
+                    if name not in wrong:  # one example of each topic is enough
+                        wrong.add(name)
+                        self.complain(f"{name}: {error}")
+                    continue
+                if event.stamp == _LATER:
+                    event = msgspec.structs.replace(event, stamp=time - self._times)
+                yield Timed(time - self._times, event)
+
+    def close(self) -> None:
+        """Close the bag."""
+        self._bag.close()
+
+    def _event(self, topic: BagTopic, type_: str, message: Any) -> Event:
+        if 0 < (at := _stamp(message)) < self._stamps.offset:
+            early = (self._stamps.offset - at) / 1e9
+            raise ValueError(
+                f"expected no stamp before the first, found one {early:.3f} s before it"
+            )
+        context = MessageContext(
+            source=topic.source, now=_LATER, stamps=self._stamps, frame_id=topic.frame_id
+        )
+        if topic.use == "truth" or topic.use == "odometry":
+            return self._truth(topic, type_, message, context)
+        if type_ == "sensor_msgs/msg/CompressedImage":
+            return _compressed(topic.use, message, context)
+        event = READERS[type_, topic.use](message, context)
+        assert event is not None
+        return event
+
+    def _truth(
+        self, topic: BagTopic, type_: str, message: Any, context: MessageContext
+    ) -> Odometry:
+        """Read a true pose; it is in ``map`` unless the settings say otherwise."""
+        context = msgspec.structs.replace(context, frame_id=topic.frame_id or "map")
+        if type_ == "nav_msgs/msg/Odometry":
+            event = READERS[type_, "odometry"](message, context)
+            assert isinstance(event, Odometry)
+            return msgspec.structs.replace(event, child_frame_id="base_link")
+        if type_ == "geometry_msgs/msg/TransformStamped":
+            moved = message.transform
+            where = SimpleNamespace(position=moved.translation, orientation=moved.rotation)
+            message = SimpleNamespace(header=message.header, pose=where)
+        pose = estimate(message, context)
+        assert isinstance(pose, PoseEstimate)
+        return Odometry(
+            stamp=pose.stamp,
+            source=pose.source,
+            frame_id=pose.frame_id,
+            position=pose.position,
+            orientation=pose.orientation,
+            linear_velocity=(0.0, 0.0, 0.0),  # nobody says
+            angular_velocity=(0.0, 0.0, 0.0),
+        )
+
+    def _first_messages(self) -> dict[str, tuple[str, int, Any]]:
+        """Return type, time of receipt and content of each topic's first message."""
+        found: dict[str, tuple[str, int, Any]] = {}
+        for name in self._topics:
+            for _, type_, time, message in self._bag.messages([name]):
+                found[name] = type_, time, message
+                break
+        if not found:
+            raise ReplayError(f"expected messages on {', '.join(self._topics)}, found none")
+        return found
+
+    def _origins(self) -> tuple[int, Stamps]:
+        """Return the time of receipt that is 0 from now on, and how stamps are converted."""
+        times = [time for _, time, _ in self._firsts.values()]
+        found = ((time, _stamp(message)) for _, time, message in self._firsts.values())
+        stamped = [(time, at) for time, at in found if at]
+        stamps = [at for _, at in stamped]
+        if all(abs(time - at) < _SAME_CLOCK for time, at in stamped):
+            origin = min(times + stamps)
+            return origin, Stamps(origin)
+        return min(times), Stamps(min(stamps))
+
+    def _announced(self, found: dict[str, tuple[str, int]]) -> Iterator[Announcement]:
+        for name, topic in self._topics.items():
+            if topic.use in {"odometry", "truth"} and name in self._firsts:
+                type_, _, message = self._firsts[name]
+                event = self._event(topic, type_, message)
+                assert isinstance(event, Odometry)
+                yield vehicle_at(event)
+        yield from self._cameras(found)
+        for name, topic in self._topics.items():
+            if topic.use == "imu" and name in self._firsts:
+                header = self._firsts[name][2].header
+                yield ImuAnnouncement(
+                    stamp=0,
+                    source=topic.source,
+                    rate=self._rate(found[name][1]),
+                    frame_id=topic.frame_id or header.frame_id or "base_link",
+                    gyroscope_noise_density=0.0,  # messages do not say
+                    gyroscope_random_walk=0.0,
+                    accelerometer_noise_density=0.0,
+                    accelerometer_random_walk=0.0,
+                )
+            elif topic.use == "estimate":
+                yield EstimatorAnnouncement(
+                    stamp=0, source=topic.source, method=f"ROS: {topic.topic}"
+                )
+
+    def _cameras(self, found: dict[str, tuple[str, int]]) -> Iterator[CameraAnnouncement]:
+        mountings = Mountings(
+            message
+            for _, type_, _, message in self._bag.messages(["/tf_static"])
+            if type_ == "tf2_msgs/msg/TFMessage"
+        )
+        images: dict[str, list[str]] = {}
+        rates: dict[str, float] = {}
+        for name, topic in self._topics.items():
+            if topic.use in {"image", "depth"} and name in self._firsts:
+                type_, _, message = self._firsts[name]
+                kind = "depth"
+                if topic.use == "image":
+                    event = self._event(topic, type_, message)
+                    assert isinstance(event, Image)
+                    kind = "rgb" if event.encoding == "rgb8" else "grey"
+                images.setdefault(topic.source, []).append(kind)
+                rates[topic.source] = self._rate(found[name][1])
+        for name, topic in self._topics.items():
+            if topic.use == "camera" and name in self._firsts and topic.source in images:
+                kinds = tuple(images.pop(topic.source))
+                message = self._firsts[name][2]
+                camera = camera_announcement(message, topic.source, kinds, topic.frame_id)
+                camera = msgspec.structs.replace(camera, rate=rates[topic.source])
+                mounting = mountings.of(message.header.frame_id)
+                if mounting is not None:
+                    place, turn = mounting
+                    camera = msgspec.structs.replace(camera, position=place, orientation=turn)
+                yield camera
+        for source in images:
+            self.complain(f"{source}: expected a camera_info, found none: it is not announced")
+
+    def _rate(self, count: int) -> float:
+        seconds = (self._bag.end - self._bag.start) / 1e9
+        return max(count - 1, 1) / seconds if seconds > 0 else 1.0
+
+
+def open_bag(path: Path) -> Bag:
+    """Open a bag whose chunks are as long as they claim; call it within `readable`."""
+    for each in [path] if path.is_file() else sorted(path.glob("*.mcap")):
+        with each.open("rb") as file:
+            if file.read(len(layout.MAGIC)) == layout.MAGIC:
+                layout.check_chunks(file)  # rosbags would believe whatever they claim
+    return Bag(path)
+
+
+@contextlib.contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Make of whatever a damaged bag raises, in rosbags and below it, an error with its name."""
+    try:
+        yield
+    except VisnavError:
+        raise
+    except Exception as error:
+        what = " ".join(str(error).split()) or type(error).__name__
+        if not isinstance(error, ReplayError | ValueError):
+            what = f"expected a readable bag, found: {what}"
+        raise ReplayError(what if str(path) in what else f"{path}: {what}") from error
+
+
+def _stamp(message: Any) -> int:
+    """Return a header's stamp (ns); 0 if it has none."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * SECOND + int(stamp.nanosec)
+
+
+def _compressed(use: Use, message: Any, context: MessageContext) -> Event:
+    stamp, frame_id = context.stamp(message.header), context.frame(message.header, "")
+    pixels = decode_compressed(message)
+    if use == "depth":
+        return DepthImage(stamp=stamp, source=context.source, frame_id=frame_id, data=pixels)
+    encoding = "rgb8" if pixels.ndim == 3 else "mono8"
+    return Image(
+        stamp=stamp, source=context.source, frame_id=frame_id, encoding=encoding, data=pixels
+    )

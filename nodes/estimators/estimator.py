@@ -1,0 +1,490 @@
+"""The base of all estimators: choice of the camera, outputs, and the frame of the estimates.
+
+Poses are computed in the subclasses (`nodes.estimators.visual_odometry` and others), and judged in
+`nodes.judging.evaluation`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence, Set
+from types import MappingProxyType
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from typing_extensions import TypeVar
+
+from events import (
+    Announcement,
+    Armed,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Image,
+    ImuAnnouncement,
+    LidarAnnouncement,
+    LidarScan,
+    PoseEstimate,
+    TakenOff,
+    TrackedFeatures,
+    TrackingEvent,
+    TrackingLost,
+    TrackingRegained,
+    TrajectoryEstimate,
+    VehicleAnnouncement,
+    VehicleEvent,
+)
+from events.camera_info import COEFFICIENTS
+from nodes.estimators.mount import Mount
+from nodes.estimators.rectification import ALIGNED, Rectification, misalignment
+from nodes.estimators.result import (
+    TrackingResult,
+    check_result,
+    check_shape,
+    check_transform,
+)
+from nodes.estimators.rig import SensorChoice
+from runtime import Bundle, Node, NodeConfig, Output, on
+from runtime.errors import DeclarationError, NodeError, suggest
+from runtime.extras import why_missing
+from runtime.node import matchers
+from runtime.units import Latency
+
+WORKER_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+"""Environment of an estimator's process: one core for each.
+
+The sums of linear algebra then always have the same order, and so the same result.
+"""
+
+
+class EstimatorConfig(NodeConfig):
+    """Settings of every estimator.
+
+    Attributes:
+        origin: ``announced``: the estimates are in ``map`` and start at the pose that the vehicle
+            announced, if that is known to be true (else as ``start``; see `Estimator`). ``start``:
+            they are in ``odom``, whose origin is the body at the first image with a pose.
+        rectify: Whether images that it cannot compute with, because of their lens or because the
+            rows of both eyes are not aligned, are turned into those of pinhole cameras first. If
+            not, they are refused. Cameras whose images need it come after others.
+        latency: Time on the run's clock from the arrival of an image to its estimate.
+        not_finite: What a pose is that is not finite (NaN): an ``error`` that ends the run, or
+            ``lost``.
+    """
+
+    origin: Literal["announced", "start"] = "announced"
+    rectify: bool = True
+    latency: Latency = Latency(0.015)  # immutable
+    not_finite: Literal["error", "lost"] = "error"
+
+
+Frame = Image | DepthImage | LidarScan
+"""What a pose is estimated for."""
+
+_KINDS = ("rgb", "grey", "depth", "segmentation", "lidar")
+"""What an estimator may need."""
+
+F = TypeVar("F", bound=tuple[Any, ...])
+C = TypeVar("C", bound=EstimatorConfig, default=EstimatorConfig)
+
+
+class Estimator(Node[C], ABC):
+    """Base of the nodes that estimate poses from images.
+
+    A subclass declares its input as ``frames``, a `Bundle` of one camera's images (of a stereo rig
+    with the fields ``left`` and ``right``, with an IMU one more, ``imu``); says in `needs`, `eyes`,
+    `inertial` and `lenses` what it takes; starts its tracker in `on_ready`, when `the_camera` is
+    known; and in `run` calls `publish` with a `TrackingResult` for each image::
+
+        class MyEstimator(Estimator):
+            needs = frozenset({"grey", "depth"})
+            frames = Bundle(RgbdFrame, keep="latest")
+
+            async def on_ready(self) -> None:
+                info, latency = self.the_camera().info, self.config.latency
+                self.tracker = await self.worker(MyTracker, info, latency=latency)
+
+            async def run(self) -> None:
+                async for image, depth in self.frames:
+                    args = image.stamp, image.data, depth.data
+                    self.publish(image, await self.tracker.call(MyTracker.track, *args))
+
+    The tracker gives poses of the optical camera (x right, y down, z forward) in the optical camera
+    at its first image. What is sent is the pose of the body (FRD) that carries the camera, as a
+    `PoseEstimate`; its stamp is on the clock of the IMU (`exposed_at`).
+
+    **Lenses.** What `refusal` says no to, and stereo pairs that are not `aligned`, is rectified
+    beside the loop (`nodes.estimators.rectification`) before `frames` gives it, unless the setting
+    ``rectify`` is false. `the_camera` is the pinhole camera then, and features are sent where they
+    are in the announced camera's own image. Rows keep the read-out time of a rolling shutter only
+    nearly.
+
+    **Frame and alignment.** The `frame_id` of the estimates, chosen with the first pose of each
+    map, says what is known about their origin, and so how `nodes.judging.evaluation` aligns them
+    with the ground truth before it compares:
+
+    - ``map``: the origin is that of the ground truth. No alignment.
+    - ``odom``, ``odom_1``, ``odom_2``, …: the origin is the body at the first image. The first pose
+      is laid on the true one (a rigid transform).
+    - If `scale_free` is announced, the unit is unknown as well: Sim(3), the rotation, translation
+      and scale of least squares.
+
+    It is ``map`` if the announced pose of the vehicle was true for the image at which the tracker's
+    poses start:
+
+    - the node was there when the run began: it is not a restarted one;
+    - the vehicle had not been armed (and had not taken off) at that image's stamp;
+    - the vehicle takes commands (its announced control rate is above 0), so that it stands still
+      until it sends `Armed`; or, for a recorded vehicle, which may move from the start without any
+      event, the image is not farther than a camera's period and latency from the announcement's
+      stamp;
+    - the estimates are in metres: the estimator is not scale-free.
+
+    Otherwise it is ``odom``, whose origin is the body at that image. After a restart, and with each
+    further map of the tracker (`TrackingResult.map`), it is ``odom_1``, ``odom_2``, …, and
+    `TrackingLost`, then `TrackingRegained` are sent. The origin of a further map is as near to the
+    one before as the tracker guesses.
+    """
+
+    needs: frozenset[str] = frozenset()
+    """Kinds of image that the camera must give, all of them; ``rgb`` serves for ``grey``, too."""
+    eyes: int = 1
+    """Number of cameras whose images it takes together; 2 for a stereo rig, whose left camera is
+    that of the poses."""
+    inertial: bool = False
+    """Whether it needs an IMU on the vehicle that carries the camera."""
+    lenses: frozenset[str] = frozenset(COEFFICIENTS)
+    """Distortion models that it can compute with, besides an ideal camera; see `refusal` for other
+    conditions."""
+    aligned: bool = True
+    """Whether the images of a stereo rig must be those of equal pinhole cameras, row by row."""
+    method: str = ""
+    """Name of the method, for the report."""
+    scale_free: bool = False
+    """Whether the unit of length is the tracker's own, as that of a single camera is."""
+    library: tuple[str, str] = "", ""
+    """The module that its worker imports and that may be missing, and how it is installed."""
+
+    estimates = Output(PoseEstimate)
+    tracking_events = Output(TrackingEvent)
+    features = Output(TrackedFeatures)
+    trajectories = Output(TrajectoryEstimate)
+
+    cameras: tuple[CameraAnnouncement, ...] = ()
+    """The cameras whose images are read, as many as `eyes`, the left one first; if they are
+    rectified, the pinhole cameras in their place."""
+    imu_announcement: ImuAnnouncement | None = None
+    """The IMU whose samples are read, if it is `inertial`."""
+    _vehicles: tuple[VehicleAnnouncement, ...] = ()
+    _choice: SensorChoice | None = None
+    _rectification: Rectification | None = None
+    _mounts: Mapping[int, Mount] = MappingProxyType({})
+    _frame = ""
+    _given: Mapping[str, str] = MappingProxyType({})
+    _lost = False
+    _armed_at: Mapping[str, int] = MappingProxyType({})
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        needs: Any = cls.needs
+        if isinstance(needs, property):
+            return
+        for need in needs if isinstance(needs, Set) else [needs]:
+            if need not in _KINDS or needs is need:
+                known = ", ".join(_KINDS)
+                raise DeclarationError(
+                    f"{cls.__name__}.needs: expected a set of {known}, found {need!r}"
+                    + ("" if needs is need else suggest(str(need), _KINDS))
+                )
+        cls.needs = frozenset(needs)
+
+    def read(self, frame: type[tuple[Any, ...]]) -> None:
+        """Read sets of this type as ``frames``, for a class whose settings say what it reads.
+
+        Call it in ``__init__``. The class declares all fields of all such types.
+        """
+        bundle = Bundle(frame, keep="latest")
+        bundle.name = "frames"
+        vars(self)["frames"] = bundle.make(self.name)
+
+    @property
+    def camera(self) -> CameraAnnouncement | None:
+        """The camera whose pose is estimated; `None` before it is known."""
+        return self.cameras[0] if self.cameras else None
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce the estimates, and what they are computed from."""
+        yield EstimatorAnnouncement(
+            stamp=0,
+            source=self.name,
+            method=self.method,
+            scale_free=self.scale_free,
+            reads=(*sorted(self.needs), *(["imu"] if self.inertial else [])),
+            eyes=self.eyes,
+            lenses=tuple(sorted(self.lenses)),
+            rectifies=self.config.rectify,
+        )
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Take the first sensors that give what is needed, or those that the file names.
+
+        The file names a camera as ``frames``, those of a stereo rig as ``frames.left`` and
+        ``frames.right``, and an IMU as ``frames.imu``.
+        """
+        if isinstance(announcement, VehicleAnnouncement):
+            self._vehicles += (announcement,)
+        if self._choice is None:
+            self._given = dict(self.sources)
+            self._choice = self._new_choice(self._given)
+        before = self._choice.cameras
+        self._choice.announced(announcement)
+        if self._choice.cameras is not before:
+            self._take(self._choice.cameras)
+            self.imu_announcement = None
+        if self.imu_announcement is None and self._choice.imu is not None:
+            self.imu_announcement = self._choice.imu
+            self._narrow_to("frames.imu", self._choice.imu.source)
+
+    def _take(self, cameras: tuple[CameraAnnouncement, ...]) -> None:
+        """Read the images of these cameras, rectified if they are of no use as they are."""
+        self.cameras, self._rectification = cameras, None
+        if self._choice is not None and self._choice.rectified:
+            self._rectification = Rectification(cameras)
+            self.cameras = self._rectification.cameras
+        for matcher in matchers(self).values():
+            matcher.prepare = self._rectify if self._rectification else None
+        ports = ("frames",) if self.eyes == 1 else ("frames.left", "frames.right")
+        for port, camera in zip(ports, cameras, strict=True):
+            self._narrow_to(port, camera.source)
+
+    def _narrow_to(self, port: str, source: str) -> None:
+        """Receive this source, and not the one before, unless the file names another."""
+        if port not in self._given:
+            self.sources[port] = source
+
+    async def _rectify(self, frame: F) -> F:
+        assert self._rectification is not None
+        return await self.offload(self._rectification.frame, frame)
+
+    def _new_choice(self, named: Mapping[str, str]) -> SensorChoice:
+        return SensorChoice(self.needs, self.eyes, self.inertial, named, self._refusals)
+
+    def _refusals(self, cameras: Sequence[CameraAnnouncement], rectified: bool) -> dict[str, str]:
+        """Return why images are of no use, as they are or rectified, by their cameras' sources."""
+        if rectified:
+            try:
+                cameras = Rectification(cameras).cameras if self.config.rectify else cameras
+            except ValueError as error:
+                return {cameras[0].source: str(error)}
+        found = {camera.source: why for camera in cameras if (why := self.refusal(camera))}
+        if len(cameras) < 2 or found or not self.aligned:
+            return found
+        if (off := misalignment(*cameras)) > ALIGNED:
+            left, right = (camera.source for camera in cameras)
+            found[right] = f"expected its rows aligned with those of {left}, found {off:.2g} px off"
+        return found
+
+    def refusal(self, camera: CameraAnnouncement) -> str:
+        """Return why a camera's images are of no use here, in a sentence; empty if they are."""
+        model = camera.info.distortion_model
+        if camera.info.is_pinhole or model in self.lenses:
+            return ""
+        coefficients = ", ".join(f"{value:g}" for value in camera.info.distortion)
+        known = f" or with {', '.join(sorted(self.lenses))}" if self.lenses else ""
+        return (
+            f"expected images without distortion{known} (rectify = true makes such of others), "
+            f"found {model} with {coefficients}"
+        )
+
+    @on(Armed, TakenOff)
+    def vehicle_events(self, event: VehicleEvent) -> None:
+        """Note from when on a vehicle may have left the pose that it announced."""
+        self._armed_at = {event.source: event.stamp, **self._armed_at}
+
+    def check(self) -> Iterable[str]:
+        """Return the error if no camera gives what is needed, or there is no IMU for it.
+
+        If the file is only checked, also if its library is missing. Says in the log what is
+        rectified.
+        """
+        library, install = self.library
+        if self.checking and library and (why := why_missing(library)):
+            yield f"{self.method} needs {library} ({why}): {install}"
+        if missing := self._missing():
+            yield missing
+        if self._rectification is not None:
+            self.log.info("%s is rectified: %s", self.the_camera().source, self._rectification)
+
+    @abstractmethod
+    async def run(self) -> None:
+        """Track the images."""
+
+    def the_camera(self) -> CameraAnnouncement:
+        """Return the announcement of the camera whose images are read.
+
+        Raises:
+            FatalError: No camera gives what is needed.
+        """
+        if self.camera is None:
+            self.log.fatal("%s", self._missing())
+        return self.camera
+
+    def exposed_at(self, image: Frame) -> int:
+        """Return when an image was exposed on the clock of IMU and ground truth (ns).
+
+        That is its stamp without the offset of the camera's clock, which was announced.
+        """
+        return image.stamp - round(self.the_camera().time_offset * 1e9)
+
+    def _sensor(self) -> CameraAnnouncement | LidarAnnouncement:
+        """Return what the tracker gives the pose of."""
+        return self.the_camera()
+
+    def _missing(self) -> str:
+        return (self._choice or self._new_choice({})).missing()
+
+    def publish(self, image: Frame, result: TrackingResult, origin: int | None = None) -> None:
+        """Send what a tracker found in an image: features, pose, and whether tracking was lost.
+
+        Args:
+            image: The image.
+            result: What the tracker found in it.
+            origin: When the image was exposed at which the tracker's poses start (ns); if `None`,
+                the first image that is published with a pose.
+
+        Raises:
+            NodeError: It is no such result.
+        """
+        stamp = self.exposed_at(image)
+        result = self._checked(stamp, result)
+        if self.restarts and not self._mounts:
+            self._lose(stamp, f"restarted: poses are in {self._odom()} from here on")
+        self._send_features(image, result)
+        if result.lost:
+            self._lose(stamp, result.reason)
+            return
+        mount = self._mount_of(result.map, stamp if origin is None else origin)
+        if mount.frame_id != self._frame and self._frame:
+            reason = f"another map: poses are in {mount.frame_id} from here on"
+            if self._lost:
+                self.log.warning("%s", reason)
+            self._lose(stamp, reason)
+        self._frame = mount.frame_id
+        if self._lost:
+            self._lost = False
+            self.log.info("regained %s", result.reason)
+            self.tracking_events.send(TrackingRegained(stamp=stamp, source=self.name))
+        self.estimates.send(mount.estimate(stamp, self.name, result))
+
+    def _checked(self, stamp: int, result: TrackingResult) -> TrackingResult:
+        which = f"pose at {stamp / 1e9:.3f} s"
+        try:
+            wrong = check_result(result)
+        except ValueError as error:
+            raise NodeError(self.name, f"{which}: {error}") from None
+        if not wrong:
+            return result
+        if self.config.not_finite == "error":
+            cure = 'not_finite = "lost" counts it as lost'
+            raise NodeError(self.name, f"{which}: {wrong} ({cure})")
+        return msgspec.structs.replace(result, lost=True, reason=wrong)
+
+    def _lose(self, stamp: int, reason: str) -> None:
+        if not self._lost:
+            self._lost = True
+            self.log.warning("lost: %s", reason or "no reason given")
+            self.tracking_events.send(TrackingLost(stamp=stamp, source=self.name, reason=reason))
+
+    def _send_features(self, image: Frame, result: TrackingResult) -> None:
+        points = result.points
+        if self._rectification is not None:
+            points = self._rectification.eyes[0].original(points).astype(np.float32)
+        self.features.send(
+            TrackedFeatures(
+                stamp=image.stamp,
+                source=self.name,
+                frame_id=image.frame_id,
+                points=points,
+                inliers=result.inliers,
+            )
+        )
+
+    def publish_trajectory(
+        self, stamps: npt.NDArray[np.int64], poses: npt.NDArray[np.float64], number: int = 0
+    ) -> None:
+        """Send the trajectory as the tracker sees it now, after loop closures; see `on_end`.
+
+        Without a pose that was published in that map, none is sent.
+
+        Args:
+            stamps: When the images were exposed (`exposed_at`), ns, strictly rising, shape (n,).
+            poses: The optical camera as in `TrackingResult`, shape (n, 4, 4).
+            number: Of the map that they are in.
+        """
+        try:
+            check_shape("poses", poses, (len(stamps), 4, 4))
+            for pose, stamp in zip(poses, stamps.tolist(), strict=True):
+                which = f"pose at {stamp / 1e9:.3f} s"
+                if not np.isfinite(pose).all():
+                    raise ValueError(f"{which}: expected finite numbers, found others")
+                check_transform(which, pose)
+        except ValueError as error:
+            raise NodeError(self.name, f"final trajectory: {error}") from None
+        if (mount := self._mounts.get(number)) is not None and len(stamps):
+            self.trajectories.send(mount.trajectory(self.clock.now(), self.name, stamps, poses))
+
+    def _mount_of(self, number: int, origin: int) -> Mount:
+        """Return the mount for poses in a map; that of the first is for poses from `origin` on."""
+        if (mount := self._mounts.get(number)) is None:
+            first = next(iter(self._mounts.values()), None)
+            mount = first and msgspec.structs.replace(first, frame_id=self._odom())
+            mount = mount or self._mounting(origin)
+            self._mounts = {**self._mounts, number: mount}
+            self._frame_numbers().append(self._frame_number())
+        return mount
+
+    def _mounting(self, origin: int) -> Mount:
+        """Return the mount for a tracker whose poses start at an image of this stamp."""
+        camera = self._sensor()
+        vehicles = (v for v in self._vehicles if camera.source.startswith(f"{v.source}/"))
+        vehicle = next(vehicles, None) if self.config.origin == "announced" else None
+        if (
+            vehicle is not None
+            and not self.scale_free
+            and not self._at_announced_pose(vehicle, origin)
+        ):
+            self.log.warning(
+                "the announced pose of %s is not known to hold at %.3f s, where tracking starts: "
+                "estimates are in %s",
+                vehicle.source,
+                origin / 1e9,
+                self._odom(),
+            )
+            vehicle = None
+        return Mount.of(camera, None if self.scale_free else vehicle, self._odom())
+
+    def _at_announced_pose(self, vehicle: VehicleAnnouncement, stamp: int) -> bool:
+        """Return whether a vehicle is known to have been at its announced pose at a time (ns)."""
+        camera = self._sensor()
+        if self.restarts or self._armed_at.get(vehicle.source, stamp) < stamp:
+            return False
+        first = camera.latency + (1.0 / camera.rate if camera.rate > 0 else 0.0)
+        return vehicle.control_rate > 0 or abs(stamp - vehicle.stamp) <= first * 1e9
+
+    def _odom(self) -> str:
+        """Return the frame of estimates whose origin is unknown."""
+        number = self._frame_number()
+        return f"odom_{number}" if number else "odom"
+
+    def _frame_number(self) -> int:
+        """Return a number that no frame has had, of this node or of those before a restart."""
+        return max([self.restarts, *(number + 1 for number in self._frame_numbers())])
+
+    def _frame_numbers(self) -> list[int]:
+        return self.share(f"frames of {self.name}", list[int])

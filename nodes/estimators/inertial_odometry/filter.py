@@ -1,0 +1,385 @@
+"""An error-state Kalman filter of a body with an IMU and a camera that sees a map.
+
+The state is orientation, position and velocity of the IMU, the biases of gyroscope and
+accelerometer, and the direction of gravity, on the sphere, as in W. Xu, Y. Cai, D. He, J. Lin and
+F. Zhang, "FAST-LIO2", IEEE T-RO 2022: the world is the first camera, which need not be level, and a
+flight may begin in motion.
+
+Landmarks are where the key frames that saw them first were, and these are known as well as the
+filter knew its own pose then, and as their pixels and depths there placed them. Their poses are
+states that are considered and not estimated: so the uncertainty grows with the length of the way
+and not only with time, and shrinks when the camera comes back to an old key frame. (S. F. Schmidt's
+filter; P. Geneva, J. Maley and G. Huang, "An efficient Schmidt-EKF for 3D visual-inertial SLAM",
+CVPR 2019.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from events.poses import inverse
+from nodes.estimators.inertial_odometry.preintegration import (
+    Floats,
+    ImuModel,
+    Preintegrated,
+    cross,
+    crosses,
+)
+
+THETA, P, V, BG, BA = (slice(at, at + 3) for at in range(0, 15, 3))
+"""Where the errors stand; that of the orientation is a small rotation in the IMU's own frame."""
+G = slice(15, 17)
+"""That of gravity's direction: small rotations about the two level axes."""
+POSE = slice(0, 6)
+_SIZE = 17
+GRAVITY = 9.81
+_SPEED = 3.0
+"""Standard deviation of the unknown velocity at the start, m/s."""
+_TILT = 0.35
+"""Standard deviation of gravity's direction as the first samples give it, radians: that of a
+vehicle that accelerates by 3.5 m/s²."""
+_NO_TILT = 1.5
+"""The same without samples."""
+_UNSTATED = np.array([0.01, 0.1])
+"""Standard deviations of biases of which nothing is announced: rad/s, m/s²."""
+_STEPS = 2
+_HUBER = 2.0
+_FLOOR = 1e-3
+"""Metres and radians by which a pose may be off without a surprise."""
+_IMPLAUSIBLE = 60.0
+"""Squared Mahalanobis distance (6 degrees of freedom) beyond which a map's pose is not believed."""
+_AHEAD = 0.8
+"""Least share of a sighting's landmarks that must be ahead of the camera in each step."""
+_BESIDE = 2
+"""Images that are remembered beside the key frames, with the numbers -1 and -2."""
+_ORIGIN = 2e-4
+"""Standard deviation of the pose at the start, metres and radians: the camera is the world."""
+_VAGUE = 0.1
+"""Standard deviation of what the landmarks of a key frame do not tell: metres, radians."""
+
+Measurement = Callable[["State"], tuple[Floats, Floats] | None]
+"""Returns Λ and Aᵀr about a state, by its pose and by those of key frames; `None`: impossible."""
+
+
+class State(msgspec.Struct, frozen=True, eq=False):
+    """What is estimated.
+
+    Attributes:
+        rotation: From the IMU to the world, shape (3, 3).
+        position: Of the IMU in the world, metres, shape (3,).
+        velocity: In the world, m/s, shape (3,).
+        bias: Of gyroscope (rad/s) and accelerometer (m/s²), shape (6,).
+        level: From a level frame, whose third axis is down, to the world, shape (3, 3).
+    """
+
+    rotation: Floats
+    position: Floats
+    velocity: Floats
+    bias: Floats
+    level: Floats
+
+    @property
+    def gravity(self) -> Floats:
+        """Gravity in the world, m/s², shape (3,)."""
+        return np.asarray(GRAVITY * self.level[:, 2])
+
+    def moved(self, error: Floats) -> State:
+        """Return the state that differs by an error, shape (17,)."""
+        return State(
+            self.rotation @ Rotation.from_rotvec(error[THETA]).as_matrix(),
+            self.position + error[P],
+            self.velocity + error[V],
+            self.bias + error[BG.start : BA.stop],
+            self.level @ Rotation.from_rotvec([*error[G], 0.0]).as_matrix(),
+        )
+
+    def error_of(self, other: State) -> Floats:
+        """Return by how much another state differs from this one, shape (17,)."""
+        x, y, z = self.level.T @ other.level[:, 2]
+        tilt = np.array([-y, x]) * (np.arctan2(np.hypot(x, y), z) / max(np.hypot(x, y), 1e-12))
+        turn = Rotation.from_matrix(self.rotation.T @ other.rotation).as_rotvec()
+        return np.concatenate(
+            [
+                turn,
+                other.position - self.position,
+                other.velocity - self.velocity,
+                other.bias - self.bias,
+                tilt,
+            ]
+        )
+
+
+class Sighting(msgspec.Struct, frozen=True, eq=False):
+    """Landmarks as one image shows them.
+
+    Attributes:
+        places: Metres in the world, shape (n, 3).
+        keyframes: Number of the key frame that each was first seen in, shape (n,).
+        measured: x/z, y/z and 1/z in the camera, shape (n, 3).
+        scale: One by their standard deviations; 0 where nothing was measured, shape (n, 3).
+    """
+
+    places: Floats
+    keyframes: npt.NDArray[np.int64]
+    measured: Floats
+    scale: Floats
+
+
+class InertialFilter:
+    """Estimates the state of an IMU.
+
+    Args:
+        imu: Its model.
+        camera: The optical camera in the IMU's frame, shape (4, 4).
+        capacity: Number of key frames that are remembered.
+        common: Shares of variance that the errors of all landmarks in one image have in common, so
+            that many tell no more than its inverse: of what is seen, and of places besides.
+
+    Attributes:
+        state: The estimate.
+        covariance: Of the state's error, shape (17, 17).
+    """
+
+    def __init__(
+        self,
+        imu: ImuModel,
+        camera: Floats,
+        capacity: int,
+        common: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self._imu, self.camera, self._common = imu, camera, common
+        self._capacity = capacity
+        back = inverse(camera)
+        none = np.zeros(3)
+        self.state = State(back[:3, :3], back[:3, 3], none, np.zeros(6), _level(none))
+        self.covariance = np.zeros((_SIZE, _SIZE))
+        self.forget()
+
+    def start(self, force: Floats, pose: Floats | None = None) -> None:
+        """Begin at an image, with gravity against the specific force, if not zero.
+
+        What is not known of velocity, gravity and biases is found from the first images, at rest or
+        in motion.
+
+        Args:
+            force: Mean specific force, m/s², shape (3,).
+            pose: The camera in the world, shape (4, 4); if `None`, the camera is the world.
+        """
+        body = inverse(self.camera) if pose is None else pose @ inverse(self.camera)
+        bias = np.where(self._imu.turn_on > 0, self._imu.turn_on, _UNSTATED)
+        tilt = _TILT if np.linalg.norm(force) > 0 else _NO_TILT
+        deviations = np.repeat([_ORIGIN, _ORIGIN, _SPEED, *bias, tilt], 3)[:_SIZE]
+        self.covariance = np.diag(np.square(deviations))
+        self._with_frames[:] = 0.0
+        self.state = State(
+            body[:3, :3], body[:3, 3], np.zeros(3), np.zeros(6), _level(-body[:3, :3] @ force)
+        )
+
+    def forget(self) -> None:
+        """Forget all key frames: a new map begins."""
+        capacity = 6 * (self._capacity + _BESIDE)
+        self._frames: dict[int, tuple[Floats, Floats]] = {}
+        self._with_frames = np.zeros((_SIZE, capacity))
+        self._of_frames = np.zeros((capacity, capacity))
+
+    def remember(self, number: int, placed: Sighting | None = None) -> None:
+        """Note the present pose as that of a key frame.
+
+        Args:
+            number: Its number, that of the newest one; or below zero, for an image beside them, of
+                which only those are kept that are noted again.
+            placed: Its new landmarks, with the noise of their places: that stays as it is whenever
+                they are seen, so they tell the pose by no more than it lets them.
+        """
+        at = int(self._slots(np.array([number]))[0])
+        self._frames.pop(number - self._capacity, None)
+        self._frames[number] = self.state.rotation, self.state.position
+        here = slice(at, at + 6)
+        self._of_frames[here] = self._with_frames[POSE]
+        self._of_frames[:, here] = self._with_frames[POSE].T
+        self._of_frames[here, here] = self.covariance[POSE, POSE]
+        if placed is not None and len(placed.places):
+            group, numbers = np.zeros(len(placed.places), np.intp), np.array([number])
+            found = self._by_landmarks(self.state, placed, group, numbers)
+            told = np.zeros((6, 6)) if found is None else found[0][POSE, POSE]
+            told = told / (1.0 + self._common[1] * (len(placed.places) - 1))
+            self._of_frames[here, here] += np.linalg.inv(told + np.eye(6) / _VAGUE**2)
+        self._with_frames[:, here] = self.covariance[:, POSE]
+
+    def propagate(self, motion: Preintegrated) -> None:
+        """Let a motion pass that the IMU felt, with the biases of the present state."""
+        state, t = self.state, motion.seconds
+        turn = np.kron(np.eye(3), state.rotation)
+        turn[:3, :3] = np.eye(3)
+        change = np.eye(_SIZE)
+        change[THETA, THETA] = motion.rotation.T
+        change[V, THETA] = -state.rotation @ cross(motion.velocity)
+        change[P, THETA] = -state.rotation @ cross(motion.position)
+        fall = GRAVITY * np.stack([-state.level[:, 1], state.level[:, 0]], axis=1)
+        change[P, V], change[V, G], change[P, G] = np.eye(3) * t, fall * t, fall * (t * t / 2)
+        order = np.r_[THETA, V, P]
+        change[order[:, None], np.arange(BG.start, BA.stop)] = turn @ motion.by_bias
+        self.covariance = change @ self.covariance @ change.T
+        self.covariance[np.ix_(order, order)] += turn @ motion.covariance @ turn.T
+        walk = np.repeat(self._imu.walk**2 * t, 3)
+        self.covariance[np.arange(9, 15), np.arange(9, 15)] += walk
+        self._with_frames = change @ self._with_frames
+        self.state = State(
+            state.rotation @ motion.rotation,
+            state.position
+            + state.velocity * t
+            + state.gravity * (t * t / 2)
+            + state.rotation @ motion.position,
+            state.velocity + state.gravity * t + state.rotation @ motion.velocity,
+            state.bias,
+            state.level,
+        )
+
+    def update(self, seen: Sighting) -> bool:
+        """Take in landmarks of an image; return False, changing nothing, if they contradict."""
+        numbers, group = np.unique(seen.keyframes, return_inverse=True)
+        return self._correct(numbers, lambda state: self._by_landmarks(state, seen, group, numbers))
+
+    def misfit(self, seen: Sighting) -> float:
+        """Return by how much half of the landmarks miss their pixels, in standard deviations."""
+        *_, image = self._image(self.state, seen)
+        return float(np.median(np.hypot(*((seen.measured - image) * seen.scale)[:, :2].T)))
+
+    def update_pose(self, camera: Floats, number: int, information: Floats, first: bool) -> bool:
+        """Take in a pose that an image has by a key frame; return False if it contradicts.
+
+        The error of such a pose is half that of the image, and half that of the key frame, which
+        does not change from image to image.
+
+        Args:
+            camera: The camera in the world if the key frame is where it was remembered, (4, 4).
+            number: The key frame.
+            information: Inverse covariance of a small motion of the camera's frame, as `moved` in
+                `nodes.estimators.odometry.pose` has it, shape (6, 6).
+            first: Whether this is the first pose by that key frame.
+        """
+        found = camera @ inverse(self.camera)
+        rotation, position = self._frames[number]
+        relative = rotation.T @ found[:3, :3], rotation.T @ (found[:3, 3] - position)
+        by = np.zeros((6, 12))
+        by[:, :6] = np.eye(6)
+        by[:3, 6:9], by[3:, 6:9] = -relative[0].T, rotation @ cross(relative[1])
+        by[3:, 9:] = -np.eye(3)
+        mounted = self.camera[:3, :3].T
+        small = np.zeros((6, 6))
+        small[:3, :3], small[:3, 3:] = mounted @ cross(self.camera[:3, 3]), -camera[:3, :3].T
+        small[3:, :3] = -mounted
+        told = small.T @ information @ small
+        if first:
+            here = self._slots(np.array([number]))
+            lasting = np.linalg.inv(told + np.eye(6) / _VAGUE**2)
+            self._of_frames[np.ix_(here, here)] += lasting
+        weighted = by.T @ told
+
+        def measure(state: State) -> tuple[Floats, Floats]:
+            turn = Rotation.from_matrix(state.rotation.T @ found[:3, :3]).as_rotvec()
+            return weighted @ by, weighted @ np.concatenate([turn, found[:3, 3] - state.position])
+
+        return self._correct(np.array([number]), measure)
+
+    def _correct(self, numbers: npt.NDArray[np.int64], measure: Measurement) -> bool:
+        """Take in a measurement by the poses of key frames, unless it contradicts.
+
+        Iterated Kalman update in the information form of the measurements: with their information
+        Λ and the covariance M of the poses concerned, gain and covariance need (I + ΛM)⁻¹ only.
+        Each step is gated on the innovation as the pose sees it, whose covariance ΛMΛ + Λ has the
+        correlations of the state with the key frames in it.
+        """
+        slots = self._slots(numbers)
+        # Covariances of the poses concerned with themselves, and of the state with these.
+        across = self._with_frames[:, slots]
+        concerned = np.block(
+            [
+                [self.covariance[POSE, POSE], across[POSE]],
+                [across[POSE].T, self._of_frames[np.ix_(slots, slots)]],
+            ]
+        )
+        state_with = np.hstack([self.covariance[:, POSE], across])
+        state, error = self.state, np.zeros(_SIZE)
+        for _ in range(_STEPS):
+            measured = measure(state)
+            if measured is None:
+                return False
+            information, vector = measured
+            vector = vector + information[:, POSE] @ error[POSE]
+            by_pose = information[POSE]
+            spread = by_pose @ concerned @ by_pose.T + by_pose[:, POSE]
+            spread += _FLOOR**2 * by_pose[:, POSE] @ by_pose[:, POSE]
+            off = vector[POSE] @ np.linalg.pinv(spread, 1e-12, hermitian=True) @ vector[POSE]
+            if not off < _IMPLAUSIBLE:
+                return False
+            both = np.column_stack([vector, information])
+            solved = np.linalg.solve(np.eye(len(vector)) + information @ concerned, both)
+            error = state_with @ solved[:, 0]
+            state = self.state.moved(error)
+        self.state = state
+        gain = state_with @ ((solved[:, 1:] + solved[:, 1:].T) / 2)
+        with_frames = np.vstack([self._with_frames[POSE], self._of_frames[slots]])
+        self.covariance = self.covariance - gain @ state_with.T
+        self._with_frames = self._with_frames - gain @ with_frames
+        return True
+
+    def _slots(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return where the poses of key frames stand, shape (6 n,)."""
+        place = np.where(numbers < 0, self._capacity - 1 - numbers, numbers % self._capacity)
+        return np.asarray((6 * place[:, None] + np.arange(6)).ravel())
+
+    def _by_landmarks(
+        self,
+        state: State,
+        seen: Sighting,
+        group: npt.NDArray[np.intp],
+        numbers: npt.NDArray[np.int64],
+    ) -> tuple[Floats, Floats] | None:
+        in_body, ahead, image = self._image(state, seen)
+        if ahead.mean() < _AHEAD:
+            return None
+        inverse = image[:, 2]
+        residual = (seen.measured - image) * seen.scale
+        size = np.abs(residual)
+        size[:, :2] = np.hypot(residual[:, 0], residual[:, 1])[:, None]
+        weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(size, _HUBER))) * ahead[:, None]
+        by_point = np.zeros((len(image), 3, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = inverse
+        by_point[:, :, 2] = -image * inverse[:, None]
+        by_body = (by_point * (weight * seen.scale)[:, :, None]) @ self.camera[:3, :3].T
+        by_world = by_body @ state.rotation.T
+        frames = [self._frames[number] for number in numbers.tolist()]
+        rotations = np.array([rotation for rotation, _ in frames])[group]
+        positions = np.array([position for _, position in frames])[group]
+        arms = np.einsum("nji,nj->ni", rotations, seen.places - positions)
+        matrix = np.zeros((len(image), 3, 1 + len(numbers), 6))
+        matrix[:, :, 0, :3], matrix[:, :, 0, 3:] = by_body @ crosses(in_body), -by_world
+        rows = np.arange(len(image))
+        matrix[rows, :, 1 + group, :3] = -by_world @ rotations @ crosses(arms)
+        matrix[rows, :, 1 + group, 3:] = by_world
+        flat = matrix.reshape(3 * len(image), -1)
+        share = 1.0 / (1.0 + self._common[0] * (len(image) - 1))
+        return share * (flat.T @ flat), share * (flat.T @ (weight * residual).ravel())
+
+    def _image(self, state: State, seen: Sighting) -> tuple[Floats, npt.NDArray[np.bool_], Floats]:
+        """Return landmarks in the IMU's frame, which are ahead, and what should be measured."""
+        in_body = (seen.places - state.position) @ state.rotation
+        x, y, z = ((in_body - self.camera[:3, 3]) @ self.camera[:3, :3]).T
+        ahead = z > 0.05
+        inverse = 1.0 / np.where(ahead, z, 1.0)
+        return in_body, ahead, np.stack([x * inverse, y * inverse, inverse], axis=1)
+
+
+def _level(down: Floats) -> Floats:
+    """Return axes of which the third is a direction, or that of no vector, shape (3, 3)."""
+    length = float(np.linalg.norm(down))
+    down = down / length if length > 0 else np.array([0.0, 1.0, 0.0])
+    across = np.cross(down, np.eye(3)[np.abs(down).argmin()])
+    across /= np.linalg.norm(across)
+    return np.column_stack([across, np.cross(down, across), down])

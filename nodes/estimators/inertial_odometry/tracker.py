@@ -1,0 +1,352 @@
+"""Visual-inertial odometry: the map of the RGB-D tracker, and a filter that the IMU drives.
+
+The IMU says where the map should be in the next image, all landmarks found there correct the
+filter (tightly coupled: none is too few), and the filter's pose is what the map grows from. Where
+landmarks are few, an alignment of edges and surfaces corrects it, too. Where nothing is seen, the
+IMU alone carries the pose on, for a while; then the camera is lost, and what it does not find
+again becomes a new map, in a frame of its own.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraAnnouncement, ImuAnnouncement
+from events.poses import inverse, pose_matrix
+from nodes.estimators import TrackingResult
+from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
+from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel, cross
+from nodes.estimators.inertial_odometry.rolling_shutter import Rows as ImageRows
+from nodes.estimators.odometry.images import Depth, Grey
+from nodes.estimators.odometry.pose import rays
+from nodes.estimators.stereo_odometry import StereoMatcher, StereoSettings
+from nodes.estimators.visual_odometry.alignment import Alignment
+from nodes.estimators.visual_odometry.features import BELIEVED, FeatureTracker
+from nodes.estimators.visual_odometry.landmarks import MapMatch
+from nodes.estimators.visual_odometry.patches import Rows
+from nodes.estimators.visual_odometry.settings import FeatureSettings
+from nodes.estimators.visual_odometry.surfaces import Surfaces, surfaces_at
+
+_KNOWN = 0.3, 0.03
+"""Standard deviations of velocity (m/s) and gravity (radians) below which the IMU is of use."""
+_READING = 0.8
+"""Noise of a reading of depth, as a share of that of one pixel: errors of place included."""
+_BENT = 0.003
+"""The same of surfaces that are not quite planes, as a share of inverse depth."""
+_PLACED = 0.5, 0.5
+"""Noise of a landmark's place, which does not change from image to image, as a share of that of one
+sighting: of its pixel, and of its depth."""
+_COMMON, _COMMON_BY_EYES = (0.02, 0.0), (0.02, 0.1)
+"""Shares of variance that the errors of all landmarks in an image have in common: of what is seen,
+and of places. That of a depth sensor's noise is none; how a surface lies and looks shifts the
+disparities of all that is on it."""
+_MISFIT = 1.5
+"""Standard deviations of a pixel by which half of the landmarks may miss theirs."""
+_PATIENCE, _DOUBTED = 0.4, 0.6
+"""Seconds over which the share of images is taken whose landmarks contradict the filter, and that
+beyond which the filter is not believed: it begins anew, in a frame of its own."""
+_SLOTS = (-1, -2)
+"""Numbers of the images that may be the reference of an alignment, beside those of key frames."""
+
+
+class InertialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the fusion with an IMU.
+
+    Attributes:
+        carry: Seconds without any landmark for which the IMU alone gives the pose; then the camera
+            is lost.
+        pixel_noise: Standard deviation of a landmark's pixel, errors of its place included.
+    """
+
+    carry: Annotated[float, msgspec.Meta(ge=0)] = 3.0
+    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.5
+
+
+class InertialTracker(FeatureTracker):
+    """Tracks a camera with depth, or a stereo rig, and an IMU on one body.
+
+    Equal images and samples give equal poses, to the bit.
+
+    Args:
+        camera: The camera, or the left one of a rectified rig.
+        imu: The IMU.
+        baseline: Metres to the right camera; 0 if there is none.
+        features: Settings of the map.
+        inertial: Settings of the fusion.
+        stereo: Settings of the stereo matching.
+    """
+
+    def __init__(
+        self,
+        camera: CameraAnnouncement,
+        imu: ImuAnnouncement,
+        baseline: float,
+        features: FeatureSettings,
+        inertial: InertialSettings,
+        stereo: StereoSettings,
+    ) -> None:
+        cv2.setNumThreads(1)
+        self._matcher = StereoMatcher(camera.info, baseline, stereo) if baseline else None
+        surfaces = surfaces_at
+        if self._matcher is not None:
+            features = msgspec.structs.replace(features, depth_noise=self._matcher.depth_noise)
+            surfaces = self._matcher.surfaces_at
+        super().__init__(camera.info, features, surfaces)
+        self._imu, self._inertial, self._readout = ImuModel(imu), inertial, camera.readout
+        mounted = inverse(self._imu.pose) @ pose_matrix(camera.position, camera.orientation)
+        common = _COMMON if self._matcher is None else _COMMON_BY_EYES
+        self._filter = InertialFilter(self._imu, mounted, features.keyframes + 1, common)
+        self._samples = np.empty((0, 7))
+        self._time: float | None = None  # of the filter, seconds
+        self._epoch: int | None = None
+        self._seen_at = 0.0
+        self._force = np.zeros(3)
+        self._doubt = 0.0  # share of the last images whose landmarks contradict
+        self._judged_at = 0.0
+        self._noted = self._referred = _SLOTS[0]
+        self._noted_pose = np.eye(4)
+
+    def fuse(
+        self,
+        stamp: int,
+        image: npt.NDArray[np.uint8],
+        other: npt.NDArray[np.uint8] | Depth,
+        samples: Floats,
+    ) -> TrackingResult:
+        """Return the pose of the next image.
+
+        Args:
+            stamp: When the image was exposed on the clock of the IMU (ns).
+            image: Grey or colour, of the (left) camera.
+            other: Its depth in metres, or the image of the right camera.
+            samples: Of the IMU since the image before: stamp (ns), angular velocity, specific
+                force; shape (n, 7).
+
+        Raises:
+            ValueError: The size is not that of the camera.
+        """
+        self._epoch = stamp if self._epoch is None else self._epoch
+        now = (stamp - self._epoch) / 1e9
+        samples = self._imu.corrected(
+            np.column_stack([(samples[:, 0] - self._epoch) / 1e9, samples[:, 1:]])
+        )
+        self._samples = np.vstack([self._samples, samples])
+        self._rates = self._advance(now)
+        if self._readout > 0:
+            image, other = self._straightened(image, other)
+        if self._matcher is None:
+            depth = np.asarray(other, np.float32)
+        else:
+            depth = self._matcher.depth(image, np.asarray(other, np.uint8))
+        self._now = now
+        self._force = samples[:, 4:].mean(axis=0) if len(samples) else np.zeros(3)
+        result = self.track(stamp, image, depth)
+        if self._time is None:
+            return result
+        lost = result.lost
+        if self._is_known:
+            lost &= not self._is_carried
+            velocity = (
+                self._filter.state.rotation @ self._filter.camera[:3, :3] @ self._camera_velocity()
+            )
+        else:
+            # In a map begun at a guess, a pose is of use when the IMU can carry it.
+            lost |= self._maps > 0
+            velocity = None
+        return msgspec.structs.replace(
+            result,
+            lost=lost,
+            reason=result.reason or ("the velocity is not known yet" if lost else ""),
+            velocity=velocity,
+            covariance=self._camera_covariance(),
+        )
+
+    @property
+    def _is_known(self) -> bool:
+        """Whether velocity and gravity are known well enough to go on without images."""
+        variances = np.diag(self._filter.covariance)
+        return not (self._time is None or self._is_doubted) and bool(
+            variances[V].max() < _KNOWN[0] ** 2 and variances[G].max() < _KNOWN[1] ** 2
+        )
+
+    def _advance(self, now: float) -> Floats:
+        """Bring the filter to a time; return angular velocity and specific force then, shape (6,).
+
+        Samples that are missing at the end are replaced by the last one.
+        """
+        samples = self._samples
+        if len(samples):
+            newest = np.maximum.accumulate(samples[:, 0])
+            samples = samples[np.concatenate([[True], np.diff(newest) > 0])]
+        else:
+            rest = -self._filter.state.gravity @ self._filter.state.rotation
+            samples = np.array([[now, 0.0, 0.0, 0.0, *rest]])
+        begin = now if self._time is None else self._time
+        inner = samples[(samples[:, 0] > begin) & (samples[:, 0] < now), 0]
+        times = np.concatenate([[begin], inner, [now]])
+        rows = self._imu.at(samples, times)
+        if now > begin:
+            self._filter.propagate(self._imu.preintegrate(rows, self._filter.state.bias))
+            self._time = now
+        used = int(np.searchsorted(samples[:, 0], now)) - 1
+        self._samples = samples[max(used, 0) :] if len(self._samples) else self._samples
+        rates: Floats = rows[-1, 1:] - self._filter.state.bias
+        return rates
+
+    def _camera_velocity(self) -> Floats:
+        """Return the camera's velocity in its own axes, m/s, shape (3,)."""
+        camera, state = self._filter.camera, self._filter.state
+        turning = np.cross(self._rates[:3], camera[:3, 3])
+        velocity: Floats = camera[:3, :3].T @ (state.rotation.T @ state.velocity + turning)
+        return velocity
+
+    def _camera_covariance(self) -> Floats:
+        """Return the covariance of the camera's pose, as `TrackingResult` has it."""
+        state, camera = self._filter.state, self._filter.camera
+        moved = np.zeros((6, 6))
+        moved[:3, :3] = -state.rotation @ cross(camera[:3, 3])
+        moved[:3, 3:], moved[3:, :3] = np.eye(3), state.rotation
+        found: Floats = moved @ self._filter.covariance[POSE, POSE] @ moved.T
+        return (found + found.T) / 2
+
+    def _straightened(
+        self, image: npt.NDArray[np.uint8], other: npt.NDArray[np.uint8] | Depth
+    ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | Depth]:
+        """Return both images as if all rows had been exposed with the middle one."""
+        turn = self._filter.camera[:3, :3].T @ self._rates[:3]
+        velocity = self._camera_velocity() if self._is_known else np.zeros(3)
+        rows = ImageRows(self._info, self._readout, turn, velocity)
+        if self._matcher is None:
+            return rows.image_and_depth(image, np.asarray(other, np.float32))
+        return rows.image(image), rows.image(np.asarray(other, np.uint8))
+
+    # What the map's tracker asks for.
+
+    def _expect(self, grey: Grey) -> Floats | None:
+        """Return the pose that the IMU predicts, once the filter knows enough; world to camera."""
+        return inverse(self._camera_pose()) if self._is_known else super()._expect(grey)
+
+    def _starts(self, stamp: int, match: MapMatch | None) -> tuple[list[Floats], bool]:
+        return ([self._pose], False) if self._is_known else super()._starts(stamp, match)
+
+    def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
+        """Find the map in an image, and let the landmarks found correct the filter."""
+        match = super()._match(grey, inverse_of)
+        if match is not None:
+            seen = self._sighting(match, inverse_of)
+            agrees = self._filter.update(seen)
+            if len(seen.places) >= self._enough:  # fewer may all be wrong
+                self._judge(agrees and self._filter.misfit(seen) < _MISFIT)
+            match = match if agrees else None
+        return None if self._is_doubted else self._corrected(match)
+
+    def _judge(self, agrees: bool) -> None:
+        """Note whether the landmarks of an image agree with the filter."""
+        share = min((self._now - self._judged_at) / _PATIENCE, 1.0) if self._is_known else 0.0
+        self._doubt += share * ((not agrees) - self._doubt)
+        self._judged_at = self._now
+
+    @property
+    def _is_doubted(self) -> bool:
+        return self._doubt > _DOUBTED
+
+    def _aligned(
+        self,
+        grey: Grey,  # noqa: ARG002
+        inverse_of: Depth,  # noqa: ARG002
+        alignment: Alignment,
+        match: MapMatch | None,
+    ) -> MapMatch | None:
+        """Let an alignment correct the filter."""
+        if self._is_doubted:
+            return None
+        if first := bool((alignment.reference == self._noted_pose).all()):
+            self._referred = self._noted
+        believed, pose = BELIEVED * alignment.information, inverse(alignment.pose)
+        if self._filter.update_pose(pose, self._referred, believed, first):
+            match = match or MapMatch.without_landmarks(alignment.pose)
+        return self._corrected(match)
+
+    def _corrected(self, match: MapMatch | None) -> MapMatch | None:
+        """Return a match at the filter's pose."""
+        self._pose = inverse(self._camera_pose())
+        if match is None:
+            return None
+        self._seen_at = self._now
+        return msgspec.structs.replace(match, pose=self._pose)
+
+    def _note(self, grey: Grey, inverse_of: Depth, aligned: bool) -> None:
+        super()._note(grey, inverse_of, aligned)
+        self._noted = _SLOTS[self._referred == _SLOTS[0]]
+        self._noted_pose = self._pose
+        self._filter.remember(self._noted)
+
+    def _add_keyframe(self, grey: Grey, inverse_of: Depth, rows: Rows, pixels: Floats) -> None:
+        super()._add_keyframe(grey, inverse_of, rows, pixels)
+        number = next(reversed(self._keyframes))
+        if number == 0:
+            self._filter.forget()
+            if self._time is None:  # the first map, or one at a guessed pose
+                self._filter.start(self._force, inverse(self._pose))
+                self._time = self._seen_at = self._now
+                self._doubt = 0.0
+            self._note(grey, inverse_of, False)
+        new = np.flatnonzero(self._map.keyframes == number)
+        read = self._surfaces_at(inverse_of, self._map.pixels[new], self._settings.depth_noise)
+        self._filter.remember(number, self._seen(new, self._map.pixels[new], read, _PLACED))
+
+    def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
+        """Return that nothing was found; after a while, start a new map.
+
+        That is where the IMU has carried the camera, while that is known; else in a new frame.
+        """
+        result = self._lost(stamp, "too few landmarks of the map were found")
+        waited = stamp - (self._lost_since or stamp)
+        if waited < self._settings.reset_timeout * 1e9 and not self._is_doubted:
+            return result
+        if self._is_carried:
+            return self._start_map(stamp, grey, inverse_of, "by a new map, where the IMU says")
+        begun, self._time = self._time, None
+        why = ", as its landmarks contradict the IMU" if self._is_doubted else ""
+        started = self._start_map(stamp, grey, inverse_of, f"by a new map, at a guessed pose{why}")
+        if started.lost:
+            self._time = begun
+        return started
+
+    @property
+    def _is_carried(self) -> bool:
+        return self._is_known and self._now - self._seen_at <= self._inertial.carry
+
+    def _camera_pose(self) -> Floats:
+        """Return the camera in the world, shape (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self._filter.state.rotation, self._filter.state.position
+        found: Floats = pose @ self._filter.camera
+        return found
+
+    def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:
+        """Return the landmarks of a match that agree with it."""
+        rows, pixels = match.rows[match.agree], match.pixels[match.agree]
+        read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
+        return self._seen(rows, pixels, read, (1.0, 1.0))
+
+    def _seen(
+        self, rows: Rows, pixels: Floats, read: Surfaces, noise: tuple[float, float]
+    ) -> Sighting:
+        """Return landmarks at pixels, with shares of the noise of a pixel and of its depth."""
+        measured = rays(pixels, self._matrix)
+        measured[:, 2] = read.inverse
+        scale = np.empty_like(measured)
+        pixel_noise = noise[0] * self._inertial.pixel_noise
+        scale[:, :2] = np.array([self._info.fx, self._info.fy]) / pixel_noise
+        # A pixel that is off reads the depth beside it, which on a slanted surface is another.
+        slant = pixel_noise * np.linalg.norm(read.slope, axis=1)
+        noises = [noise[1] * _READING * self._settings.depth_noise, slant, _BENT * read.inverse]
+        variance = sum(np.square(each) for each in noises)
+        scale[:, 2] = np.where(read.continuous, 1.0 / np.sqrt(variance), 0.0)
+        return Sighting(self._map.places[rows], self._map.keyframes[rows], measured, scale)

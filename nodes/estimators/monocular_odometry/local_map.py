@@ -1,0 +1,270 @@
+"""The map: the last key frames, the corners followed through them, and their points.
+
+Poses between key frames are computed in `nodes.estimators.monocular_odometry.tracker`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from events.poses import inverse
+from nodes.estimators.monocular_odometry.bundle import Indices, adjust
+from nodes.estimators.monocular_odometry.initialization import InitialMap
+from nodes.estimators.monocular_odometry.keyframes import Keyframe, new_corners
+from nodes.estimators.monocular_odometry.settings import MonocularSettings
+from nodes.estimators.monocular_odometry.views import parallax, reprojection_errors, triangulate
+from nodes.estimators.odometry.images import Floats, Grey
+from nodes.estimators.odometry.pose import rays
+
+Mask = npt.NDArray[np.bool_]
+View = tuple[float, float]
+
+
+class Tracks:
+    """Corners that are followed.
+
+    Attributes:
+        pixels: Column and row in the newest key frame, shape (n, 2).
+        points: Points in the world, shape (n, 3); not a number while they are unknown.
+        views: Pixels of each by key frame.
+    """
+
+    def __init__(self, pixels: Floats, keyframe: int) -> None:
+        self.pixels = pixels
+        self.points = np.full((len(pixels), 3), np.nan)
+        self.views: list[dict[int, View]] = [{keyframe: (x, y)} for x, y in pixels.tolist()]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def known(self) -> Mask:
+        """Which have a known point in the world, shape (n,)."""
+        return np.asarray(np.isfinite(self.points[:, 0]))
+
+    def keep(self, rows: npt.NDArray[np.int64]) -> list[tuple[Floats, dict[int, View]]]:
+        """Keep some; return points and views of those others whose point is known."""
+        kept = np.zeros(len(self), np.bool_)
+        kept[rows] = True
+        gone = np.flatnonzero(~kept & self.known)
+        retired = [(self.points[row], self.views[row]) for row in gone.tolist()]
+        self.drop(np.flatnonzero(~kept))
+        return retired
+
+    def drop(self, rows: npt.NDArray[np.int64]) -> None:
+        """Follow some no longer."""
+        kept = np.ones(len(self), np.bool_)
+        kept[rows] = False
+        self.views = [self.views[row] for row in np.flatnonzero(kept).tolist()]
+        self.pixels, self.points = self.pixels[kept], self.points[kept]
+
+    def add_view(self, keyframe: int, pixels: Floats) -> None:
+        """Add their pixels in a new key frame, shape (n, 2)."""
+        self.pixels = pixels
+        for views, (x, y) in zip(self.views, pixels.tolist(), strict=True):
+            views[keyframe] = (x, y)
+
+    def add(self, pixels: Floats, keyframe: int) -> None:
+        """Begin to follow new corners of a key frame, shape (m, 2)."""
+        more = Tracks(pixels, keyframe)
+        self.pixels = np.concatenate([self.pixels, more.pixels])
+        self.points = np.concatenate([self.points, more.points])
+        self.views += more.views
+
+
+_GOOD = 2.0
+"""Pixels of reprojection error up to which a landmark is kept."""
+
+
+class LocalMap:
+    """Key frames and landmarks; it grows by one key frame at a time and forgets the oldest.
+
+    Attributes:
+        image: Image of the newest key frame, grey.
+        tracks: The corners that are followed from it.
+    """
+
+    def __init__(
+        self,
+        image: Grey,
+        poses: list[Floats],
+        tracks: Tracks,
+        matrix: Floats,
+        settings: MonocularSettings,
+    ) -> None:
+        self.image = image
+        self.tracks = tracks
+        self._poses = dict(enumerate(poses))  # by key frame, world to camera
+        # Landmarks that are no longer followed: point and views of each.
+        self._past: list[tuple[Floats, dict[int, View]]] = []
+        self._matrix = matrix
+        self._settings = settings
+
+    @classmethod
+    def first(
+        cls,
+        found: InitialMap,
+        image: Grey,
+        start: Floats,
+        unit: float,
+        matrix: Floats,
+        settings: MonocularSettings,
+    ) -> LocalMap:
+        """Make a map of its first two key frames.
+
+        Args:
+            found: In a frame and a unit of its own.
+            image: The second of its images, grey.
+            start: Pose of its first camera: camera to world, shape (4, 4).
+            unit: Its unit of length in that of the world.
+            matrix: K, shape (3, 3).
+            settings: Settings of the odometry.
+        """
+        second = found.second.copy()
+        second[:3, 3] *= unit
+        tracks = Tracks(found.pixels[0], 0)
+        tracks.points = unit * found.points @ start[:3, :3].T + start[:3, 3]
+        tracks.add_view(1, found.pixels[1])
+        before = inverse(start)
+        made = cls(image, [before, second @ before], tracks, matrix, settings)
+        made._add_corners()
+        return made
+
+    @classmethod
+    def around(cls, keyframe: Keyframe, matrix: Floats, settings: MonocularSettings) -> LocalMap:
+        """Make a map of a single stored key frame."""
+        tracks = Tracks(keyframe.pixels, 0)
+        tracks.points = keyframe.landmarks.copy()
+        return cls(keyframe.image, [keyframe.pose], tracks, matrix, settings)
+
+    @property
+    def keyframes(self) -> list[int]:
+        """The numbers of the key frames, ascending."""
+        return sorted(self._poses)
+
+    @property
+    def newest(self) -> int:
+        """The number of the newest key frame."""
+        return max(self._poses)
+
+    @property
+    def pose(self) -> Floats:
+        """Pose of the newest key frame: world to camera, shape (4, 4)."""
+        return self._poses[self.newest]
+
+    @property
+    def depth(self) -> float:
+        """Median depth of the landmarks that the newest key frame sees; 1 if it sees none."""
+        points = self.tracks.points[self.tracks.known]
+        if not len(points):
+            return 1.0
+        return float(np.median((points @ self.pose[:3, :3].T + self.pose[:3, 3])[:, 2]))
+
+    def keyframe(self) -> Keyframe:
+        """Return the newest key frame, to be stored."""
+        known = self.tracks.known
+        points, pixels = self.tracks.points[known], self.tracks.pixels[known]
+        return Keyframe(self.image, self.pose, points, pixels)
+
+    def approximate_points(self) -> Floats:
+        """Return the points of the corners, shape (n, 3); unknown ones at the median depth."""
+        points, pose, unknown = self.tracks.points.copy(), self.pose, ~self.tracks.known
+        seen = self.depth * rays(self.tracks.pixels[unknown], self._matrix)
+        points[unknown] = (seen - pose[:3, 3]) @ pose[:3, :3]
+        return points
+
+    def add_keyframe(self, image: Grey, pose: Floats, rows: Indices, pixels: Floats) -> None:
+        """Make an image a key frame, and improve the map by it.
+
+        Args:
+            image: Grey.
+            pose: World to camera, shape (4, 4).
+            rows: Indices of the tracks that it shows, shape (n,), ascending.
+            pixels: Their pixels, shape (n, 2).
+        """
+        number = self.newest + 1
+        self._past += self.tracks.keep(rows)
+        self._poses[number] = pose
+        self.tracks.add_view(number, pixels)
+        self.image = image
+        self._triangulate()
+        self._adjust()
+        self._add_corners()
+        self._remove_keyframes()
+
+    def _add_corners(self) -> None:
+        wanted = self._settings.corners
+        count = max(wanted - len(self.tracks), wanted // 10)
+        self.tracks.add(new_corners(self.image, self.tracks.pixels, count), self.newest)
+
+    def _triangulate(self) -> None:
+        """Compute the points of corners that now have been seen with enough parallax."""
+        tracks, pose = self.tracks, self.pose
+        by_first: dict[int, list[int]] = {}
+        for row in np.flatnonzero(~tracks.known).tolist():
+            by_first.setdefault(min(tracks.views[row]), []).append(row)
+        for first, rows in by_first.items():
+            before = self._poses[first]
+            there = np.array([tracks.views[row][first] for row in rows])
+            here = tracks.pixels[rows]
+            a, b = rays(there, self._matrix), rays(here, self._matrix)
+            points = triangulate(before, pose, a, b)
+            good = parallax(before, pose, a, b) > self._settings.min_parallax
+            for view, pixels in ((before, there), (pose, here)):
+                good &= reprojection_errors(view, points, pixels, self._matrix) < _GOOD
+            tracks.points[np.array(rows)[good]] = points[good]
+
+    def _adjust(self) -> None:
+        """Adjust the last key frames and their landmarks."""
+        window = self.keyframes[-self._settings.keyframes :]
+        if len(window) < 3:
+            return
+        index = {keyframe: i for i, keyframe in enumerate(window)}
+        tracks = self.tracks
+        self._past = [
+            (point, views)
+            for point, views in self._past
+            if sum(keyframe in index for keyframe in views) > 1
+        ]
+        live = np.flatnonzero(tracks.known)
+        all_views = [tracks.views[row] for row in live.tolist()]
+        all_views += [views for _, views in self._past]
+        past = np.array([point for point, _ in self._past]).reshape(-1, 3)
+        frame, landmark, pixels = [], [], []
+        for number, views in enumerate(all_views):
+            for keyframe, pixel in views.items():
+                if keyframe in index:
+                    frame.append(index[keyframe])
+                    landmark.append(number)
+                    pixels.append(pixel)
+        poses, points, errors = adjust(
+            np.stack([self._poses[keyframe] for keyframe in window]),
+            np.concatenate([tracks.points[live], past]),
+            np.array(frame),
+            np.array(landmark),
+            np.array(pixels),
+            self._matrix,
+            fixed=2,
+            noise=self._settings.pixel_noise,
+        )
+        self._poses.update(zip(window, poses, strict=True))
+        worst = np.zeros(len(points))
+        np.maximum.at(worst, landmark, errors)
+        good = worst < _GOOD
+        count = len(live)
+        tracks.points[live] = points[:count]
+        self._past = [
+            (point, views)
+            for point, (_, views), fits in zip(
+                points[count:], self._past, good[count:], strict=True
+            )
+            if fits
+        ]
+        tracks.drop(live[~good[:count]])
+
+    def _remove_keyframes(self) -> None:
+        """Remove key frames that are neither adjusted any more nor needed by a track."""
+        needed = {min(views) for views in self.tracks.views}
+        needed.update(self.keyframes[-self._settings.keyframes :])
+        self._poses = {number: pose for number, pose in self._poses.items() if number in needed}

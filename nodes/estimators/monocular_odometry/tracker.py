@@ -1,0 +1,229 @@
+"""Monocular odometry on corners: poses from landmarks, landmarks from poses, both adjusted.
+
+In the manner of sparse, semi-direct methods (C. Forster, M. Pizzoli and D. Scaramuzza, "SVO", ICRA
+2014): patches are aligned with the last key frame directly, poses come from the landmarks behind
+them, and new landmarks from two views far enough apart; the last key frames and their landmarks are
+then adjusted together. The unit of length is the first map's.
+
+The first map is made in `nodes.estimators.monocular_odometry.initialization`, and extended in
+`nodes.estimators.monocular_odometry.local_map`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraInfo
+from events.poses import inverse
+from nodes.estimators import TrackingResult
+from nodes.estimators.monocular_odometry.bundle import Indices
+from nodes.estimators.monocular_odometry.initialization import Initialization
+from nodes.estimators.monocular_odometry.keyframes import Keyframe
+from nodes.estimators.monocular_odometry.local_map import LocalMap
+from nodes.estimators.monocular_odometry.settings import MonocularSettings
+from nodes.estimators.odometry.images import (
+    Floats,
+    Grey,
+    follow_both_ways,
+    grey_image,
+    inside,
+    refuse_distortion,
+)
+from nodes.estimators.odometry.pose import Observations, Solution, intrinsics, solve_pose
+from nodes.estimators.odometry.relocalization import describe, detect_and_describe, relocalize
+
+_AGREES = 6.0
+"""Standard deviations up to which a landmark agrees with a pose."""
+_FEW = 120
+"""Corners that suffice for an approximate pose."""
+_STORED = 6
+"""Newest key frames by which a lost camera is relocalized."""
+_ORB_POINTS = 1000
+"""Points by which the image of a lost camera is described."""
+
+
+class MonocularTracker:
+    """Tracks a single camera. Equal images give equal poses, to the bit.
+
+    Args:
+        info: Intrinsics of the images, which must be free of distortion.
+        settings: Settings of the method.
+
+    Raises:
+        ValueError: The images are distorted.
+    """
+
+    def __init__(self, info: CameraInfo, settings: MonocularSettings | None = None) -> None:
+        refuse_distortion(info)
+        self._info = info
+        self._settings = settings or MonocularSettings()
+        self._matrix = info.matrix()
+        self._map: LocalMap | None = None
+        self._initialization: Initialization | None = None
+        self._pose = np.eye(4)  # the last known one, world to camera
+        self._guess = self._pose  # from which the next pose is computed
+        self._before: tuple[Grey, Floats, Floats] | None = None  # image, landmarks, their pixels
+        self._known: deque[Keyframe] = deque(maxlen=_STORED)
+        self._lost_since: int | None = None
+        self._maps = 0  # begun at a guessed pose, with a guessed unit
+
+    def track(self, stamp: int, image: npt.NDArray[np.uint8]) -> TrackingResult | None:
+        """Return the pose of the next image; `None` before there is a map.
+
+        Args:
+            stamp: Stamp of the exposure (ns).
+            image: Shape (h, w, 3) red, green, blue, or (h, w) grey.
+
+        Raises:
+            ValueError: The size is not that of the camera.
+        """
+        grey = grey_image(self._info, image)
+        if self._map is None:
+            return self._initialize(grey)
+        expected = self._expect(grey)
+        rows, pixels = self._follow(grey, self._map, expected)
+        tracks = self._map.tracks
+        known = tracks.known[rows]
+        solution = self._solve(tracks.points[rows][known], pixels[known], expected)
+        if solution is None:
+            return self._lost(stamp, grey, pixels)
+        reason = "" if self._lost_since is None else "against a key frame"
+        self._lost_since = self._initialization = None
+        self._pose = self._guess = solution.pose
+        agree = np.ones(len(rows), np.bool_)
+        agree[known] = solution.errors < _AGREES
+        seen = known & agree
+        self._before = grey, tracks.points[rows][seen], pixels[seen]
+        result = TrackingResult(
+            pose=inverse(self._pose),
+            reason=reason,
+            points=pixels[known].astype(np.float32),
+            inliers=agree[known],
+            map=self._maps,
+        )
+        shift = np.linalg.norm(pixels - tracks.pixels[rows], axis=1)
+        far = float(np.median(shift[agree])) > self._settings.keyframe_shift
+        overlap = self._settings.keyframe_overlap
+        fewer = agree.sum() < overlap * len(tracks) or seen.sum() < overlap * tracks.known.sum()
+        if far or fewer:
+            self._map.add_keyframe(grey, self._pose, rows[agree], pixels[agree])
+            self._continue_from(self._map)
+        return result
+
+    # The first map, and later ones.
+
+    def _initialize(self, grey: Grey) -> TrackingResult | None:
+        """Add an image to the initialization; return its pose if there is a map now.
+
+        The first map is the world. Any other is put where the last one ended and given its median
+        depth, for want of anything better.
+        """
+        if self._initialization is None:
+            self._initialization = Initialization(self._matrix, self._settings)
+        found = self._initialization.add(grey)
+        if found is None:
+            return None
+        unit, reason = 1.0, ""
+        if self._map is not None:
+            unit, reason = self._map.depth, "by a new map: its unit of length is a guess"
+            self._maps += 1
+        start = inverse(self._pose)
+        self._map = LocalMap.first(found, grey, start, unit, self._matrix, self._settings)
+        self._lost_since = self._initialization = None
+        self._known.clear()
+        self._continue_from(self._map)
+        count = len(found.points)
+        return TrackingResult(
+            pose=inverse(self._pose),
+            reason=reason,
+            points=found.pixels[1].astype(np.float32),
+            inliers=np.ones(count, np.bool_),
+            map=self._maps,
+        )
+
+    def _continue_from(self, world: LocalMap) -> None:
+        """Go on from the map's newest key frame, and store it."""
+        keyframe = world.keyframe()
+        self._pose = self._guess = keyframe.pose
+        self._before = keyframe.image, keyframe.landmarks, keyframe.pixels
+        self._known.append(keyframe)
+
+    # Every image.
+
+    def _expect(self, grey: Grey) -> Floats:
+        """Return the approximate pose, by following a few corners from the previous image."""
+        if self._before is None:
+            return self._guess
+        image, points, pixels = self._before
+        few = slice(None, None, max(len(pixels) // _FEW, 1))
+        settings = self._settings
+        there, good = follow_both_ways(
+            image, grey, pixels[few], pixels[few], settings.window, settings.levels
+        )
+        if 2 * good.sum() < settings.min_inliers:
+            return self._guess
+        return self._refine(points[few][good], there[good], self._guess).pose
+
+    def _follow(self, grey: Grey, world: LocalMap, expected: Floats) -> tuple[Indices, Floats]:
+        """Find the newest key frame's corners; return which were found, and their pixels."""
+        points = world.approximate_points()
+        window = self._settings.window
+        fx, fy, cx, cy = intrinsics(self._matrix)
+        seen = points @ expected[:3, :3].T + expected[:3, 3]
+        z = np.maximum(seen[:, 2], 1e-6)
+        guess = np.stack([fx * seen[:, 0] / z + cx, fy * seen[:, 1] / z + cy], axis=1)
+        visible = (seen[:, 2] > 1e-3 * world.depth) & inside(guess, grey.shape, window // 2)
+        rows = np.flatnonzero(visible)
+        if not len(rows):
+            return rows, np.empty((0, 2))
+        start = world.tracks.pixels[rows]
+        pixels, good = follow_both_ways(world.image, grey, start, guess[rows], window, 1)
+        return rows[good], pixels[good]
+
+    def _solve(self, points: Floats, pixels: Floats, expected: Floats) -> Solution | None:
+        """Return the pose, if enough landmarks agree with it."""
+        least = self._settings.min_inliers
+        if len(points) < least:
+            return None
+        solution = self._refine(points, pixels, expected)
+        agree = solution.errors < _AGREES
+        if agree.sum() < max(least, 0.4 * len(agree)):
+            return None
+        final = self._refine(points[agree], pixels[agree], solution.pose)
+        errors = solution.errors.copy()
+        errors[agree] = final.errors
+        return Solution(final.pose, errors)
+
+    def _refine(self, points: Floats, pixels: Floats, start: Floats) -> Solution:
+        seen = Observations.without_depth(points, pixels)
+        return solve_pose(seen, start, self._matrix, self._settings.pixel_noise, 1.0)
+
+    # Lost.
+
+    def _lost(self, stamp: int, grey: Grey, pixels: Floats) -> TrackingResult:
+        """Relocalize by the stored key frames; after a while, try a new map as well."""
+        if self._lost_since is None:
+            self._lost_since = stamp
+        self._before = None
+        corners, descriptors = detect_and_describe(grey, _ORB_POINTS)
+        for keyframe in reversed(self._known):
+            known = describe(keyframe.image, keyframe.pixels, keyframe.landmarks)
+            found = relocalize(corners, descriptors, known, self._matrix)
+            if found is not None:  # tracking goes on from there with the next image
+                self._map = LocalMap.around(keyframe, self._matrix, self._settings)
+                self._guess = found
+                break
+        else:
+            waited = stamp - self._lost_since >= self._settings.reset_timeout * 1e9
+            if waited and (result := self._initialize(grey)) is not None:
+                return result
+        return TrackingResult(
+            pose=inverse(self._pose),
+            lost=True,
+            reason=f"too few of the {len(pixels)} corners that were found agree on a pose",
+            points=pixels.astype(np.float32),
+            inliers=np.zeros(len(pixels), np.bool_),
+        )

@@ -1,0 +1,151 @@
+"""ORB-SLAM3 as a node: its inputs in each of its modes, and its vocabulary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+from events import DepthImage, Image, Imu
+from nodes.estimators import (
+    Estimator,
+    EstimatorConfig,
+    MonocularFrame,
+    MonocularInertialFrame,
+    RgbdFrame,
+    RgbdInertialFrame,
+    StereoFrame,
+    StereoInertialFrame,
+    sample_rows,
+)
+from nodes.estimators.orb_slam3.process import INSTALL, OrbSlam3Process
+from nodes.estimators.orb_slam3.settings import LENSES, Mode, OrbSettings, Settings, make_settings
+from nodes.estimators.orb_slam3.vocabulary_file import find_vocabulary
+from runtime import Bundle, Duration
+from runtime.paths import InputPath
+
+
+class Frame(NamedTuple):
+    """All that any mode reads."""
+
+    image: Image
+    depth: DepthImage | None
+    left: Image | None
+    right: Image | None
+    imu: Imu | None
+
+
+_FRAMES: dict[Mode, type[tuple[Any, ...]]] = {
+    "rgbd": RgbdFrame,
+    "monocular": MonocularFrame,
+    "stereo": StereoFrame,
+    "rgbd_inertial": RgbdInertialFrame,
+    "monocular_inertial": MonocularInertialFrame,
+    "stereo_inertial": StereoInertialFrame,
+}
+
+
+class OrbSlam3Config(EstimatorConfig):
+    """Settings of ORB-SLAM3.
+
+    Attributes:
+        mode: The sensors that are used.
+        vocabulary: File in DBoW2's text format; if empty, the one that
+            ``python -m runtime vocabulary CONFIG`` has made.
+        orb: ORB-SLAM3's own settings.
+        mapping_timeout: Time that its other threads may compute after each image, at most, before
+            the next; not counted while other programs have the processors.
+    """
+
+    mode: Mode = "rgbd"
+    vocabulary: InputPath = ""
+    orb: OrbSettings = OrbSettings()
+    mapping_timeout: Duration = Duration(0.02)  # immutable
+
+
+class OrbSlam3(Estimator[OrbSlam3Config]):
+    """Estimates the pose of a camera by ORB-SLAM3, in a process of its own.
+
+    Because of its threads the results vary from run to run, and so does the digest.
+    """
+
+    deterministic: ClassVar[bool] = False
+    library = "pyorbslam3", INSTALL
+
+    frames = Bundle(Frame, keep="latest")
+
+    def __init__(self) -> None:
+        mode = self.config.mode
+        self.needs = frozenset({"grey", "depth"} if "rgbd" in mode else {"grey"})
+        self.eyes = 2 if "stereo" in mode else 1
+        self.inertial = "inertial" in mode
+        self.lenses = LENSES[mode.removesuffix("_inertial")]
+        self.method = f"ORB-SLAM3 ({mode.replace('_', ', ')})"
+        self.scale_free = mode == "monocular"
+        self.read(_FRAMES[mode])
+
+    def check(self) -> Iterable[str]:
+        """Return the errors: no camera, an IMU on another body, or no vocabulary."""
+        missing = [*super().check()]
+        yield from missing
+        if missing:
+            return
+        try:
+            self._settings()
+            find_vocabulary(self.config.vocabulary)
+        except ValueError as error:
+            yield str(error)
+
+    async def on_ready(self) -> None:
+        """Start ORB-SLAM3, in a process of its own."""
+        self.the_camera()
+        self._slam = await self.worker(
+            OrbSlam3Process,
+            self._settings(),
+            self._vocabulary(),
+            float(self.config.mapping_timeout),
+            latency=self.config.latency,
+        )
+
+    async def run(self) -> None:
+        """Track each image; those that arrive meanwhile are skipped."""
+        initialized = False
+        async for frame in self.frames:
+            given = frame._asdict()
+            image = frame[0]
+            result = await self._slam.call(
+                OrbSlam3Process.track,
+                self.exposed_at(image),
+                image.data,
+                given["depth"].data if "depth" in given else None,
+                given["right"].data if "right" in given else None,
+                sample_rows(given["imu"]) if "imu" in given else None,
+            )
+            initialized = initialized or not result.lost
+            if initialized:
+                first = result.first_keyframe
+                self.publish(image, result, origin=first if first >= 0 else None)
+
+    async def on_end(self) -> None:
+        """Send the trajectory after loop closures and other corrections."""
+        self.publish_trajectory(*await self._slam.call_for(0.0, OrbSlam3Process.trajectory))
+
+    def _settings(self) -> Settings:
+        """Return ORB-SLAM3's settings for the sensors.
+
+        Raises:
+            ValueError: It cannot compute with them.
+        """
+        config = self.config
+        return make_settings(config.mode, self.cameras, self.imu_announcement, config.orb)
+
+    def _vocabulary(self) -> Path:
+        """Return the vocabulary's file.
+
+        Raises:
+            FatalError: There is none, or it is in another format.
+        """
+        try:
+            return find_vocabulary(self.config.vocabulary)
+        except ValueError as error:
+            self.log.fatal("%s", error)

@@ -1,0 +1,178 @@
+"""Depth from a rectified stereo pair: coarse for all pixels, fine at those that are tracked.
+
+Block matching (K. Konolige, "Small vision systems", ISRR 1997; OpenCV's `cv2.StereoBM`) on halved
+images says where surfaces are continuous, and starts the optical flow that finds a corner in the
+right image to a few hundredths of a pixel, and back. Block matching alone draws slanted surfaces
+towards whole pixels: in the hall its trajectory has four times the error. Where it finds nothing,
+as on surfaces of one colour, flow starts from afar, and finds the corner's neighbours, too.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraInfo
+from nodes.estimators.odometry.images import Depth, Floats, Grey, follow_both_ways, grey_image
+from nodes.estimators.visual_odometry.patches import SAME, around, correlation
+from nodes.estimators.visual_odometry.surfaces import Surfaces, surfaces_at
+
+_LARGE = 320
+"""Side (pixels) of images that are halved before blocks are matched."""
+_BLOCK = 11
+_WINDOW = 15
+_REFINED = 1.5
+"""Pixels by which flow may move what block matching found."""
+_OFF_ROW = 0.6
+"""Pixels by which a corner may leave its row."""
+_COARSE = 2.0
+"""Noise of block matching, in units of that of flow."""
+_STEP, _DISTINCT = 3.0, 1.5
+"""Pixels beside a disparity at which what differs, by the correlation, must be so many times more:
+so it is known to 3 / 15 / √0.5 = 0.3 pixels, if noise is all that differs."""
+_LEVELS = 3
+"""Times that flow halves the images where block matching found nothing."""
+_ASIDE = 4
+"""Pixels from such a corner to its neighbours, by which its plane is found."""
+_BESIDE = np.array([(_ASIDE, 0), (-_ASIDE, 0), (0, _ASIDE), (0, -_ASIDE)])
+_TORN, _BENT = 0.02, 0.15
+"""Share of its disparity, and pixels, by which a corner's may differ from its neighbours' mean."""
+
+
+class StereoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of stereo matching.
+
+    Attributes:
+        min_depth: Metres; what is nearer has no depth. The nearer, the wider is the strip at the
+            left edge in which nothing can be matched.
+        max_depth: Metres; what is farther has no depth.
+        noise: Standard deviation of a corner's disparity, pixels.
+    """
+
+    min_depth: Annotated[float, msgspec.Meta(gt=0)] = 0.6
+    max_depth: Annotated[float, msgspec.Meta(gt=0)] = 50.0
+    noise: Annotated[float, msgspec.Meta(gt=0)] = 0.08
+
+    def __post_init__(self) -> None:
+        if self.min_depth >= self.max_depth:
+            raise ValueError(
+                f"expected min_depth below max_depth, found {self.min_depth} and {self.max_depth}"
+            )
+
+
+class StereoMatcher:
+    """Measures depth in the left camera of a rectified pair.
+
+    Args:
+        info: Intrinsics of both cameras, without distortion.
+        baseline: Metres from the left camera to the right one.
+        settings: Settings of the matching.
+
+    Attributes:
+        depth_noise: Standard deviation of a corner's inverse depth, 1/m.
+    """
+
+    def __init__(
+        self, info: CameraInfo, baseline: float, settings: StereoSettings | None = None
+    ) -> None:
+        self._info = info
+        settings = settings or StereoSettings()
+        self._unit = info.fx * baseline  # disparity (pixels) times depth
+        self.depth_noise = settings.noise / self._unit
+        self._least = self._unit / settings.max_depth
+        self._reduction = 2 if min(info.width, info.height) >= _LARGE else 1
+        nearest = self._unit / settings.min_depth / self._reduction
+        self._blocks = cv2.StereoBM.create(16 * math.ceil(nearest / 16), _BLOCK)
+        self._blocks.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
+        self._blocks.setUniquenessRatio(10)
+        self._blocks.setDisp12MaxDiff(1)
+        self._pair: tuple[Grey, Grey] | None = None
+
+    def depth(self, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8]) -> Depth:
+        """Return coarse depth (metres, shape (h, w); ``inf`` where unknown), and keep the images.
+
+        Args:
+            left: Grey, shape (h, w), or red, green, blue, shape (h, w, 3).
+            right: The same.
+
+        Raises:
+            ValueError: The size is not that of the camera.
+        """
+        self._pair = pair = grey_image(self._info, left), grey_image(self._info, right)
+        if self._reduction > 1:
+            pair = (
+                np.asarray(cv2.pyrDown(pair[0]), np.uint8),
+                np.asarray(cv2.pyrDown(pair[1]), np.uint8),
+            )
+        found: Any = self._blocks.compute(*pair)  # sixteenths of a pixel
+        disparity = found.astype(np.float32) * (self._reduction / 16.0)
+        if self._reduction > 1:
+            size = self._info.width, self._info.height
+            disparity = cv2.resize(disparity, size, interpolation=cv2.INTER_NEAREST)
+        depth = np.full(disparity.shape, np.inf, np.float32)
+        np.divide(self._unit, disparity, out=depth, where=disparity > self._least)
+        return depth
+
+    def surfaces_at(self, inverse: Depth, pixels: Floats, noise: float) -> Surfaces:
+        """Return the planes around pixels of the pair that `depth` was last called with.
+
+        Args:
+            inverse: Of its coarse depth, as
+                `nodes.estimators.visual_odometry.surfaces.inverse_depth` gives it, shape (h, w).
+            pixels: Column and row, shape (n, 2).
+            noise: Standard deviation of inverse depth, 1/m.
+        """
+        found = surfaces_at(inverse, pixels, _COARSE * noise)
+        if self._pair is None or not len(pixels):
+            return found
+        rows, without = np.flatnonzero(found.continuous), np.flatnonzero(~found.continuous)
+        there, slope = found.inverse * self._unit, found.slope.copy()
+        fine = np.zeros(len(pixels))
+        if len(rows):
+            disparity, good = self._disparity(pixels[rows], there[rows], 0)
+            good &= np.abs(disparity - there[rows]) < _REFINED
+            good &= self._is_distinct(pixels[rows], disparity)
+            fine[rows[good]] = disparity[good]
+        if len(without):
+            # Blocks match on little texture, and at no outline; flow finds any corner, and says by
+            # its neighbourhood whether that is a plane.
+            centre = pixels[without]
+            disparity, good = self._disparity(centre, np.zeros(len(centre)), _LEVELS)
+            beside, all_good = self._disparity(
+                (centre[:, None] + _BESIDE).reshape(-1, 2), disparity.repeat(len(_BESIDE)), 0
+            )
+            right, left, below, above = beside.reshape(-1, len(_BESIDE)).T
+            bend = np.abs(np.stack([right + left, below + above]) / 2 - disparity).max(axis=0)
+            good &= all_good.reshape(-1, len(_BESIDE)).all(axis=1)
+            good &= bend < np.maximum(_TORN * disparity, _BENT)
+            good &= self._is_distinct(centre, disparity)
+            fine[without[good]] = disparity[good]
+            change = np.stack([right - left, below - above], axis=1) / (2 * _ASIDE)
+            slope[without] = change / self._unit
+        return Surfaces(fine / self._unit, slope, fine > 0)
+
+    def _disparity(
+        self, pixels: Floats, guess: Floats, levels: int
+    ) -> tuple[Floats, npt.NDArray[np.bool_]]:
+        """Return disparities by flow from a guess, shape (n,), and which are good, shape (n,)."""
+        assert self._pair is not None
+        there = pixels - guess[:, None] * (1.0, 0.0)
+        found, good = follow_both_ways(*self._pair, pixels, there, _WINDOW, levels)
+        disparity = pixels[:, 0] - found[:, 0]
+        good &= np.abs(found[:, 1] - pixels[:, 1]) < _OFF_ROW
+        return disparity, good & (disparity > self._least)
+
+    def _is_distinct(self, pixels: Floats, disparity: Floats) -> npt.NDArray[np.bool_]:
+        """Return which disparities are those of something: noise and level edges fit any."""
+        assert self._pair is not None
+        left, there = around(self._pair[0], pixels, _WINDOW), pixels - disparity[:, None] * (1, 0)
+        at, before, after = (
+            correlation(left, around(self._pair[1], there + np.array([step, 0.0]), _WINDOW))
+            for step in (0.0, -_STEP, _STEP)
+        )
+        return (at > SAME) & (1.0 - np.maximum(before, after) > _DISTINCT * (1.0 - at))

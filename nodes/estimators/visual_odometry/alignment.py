@@ -1,0 +1,330 @@
+"""Alignment of an image with a reference image by brightness at edges and by depth.
+
+Corners need texture; a plain room has but few, most of them at the outlines of things, where depth
+is torn. Here any pixel with a gradient is compared (J. Engel, V. Koltun and D. Cremers, "Direct
+Sparse Odometry", IEEE T-PAMI 2018, with gain and offset of the brightness), and beside it the
+distances of surfaces (point-to-plane: Y. Chen and G. Medioni, "Object modeling by registration of
+multiple range images", ICRA 1991). Distances are compared as inverse depth, in which a plane is
+affine, and a triangulating sensor has the same noise everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events.poses import inverse
+from nodes.estimators.odometry.images import Depth, Floats, Grey, inside
+from nodes.estimators.odometry.pose import intrinsics, motion_between, moved, rays
+from nodes.estimators.visual_odometry.surfaces import surfaces_at
+
+_LEVELS = 4
+_CELL = 4
+"""Side of the squares of the half-sized image of which each gives one edge pixel at most."""
+_EDGE = 2.0
+"""Least gradient of an edge in the half-sized image, grey levels per pixel."""
+_EDGES = 1000
+_SPACING = 16
+"""Distance of the surface points, pixels."""
+_OUTLINE = 0.05
+"""Share by which inverse depth differs around an outline."""
+_BRIGHTNESS_NOISE = 3.0
+"""Least standard deviation of a difference of brightness, grey levels."""
+_HUBER = 1.5
+_STEPS = 6
+"""Steps with each size of image, at most."""
+_RIM = 4
+"""Pixels at the edge of the image without points."""
+_CORRELATED = 9.0
+"""Number of residuals that count as one, as neighbours share their errors."""
+_AGREES = 3.0
+"""Standard deviations up to which a point agrees, and"""
+_OFF = 0.5
+"""the pixels by which an edge may be off besides."""
+_FEW = 30
+"""Edges below which their agreement says nothing."""
+_OTHER, _OTHER_SHARE = 6.0, 0.1
+"""Standard deviations, and share of inverse depth, beyond which a surface is another one."""
+_HIDDEN = 1.15
+"""Share of an edge's inverse depth from which on what is there hides it."""
+_ORDINARY = np.diag([1e2, 1e-2])
+"""Information that gain and offset are those of equal exposures."""
+_SMALL = 2e-4
+"""Step, metres and radians, after which the smallest change of pose is found; of full images."""
+
+
+class View(msgspec.Struct, frozen=True, eq=False):
+    """An image made ready to be aligned.
+
+    Attributes:
+        greys: Grey float32 images, each half as large as the one before.
+        inverse_of: Inverse depth, as `inverse_depth` gives it, shape (h, w).
+        smooth: The same, the mean of more pixels.
+    """
+
+    greys: tuple[Depth, ...]
+    inverse_of: Depth
+    smooth: Depth
+
+    @classmethod
+    def of(cls, grey: Grey, inverse_of: Depth) -> View:
+        """Return the view of an image and its inverse depth."""
+        greys = [np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (3, 3), 0.0), np.float32)]
+        while len(greys) < _LEVELS and min(greys[-1].shape) >= 64:
+            greys.append(np.asarray(cv2.pyrDown(greys[-1]), np.float32))
+        return cls(tuple(greys), inverse_of, np.asarray(cv2.blur(inverse_of, (5, 5))))
+
+
+class Reference(msgspec.Struct, frozen=True, eq=False):
+    """Points of an image with which others are aligned.
+
+    Attributes:
+        pose: World to camera, shape (4, 4).
+        edges: Points at edges of brightness, in the camera, metres, shape (3, n).
+        brightness: Theirs, for each size of image, shape (levels, n).
+        surfaces: Points of surfaces, in the camera, metres, shape (3, m).
+        planes: Their planes: vectors p with p · x = 1 for all points x of it, shape (3, m).
+    """
+
+    pose: Floats
+    edges: Floats
+    brightness: Floats
+    surfaces: Floats
+    planes: Floats
+
+    @classmethod
+    def of(cls, view: View, pose: Floats, matrix: Floats, noise: float) -> Reference:
+        """Return the points of a view.
+
+        Args:
+            view: The view.
+            pose: World to camera, shape (4, 4).
+            matrix: K, shape (3, 3).
+            noise: Standard deviation of inverse depth, 1/m.
+        """
+        pixels, nearest = _edges(view)
+        edges = (rays(pixels, matrix) / nearest[:, None]).T
+        brightness = np.stack([_sample(grey, pixels, n) for n, grey in enumerate(view.greys)])
+        height, width = view.inverse_of.shape
+        columns, rows = np.meshgrid(
+            np.arange(_SPACING // 2, width, _SPACING), np.arange(_SPACING // 2, height, _SPACING)
+        )
+        grid = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+        seen = surfaces_at(view.inverse_of, grid, noise)
+        ray = rays(grid[seen.continuous], matrix)
+        depth = seen.inverse[seen.continuous]
+        fx, fy, *_ = intrinsics(matrix)
+        across = seen.slope[seen.continuous] * (fx, fy)
+        constant = depth - (across * ray[:, :2]).sum(axis=1)
+        planes = np.column_stack([across, constant]).T
+        return cls(pose, edges, brightness, (ray / depth[:, None]).T, planes)
+
+
+class Alignment(NamedTuple):
+    """What an alignment has found.
+
+    Attributes:
+        pose: World to camera, shape (4, 4).
+        reference: The same of the reference.
+        information: Inverse covariance of the pose's error, a small motion of the camera's frame:
+            translation, rotation, shape (6, 6); of the image alone, without what was expected.
+        share: Share of the reference's points that are in the image and agree.
+        sharp: Share of the edges in view whose brightness agrees, to the noise and a part of a
+            pixel; 1 if there are too few to tell.
+        pixels: Of the reference's points that are in the image, shape (n, 2).
+        agree: Which of them agree, shape (n,).
+    """
+
+    pose: Floats
+    reference: Floats
+    information: Floats
+    share: float
+    sharp: float
+    pixels: Floats
+    agree: npt.NDArray[np.bool_]
+
+    def deviation(self) -> float:
+        """Return the largest standard deviation of the position in any direction, metres."""
+        if np.linalg.eigvalsh(self.information)[0] < 1e-9:
+            return math.inf
+        return math.sqrt(np.linalg.eigvalsh(np.linalg.inv(self.information)[:3, :3])[-1])
+
+
+class _Residuals(NamedTuple):
+    """Residuals of n points, their weights, and derivatives by pose, gain and offset, (8, n)."""
+
+    values: Floats
+    weights: Floats
+    by: Floats
+    pixels: Floats
+    agree: npt.NDArray[np.bool_]
+    visible: int
+
+
+def align(
+    reference: Reference,
+    view: View,
+    start: Floats,
+    matrix: Floats,
+    noise: float,
+    prior: tuple[float, float],
+) -> Alignment:
+    """Return the pose from which an image shows what a reference shows.
+
+    Args:
+        reference: The reference.
+        view: The image.
+        start: Expected pose, world to camera, shape (4, 4).
+        matrix: K, shape (3, 3).
+        noise: Standard deviation of inverse depth at a point, 1/m.
+        prior: Standard deviations of the expected pose: metres, radians.
+    """
+    expected = start @ inverse(reference.pose)
+    pose, brightness = expected.copy(), np.array([1.0, 0.0])
+    sure = np.diag(np.repeat(1.0 / np.square(prior), 3))
+    for level in reversed(range(len(view.greys))):
+        for _ in range(_STEPS):
+            edges = _brightness(reference, view, level, pose, brightness, matrix)
+            surfaces = _distances(reference, view, pose, matrix, noise)
+            normal, gradient = np.zeros((8, 8)), np.zeros(8)
+            for values, weights, by, *_ in (edges, surfaces):
+                weighted = by * (weights / _CORRELATED)
+                normal += weighted @ by.T
+                gradient += weighted @ values
+            normal[6:, 6:] += _ORDINARY
+            gradient[6:] += _ORDINARY @ (brightness - (1.0, 0.0))
+            information = normal[:6, :6].copy()
+            normal[:6, :6] += sure
+            gradient[:6] += sure @ motion_between(expected, pose)
+            step: Floats = np.asarray(np.linalg.solve(normal, -gradient), np.float64)
+            pose, brightness = moved(pose, step[:6]), brightness + step[6:]
+            if np.abs(step[:6]).max() < _SMALL * 2**level:
+                break
+    information -= normal[:6, 6:] @ np.linalg.solve(normal[6:, 6:], normal[6:, :6])
+    pose[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(pose[:3, :3])[0])[0]  # a rotation, to the last bit
+    agree = np.concatenate([edges.agree, surfaces.agree])
+    return Alignment(
+        pose=pose @ reference.pose,
+        reference=reference.pose,
+        information=information,
+        share=agree.sum() / max(reference.edges.shape[1] + reference.surfaces.shape[1], 1),
+        sharp=edges.agree.sum() / edges.visible if edges.visible >= _FEW else 1.0,
+        pixels=np.concatenate([edges.pixels, surfaces.pixels]),
+        agree=agree,
+    )
+
+
+def _edges(view: View) -> tuple[Floats, Floats]:
+    """Return pixels with a gradient, shape (n, 2), and their inverse depth, shape (n,)."""
+    grey = view.greys[1] if len(view.greys) > 1 else view.greys[0]
+    scale = view.greys[0].shape[1] / grey.shape[1]
+    strength = cv2.magnitude(
+        cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125),
+        cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125),
+    )
+    strength[:_RIM], strength[-_RIM:], strength[:, :_RIM], strength[:, -_RIM:] = 0, 0, 0, 0
+    height, width = (side // _CELL for side in strength.shape)
+    whole = strength[: height * _CELL, : width * _CELL].reshape(height, _CELL, width, _CELL)
+    cells = whole.swapaxes(1, 2).reshape(-1, _CELL * _CELL)
+    best = cells.argmax(axis=1)
+    chosen = np.flatnonzero(cells[np.arange(len(cells)), best] > _EDGE)
+    row, column = (
+        chosen // width * _CELL + best[chosen] // _CELL,
+        chosen % width * _CELL + best[chosen] % _CELL,
+    )
+    pixels = np.stack([column, row], axis=1) * scale
+    # An outline belongs to what is nearer; its own depth may be of either side, or missing.
+    around = np.ones((9, 9), np.uint8)
+    at = tuple(pixels.astype(int).T[::-1])
+    nearest = cv2.dilate(view.inverse_of, around)[at].astype(np.float64)
+    farthest = cv2.erode(view.inverse_of, around)[at]
+    own = view.inverse_of[at]
+    depth = np.where(farthest < (1.0 - 2 * _OUTLINE) * nearest, nearest, own)
+    known = np.flatnonzero(depth > 0.02)
+    known = known[:: max(-(-len(known) // _EDGES), 1)]
+    return pixels[known], depth[known]
+
+
+def _sample(image: Depth, pixels: Floats, level: int, how: int = cv2.INTER_LINEAR) -> Floats:
+    """Return an image's values at pixels of the largest size, shape (n,)."""
+    if not len(pixels):
+        return np.empty(0)
+    # OpenCV keeps every second pixel, so a pixel's coordinates are halved.
+    x, y = (pixels.T / 2**level).astype(np.float32)
+    found = cv2.remap(image, x[None], y[None], how, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found, np.float64).ravel()
+
+
+def _project(points: Floats, pose: Floats, matrix: Floats) -> tuple[Floats, Floats]:
+    """Return points as x/z, y/z, 1/z in a camera, shape (3, n), and their pixels, shape (n, 2)."""
+    fx, fy, cx, cy = intrinsics(matrix)
+    there = pose[:3, :3] @ points + pose[:3, 3:]
+    z = np.maximum(there[2], 0.05)
+    image = np.stack([there[0] / z, there[1] / z, 1.0 / z])
+    image[:2, there[2] < 0.05] = np.inf
+    return image, np.stack([fx * image[0] + cx, fy * image[1] + cy], axis=1)
+
+
+def _motions(image: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the derivatives of x/z, y/z and 1/z by translation and rotation, (6, n) each."""
+    x, y, w = image
+    o = np.zeros_like(x)
+    return (
+        np.stack([w, o, -x * w, -x * y, 1.0 + x * x, -y]),
+        np.stack([o, w, -y * w, -1.0 - y * y, x * y, x]),
+        np.stack([o, o, -w * w, -y * w, x * w, o]),
+    )
+
+
+def _huber(errors: Floats) -> Floats:
+    return np.asarray(_HUBER / np.maximum(np.abs(errors), _HUBER))
+
+
+def _brightness(
+    reference: Reference, view: View, level: int, pose: Floats, brightness: Floats, matrix: Floats
+) -> _Residuals:
+    """Return the differences of brightness at edges."""
+    image, pixels = _project(reference.edges, pose, matrix)
+    good = np.flatnonzero(inside(pixels, view.inverse_of.shape, 2 * 2**level))
+    image, pixels = image[:, good], pixels[good]
+    visible = _sample(view.inverse_of, pixels, 0, cv2.INTER_NEAREST) < _HIDDEN * image[2]
+    apart = 0.5 * 2**level
+    around = np.array([(0, 0), (apart, 0), (-apart, 0), (0, apart), (0, -apart)])
+    beside = _sample(view.greys[level], (pixels + around[:, None]).reshape(-1, 2), level)
+    value, right, left, below, above = beside.reshape(5, -1)
+    across, down = (right - left) / (2 * apart), (below - above) / (2 * apart)
+    fx, fy, *_ = intrinsics(matrix)
+    dx, dy, _ = _motions(image)
+    own = reference.brightness[level][good]
+    residual = value - brightness[0] * own - brightness[1]
+    by = np.concatenate([across * fx * dx + down * fy * dy, [-own, -np.ones(len(own))]])
+    spread = 1.4826 * float(np.median(np.abs(residual))) if len(good) else 0.0
+    deviation = max(spread, _BRIGHTNESS_NOISE)
+    weights = _huber(residual / deviation) * visible / deviation**2
+    limit = _AGREES * _BRIGHTNESS_NOISE + _OFF * np.hypot(across, down)
+    agree = visible & (np.abs(residual) < limit)
+    return _Residuals(residual, weights, by, pixels, agree, int(visible.sum()))
+
+
+def _distances(
+    reference: Reference, view: View, pose: Floats, matrix: Floats, noise: float
+) -> _Residuals:
+    """Return the differences of inverse depth from that of the reference's planes."""
+    image, pixels = _project(reference.surfaces, pose, matrix)
+    good = np.flatnonzero(inside(pixels, view.inverse_of.shape, _RIM))
+    image, pixels = image[:, good], pixels[good]
+    measured = _sample(view.smooth, pixels, 0)
+    planes = pose[:3, :3] @ reference.planes[:, good]
+    planes = planes / (1.0 + pose[:3, 3] @ planes)
+    residual = measured - image[2]
+    dx, dy, dw = _motions(image)
+    by = np.concatenate([planes[0] * dx + planes[1] * dy - dw, np.zeros((2, len(good)))])
+    errors = np.abs(residual) / noise
+    close = (measured > 0) & (errors < np.maximum(_OTHER, _OTHER_SHARE * image[2] / noise))
+    weights = _huber(errors) * close / noise**2
+    return _Residuals(residual, weights, by, pixels, close & (errors < _AGREES), len(good))

@@ -1,0 +1,441 @@
+"""RGB-D odometry on corners: patches of key frames are found again, and placed by their depth.
+
+A few corners, followed from the previous image, give an approximate pose. Then landmarks of all
+stored key frames are looked for as they should look from there, each by its patch in the key frame
+in which it was first seen: so the error grows with new landmarks and not with images, and not at
+all where the camera returns soon enough. A landmark's depth is the mean of all readings.
+
+Where that finds few landmarks, edges and surfaces are aligned with those of an earlier image, and
+the landmarks refine the pose. The parts are in `keyframes`, `landmarks`, `patches`, `surfaces`,
+`alignment`, `references`, `motion`, and in `nodes.estimators.odometry`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from events import CameraInfo
+from events.poses import inverse
+from nodes.estimators import TrackingResult
+from nodes.estimators.odometry.images import (
+    FLOW_CRITERIA,
+    Depth,
+    Floats,
+    Grey,
+    grey_and_depth,
+    refuse_distortion,
+)
+from nodes.estimators.odometry.pose import (
+    Observations,
+    Solution,
+    from_rotation_vector,
+    solve_pose,
+)
+from nodes.estimators.odometry.relocalization import detect_and_describe, relocalize
+from nodes.estimators.visual_odometry.alignment import Alignment, View
+from nodes.estimators.visual_odometry.keyframes import (
+    ORB_POINTS,
+    Described,
+    Keyframe,
+    find_corners,
+    squares,
+)
+from nodes.estimators.visual_odometry.landmarks import Landmarks, MapMatch
+from nodes.estimators.visual_odometry.motion import Motion
+from nodes.estimators.visual_odometry.patches import Rows, find_patches, half_width
+from nodes.estimators.visual_odometry.references import References
+from nodes.estimators.visual_odometry.settings import FeatureSettings
+from nodes.estimators.visual_odometry.surfaces import Surfaces, inverse_depth, surfaces_at
+
+_FLOW_WINDOW = 15
+_LARGE = 320
+"""Side (pixels) of images that are halved before corners are followed."""
+_AGREES = 4.0
+"""Standard deviations up to which a landmark agrees with a pose."""
+_FEW = 120
+"""Corners that suffice for an approximate pose, at most."""
+_ENOUGH = 60 / 512**2
+"""Agreeing landmarks a pixel that give a pose alone: a smaller image has room for fewer of them.
+With less than that, edges and surfaces are aligned, too."""
+BELIEVED = 0.03
+"""Share of an alignment's information that counts beside landmarks: errors of pixels that lie
+beside each other are not independent, and some of the pixels may be on things that move."""
+_FEWEST = 4
+"""Agreeing landmarks that are of use beside that."""
+_SEARCHED = 20
+"""Newest key frames by which a lost camera is relocalized."""
+_SEARCHED_PER_IMAGE = 2
+"""Key frames tried with each image, because each takes as long as tracking does."""
+_SURE = 0.6
+"""Share of the landmarks looked for that must agree with a pose found by relocalization."""
+_NEAR = 64.0
+"""Pixels beyond the image's edge up to which landmarks may soon be in view."""
+_SOON = 8
+"""Images for which a list of such landmarks is used."""
+_READING = 0.5
+"""Noise of a reading of depth, as a share of that of one pixel.
+
+A reading is the mean of many pixels, but not of an exact plane.
+"""
+
+
+class FeatureTracker:
+    """Tracks an RGB-D camera. Equal images give equal poses, to the bit.
+
+    Args:
+        info: Intrinsics of the images, which must be free of distortion.
+        settings: Settings of the method.
+        surfaces: Reads depth at pixels, as `surfaces_at` does.
+    """
+
+    _aligns: ClassVar[bool] = True
+    """Whether edges and surfaces are aligned where landmarks are few."""
+
+    def __init__(
+        self,
+        info: CameraInfo,
+        settings: FeatureSettings | None = None,
+        surfaces: Callable[[Depth, Floats, float], Surfaces] = surfaces_at,
+    ) -> None:
+        refuse_distortion(info)
+        self._info = info
+        self._settings = settings or FeatureSettings()
+        self._surfaces_at = surfaces
+        self._matrix = info.matrix()
+        large = self._settings.levels and min(info.width, info.height) >= _LARGE
+        self._reduction = 2 if large else 1
+        self._enough = max(_ENOUGH * info.width * info.height, self._settings.min_inliers)
+        self._pose = np.eye(4)  # world (the first camera) to camera
+        self._lost_since: int | None = None
+        self._count = 0  # images so far
+        self._maps = 0  # begun at a guessed pose
+        self._searched = 0  # key frames, since tracking was lost
+        self._near_until = 0
+        self._near: Rows | None = None  # landmarks that are or may soon be in view
+        self._motion = Motion()
+        self._references = References(self._matrix, self._settings.depth_noise)
+        self._clear_map()
+
+    def track(self, stamp: int, image: npt.NDArray[np.uint8], depth: Depth) -> TrackingResult:
+        """Return the pose of the next image; see `Tracker.track`."""
+        grey, depth = grey_and_depth(self._info, image, depth)
+        inverse_of = inverse_depth(depth)
+        self._count += 1
+        if not self._keyframes:
+            first = "" if self._lost_since is None else "by a first map"
+            return self._start_map(stamp, grey, inverse_of, first)
+        lost, alignment = self._lost_since is not None, None
+        match = self._match(grey, inverse_of)
+        if self._aligns and (match is None or match.agree.sum() < self._enough):
+            view = View.of(grey, inverse_of)
+            starts, guessed = self._starts(stamp, match)
+            alignment = self._references.align(view, starts, guessed)
+            if alignment is not None:
+                match = self._aligned(grey, inverse_of, alignment, match)
+        if match is None:
+            return self._lose(stamp, grey, inverse_of)
+        (self._motion.placed if lost else self._motion.measured)(stamp, match.pose)
+        self._lost_since = None
+        self._pose = match.pose
+        agree, rows = match.agree, match.rows
+        self._map.update_found(
+            self._count, rows[agree], np.concatenate([match.missed, rows[~agree]])
+        )
+        noise = self._settings.depth_noise
+        read = self._surfaces_at(inverse_of, match.pixels[agree], noise)
+        self._map.fuse(self._pose, rows[agree], read, _READING * noise)
+        self._before = self._reduced(grey), rows[agree], match.pixels[agree]
+        self._note(grey, inverse_of, alignment is not None)
+        points, inliers = match.pixels, agree
+        if alignment is None:
+            far = self._is_far(rows[agree])
+        else:
+            far = alignment.share < self._settings.keyframe_overlap
+            far |= self._is_far_from(alignment.reference, np.inf)
+            points = np.concatenate([points, alignment.pixels])
+            inliers = np.concatenate([inliers, alignment.agree])
+            if far:
+                self._references.renew(view, self._pose)
+        if far:
+            self._add_keyframe(grey, inverse_of, rows[agree], match.pixels[agree])
+        return TrackingResult(
+            pose=inverse(self._pose),
+            reason="against a key frame" if lost else "",
+            points=points.astype(np.float32),
+            inliers=inliers,
+            map=self._maps,
+        )
+
+    def _starts(self, stamp: int, match: MapMatch | None) -> tuple[list[Floats], bool]:
+        """Return poses to begin an alignment with, and whether these are guesses only."""
+        lost = self._lost_since is not None
+        starts = [match.pose] if match and lost else [self._motion.expected(stamp)]
+        if match is None and lost:
+            starts += [self._motion.steady(stamp), self._pose]
+        return starts, lost
+
+    def _aligned(
+        self,
+        grey: Grey,
+        inverse_of: Depth,
+        alignment: Alignment,
+        match: MapMatch | None,  # noqa: ARG002
+    ) -> MapMatch | None:
+        """Return what was found in an image that is aligned, beside a match of few landmarks."""
+        believed = BELIEVED * alignment.information
+        found = self._find(grey, inverse_of, alignment.pose, believed)
+        return found or MapMatch.without_landmarks(alignment.pose)
+
+    def _note(self, grey: Grey, inverse_of: Depth, aligned: bool) -> None:
+        """Remember an image whose pose is known, and whether it is by an alignment."""
+        self._references.note(grey, inverse_of, self._pose, aligned)
+
+    def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
+        """Find the map in an image, from the previous pose or, if lost, by relocalization."""
+        expected = self._expect(grey)
+        match = None if expected is None else self._find(grey, inverse_of, expected)
+        if match is not None or self._lost_since is None:
+            return match
+        pixels, descriptors = detect_and_describe(grey, ORB_POINTS)
+        for frame in self._next_searched():
+            found = relocalize(pixels, descriptors, frame.points, self._matrix, cv2.SOLVEPNP_AP3P)
+            if found is not None:
+                self._near = None
+                match = self._find(grey, inverse_of, found)
+                # Again from there, for the landmarks that were beyond the margin of the search.
+                match = match and self._find(grey, inverse_of, match.pose)
+                if match is not None and match.share > _SURE:
+                    return match
+        self._near = None
+        return None
+
+    def _next_searched(self) -> list[Described]:
+        """Return the key frames to try with this image: each time further back in time."""
+        frames = list(reversed(self._newest))
+        start, self._searched = self._searched % len(frames), self._searched + _SEARCHED_PER_IMAGE
+        return frames[start : start + _SEARCHED_PER_IMAGE]
+
+    def _expect(self, grey: Grey) -> Floats | None:
+        """Return the approximate pose, by following a few corners from the previous image.
+
+        Coarse to fine, and without a guess: where texture repeats, a guess that is off by half a
+        brick would find the next brick.
+        """
+        image, rows, pixels = self._before
+        if len(rows) < self._settings.min_inliers:
+            return None
+        few = slice(None, None, max(-(-len(rows) // _FEW), 1))
+        rows, pixels = rows[few], pixels[few]
+        no_guess: Any = None
+        there, arrived, _ = cv2.calcOpticalFlowPyrLK(
+            image,
+            self._reduced(grey),
+            (pixels / self._reduction).astype(np.float32).reshape(-1, 1, 2),
+            no_guess,
+            winSize=(_FLOW_WINDOW, _FLOW_WINDOW),
+            maxLevel=self._settings.levels - (self._reduction > 1),
+            criteria=FLOW_CRITERIA,
+        )
+        good = arrived.ravel() == 1
+        if good.sum() < self._settings.min_inliers:
+            return None
+        places = self._map.places[rows[good]]
+        there = self._reduction * there.reshape(-1, 2)[good].astype(np.float64)
+        solution = self._solve(places, there, self._pose)
+        if (solution.errors < 2 * _AGREES).mean() > 0.6:
+            return solution.pose
+        cv2.setRNGSeed(1)
+        found, rotation, translation, _ = cv2.solvePnPRansac(
+            places,
+            there,
+            self._matrix,
+            None,
+            flags=cv2.SOLVEPNP_EPNP,
+            reprojectionError=2.0,
+        )
+        if not found:
+            return None
+        return from_rotation_vector(rotation, translation)
+
+    def _reduced(self, grey: Grey) -> Grey:
+        """Return the image in which corners are followed: half as large, if it is large."""
+        return np.asarray(cv2.pyrDown(grey), np.uint8) if self._reduction > 1 else grey
+
+    def _find(
+        self,
+        grey: Grey,
+        inverse_of: Depth,
+        expected: Floats,
+        information: Floats | None = None,
+    ) -> MapMatch | None:
+        """Find the map in an image that was taken near an expected pose.
+
+        If that pose comes with its information, as an alignment gives it, few landmarks suffice.
+        """
+        settings, landmarks = self._settings, self._map
+        least = settings.min_inliers if information is None else _FEWEST
+        size = self._info.width, self._info.height
+        near = self._near
+        if near is None or self._count >= self._near_until:
+            near = landmarks.in_view(expected, size, _NEAR, np.arange(len(landmarks)))
+            self._near, self._near_until = near, self._count + _SOON
+        rows = landmarks.active(self._count, near)
+        rows = landmarks.in_view(expected, size, -half_width(settings.window) - 1.0, rows)
+        rows = landmarks.unhidden(expected, inverse_of, rows, settings.depth_noise)
+        rows, patches = landmarks.patches(expected, rows)
+        # The oldest of each square, as they have the least error.
+        _, oldest = np.unique(squares(patches.expected, settings.spacing), return_index=True)
+        rows, patches = rows[oldest], patches.take(oldest)
+        if len(rows) < least:
+            return None
+        pixels, found = find_patches(patches, self._images(), grey, settings.window)
+        missed, rows, pixels = rows[~found], rows[found], pixels[found]
+        if len(rows) < least:
+            return None
+        read = self._surfaces_at(inverse_of, pixels, settings.depth_noise)
+        places = landmarks.places[rows]
+        first = self._solve(places, pixels, expected, read.inverse, read.continuous, information)
+        agree = first.errors < _AGREES
+        if agree.sum() < max(least, 0.4 * len(agree)):
+            return None
+        last = self._solve(
+            places[agree],
+            pixels[agree],
+            first.pose if information is None else expected,
+            read.inverse[agree],
+            read.continuous[agree],
+            information,
+        )
+        return MapMatch(last.pose, rows, pixels, agree, missed)
+
+    def _solve(
+        self,
+        places: Floats,
+        pixels: Floats,
+        start: Floats,
+        read: Floats | None = None,
+        continuous: npt.NDArray[np.bool_] | None = None,
+        information: Floats | None = None,
+    ) -> Solution:
+        if read is None or continuous is None:
+            observations = Observations.without_depth(places, pixels)
+        else:
+            observations = Observations(places, pixels, read, continuous)
+        settings = self._settings
+        return solve_pose(
+            observations,
+            start,
+            self._matrix,
+            settings.pixel_noise,
+            _READING * settings.depth_noise,
+            information,
+        )
+
+    def _is_far(self, rows: Rows) -> bool:
+        """Return whether the last key frame is nearly out of sight."""
+        if len(rows) < self._settings.keyframe_overlap * self._at_keyframe:
+            return True
+        _, z = self._map.project(self._pose, rows)
+        last = next(reversed(self._keyframes.values()))
+        return self._is_far_from(last.pose, float(np.median(z)))
+
+    def _is_far_from(self, other: Floats, depth: float) -> bool:
+        """Return whether the camera has turned much, or moved much for things at a depth."""
+        settings, between = self._settings, self._pose @ inverse(other)
+        angle = math.acos(min(max((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0), 1.0))
+        shift = self._info.fx * float(np.linalg.norm(between[:3, 3]) / depth)
+        return math.degrees(angle) > settings.keyframe_rotation or shift > settings.keyframe_shift
+
+    def _add_keyframe(self, grey: Grey, inverse_of: Depth, rows: Rows, pixels: Floats) -> None:
+        """Store this image, and new landmarks between those found."""
+        settings = self._settings
+        corners = find_corners(grey, settings.spacing, pixels)
+        seen = self._surfaces_at(inverse_of, corners, settings.depth_noise)
+        number = next(reversed(self._keyframes), -1) + 1
+        new = self._map.add(
+            number, self._pose, corners[seen.continuous], seen.take(seen.continuous)
+        )
+        rows, pixels = (
+            np.concatenate([rows, new]),
+            np.concatenate([pixels, corners[seen.continuous]]),
+        )
+        self._keyframes[number] = frame = Keyframe(grey, self._pose)
+        self._newest.append(Described(frame, inverse_of, self._matrix, settings.depth_noise))
+        self._at_keyframe = len(rows)
+        self._near = None
+        if len(self._keyframes) > settings.keyframes:
+            del self._keyframes[next(iter(self._keyframes))]
+            gone = self._map.forget_before(next(iter(self._keyframes)))
+            pixels, rows = pixels[rows >= gone], rows[rows >= gone] - gone
+        self._before = self._reduced(grey), rows, pixels
+
+    def _images(self) -> dict[int, Grey]:
+        return {number: frame.image for number, frame in self._keyframes.items()}
+
+    def _clear_map(self) -> None:
+        self._map = Landmarks(self._matrix)
+        self._keyframes: dict[int, Keyframe] = {}
+        self._newest: deque[Described] = deque(maxlen=min(_SEARCHED, self._settings.keyframes))
+        self._at_keyframe = 0
+        self._near = None
+        self._near_until = 0
+
+    def _start_map(self, stamp: int, grey: Grey, inverse_of: Depth, reason: str) -> TrackingResult:
+        """Make the first key frame of a new map, at the present pose, if it shows enough."""
+        corners = find_corners(grey, self._settings.spacing, np.empty((0, 2)))
+        seen = self._surfaces_at(inverse_of, corners, self._settings.depth_noise)
+        count = int(seen.continuous.sum())
+        if count < self._settings.min_inliers:
+            view = View.of(grey, inverse_of)
+            if not (self._aligns and self._references.suffices(view)):
+                least = self._settings.min_inliers
+                few = f"{count} corners with depth, of {least} needed for a map, and too few edges"
+                return self._lost(stamp, few)
+        self._maps += bool(self._keyframes) and not self._is_carried
+        self._clear_map()
+        self._lost_since = None
+        self._motion.placed(stamp, self._pose)
+        self._references.note(grey, inverse_of, self._pose, False)
+        self._add_keyframe(grey, inverse_of, np.empty(0, np.int64), np.empty((0, 2)))
+        _, _, pixels = self._before
+        return TrackingResult(
+            pose=inverse(self._pose),
+            reason=reason,
+            points=pixels.astype(np.float32),
+            inliers=np.ones(count, np.bool_),
+            map=self._maps,
+        )
+
+    @property
+    def _is_carried(self) -> bool:
+        """Whether the pose is known without the map, so that a new one goes on in its frame."""
+        return False
+
+    def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
+        """Return that tracking is lost; after a while, start a new map.
+
+        Where that starts is known from the images meanwhile, or guessed from the last motion.
+        """
+        result = self._lost(stamp, "too few landmarks of the map were found")
+        assert self._lost_since is not None
+        carried = self._pose
+        if self._aligns:
+            view = View.of(grey, inverse_of)
+            carried = self._references.carry(view, self._motion.carried(stamp))
+            self._motion.placed(stamp, carried)
+        if stamp - self._lost_since < self._settings.reset_timeout * 1e9:
+            return result
+        self._pose = carried
+        return self._start_map(stamp, grey, inverse_of, "by a new map, at the estimated pose")
+
+    def _lost(self, stamp: int, reason: str) -> TrackingResult:
+        if self._lost_since is None:
+            self._lost_since, self._searched = stamp, 0
+        return TrackingResult(pose=inverse(self._pose), lost=True, reason=reason)

@@ -1,0 +1,234 @@
+"""The map: landmarks, each with the key frame in which it was first seen, and its depth there.
+
+Rows are in the order of age, so that forgetting the oldest key frame is cutting off the front.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events.poses import inverse
+from nodes.estimators.odometry.images import Depth, Floats
+from nodes.estimators.odometry.pose import intrinsics, rays
+from nodes.estimators.visual_odometry.patches import Patches, Rows
+from nodes.estimators.visual_odometry.surfaces import Surfaces
+
+_SHRUNK, _GROWN, _SHEARED = 0.6, 2.0, 2.5
+"""Limits of how much smaller, larger or more slanted a landmark may look than at first."""
+_MEAN_OF = 20.0
+"""Readings of depth after which the mean of a landmark's depth becomes a moving one."""
+_CONTRADICTS = 5.0
+"""Standard deviations by which a reading of depth may differ from a landmark's."""
+_HIDES = 0.05
+"""Share of a landmark's inverse depth by which another surface must differ from it."""
+
+
+class Landmarks:
+    """Points of the world, by rows.
+
+    Attributes:
+        places: Metres in the world, shape (n, 3).
+        keyframes: Number of the key frame each was first seen in, ascending, shape (n,).
+        pixels: Its pixels there, shape (n, 2).
+    """
+
+    _COLUMNS = (
+        "places",
+        "keyframes",
+        "pixels",
+        "_directions",
+        "_origins",
+        "_inverse",
+        "_slopes",
+        "_readings",
+        "_missed",
+        "_inactive_until",
+    )
+
+    def __init__(self, matrix: Floats) -> None:
+        self._matrix = matrix
+        self.places = np.empty((0, 3))
+        self.keyframes: Rows = np.empty(0, np.int64)
+        self.pixels = np.empty((0, 2))
+        # In the world: the change by one column, that by one row, and the ray.
+        self._directions = np.empty((0, 3, 3))
+        self._origins = np.empty((0, 3))
+        self._inverse = np.empty(0)
+        self._slopes = np.empty((0, 2))
+        self._readings = np.empty(0)
+        self._missed: Rows = np.empty(0, np.int64)
+        self._inactive_until: Rows = np.empty(0, np.int64)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def add(self, number: int, pose: Floats, pixels: Floats, seen: Surfaces) -> Rows:
+        """Add landmarks of a key frame and return their rows.
+
+        Args:
+            number: Number of the key frame, not less than any before.
+            pose: World to camera, shape (4, 4).
+            pixels: Their pixels there, shape (n, 2).
+            seen: Their surfaces, all continuous.
+        """
+        back, count, before = inverse(pose), len(pixels), len(self)
+        fx, fy, *_ = intrinsics(self._matrix)
+        axes = np.zeros((count, 3, 3))
+        axes[:, 0, 0], axes[:, 1, 1] = 1 / fx, 1 / fy
+        axes[:, :, 2] = rays(pixels, self._matrix)
+        directions = back[:3, :3] @ axes
+        origins = np.tile(back[:3, 3], (count, 1))
+        places = origins + directions[:, :, 2] / seen.inverse[:, None]
+        none = np.zeros(count, np.int64)
+        self.places = np.concatenate([self.places, places])
+        self.keyframes = np.concatenate([self.keyframes, none + number])
+        self.pixels = np.concatenate([self.pixels, pixels])
+        self._directions = np.concatenate([self._directions, directions])
+        self._origins = np.concatenate([self._origins, origins])
+        self._inverse = np.concatenate([self._inverse, seen.inverse])
+        self._slopes = np.concatenate([self._slopes, seen.slope])
+        self._readings = np.concatenate([self._readings, np.ones(count)])
+        self._missed = np.concatenate([self._missed, none])
+        self._inactive_until = np.concatenate([self._inactive_until, none])
+        return np.arange(before, len(self))
+
+    def forget_before(self, number: int) -> int:
+        """Forget landmarks of key frames before this one, and return how many those were."""
+        gone = int(np.searchsorted(self.keyframes, number))
+        for name in self._COLUMNS:
+            setattr(self, name, getattr(self, name)[gone:])
+        return gone
+
+    def in_view(self, pose: Floats, size: tuple[int, int], margin: float, rows: Rows) -> Rows:
+        """Return which of some landmarks fall into an image, or miss it by `margin` at most.
+
+        Args:
+            pose: World to camera, shape (4, 4).
+            size: Width and height.
+            margin: Pixels; below zero for those well inside.
+            rows: Rows of the landmarks.
+        """
+        pixels, z = self.project(pose, rows)
+        inside = (pixels > -margin).all(axis=1) & (pixels < np.array(size) - 1 + margin).all(axis=1)
+        return rows[inside & (z > 0.05)]
+
+    def project(self, pose: Floats, rows: Rows) -> tuple[Floats, Floats]:
+        """Return the pixels of landmarks, shape (n, 2), and their depth, metres, shape (n,)."""
+        fx, fy, cx, cy = intrinsics(self._matrix)
+        points = self.places[rows] @ pose[:3, :3].T + pose[:3, 3]
+        z = points[:, 2]
+        ahead = np.where(z > 0.05, z, 1.0)
+        return np.stack([fx * points[:, 0] / ahead + cx, fy * points[:, 1] / ahead + cy], 1), z
+
+    def unhidden(self, pose: Floats, inverse_depth: Depth, rows: Rows, noise: float) -> Rows:
+        """Return those of some landmarks, all in view, where no other surface is measured.
+
+        Args:
+            pose: World to camera, shape (4, 4).
+            inverse_depth: As `surfaces.inverse_depth` gives it, shape (h, w).
+            rows: Rows of the landmarks.
+            noise: Standard deviation of a reading, 1/m.
+        """
+        pixels, z = self.project(pose, rows)
+        column, row = np.rint(pixels).astype(int).T
+        there = inverse_depth[row, column]
+        off = np.abs(there - 1.0 / z)
+        return np.asarray(rows[(there <= 0) | (off < np.maximum(_HIDES / z, 4 * noise))])
+
+    def active(self, now: int, rows: Rows) -> Rows:
+        """Return those of some landmarks that are looked for now, as `update_found` says."""
+        return np.asarray(rows[self._inactive_until[rows] <= now])
+
+    def patches(self, pose: Floats, rows: Rows) -> tuple[Rows, Patches]:
+        """Return the patches to look for, and the rows whose look has not changed too much.
+
+        The warp is the derivative, at the landmark, of the homography that its plane induces.
+        """
+        fx, fy, *_ = intrinsics(self._matrix)
+        expected, z = self.project(pose, rows)
+        x = (self.places[rows] @ pose[:3, :3].T + pose[:3, 3]) / z[:, None]
+        turn = pose[:3, :3] @ self._directions[rows, :, :2]
+        origin = self._origins[rows] @ pose[:3, :3].T + pose[:3, 3]
+        # A neighbour's point, times its inverse depth, is direction + inverse depth × origin.
+        change = (turn + origin[:, :, None] * self._slopes[rows][:, None]) / (
+            self._inverse[rows] * z
+        )[:, None, None]
+        warps = np.stack(
+            [
+                fx * (change[:, 0] - x[:, :1] * change[:, 2]),
+                fy * (change[:, 1] - x[:, 1:2] * change[:, 2]),
+            ],
+            axis=1,
+        )
+        area = np.linalg.det(warps)
+        good = (area > _SHRUNK**2) & (area < _GROWN**2)
+        good &= np.abs(warps).max(axis=(1, 2)) < _SHEARED
+        rows = rows[good]
+        return rows, Patches(self.keyframes[rows], self.pixels[rows], expected[good], warps[good])
+
+    def update_found(self, now: int, found: Rows, missed: Rows) -> None:
+        """Note which landmarks were found; the others are left out for a while.
+
+        That is the longer, the more often they were missed in a row.
+        """
+        self._missed[found] = 0
+        self._missed[missed] += 1
+        self._inactive_until[missed] = now + 1 + self._missed[missed] ** 2
+
+    def fuse(self, pose: Floats, rows: Rows, read: Surfaces, noise: float) -> None:
+        """Move landmarks along their first rays to the mean of all readings of their depth.
+
+        Args:
+            pose: World to camera, shape (4, 4).
+            rows: Landmarks seen.
+            read: Their surfaces in this image.
+            noise: Standard deviation of a reading, 1/m.
+        """
+        _, z = self.project(pose, rows)
+        use = read.continuous & (np.abs(read.inverse - 1.0 / z) < _CONTRADICTS * noise)
+        rows, now = rows[use], read.inverse[use]
+        origin = self._origins[rows] @ pose[2, :3] + pose[2, 3]
+        ahead = self._directions[rows, :, 2] @ pose[2, :3]
+        beyond = 1.0 / now - origin
+        again = ahead / beyond
+        # By how much the reading's noise grows on its way to the first key frame.
+        gain = again / (beyond * now**2)
+        use = (beyond > 0.05) & (gain > 0.2)
+        rows, again, weight = rows[use], again[use], 1.0 / gain[use] ** 2
+        total = self._readings[rows] + weight
+        self._inverse[rows] += (again - self._inverse[rows]) * weight / total
+        self._readings[rows] = np.minimum(total, _MEAN_OF)
+        self.places[rows] = (
+            self._origins[rows] + self._directions[rows, :, 2] / self._inverse[rows][:, None]
+        )
+
+
+class MapMatch(msgspec.Struct, frozen=True, eq=False):
+    """The landmarks of the map that were found in an image, and the pose from them.
+
+    Attributes:
+        pose: World to camera, shape (4, 4).
+        rows: Landmarks found, shape (n,).
+        pixels: Their pixels, shape (n, 2).
+        agree: Which of them agree with the pose, shape (n,).
+        missed: Landmarks looked for and not found.
+    """
+
+    pose: Floats
+    rows: Rows
+    pixels: Floats
+    agree: npt.NDArray[np.bool_]
+    missed: Rows
+
+    @classmethod
+    def without_landmarks(cls, pose: Floats) -> MapMatch:
+        """Return that none were looked for, as the pose is known without."""
+        none = np.empty(0, np.int64)
+        return cls(pose, none, np.empty((0, 2)), np.empty(0, np.bool_), none)
+
+    @property
+    def share(self) -> float:
+        """Share of the landmarks looked for that agree with the pose."""
+        return float(self.agree.sum()) / (len(self.rows) + len(self.missed))

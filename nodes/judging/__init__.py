@@ -1,0 +1,1 @@
+"""Judging: from estimates and truth to figures, verdicts and reports."""

@@ -1,0 +1,136 @@
+"""For how much of a flight there was a pose: coverage, and the intervals without one.
+
+Everything is measured on the stamps of the images there were, from the first to the last: silence
+before the first pose and after the last one counts. When a pose arrived plays no part here, so an
+estimator that is late is late in `latency`, and one that is silent is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from runtime.time.schedule import SECOND
+
+Stamps = npt.NDArray[np.int64]
+
+
+class Interval(NamedTuple):
+    """A stretch of time, nanoseconds."""
+
+    start: int
+    end: int
+
+
+class Coverage(msgspec.Struct, frozen=True):
+    """What an estimator covered of a flight.
+
+    Attributes:
+        flight: From the first image to the last.
+        frames: How many images there were, or would have been.
+        answered: How many of them have a pose: one within half an image's period.
+        lost: Intervals without a pose, in order; they do not touch.
+    """
+
+    flight: Interval
+    frames: int
+    answered: int
+    lost: list[Interval]
+
+    @property
+    def percent(self) -> float:
+        """Share of the flight's time in which the estimator was not lost, in percent."""
+        length = self.flight.end - self.flight.start
+        if not length:
+            return 100.0 if self.answered else 0.0
+        return max(100.0 * (1.0 - seconds(self.lost) * SECOND / length), 0.0)
+
+    @property
+    def frames_percent(self) -> float:
+        """Share of the images that have a pose, in percent."""
+        return 100.0 * self.answered / self.frames
+
+
+def cover(
+    frames: Stamps,
+    poses: Stamps,
+    gap: int,
+    announced: Sequence[Interval] = (),
+    planned: int | None = None,
+) -> Coverage:
+    """Return what poses cover of a flight.
+
+    Lost is what a user means by it: no pose for longer than `gap` although there were images, or
+    the estimator's own word. A camera that is slower than `gap` makes nobody lost.
+
+    Args:
+        frames: Stamps of the images, strictly rising, shape (n,), n ≥ 1.
+        poses: Stamps of the poses, strictly rising, shape (m,).
+        gap: Silence that counts (ns).
+        announced: Intervals in which the estimator itself reported that it was lost, in any order.
+        planned: When the flight should have ended (ns), if it was ended before: images were to
+            come until then at their usual rate, and are without a pose.
+    """
+    first, last = int(frames[0]), int(frames[-1])
+    has_pose = answered(frames, poses)
+    inside = poses[(poses >= first) & (poses <= last)]
+    starts, ends = np.append(first, inside), np.append(inside, last)
+    unanswered = np.append(0, np.cumsum(~has_pose))  # in the first k images
+    missing = (
+        unanswered[np.searchsorted(frames, ends, side="right")]
+        - unanswered[np.searchsorted(frames, starts, side="left")]
+    )
+    silent = np.flatnonzero((ends - starts > gap) & (missing > 0))
+    clipped = [Interval(max(s, first), min(e, last)) for s, e in announced]
+    lost = [Interval(int(starts[k]), int(ends[k])) for k in silent]
+    lost += [each for each in clipped if each.end > each.start]
+    count = len(frames)
+    if planned is not None and planned > last > first:
+        count += round((planned - last) * (count - 1) / (last - first))
+        lost.append(Interval(last, planned))
+        last = planned
+    return Coverage(Interval(first, last), count, int(has_pose.sum()), union(lost))
+
+
+def answered(frames: Stamps, poses: Stamps) -> npt.NDArray[np.bool_]:
+    """Tell which images have a pose within half the usual period between images, shape (n,).
+
+    Stamps that went through a double or a clock of their own still count; a wrong pose for the
+    stamp is found by the errors.
+    """
+    if not len(poses):
+        return np.zeros(len(frames), np.bool_)
+    period = int(np.median(np.diff(frames))) if len(frames) > 1 else 0
+    after = np.clip(np.searchsorted(poses, frames), 0, len(poses) - 1)
+    before = np.clip(after - 1, 0, None)
+    distance = np.minimum(abs(poses[after] - frames), abs(poses[before] - frames))
+    return np.asarray(2 * distance <= period)
+
+
+def choose_frames(cameras: Mapping[str, Stamps], poses: Stamps) -> Stamps | None:
+    """Return the stamps of the camera that an estimator follows: most of its poses have them.
+
+    Of cameras that fit as well as each other it is the first; `None` if no camera has images.
+    """
+    there = (stamps for stamps in cameras.values() if len(stamps))
+    return max(there, key=lambda stamps: int(np.isin(poses, stamps).sum()), default=None)
+
+
+def union(intervals: Sequence[Interval]) -> list[Interval]:
+    """Return the same time as intervals that do not touch, in order."""
+    found: list[Interval] = []
+    for each in sorted(intervals):
+        if found and each.start <= found[-1].end:
+            found[-1] = Interval(found[-1].start, max(found[-1].end, each.end))
+        else:
+            found.append(each)
+    return found
+
+
+def seconds(intervals: Sequence[Interval]) -> float:
+    """Return how long intervals are together."""
+    return sum(each.end - each.start for each in intervals) / SECOND

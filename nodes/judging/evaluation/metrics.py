@@ -1,0 +1,256 @@
+"""Errors of an estimated trajectory: absolute, relative, drift; and of one pose, on plain floats.
+
+Definitions are those of J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems"
+(IROS 2012), as the tool evo computes them, so that its figures and ours agree. Both trajectories
+have the same stamps and are in one frame: see `nodes.judging.evaluation.alignment` for how they get
+there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from nodes.trajectory import Trajectory
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+SHARES = (1, 2, 5, 10, 20)
+"""Percent of a flight's path over which relative errors are taken; see `share_errors`."""
+
+
+def absolute_errors(truth: Trajectory, estimate: Trajectory) -> dict[str, float]:
+    """Return the absolute trajectory errors (ATE) of an aligned estimate: how far each pose is off.
+
+    Returns:
+        By name, with the unit at its end: root mean square, mean, median, standard deviation,
+        maximum and mean square of the distances; root mean squares along x (north), y (east) and
+        z (down) of the truth's frame; root mean square of the angles between the orientations,
+        and of the differences of the headings: where the body's x axis points, seen along z.
+
+    Raises:
+        ValueError: The stamps of the two differ.
+    """
+    same_stamps(truth, estimate)
+    errors = position_errors(truth.positions, estimate.positions)
+    angles = rotation_errors(truth.orientations, estimate.orientations)
+    x, y, z = (estimate.positions - truth.positions).T
+    ahead, said = (t.rotations().apply([1.0, 0.0, 0.0]) @ [1, 1j, 0] for t in (truth, estimate))
+    return {
+        "ate_rmse_m": rms(errors),
+        "ate_mean_m": float(errors.mean()),
+        "ate_median_m": float(np.median(errors)),
+        "ate_std_m": float(errors.std()),
+        "ate_max_m": float(errors.max()),
+        "ate_north_rmse_m": rms(x),
+        "ate_east_rmse_m": rms(y),
+        "ate_down_rmse_m": rms(z),
+        "mse_m2": float(np.mean(errors**2)),
+        "rot_rmse_deg": rms(np.degrees(angles)),
+        "heading_rmse_deg": rms(np.angle(said * ahead.conj(), deg=True)),
+    }
+
+
+def path_errors(truth: Trajectory, estimate: Trajectory, delta: float = 1.0) -> dict[str, float]:
+    """Return the relative errors (RPE) over all pairs of poses a given path length apart.
+
+    No alignment but that of the scale changes them. The same as evo's with ``--delta 1
+    --delta_unit m --all_pairs --pairs_from_reference`` (without the last, evo measures the
+    stretches along the estimate, which noise makes longer).
+
+    Args:
+        truth: The true poses.
+        estimate: The estimated ones, at the same stamps.
+        delta: Length of true path in metres; a pair may miss it by a tenth.
+
+    Raises:
+        ValueError: The stamps of the two differ, or no poses are that far apart.
+    """
+    same_stamps(truth, estimate)
+    distances = truth.distances()
+    first, last = path_pairs(distances, delta)
+    if not len(first):
+        raise ValueError(
+            f"relative error: expected poses {delta:g} m apart along the path, found none "
+            f"in {len(truth)} poses and {distances[-1]:.3f} m"
+        )
+    shifts, angles = relative_errors(truth, estimate, first, last)
+    return {
+        "rpe_trans_percent": 100.0 * rms(shifts) / delta,
+        "rpe_rot_deg_per_m": rms(np.degrees(angles)) / delta,
+    }
+
+
+def share_errors(truth: Trajectory, estimate: Trajectory, path: float) -> dict[str, float | None]:
+    """Return the relative errors over 1, 2, 5, 10 and 20 % of a flight's path, and their mean.
+
+    As the development kit of KITTI's odometry benchmark has it (A. Geiger, P. Lenz, R. Urtasun,
+    CVPR 2012; ``evaluate_odometry.cpp``): the mean, not the root mean square, of the errors of all
+    stretches of a length, divided by the length; and the mean over the stretches of all lengths.
+    Three things differ: the lengths are shares of the path instead of 100 to 800 m, every pose
+    begins a stretch and not every tenth, and it ends at the pose that is nearest to its length
+    (`path_pairs`), not at the first one beyond.
+
+    Args:
+        truth: The true poses.
+        estimate: The estimated ones, at the same stamps.
+        path: Metres of the whole flight, above 0.
+
+    Returns:
+        By name; `None` for a length that no stretch has.
+
+    Raises:
+        ValueError: The stamps of the two differ.
+    """
+    same_stamps(truth, estimate)
+    distances = truth.distances()
+    found: dict[str, float | None] = {}
+    everything: list[tuple[Floats, Floats]] = []
+    for share in SHARES:
+        length = share / 100.0 * path
+        shifts, angles = relative_errors(truth, estimate, *path_pairs(distances, length))
+        each = 100.0 * shifts / length, np.degrees(angles) / length
+        everything.append(each)
+        found |= dict(zip(_share_names(str(share)), map(_mean, each), strict=True))
+    all_of = (np.concatenate(values) for values in zip(*everything, strict=True))
+    return found | dict(zip(_share_names("mean"), map(_mean, all_of), strict=True))
+
+
+def _share_names(which: str) -> tuple[str, str]:
+    return f"rpe_{which}_trans_percent", f"rpe_{which}_rot_deg_per_m"
+
+
+def _mean(values: Floats) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+def drift_percent(truth: Trajectory, estimate: Trajectory) -> float:
+    """Return how far off the last pose is, seen from the first, in percent of the true path.
+
+    As if the estimate had been aligned at its first pose: no alignment but that of the scale
+    changes it.
+
+    Raises:
+        ValueError: The stamps of the two differ, or the true path has no length.
+    """
+    same_stamps(truth, estimate)
+    length = truth.length()
+    if not length > 0.0:
+        raise ValueError(f"drift: expected a path longer than 0 m, found {len(truth)} poses on it")
+    ends = np.array([0]), np.array([len(truth) - 1])
+    shifts, _ = relative_errors(truth, estimate, *ends)
+    return 100.0 * float(shifts[0]) / length
+
+
+def path_pairs(distances: Floats, delta: float, tolerance: float = 0.1) -> tuple[Indices, Indices]:
+    """Return all pairs of poses a given path length apart, as evo's `filter_pairs_by_path` does.
+
+    For each pose that is the later one whose distance is nearest; the first of equals.
+
+    Args:
+        distances: Path length from the start to each pose, metres, not falling, shape (n,).
+        delta: Metres between the two.
+        tolerance: By what share of it a pair may miss it.
+
+    Returns:
+        Row numbers of the first and of the second poses, each of shape (m,).
+
+    Raises:
+        ValueError: `delta` is not a positive length.
+    """
+    if not 0.0 < delta < math.inf:
+        raise ValueError(f"path_pairs: delta: expected a length above 0 m, found {delta}")
+    n = len(distances)
+    first = np.arange(n - 1)
+    above = np.clip(np.searchsorted(distances, distances[:-1] + delta), first + 1, n - 1)
+    # The nearest from below, and of those that stand on one spot the one that came first.
+    below = np.searchsorted(distances, distances[above - 1])
+    below = np.where(below > first, below, np.minimum(first + 1, above))
+    miss_above = np.abs(distances[above] - distances[first] - delta)
+    miss_below = np.abs(distances[below] - distances[first] - delta)
+    second = np.where(miss_below <= miss_above, below, above)
+    kept = np.minimum(miss_below, miss_above) <= delta * tolerance
+    return first[kept], second[kept]
+
+
+def position_errors(truth: Floats, estimate: Floats) -> Floats:
+    """Return the distances between positions, metres: shapes (n, 3) and (n, 3) to (n,)."""
+    return np.asarray(np.linalg.norm(estimate - truth, axis=1))
+
+
+def rotation_errors(truth: Floats, estimate: Floats) -> Floats:
+    """Return the angles between orientations, radians in [0, π].
+
+    Args:
+        truth: Unit quaternions w, x, y, z, shape (n, 4).
+        estimate: The same.
+
+    Returns:
+        Shape (n,).
+    """
+    apart, along = (np.linalg.norm(estimate + s * truth, axis=1) for s in (-1.0, 1.0))
+    return np.asarray(4.0 * np.arctan2(np.minimum(apart, along), np.maximum(apart, along)))
+
+
+def _turns(first: Floats, last: Floats) -> Floats:
+    """Return the rotations from the first to the last, each in its first: quaternions (n, 4)."""
+    (w, x, y, z), (a, b, c, d) = first.T * [[1.0], [-1.0], [-1.0], [-1.0]], last.T
+    return np.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        axis=1,
+    )
+
+
+def interpolated(known: Indices, values: Floats, stamps: Indices) -> Floats:
+    """Return values at other times, which may repeat: shapes (n,), (n, d) and (k,) to (k, d)."""
+    times = stamps - known[0], known - known[0]  # so that a float holds every nanosecond
+    return np.stack([np.interp(*times, column) for column in values.T], axis=1)
+
+
+def same_stamps(truth: Trajectory, estimate: Trajectory) -> None:
+    """Raise `ValueError` unless two trajectories have the same stamps."""
+    if len(truth) != len(estimate):
+        raise ValueError(
+            f"expected poses at the same stamps, found {len(truth)} of the truth "
+            f"and {len(estimate)} of the estimate; see associate()"
+        )
+    if differ := np.flatnonzero(truth.stamps != estimate.stamps).tolist():
+        row = differ[0]
+        raise ValueError(
+            f"expected poses at the same stamps, found {truth.stamps[row]} ns of the truth beside "
+            f"{estimate.stamps[row]} ns of the estimate in row {row}; see associate()"
+        )
+
+
+def relative_errors(
+    truth: Trajectory, estimate: Trajectory, first: Indices, last: Indices
+) -> tuple[Floats, Floats]:
+    """Return the errors of the motions between pairs of poses: metres and radians, shape (m,).
+
+    Args:
+        truth: The true poses.
+        estimate: The estimated ones, at the same stamps.
+        first: Row numbers of the first pose of each pair; see `path_pairs`.
+        last: Row numbers of the second.
+    """
+    (r1, p1), (r2, p2) = (
+        (t.rotations(), t.positions[last] - t.positions[first]) for t in (truth, estimate)
+    )
+    true_motion = r1[first].inv().apply(p1)
+    said_motion = r2[first].inv().apply(p2)
+    turns = (_turns(t.orientations[first], t.orientations[last]) for t in (truth, estimate))
+    shifts = np.linalg.norm(said_motion - true_motion, axis=1)
+    return np.asarray(shifts), rotation_errors(*turns)
+
+
+def rms(values: Floats) -> float:
+    """Return the root mean square."""
+    return math.sqrt(float(np.mean(values**2)))

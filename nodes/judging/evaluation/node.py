@@ -1,0 +1,329 @@
+"""Holds estimates against the truth, live and at the end."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    Collision,
+    EstimatorAnnouncement,
+    Image,
+    LidarScan,
+    Odometry,
+    PlannedPose,
+    PoseEstimate,
+    PositionSetpoint,
+    Score,
+    TrackedFeatures,
+    TrackingEvent,
+    TrajectoryEstimate,
+)
+from nodes.judging.evaluation.album import Album
+from nodes.judging.evaluation.flight import Flight, collision_rows
+from nodes.judging.evaluation.judging import Judgement, judge
+from nodes.judging.evaluation.live import LiveErrors
+from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.results import FRAMES, write_results
+from nodes.judging.evaluation.verdict import Thresholds, conclude, planned_end
+from nodes.trajectory import Trajectory
+from nodes.trajectory.formats import tum_row
+from nodes.trajectory.growing import GrowingFile
+from nodes.vehicles import Vehicles
+from runtime import Duration, Node, NodeConfig, Output, on
+from runtime.errors import suggest
+from runtime.paths import source_file
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class EvaluationConfig(NodeConfig):
+    """Settings of an evaluation.
+
+    Attributes:
+        alignment: How an estimate is laid on the truth: ``none``, ``origin`` (first pose on first
+            pose), ``se3``, ``sim3``; ``auto`` is ``sim3`` for scale-free estimators, ``none`` for
+            estimates in ``map``, and ``origin`` for all others.
+        vehicle: Name of the vehicle whose truth all estimates are held against; if empty, each
+            estimator's is that which its source names or which carries the camera that it follows,
+            or else the first.
+        control_rate: Hertz of the controller for which the newest pose is judged.
+        delta: Metres of path over which relative errors are taken.
+        gap: Silence of an estimator that counts as lost.
+        thresholds: What the figures may be; if one is missed, the run's exit code is 1. Without
+            any, an estimator is not judged, unless it misses what is asked of everybody (it was
+            there for nine tenths of the flight, in one frame, with stamps that rise; its vehicle
+            hit nothing; the run came to its planned end). With some, there must be an estimator.
+        image_count: Sample images with features to keep of each estimator; 0 for none.
+    """
+
+    alignment: Literal["auto", "none", "origin", "se3", "sim3"] = "auto"
+    vehicle: str = ""
+    control_rate: Positive = 400
+    delta: Positive = 1.0
+    gap: Duration = Duration(0.5)  # immutable
+    thresholds: Thresholds = Thresholds()
+    image_count: Annotated[int, msgspec.Meta(ge=0, le=100)] = 12
+
+
+class Evaluation(Node[EvaluationConfig]):
+    """Judges every estimator that it receives against the odometry of its vehicle.
+
+    Errors are sent as `Score` as the estimates come; the rest is written at the end, and the
+    verdict put into the run's summary.
+    """
+
+    reads_truth = "judging"
+    files = ("trajectories", "evaluation", "frames")
+    scores = Output(Score)
+
+    async def on_startup(self) -> None:
+        """Open the files of trajectories: they grow as the run goes on."""
+        self._vehicles = Vehicles()
+        self._flights: dict[str, Flight] = {}  # by vehicle
+        self._records: dict[str, EstimatorRecord] = {}
+        self._live: dict[str, LiveErrors] = {}
+        self._frames: dict[str, array[int]] = {}  # times of exposure by camera
+        self._scans: dict[str, array[int]] = {}  # by lidar
+        self._late: dict[str, int] = {}  # offsets of the cameras' clocks
+        self._album = Album(self.config.image_count)
+        self._files: dict[str, GrowingFile] = {}
+        self._closed = False
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Note vehicles and their cameras; expect estimators."""
+        self._vehicles.announced(announcement)
+        if isinstance(announcement, CameraAnnouncement):
+            self._late[announcement.source] = round(announcement.time_offset * 1e9)
+        if isinstance(announcement, EstimatorAnnouncement):
+            record = EstimatorRecord(
+                announcement.scale_free, announcement.method, announcement.reads
+            )
+            self._records[announcement.source] = record
+
+    def check(self) -> Iterable[str]:
+        """Say if there is no such vehicle as the file names, or nobody to judge."""
+        asked = self.config.thresholds != Thresholds()
+        if asked and not (self._records or self.senders_of(PoseEstimate, TrajectoryEstimate)):
+            yield "thresholds: expected an estimator to judge, found none"
+        if (name := self.config.vehicle) and name not in (names := self._vehicles.names):
+            yield (
+                f"vehicle: expected one that is announced ({', '.join(names) or 'none'}), "
+                f'found "{name}"{suggest(name, names)}'
+            )
+
+    @on(Odometry)
+    def odometry(self, event: Odometry) -> None:
+        """Note the truth."""
+        known = self._vehicles.names
+        if self._closed or (known and event.source not in known and "odometry" not in self.sources):
+            return
+        flight = self._flights.get(event.source)
+        if flight is None:
+            self._vehicles.add(event.source)
+            flight = self._flights[event.source] = self._flights.pop("", Flight())
+        flight.add(event)
+        self._append(self._named("truth", event.source), event)
+
+    @on(PlannedPose, PositionSetpoint)
+    def plans(self, event: PlannedPose | PositionSetpoint) -> None:
+        """Note where a pilot means its vehicle to be."""
+        vehicle = self._vehicles.of(event.vehicle or event.source)
+        self._flights.setdefault(vehicle, Flight()).add_plan(event)
+
+    @on(PoseEstimate)
+    def estimates(self, event: PoseEstimate) -> None:
+        """Note an estimate, and send its errors as scores."""
+        if self._closed:
+            return
+        name, now = event.source, self.clock.now()
+        record = self._records.setdefault(name, EstimatorRecord())
+        if not record.add(event, now):
+            return
+        self._append(source_file(name), event)
+        self._score(event, "latency", (now - event.stamp) / 1e9, "s")
+        truth = self._flight_of(name).recent.at(event.stamp)
+        if truth is None or record.scale_free:
+            return
+        live = self._live.setdefault(name, LiveErrors())
+        distance, angle = live.of(event, truth)
+        self._score(event, "position_error", distance, "m")
+        self._score(event, "rotation_error", angle, "rad")
+        self._score(event, "mean_square_error", live.mean_square, "m^2")
+
+    @on(TrackingEvent)
+    def tracking_events(self, event: TrackingEvent) -> None:
+        """Note that an estimator lost or regained its way."""
+        record = self._records.setdefault(event.source, EstimatorRecord())
+        record.note(event, self.clock.now())
+
+    @on(TrajectoryEstimate)
+    def trajectories(self, event: TrajectoryEstimate) -> None:
+        """Note an estimator's trajectory after loop closures; the last one counts."""
+        if not self._closed:
+            self._records.setdefault(event.source, EstimatorRecord()).add_final(event)
+
+    @on(LidarScan)
+    def scans(self, event: LidarScan) -> None:
+        """Note that there was a scan, when it was complete: a pose may be for any of its rays."""
+        stamps = self._scans.setdefault(event.source, array("q"))
+        if not stamps or event.end > stamps[-1]:
+            stamps.append(event.end)
+
+    @on(Image)
+    def images(self, event: Image) -> None:
+        """Note that there was an image; hold it for a while: its features may follow."""
+        stamps = self._frames.setdefault(event.source, array("q"))
+        exposed = event.stamp - self._late.get(event.source.removesuffix("/grey"), 0)
+        if not stamps or exposed > stamps[-1]:
+            stamps.append(exposed)
+        self._album.add_image(event)
+
+    @on(Collision)
+    def collisions(self, event: Collision) -> None:
+        """Note a vehicle's collision."""
+        self._flights.setdefault(event.source, Flight()).collisions.append(event)
+
+    @on(TrackedFeatures)
+    def features(self, event: TrackedFeatures) -> None:
+        """Note whose images an estimator looks at; keep one with its features at intervals."""
+        self._vehicles.tracked(event)
+        self._album.add_features(event)
+
+    async def on_shutdown(self) -> None:
+        """Judge, and write what came of it."""
+        self._closed = True  # while it judges, beside the loop, nothing may change
+        for file in self._files.values():
+            file.close()
+        if not self._records and self.clock.now() > 0:
+            self.log.info("no estimator has announced itself or sent an estimate")
+        judgements, verdict = await self.offload(self._finish, self.clock.now())
+        for name in judgements:
+            figures = verdict["estimators"][name]
+            rest = {k: v for k, v in figures.items() if k != "passed"}
+            self.conclude(name, rest, passed=figures["passed"])
+            if figures.get("why"):
+                self.log.warning("%s: %s", name, figures["why"])
+        if not judgements and "failed" in verdict:
+            self.conclude(self.name, {"failed": verdict["failed"]}, passed=verdict["passed"])
+
+    def _finish(self, end: int) -> tuple[dict[str, Judgement], dict[str, Any]]:
+        config = self.config
+        truths = {v: f.truth.trajectory() for v, f in self._flights.items() if len(f.truth)}
+        flown = {v: flight.figures(truths.get(v)) for v, flight in self._flights.items()}
+        judgements = {}
+        how = self.run_end
+        for name, record in self._records.items():
+            vehicle = self._vehicle_of(name)
+            sensors = self._scans if "lidar" in record.reads else self._frames
+            seen = self._seen(vehicle, sensors)
+            body = self._flights.get(vehicle, Flight()).body
+            judgement = self._judge(
+                record,
+                truths.get(vehicle),
+                cameras=seen,
+                end=end,
+                planned=planned_end(how),
+                body=body,
+            )
+            judgement.figures.update(flown.get(vehicle, {}))
+            if len(self._vehicles.names) > 1:
+                judgement.figures["vehicle"] = vehicle
+            judgements[name] = judgement
+        restarted = (
+            f"{self.name}: expected it to judge the whole flight, found that it was restarted: "
+            "what was sent before is not in the figures"
+        )
+        figures = {name: judgement.figures for name, judgement in judgements.items()}
+        faults = [restarted] if self.restarts else []
+        declared = [name for name, record in self._records.items() if "truth" in record.reads]
+        verdict = conclude(figures, config.thresholds, faults, how, declared)
+        if self.out is not None:
+            plans = {self._named("plan", v): f.plan() for v, f in self._flights.items()}
+            write_results(self.out, plans, judgements, verdict)
+            collisions = [c for flight in self._flights.values() for c in flight.collisions]
+            file = self.out / "trajectories" / "collisions.csv"
+            file.write_text(collision_rows(collisions), encoding="utf-8")
+            self._album.write(self.out / "frames")
+        return judgements, verdict
+
+    def _judge(self, record: EstimatorRecord, truth: Trajectory | None, **seen: Any) -> Judgement:
+        """Judge one estimator; whatever it sent, the others are judged."""
+        if truth is None:
+            why = "expected a truth to hold it against, found no odometry"
+            return Judgement(figures={"why": why}, estimate=None)
+        config = self.config
+        try:
+            return judge(
+                record,
+                truth,
+                **seen,
+                alignment=config.alignment,
+                rate=config.control_rate,
+                delta=config.delta,
+                gap=config.gap,
+            )
+        except Exception as error:
+            self.log.exception("it cannot be judged")
+            why = f"cannot be judged: {type(error).__name__}: {error}"
+            return Judgement(figures={"why": why}, estimate=None)
+
+    def _vehicle_of(self, estimator: str) -> str:
+        """Return the vehicle that an estimator is judged by."""
+        found = self.config.vehicle or self._vehicles.of(estimator)
+        flying = [vehicle for vehicle, flight in self._flights.items() if len(flight.truth)]
+        return flying[0] if len(flying) == 1 else found  # the file may have chosen its odometry
+
+    def _flight_of(self, estimator: str) -> Flight:
+        return self._flights.get(self._vehicle_of(estimator)) or Flight()
+
+    def _seen(
+        self, vehicle: str, sensors: dict[str, array[int]]
+    ) -> dict[str, npt.NDArray[np.int64]]:
+        """Return the stamps of those sensors that may be a vehicle's: of several, its own."""
+        several = len(self._vehicles.names) > 1
+        return {
+            sensor: np.array(stamps, np.int64)
+            for sensor, stamps in sensors.items()
+            if not several or self._vehicles.carrier(sensor) in {"", vehicle}
+        }
+
+    def _named(self, what: str, vehicle: str) -> str:
+        """Return the name of a file: ``truth`` of the first vehicle, ``truth.<name>`` of others."""
+        first = next(iter(self._vehicles.names), vehicle)
+        return what if vehicle == first else f"{what}.{source_file(vehicle)}"
+
+    def _append(self, name: str, event: Odometry | PoseEstimate) -> None:
+        """Add a pose to a file: should the run be killed, what was sent until then is there."""
+        if self.out is None:
+            return
+        file = self._files.get(name)
+        if file is None:
+            folder = self.out / "trajectories"
+            folder.mkdir(exist_ok=True)
+            path = folder / f"{name}.tum"
+            true = isinstance(event, Odometry)
+            frame = event.frame_id.encode("unicode_escape").decode("ascii")  # in one line
+            frame = "map (NED)" if true else f"{frame}, as it was sent"
+            head = f"# {FRAMES.format(frame)}\n"
+            file = self._files[name] = GrowingFile(self, path, head)
+        file.add(tum_row(event.stamp, event.position, event.orientation))
+
+    def _score(self, event: PoseEstimate, metric: str, value: float, unit: str) -> None:
+        self.scores.send(
+            Score(
+                stamp=event.stamp,
+                source=self.name,
+                subject=event.source,
+                metric=metric,
+                value=value,
+                unit=unit,
+            )
+        )

@@ -1,0 +1,167 @@
+"""Several trajectories held against one truth, and the folder that is left of it.
+
+The figures are those of an evaluation (`nodes.judging.evaluation.judging`), but for what poses
+alone do not tell: when they came, and thus latencies, errors at control ticks and stamps of the
+future.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.judging.evaluation.alignment import How
+from nodes.judging.evaluation.judging import Judgement, judge
+from nodes.judging.evaluation.node import EvaluationConfig
+from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.results import FRAMES, write_results
+from nodes.judging.evaluation.verdict import conclude
+from nodes.judging.judge.sources import Axes, Source
+from nodes.judging.report.contents import Facts, Verdict
+from nodes.judging.report.page import write_report
+from nodes.trajectory import Trajectory
+from nodes.trajectory.formats import write_tum
+from runtime import Duration
+from runtime.errors import ResultsError
+from runtime.paths import source_file
+from runtime.run import results
+from runtime.run.environment import command_line, commit, environment
+from runtime.time.schedule import SECOND
+
+
+class JudgeConfig(EvaluationConfig):
+    """How to judge: as an evaluation, but ``auto`` is ``se3`` where nobody says the frame.
+
+    Attributes:
+        scale_free: Whether the estimates' unit of length is their own.
+        axes: Those of the estimates' files; see `nodes.judging.judge.sources.AXES`.
+        max_difference: From an estimate to the nearest true pose, at most; one that is farther
+            from it is not compared.
+    """
+
+    scale_free: bool = False
+    axes: Axes | None = None
+    max_difference: Duration = Duration(0.1)
+
+
+def judge_all(
+    truth: Source,
+    estimates: Sequence[Source],
+    frames: npt.NDArray[np.int64] | None,
+    config: JudgeConfig,
+    finals: Mapping[str, Trajectory] = MappingProxyType({}),
+) -> tuple[dict[str, Judgement], Verdict, list[str]]:
+    """Judge estimates by the truth; the flight is that of the images, if their stamps are known.
+
+    Args:
+        truth: The true poses.
+        estimates: What was said at the time.
+        frames: Stamps of the images (ns), if they are known.
+        config: How to judge.
+        finals: The trajectories after loop closures, by the name of the estimate.
+
+    Returns:
+        Judgements by name, the verdict, and sentences on what was not compared.
+
+    Raises:
+        ValueError: Two have one name, one is nowhere near to a true pose in time, or a final
+            trajectory is of none of them.
+    """
+    names = [source.name for source in estimates]
+    if strangers := finals.keys() - {*names}:
+        raise ValueError(
+            f"final: expected the name of an estimate ({', '.join(names)}), found {min(strangers)}"
+        )
+    judgements: dict[str, Judgement] = {}
+    notes = []
+    for source in estimates:
+        if source.name in {*judgements, "truth", "plan"}:
+            raise ValueError(f"{source.file}: expected a name of its own, NAME={source.file}")
+        by_frame: dict[str, How] = {"": "se3", "map": "none"}
+        usual = "sim3" if config.scale_free else by_frame.get(source.frame_id, "origin")
+        poses, note = _compared(truth.poses, source, config.max_difference)
+        record = EstimatorRecord.of(poses)
+        record.final = finals.get(source.name)
+        judgement = judge(
+            record,
+            truth.poses,
+            cameras=None if frames is None else {"": frames},
+            alignment=usual if config.alignment == "auto" else config.alignment,
+            delta=config.delta,
+            gap=config.gap,
+        )
+        unknown = {"restarts", "repeated_stamps", "future_stamps", "other_bodies"}
+        figures = {k: v for k, v in judgement.figures.items() if k not in unknown} | source.counts
+        figures["method"] = source.file
+        figures["compared"] = int(truth.poses.covers(poses.stamps).sum())
+        judgements[source.name] = msgspec.structs.replace(judgement, figures=figures)
+        notes += [f"{source.name}: {note}"] if note else []
+    verdict = conclude({k: j.figures for k, j in judgements.items()}, config.thresholds)
+    return judgements, msgspec.convert(verdict, Verdict), notes
+
+
+def write(
+    out: Path,
+    truth: Source,
+    judgements: dict[str, Judgement],
+    verdict: Verdict,
+    notes: Sequence[str],
+) -> Path:
+    """Write a folder as a run leaves it, with figures and a report; return the report's path.
+
+    What an earlier judgement left there goes to ``NAME.1``.
+
+    Raises:
+        ResultsError: There is something else in the folder, or it cannot be written.
+    """
+    if (out / "config.toml").exists():
+        raise ResultsError(f"{out}: expected no run's folder: name another with --out")
+    with results.Folder(out) as folder:
+        page = _write(out, truth, judgements, verdict, notes)
+        folder.flown()
+    return page
+
+
+def _write(
+    out: Path,
+    truth: Source,
+    judgements: dict[str, Judgement],
+    verdict: Verdict,
+    notes: Sequence[str],
+) -> Path:
+    write_results(out, {}, judgements, msgspec.to_builtins(verdict))
+    write_tum(out / "trajectories" / "truth.tum", truth.poses, FRAMES.format("map (NED)"))
+    for name, judgement in judgements.items():
+        assert judgement.estimate is not None
+        path = out / "trajectories" / f"{source_file(name)}.tum"
+        write_tum(path, judgement.estimate, FRAMES.format("a frame of its own"))
+    facts = Facts(
+        name=out.name,
+        verdict=verdict,
+        environment={**environment(), "command": command_line(), "commit": commit()},
+        judged={"truth": truth.file, **{k: j.figures["method"] for k, j in judgements.items()}},
+        notes=list(notes),
+    )
+    text = msgspec.json.format(msgspec.json.encode(facts), indent=2)
+    results.write(out / "summary.json", text + b"\n")
+    return write_report(out)
+
+
+def _compared(truth: Trajectory, source: Source, most: float) -> tuple[Trajectory, str]:
+    """Return the poses but those far from true ones, and a sentence on what is not compared."""
+    poses = source.poses
+    after = np.searchsorted(truth.stamps, poses.stamps)
+    ends = truth.stamps[np.clip([after - 1, after], 0, len(truth) - 1)]
+    inside = truth.covers(poses.stamps)
+    far = inside & (abs(ends - poses.stamps).min(axis=0) > most * SECOND)
+    if far.all():
+        raise ValueError(f"{source.file}: expected true poses within {most:g} s of its, found none")
+    said = [f"{(~inside).sum()} outside the truth's time"] if not inside.all() else []
+    said += [f"{far.sum()} more than {most:g} s from any true pose"] if far.any() else []
+    note = f"not compared, of {len(poses)} poses: {', '.join(said)}" if said else ""
+    return poses.take(~far), note

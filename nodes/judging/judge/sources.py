@@ -1,0 +1,197 @@
+"""Where trajectories come from: files, topics of bags, and folders of runs and data sets.
+
+A file's format is recognized by its content. No file says which axes it means: the user does, or
+else the format's habit holds (`AXES`).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.data.export.trajectories import mounting
+from nodes.judging.judge.topic import read_topic
+from nodes.trajectory import Trajectory
+from nodes.trajectory.formats import read_euroc, read_kitti, read_tum, read_vslamlab
+from nodes.trajectory.table import Row, read_rows
+from runtime.time.schedule import SECOND
+
+Floats = npt.NDArray[np.float64]
+Axes = Literal["ned", "nwu", "enu", "optical"]
+
+_SAME, _HALF_TURN, _OPTICAL = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)[[2, 0, 1, 3]]
+AXES: dict[Axes, tuple[Floats, Floats]] = {
+    "ned": (_SAME, _SAME),
+    "nwu": (_HALF_TURN, _SAME),
+    "enu": (np.eye(4)[[1, 0, 2, 3]] * [1.0, 1.0, -1.0, 1.0], _HALF_TURN),
+    "optical": (_OPTICAL, _OPTICAL),
+}
+"""Transforms from a file's world to NED, and from its body to the truth's body, shape (4, 4).
+
+``ned``: our own files and TUM's; ``nwu``: z up, the body as it is, as EuRoC and VSLAM-LAB; ``enu``:
+REP 103, with a body FLU; ``optical``: both as a camera that looks ahead has them, as KITTI.
+"""
+
+_FORMATS = (
+    "a trajectory: rows of TUM (8 fields with blanks between), KITTI (12), EuRoC (17 with commas), "
+    "or 8 with commas under a header that names the columns (EuRoC, VSLAM-LAB)"
+)
+_SCALAR = re.compile(r"q\w*w\b")
+"""Of a header: the column of a quaternion's scalar part."""
+_FRAME = re.compile(r"# base_link \(FRD\) in (\S+), as it was sent")  # of a run's estimate
+_LONGEST_STEP = 10 * 86_400 * SECOND  # more are stamps of different units or clocks
+
+
+class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+    """A trajectory from outside: poses of the truth's body in a world NED.
+
+    Attributes:
+        frame_id: That the poses are in, if the source says so.
+        counts: Figures that only a topic has: restarts and repeated stamps.
+    """
+
+    name: str
+    file: str
+    poses: Trajectory
+    frame_id: str = ""
+    counts: dict[str, int] = {}
+
+
+def read_truth(text: str, times: str) -> Source:
+    """Read the true poses: a file, a topic, or those in a run's folder.
+
+    Raises:
+        ValueError: It cannot be read; the message names file and line.
+    """
+    own = Path(text) / "trajectories" / "truth.tum"
+    found = read(str(own) if own.is_file() else text, None, times)
+    if odd := {name: count for name, count in found.counts.items() if count}:
+        raise ValueError(f"{text}: expected one truth with stamps that rise, found {odd}")
+    return found
+
+
+def read(text: str, axes: Axes | None, times: str = "", camera: Floats | None = None) -> Source:
+    """Read a trajectory: a file, or a topic as ``bag:/topic``.
+
+    Args:
+        text: Where it is; ``NAME=`` before it gives it a name.
+        axes: Those of a file, if they are not its format's; a topic's are REP 103's.
+        times: File of the stamps of a KITTI file.
+        camera: Transform from a camera's optical frame to the body, shape (4, 4), if the poses
+            are the camera's: then the body's axes are of no account.
+
+    Raises:
+        ValueError: It cannot be read; the message names file and line, or pose.
+    """
+    name, equals, file = text.partition("=")
+    if not equals or Path(text).exists():
+        name, file = "", text
+    bag, colon, topic = file.rpartition(":/")
+    path = Path(bag if colon and not Path(file).exists() else file)
+    if path.suffix in {".mcap", ".db3", ".bag"} or (path / "metadata.yaml").is_file():
+        topic = f"/{topic}" if path != Path(file) else ""
+        poses, child, record = read_topic(path, topic)
+        name, frame_id = name or topic.strip("/"), record.frame_id
+        counts = {"restarts": record.restarts, "repeated_stamps": record.repeated}
+        world, body = _SAME, _OPTICAL if child == "optical" else _SAME
+        if camera is not None and child == "body":  # as which a camera's poses were read, then
+            camera = camera @ _HALF_TURN
+    else:
+        usual, frame_id, poses = _read_file(path, times)
+        name, counts = name or path.stem, {}
+        world, body = AXES[axes or usual]
+    if far := np.flatnonzero(np.diff(poses.stamps) > _LONGEST_STEP).tolist():
+        before, after = (poses.stamps[far[0] + k] / SECOND for k in (0, 1))
+        raise ValueError(
+            f"{file}: pose {far[0] + 2}: expected stamps of one unit and one clock, found "
+            f"{after:.3f} s after {before:.3f} s"
+        )
+    body = body if camera is None else camera
+    if world is not _SAME or body is not _SAME:
+        matrices = world @ poses.matrices() @ np.linalg.inv(body)
+        poses = Trajectory.from_matrices(poses.stamps, matrices)
+    return Source(name=name, file=file, poses=poses, frame_id=frame_id, counts=counts)
+
+
+def read_mounting(text: str, run: str) -> Floats:
+    """Return the transform from a camera's optical frame to the body, shape (4, 4).
+
+    It is given as ``tx ty tz qx qy qz qw`` (metres, the scalar last), as a file in TUM's format
+    with one pose, or by the name of a camera that the run in a folder has announced.
+
+    Raises:
+        ValueError: It is none of these.
+    """
+    if Path(text).is_file():
+        return np.asarray(read_tum(Path(text)).matrices()[0])
+    row = Row("--body-from-camera", text.replace(",", " ").split())
+    if len(row.fields) == 1 and Path(run).is_dir():
+        return mounting(Path(run), text)
+    if len(row.fields) != 7:
+        row.wrong('"tx ty tz qx qy qz qw", a file, or a camera of the run that is the truth', text)
+    values = np.array([row.numbers(0, 7)])
+    pose = Trajectory(np.array([0]), values[:, :3], values[:, [6, 3, 4, 5]])
+    return np.asarray(pose.matrices()[0])
+
+
+def read_stamps(path: Path) -> npt.NDArray[np.int64]:
+    """Return the stamps (ns) of a list of images or of poses: the first field of each row.
+
+    They are nanoseconds where there are commas (EuRoC, VSLAM-LAB), or else seconds (TUM, KITTI).
+
+    Raises:
+        ValueError: It cannot be read, or the stamps do not rise; the message names the line.
+    """
+    commas = "," in _start(path)[2]
+    rows = list(read_rows(path, "," if commas else None, range(1, 100), "stamps, …", header=commas))
+    stamps = np.array([row.nanoseconds() if commas else row.seconds() for row in rows], np.int64)
+    if back := np.flatnonzero(np.diff(stamps) <= 0).tolist():
+        before, after = stamps[back[0] : back[0] + 2]
+        rows[back[0] + 1].wrong(f"a stamp above {before} ns", f"{after} ns")
+    return stamps
+
+
+def _read_file(path: Path, times: str) -> tuple[Axes, str, Trajectory]:
+    """Return the axes that a file's format usually has, the frame that it names, and its poses."""
+    number, head, row = _start(path)
+    commas = "," in row
+    fields = row.split("," if commas else None)
+    names = head[-1].lower().split(",") if head else []
+    scalar = [k for k, name in enumerate(names) if _SCALAR.search(name)]
+    if commas and len(fields) == 8 and scalar == [7]:
+        return "nwu", "", read_vslamlab(path)
+    if commas and (len(fields) == 17 or (len(fields) == 8 and scalar == [4])):
+        return "nwu", "", read_euroc(path)
+    if not commas and len(fields) == 8:
+        named = _FRAME.search("\n".join(head))
+        return "ned", named[1] if named else "", read_tum(path)
+    if commas or len(fields) != 12:
+        Row(f"{path}:{number}", fields).wrong(_FORMATS, row)
+    if not times:
+        raise ValueError(f"{path}: expected --times beside KITTI's poses, which have no stamps")
+    stamps, matrices = read_stamps(Path(times)), read_kitti(path)
+    if len(stamps) != len(matrices):
+        raise ValueError(
+            f"{path}: expected {len(stamps)} poses, as many as {times} has stamps, "
+            f"found {len(matrices)}"
+        )
+    return "optical", "", Trajectory.from_matrices(stamps, matrices)
+
+
+def _start(path: Path) -> tuple[int, list[str], str]:
+    """Return the number of a file's first row, the lines before it, and the row."""
+    head: list[str] = []
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            for number, line in enumerate(map(str.strip, file), start=1):
+                if line and not (line[0] == "#" or line[0].isalpha()):
+                    return number, head, line
+                head += [line] if line else []
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: expected {_FORMATS}, found: {error}") from None
+    raise ValueError(f"{path}: expected {_FORMATS}, found no rows")

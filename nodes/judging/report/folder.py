@@ -1,0 +1,242 @@
+"""What a run left in its folder, read for the report.
+
+Everything is optional, as a run may have been killed at any time: what is not there, or cannot be
+read, is named in `Run.missing`, and the rest of the report goes on without it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.judging.evaluation.coverage import Interval, seconds
+from nodes.judging.evaluation.judging import Errors, judge
+from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.results import read_errors
+from nodes.judging.report.contents import Estimator, Facts, Run, Verdict
+from nodes.judging.report.poses import gaps, read_poses
+from nodes.judging.report.style import COLORS
+from nodes.trajectory import Trajectory
+from runtime.paths import source_file, source_of
+
+T = TypeVar("T")
+
+SIGNS = ("summary.json", "config.toml", "log.txt", "trajectories", "evaluation")
+"""A folder with one of these is a run's."""
+
+_LOG_LINES = 200
+_NO_ESTIMATES = {"truth", "plan"}
+_ABOUT = 0.25
+"""Seconds by which two counts of lost time may differ."""
+_LOUD = {"WARNING", "ERROR", "CRITICAL"}
+
+
+def read_run(folder: Path) -> Run:
+    """Read what there is.
+
+    Raises:
+        ValueError: The folder is not there, or is no run's.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: expected the folder of a run, found none")
+    if not any((folder / sign).exists() for sign in SIGNS):
+        inside = ", ".join(sorted(p.name for p in folder.iterdir())[:5]) or "nothing"
+        raise ValueError(
+            f"{folder}: expected the folder of a run, with {', '.join(SIGNS[:-1])} "
+            f"or {SIGNS[-1]} in it, found {inside}"
+        )
+    return _Reader(folder).run()
+
+
+class _Reader:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.missing: list[str] = []
+
+    def run(self) -> Run:
+        facts = self._try("summary.json", _decoder(Facts), "the run did not end in an orderly way")
+        verdict = self._try(
+            "evaluation/verdict.json", _decoder(Verdict), "nothing was evaluated to the end"
+        )
+        if facts is not None:
+            if verdict is not None and verdict.estimators and facts.verdict is None:
+                self.missing.append(
+                    "evaluation/verdict.json is of an earlier run: by its summary, nobody was "
+                    "judged in this one. Trajectories and figures may be that one's, too"
+                )
+                verdict = None
+            verdict = verdict or facts.verdict
+        self.missing += [] if facts is None else facts.notes
+        flown = facts is None or not facts.judged
+        config = self._try("config.toml", _text, "the settings are not known" if flown else "")
+        log = self._try("log.txt", _text, "what was logged is not known" if flown else "")
+        first = _first_vehicle(facts or Facts())
+        truths = self._by_vehicle("truth", first)
+        if not (self.folder / "trajectories" / "truth.tum").is_file():
+            self.missing.append(
+                "trajectories/truth.tum is not there: there is nothing to compare with"
+            )
+        return Run(
+            folder=self.folder,
+            facts=facts or Facts(),
+            verdict=verdict,
+            truths=truths,
+            plans=self._by_vehicle("plan", first),
+            collisions=self._collisions(),
+            estimators=self._estimators(verdict, truths),
+            frames=_frames(self.folder / "frames"),
+            clouds=sorted((self.folder / "clouds").glob("*.ply")),
+            config=config,
+            log=_loud(log or ""),
+            missing=self.missing,
+        )
+
+    def _by_vehicle(self, what: str, first: str) -> dict[str, Trajectory]:
+        """Read the file of the first vehicle, and those of all others: ``<what>.<vehicle>.tum``."""
+        paths = sorted((self.folder / "trajectories").glob(f"{what}.*tum"))
+        names = {
+            source_of(p.stem.partition(".")[2]) or first: f"trajectories/{p.name}" for p in paths
+        }
+        found = {vehicle: self._try(name, read_poses) for vehicle, name in names.items()}
+        order = sorted(found.items(), key=lambda item: item[0] != first)
+        return {vehicle: poses for vehicle, poses in order if poses is not None}
+
+    def _collisions(self) -> npt.NDArray[np.float64]:
+        found = self._try("trajectories/collisions.csv", _places)
+        return np.empty((0, 3)) if found is None else found
+
+    def _estimators(
+        self, verdict: Verdict | None, truths: dict[str, Trajectory]
+    ) -> list[Estimator]:
+        figures = {} if verdict is None else verdict.estimators
+        files = {source_file(name): name for name in figures}
+        there = {p.stem for p in (self.folder / "trajectories").glob("*.tum")}
+        sent = {name for name in there if name.partition(".")[0] not in _NO_ESTIMATES}
+        files |= {file: source_of(file) for file in sorted(sent - set(files))}
+        if not files:
+            self.missing.append("no estimator has sent anything, and none was judged")
+        return [
+            self._estimator(file, name, COLORS[k % len(COLORS)], figures.get(name, {}), truths)
+            for k, (file, name) in enumerate(files.items())
+        ]
+
+    def _estimator(
+        self,
+        file: str,
+        name: str,
+        color: str,
+        figures: dict[str, Any],
+        truths: dict[str, Trajectory],
+    ) -> Estimator:
+        first = next(iter(truths.values()), None)
+        truth = truths.get(str(figures.get("vehicle")), first)
+        final = self._try(f"evaluation/{file}.final.tum", read_poses)
+        found = Estimator(name=name, color=color, figures=figures, final=final)
+        aligned = self._try(f"evaluation/{file}.aligned.tum", read_poses)
+        errors = self._try(f"evaluation/{file}.csv", _errors)
+        ticks = self._try(f"evaluation/{file}.ticks.csv", _errors)
+        if aligned is None:
+            estimate = self._try(f"trajectories/{file}.tum", read_poses)
+            if estimate is None:
+                why = figures.get("why") or "it left no poses"
+                self.missing.append(f"{name}: no curves: {why}")
+                return found
+            if truth is not None:
+                judged = judge(EstimatorRecord.of(estimate), truth, alignment="origin")
+                aligned, errors = judged.aligned, judged.of_images
+                if aligned is None:
+                    self.missing.append(f"{name}: no curves: {judged.figures['why']}")
+                    return found
+                self.missing.append(
+                    f"{name}: the run left no evaluation of it; its first pose was laid on the "
+                    "true one for this report, its scale left as it is"
+                )
+        lost = self._try(f"evaluation/{file}.lost.csv", _intervals)
+        if lost is None:
+            lost = gaps(aligned, truth)
+            known, counted = seconds(lost), figures.get("lost_seconds")
+            if isinstance(counted, int | float) and abs(counted - known) > _ABOUT:
+                self.missing.append(
+                    f"{name}: lost for {counted:.1f} s by the figures; gaps between its poses "
+                    f"tell of {known:.1f} s, which are what the figures show"
+                )
+        return msgspec.structs.replace(
+            found, aligned=aligned, of_images=errors, of_ticks=ticks, lost=lost
+        )
+
+    def _try(self, name: str, read: Callable[[Path], T], without: str = "") -> T | None:
+        """Read a file; say so if it is not there (and is expected) or is not what it should be."""
+        path = self.folder / name
+        if not path.is_file():
+            if without:
+                self.missing.append(f"{name} is not there: {without}")
+            return None
+        try:
+            return read(path)
+        except (OSError, ValueError, msgspec.MsgspecError) as error:
+            text = str(error).replace(f"{path}: ", "").replace(f"{path}:", "line ")
+            self.missing.append(f"{name} cannot be read: {text}")
+            return None
+
+
+def _first_vehicle(facts: Facts) -> str:
+    """Return the name of the vehicle that was announced first; empty if none was."""
+    vehicles = (a["source"] for a in facts.announcements if a.get("type") == "VehicleAnnouncement")
+    return str(next(vehicles, ""))
+
+
+def _places(path: Path) -> npt.NDArray[np.float64]:
+    """Read where collisions were, shape (n, 3)."""
+    rows = [line.split(",")[-4:-1] for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+    return np.array(rows, np.float64).reshape(-1, 3)
+
+
+def _decoder(type_: type[T]) -> Callable[[Path], T]:
+    return lambda path: msgspec.json.decode(path.read_bytes(), type=type_)
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _errors(path: Path) -> Errors:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy's, of a file without rows
+        errors = read_errors(path)
+    if not len(errors.stamps):
+        raise ValueError("expected rows of errors, found none")
+    if not (np.isfinite(errors.position).all() and np.isfinite(errors.rotation).all()):
+        raise ValueError("expected finite errors, found others")
+    return errors
+
+
+def _intervals(path: Path) -> list[Interval]:
+    """Read a file of rows ``start_ns,end_ns`` under a header."""
+    rows = [line.split(",") for line in path.read_text(encoding="ascii").splitlines()[1:]]
+    return [Interval(int(start), int(end)) for start, end in rows]
+
+
+def _frames(folder: Path) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for path in sorted(folder.glob("*.jpg")):
+        found.setdefault(path.stem.rpartition("_")[0], []).append(path)
+    return found
+
+
+def _loud(log: str) -> list[str]:
+    """Return warnings and errors, with the lines that go on about them; the last ones."""
+    found: list[str] = []
+    loud = False
+    for line in log.splitlines():
+        words = line.split(None, 2)
+        if len(words) > 1 and words[0].replace(".", "", 1).isdigit():
+            loud = words[1] in _LOUD
+        if loud:
+            found.append(line)
+    return found[-_LOG_LINES:]

@@ -1,0 +1,171 @@
+"""The page itself: everything in one file, that needs no network and no script."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
+
+from nodes.judging.report import tables
+from nodes.judging.report.clouds import draw_clouds
+from nodes.judging.report.contents import Run
+from nodes.judging.report.curves import (
+    draw_axes,
+    draw_distributions,
+    draw_errors,
+    draw_latency,
+    draw_relative,
+)
+from nodes.judging.report.folder import read_run
+from nodes.judging.report.frames import draw_frames
+from nodes.judging.report.style import Plot, drawing
+from nodes.judging.report.trajectories import draw_trajectories
+from runtime.summary import OUTSIDE_COLUMNS, WORKER_COLUMNS
+
+PAGE = "report.html"
+PLOTS = "plots"
+_OURS = (
+    "trajectories",
+    "errors",
+    "axes",
+    "distributions",
+    "latency",
+    "relative",
+    "frames_*",
+    "clouds_*",
+)
+"""Names of the figures; those of an earlier report are removed."""
+
+_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 88]
+
+_ALIGNED = {
+    "none": "in the truth's frame as it is",
+    "origin": "laid on the truth at its first pose",
+    "se3": "laid on the truth as a whole (SE3)",
+    "sim3": "laid on the truth as a whole, with scale (Sim3)",
+}
+"""How estimates and the truth were brought together, in words."""
+
+
+def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:
+    """Write ``report.html`` and its figures, ``plots/*``, anew.
+
+    Args:
+        out: The folder of a run, whatever is in it.
+        formats: Of the figures: png (always, if there is any), svg, pdf; none for tables only.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        ValueError: The folder is not there, or is no run's.
+        OSError: Something cannot be written.
+    """
+    run = read_run(out)
+    plots = out / PLOTS
+    plots.mkdir(exist_ok=True)
+    for pattern in _OURS:
+        for old in plots.glob(f"{pattern}.*"):
+            old.unlink()
+    shown: list[list[dict[str, str]]] = [[], [], []]
+    if formats:
+        curves = (
+            draw_trajectories,
+            draw_errors,
+            draw_axes,
+            draw_distributions,
+            draw_latency,
+            draw_relative,
+        )
+        with drawing():
+            for place, found in zip(
+                shown,
+                ((draw(run) for draw in curves), draw_clouds(run), draw_frames(run)),
+                strict=True,
+            ):
+                place += [_written(each, plots, formats) for each in found if each is not None]
+    page = out / PAGE
+    page.write_text(render(run, *shown), encoding="utf-8", newline="\n")
+    return page
+
+
+def render(
+    run: Run,
+    curves: list[dict[str, str]],
+    clouds: list[dict[str, str]],
+    frames: list[dict[str, str]],
+) -> str:
+    """Return the page."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return environment.get_template("page.html.jinja").render(
+        run=run,
+        main=tables.figures(run, main=True),
+        others=tables.figures(run, main=False),
+        facts=tables.facts(run),
+        sensors=tables.sensors(run),
+        ticks=tables.ticks(run),
+        workers=tables.workers(run),
+        outside=tables.outside(run),
+        outside_columns=("system", *OUTSIDE_COLUMNS),
+        worker_columns=("worker", *WORKER_COLUMNS),
+        outputs=tables.outputs(run),
+        curves=curves,
+        frames=frames,
+        clouds=clouds,
+        verdicts=[_verdict(*each) for each in _judged(run)],
+    )
+
+
+def _written(plot: Plot, folder: Path, formats: Sequence[str]) -> dict[str, str]:
+    return embedded(plot.write(folder, formats), plot.title, plot.caption, plot.photo)
+
+
+def embedded(path: Path, title: str, caption: str, photo: bool) -> dict[str, str]:
+    """Return a figure for a page that holds it whole: its title, caption and source."""
+    data, kind = path.read_bytes(), "png"
+    if photo:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if image is not None:
+            data, kind = cv2.imencode(".jpg", image, _QUALITY)[1].tobytes(), "jpeg"
+    return {
+        "title": title,
+        "caption": caption,
+        "source": f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}",
+    }
+
+
+def _judged(run: Run) -> list[tuple[str, dict[str, Any], str]]:
+    """Return name, figures and colour of each estimator, and of all else that was judged."""
+    found = [(each.name, each.figures, each.color) for each in run.estimators]
+    summary = {} if run.facts.verdict is None else run.facts.verdict.estimators
+    known = {name for name, _, _ in found}
+    return found + [(name, each, "inherit") for name, each in summary.items() if name not in known]
+
+
+def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
+    """Return what the top of the page says of an estimator."""
+    passed = figures.get("passed")
+    failed = figures.get("failed")
+    if passed is None and "why" in figures:
+        failed = [figures["why"]]
+    laid = _ALIGNED.get(str(figures.get("alignment")), "")
+    vehicle = f"of {figures['vehicle']}" if "vehicle" in figures else ""
+    return {
+        "name": name,
+        "color": color,
+        "method": str(figures.get("method") or ""),
+        "alignment": "; ".join(filter(None, (vehicle, laid))),
+        "state": "not judged" if passed is None else "passed" if passed else "failed",
+        "failed": [str(each) for each in failed] if isinstance(failed, list) else [],
+    }

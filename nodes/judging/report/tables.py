@@ -1,0 +1,249 @@
+"""The report's tables: figures beside their thresholds, facts of the run, punctuality."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from nodes.judging.evaluation.verdict import AT_LEAST, IF_ANY
+from nodes.judging.report.contents import Facts, Run
+from nodes.judging.report.style import number
+
+MAIN = {
+    "ate_rmse_m": ("absolute trajectory error (ATE), RMS", "m"),
+    "ate_percent": ("ATE in percent of the path", "%"),
+    "held_ate_percent": ("ATE over the whole flight, lost time as 100 % drift", "%"),
+    "final_ate_rmse_m": ("ATE after loop closures", "m"),
+    "final_ate_percent": ("the same in percent of the path", "%"),
+    "final_held_ate_percent": ("the same over the whole flight", "%"),
+    "coverage_percent": ("share of the flight with poses", "%"),
+    "ate_max_m": ("greatest position error", "m"),
+    "rot_rmse_deg": ("rotation error, RMS", "°"),
+    "rpe_trans_percent": ("relative pose error (RPE), position", "%"),
+    "rpe_rot_deg_per_m": ("relative pose error (RPE), rotation", "°/m"),
+    "rpe_mean_trans_percent": ("RPE, mean over 1 to 20 % of the path, position", "%"),
+    "rpe_mean_rot_deg_per_m": ("the same, rotation", "°/m"),
+    "drift_percent": ("drift at the end, in percent of the path", "%"),
+    "scale_error_percent": ("error of the scale", "%"),
+    "velocity_rmse_m_per_s": ("velocity error, RMS", "m/s"),
+    "heading_rmse_deg": ("heading error, RMS", "°"),
+    "nees_position": ("NEES of the position, 3 if consistent", ""),
+    "nees_pose": ("NEES of the pose, 6 if consistent", ""),
+    "within_3_sigma_percent": ("share of the positions within 3 sigma of their covariance", "%"),
+    "covariances_percent": ("share of the poses with a covariance", "%"),
+    "covariance_invalid": ("covariances that are none", ""),
+    "velocities_percent": ("share of the poses with a velocity", "%"),
+    "available_rmse_m": ("error of the newest pose at control ticks, RMS", "m"),
+    "available_rot_rmse_deg": ("rotation error of the same, RMS", "°"),
+    "plan_rmse_m": ("distance of the flight from its plan, RMS", "m"),
+    "plan_max_m": ("greatest distance of the flight from its plan", "m"),
+    "latency_p50_ms": ("latency, median", "ms"),
+    "latency_p99_ms": ("latency, 99th percentile", "ms"),
+    "frame_coverage_percent": ("share of the images with a pose", "%"),
+    "lost_seconds": ("time without a pose", "s"),
+    "lost_count": ("times lost", ""),
+    "initialization_seconds": ("time before the first pose", "s"),
+    "relocalization_max_seconds": ("longest time to have a pose again", "s"),
+    "restarts": ("times that it began anew, in a frame of its own or as a node", ""),
+    "repeated_stamps": ("poses whose stamp was not later than the one before", ""),
+    "future_stamps": ("poses and losses of a time that had not come", ""),
+    "not_causal": ("poses so late that later images may be in them", ""),
+    "other_bodies": ("poses of another body than the truth's", ""),
+    "early_end": ("time that the run ended before its plan", "s"),
+    "ended_by": ("who ended the run", ""),
+    "reads_truth": ("whether it reads the truth", ""),
+    "collisions": ("collisions of the vehicle", ""),
+    "rate_hz": ("estimates a second", "Hz"),
+}
+"""Figures that the top of the report shows: what they are, and their units."""
+
+_UNITS = {
+    "_percent": "%",
+    "_deg_per_m": "°/m",
+    "_m_per_s": "m/s",
+    "_deg": "°",
+    "_ms": "ms",
+    "_hz": "Hz",
+    "_m2": "m²",
+    "_m": "m",
+    "_s": "s",
+    "_seconds": "s",
+}
+"""Units of other figures, by the end of their names."""
+
+_NO_FIGURES = {"passed", "failed", "why"}
+
+
+class Row(msgspec.Struct, frozen=True):
+    """A row of a table of figures.
+
+    Attributes:
+        name: In the files.
+        meaning: In words.
+        unit: Of its values.
+        limit: Threshold; empty if there is none.
+        cells: One an estimator: its value, and whether it is missed.
+    """
+
+    name: str
+    meaning: str
+    unit: str
+    limit: str
+    cells: list[tuple[str, bool]]
+
+
+def figures(run: Run, *, main: bool) -> list[Row]:
+    """Return the main figures, or all others, with the thresholds there are."""
+    thresholds = run.verdict.thresholds if run.verdict is not None else {}
+    asked = {name: limit for name, limit in thresholds.items() if limit is not None}
+    names = dict.fromkeys(MAIN) | dict.fromkeys(asked)
+    if not main:
+        others = dict.fromkeys(k for e in run.estimators for k in e.figures)
+        names = {k: None for k in others if k not in names and k not in _NO_FIGURES}
+    rows = []
+    for name in names:
+        values = [e.figures.get(name) for e in run.estimators]
+        limit = asked.get(name)
+        if (limit is None or name in IF_ANY) and all(value is None for value in values):
+            continue
+        meaning, unit = MAIN.get(name) or (name.replace("_", " "), _unit(name))
+        why = [e.figures.get("failed") or () for e in run.estimators]
+        missed = [any(str(reason).startswith(f"{name}: ") for reason in each) for each in why]
+        cells = list(zip(map(show, values), missed, strict=True))
+        rows.append(
+            Row(name, meaning, unit, "" if limit is None else f"{_side(name)} {limit:g}", cells)
+        )
+    return rows
+
+
+def show(value: Any) -> str:
+    """Return a figure as it is read."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return number(value)
+    if isinstance(value, list | dict):
+        return msgspec.json.encode(value).decode()
+    return str(value)
+
+
+def facts(run: Run) -> list[tuple[str, str]]:
+    """Return what is known of the run as a whole."""
+    f = run.facts
+    rows = list(f.judged.items())
+    for vehicle, truth in run.truths.items():
+        name = f"true path of {vehicle}" if len(run.truths) > 1 else "true path"
+        speed = np.linalg.norm(truth.velocities(), axis=1).max()
+        text = f"{number(truth.length())} m, at most {number(float(speed))} m/s"
+        rows.append((name, text))
+    speed = (f.sim_seconds or 0.0) / max(f.wall_seconds or 0.0, 1e-9)
+    known = {
+        "clock": f.clock,
+        "seed": f.seed,
+        "time on the run's clock": f.sim_seconds and f"{f.sim_seconds:.2f} s",
+        "real time": f.wall_seconds and f"{f.wall_seconds:.2f} s ({number(speed)} × real time)",
+        "command": f.environment.get("command") or None,
+        "commit": f.environment.get("commit") or None,
+        "ended by": f.reason,
+        "error": f.error,
+        "digest": f.clock and _digest(f),
+        "run twice": f.twice and (f.twice.first or "it repeats"),
+    }
+    rows += [(name, str(value)) for name, value in known.items() if value is not None]
+    rows += [(f"digest of what {k} was sent", o.inputs) for k, o in f.outside.items() if o.inputs]
+    rows += [(f"digest of what {k} answered", o.answers) for k, o in f.outside.items() if o.answers]
+    rows += [(f"dropped at {port}", str(s.dropped)) for port, s in f.streams.items() if s.dropped]
+    rows += [
+        (f"unmatched sets at {port}", _counts(s.missed))
+        for port, s in f.streams.items()
+        if s.missed
+    ]
+    rows += [
+        (f"link {port}", f"{link.lost} lost, {link.thinned} left out")
+        for port, link in f.links.items()
+    ]
+    rows += [(f"loop stood still in {node}", f"{count} times") for node, count in f.stalls.items()]
+    if f.clock is not None and not any(s.dropped or s.missed for s in f.streams.values()):
+        rows.append(("dropped or unmatched", "nothing"))
+    return rows
+
+
+def _digest(f: Facts) -> str:
+    if f.digest is None:
+        return "off"
+    if f.clock != "lockstep":
+        return f"{f.digest} (not promised: the clock is real)"
+    if f.not_deterministic:
+        return f"{f.digest} (not promised, because of {', '.join(f.not_deterministic)})"
+    return f"{f.digest} (an equal run gives the same)"
+
+
+def sensors(run: Run) -> list[list[str]]:
+    """Return what was announced of each sensor: source, kind, rate, and the rest in words."""
+    rows = []
+    for each in run.facts.announcements:
+        kind = str(each.get("type", "")).removesuffix("Announcement")
+        if "rate" not in each or not kind:
+            continue
+        info = each.get("info") or {}
+        size = [f"{info['width']} × {info['height']}"] if "width" in info else []
+        lens = any(info.get("distortion", ())) or info.get("distortion_model") == "equidistant"
+        size += [str(info["distortion_model"])] if lens else []
+        rest = {k: v for k, v in each.items() if k not in _PLACES and v not in (0, 0.0, "", [])}
+        said = [f"{name.replace('_', ' ')} {_said(value)}" for name, value in rest.items()]
+        rows.append([str(each.get("source")), kind, _said(each["rate"]), ", ".join(size + said)])
+    return rows
+
+
+_PLACES = {
+    "type", "source", "stamp", "rate", "info", "frame_id", "parent_frame_id", "position",
+    "orientation",
+}  # fmt: skip
+"""What the table of sensors shows elsewhere, or not at all."""
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_said, value))
+    return f"{value:g}" if isinstance(value, float) else show(value)
+
+
+def ticks(run: Run) -> list[list[str]]:
+    """Return how punctual each ticker was."""
+    late = {k: (t.late_p50_us, t.late_p99_us, t.late_max_us) for k, t in run.facts.ticks.items()}
+    return [
+        [name, f"{t.hz:g}", str(t.calls), *(f"{each:.0f}" for each in late[name]), str(t.missed)]
+        for name, t in sorted(run.facts.ticks.items())
+    ]
+
+
+def workers(run: Run) -> list[list[str]]:
+    """Return what estimators (and all else in processes of its own) cost."""
+    return [[name, *worker.row()] for name, worker in sorted(run.facts.workers.items())]
+
+
+def outside(run: Run) -> list[list[str]]:
+    """Return how systems outside the process answered what they were sent."""
+    return [[name, *each.row()] for name, each in sorted(run.facts.outside.items())]
+
+
+def outputs(run: Run) -> list[list[str]]:
+    """Return what was sent."""
+    seconds = max(run.facts.sim_seconds or 0.0, 1e-9)
+    return [[k, str(n), f"{n / seconds:.1f}"] for k, n in sorted(run.facts.outputs.items())]
+
+
+def _unit(name: str) -> str:
+    return next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
+
+
+def _side(name: str) -> str:
+    return "≥" if name in AT_LEAST else "≤"
+
+
+def _counts(missed: dict[str, int]) -> str:
+    return ", ".join(f"{count} without {field}" for field, count in sorted(missed.items()))

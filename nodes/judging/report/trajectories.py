@@ -1,0 +1,210 @@
+"""The trajectories, from above and from the side, on one scale; and the height over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.judging.evaluation.coverage import Interval
+from nodes.judging.report.contents import Run
+from nodes.judging.report.poses import Floats, broken
+from nodes.judging.report.style import (
+    HIT,
+    PLAN,
+    TRUTHS,
+    WIDTH,
+    Plot,
+    bounds,
+    label,
+    legend_columns,
+    mark_ends,
+    sheet,
+    thin,
+)
+from nodes.trajectory import Trajectory
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 0.7, 0.2, 0.5, 0.5
+_ASIDE, _BETWEEN = 0.75, 0.8
+"""Inches around the axes, and between them."""
+_ROW = 0.2
+"""Inches of a row of the legend."""
+_TALLEST = 6.0
+"""Inches of the view from above, at most."""
+_TIME = 1.3
+"""Inches of the height over time, at least."""
+
+Rectangle = tuple[float, float, float, float]
+"""Left, bottom, width, height; inches."""
+
+
+class _Line(msgspec.Struct, frozen=True, eq=False):
+    """What is drawn: stamps (ns), points east, north, up (m)."""
+
+    name: str
+    stamps: npt.NDArray[np.int64]
+    points: Floats
+    style: dict[str, Any]
+
+
+def draw_trajectories(run: Run) -> Plot | None:
+    """Draw truth, plan and aligned estimates; `None` if there is none of them.
+
+    Both views are of one scale, metre for metre, and share the east axis.
+    """
+    lines = _lines(run)
+    if not lines:
+        return None
+    low, high = _bounds(lines)
+    marks = ["start", "end", *(["collision"] if len(run.collisions) else [])]
+    columns = legend_columns([*(line.name for line in lines), *marks])
+    top = _TOP + _ROW * -(-(len(lines) + len(marks)) // columns)
+    east, north, up = (high - low).tolist()
+    height, *places = _layout(east, north, up, top)
+    figure = sheet(height, constrained=False)
+    above, beside, later = (
+        figure.add_axes((x / WIDTH, y / height, w / WIDTH, h / height)) for x, y, w, h in places
+    )
+    for line in lines:
+        x, y, z = line.points.T
+        above.plot(x, y, label=line.name, **line.style)
+        beside.plot(x, z, **line.style)
+        later.plot((line.stamps - run.start) / 1e9, z, **line.style)
+    for line in lines:
+        if line.style["color"] != PLAN:
+            _ends(above, beside, line, main=line is lines[0] or line.style["color"] in TRUTHS)
+    for axis, rows in ((above, [0, 1]), (beside, [0, 2])) if len(run.collisions) else ():
+        hits = _shown(run.collisions)[:, rows]
+        axis.plot(*hits.T, "x", color=HIT, ms=8, mew=1.8, zorder=5, label="collision")
+    above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    above.set(xlabel="east (m)", ylabel="north (m)", title="from above")
+    beside.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]))
+    beside.set(xlabel="east (m)", ylabel="height (m)", title="from the side (looking north)")
+    later.set(xlabel="time (s)", ylabel="height (m)", title="height over time")
+    later.set_ylim(low[2], high[2])
+    later.margins(x=0.01)
+    handles, names = above.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        names,
+        loc="upper left",
+        bbox_to_anchor=((_LEFT - 0.1) / WIDTH, 1.0 - 0.05 / height),
+        ncols=columns,
+    )
+    astray = any(((p < low) | (p > high)).any() for p in (line.points for line in lines))
+    return Plot("trajectories", figure, "Trajectories", _caption(run, astray=astray))
+
+
+def _caption(run: Run, *, astray: bool) -> str:
+    how = {str(e.figures["alignment"]) for e in run.estimators if "alignment" in e.figures}
+    laid = f" (alignment: {', '.join(sorted(how))})" if how else ""
+    text = "Both views have one scale."
+    if any(e.aligned is not None for e in run.estimators):
+        text += (
+            f" Estimates as laid on the truth for the evaluation{laid}; "
+            "their lines are broken where they were lost."
+        )
+    if astray:
+        text += " What goes farther astray than this is cut off."
+    return text
+
+
+def _lines(run: Run) -> list[_Line]:
+    found = []
+    several = len(run.truths) > 1
+    for k, (vehicle, truth) in enumerate(run.truths.items()):
+        style = {"color": TRUTHS[k % len(TRUTHS)], "lw": 3.2, "alpha": 0.45}
+        style["solid_capstyle"] = "round"
+        found.append(_line(f"truth of {label(vehicle)}" if several else "truth", truth, style))
+    for vehicle, plan in run.plans.items():
+        style = {"color": PLAN, "lw": 0.9, "ls": (0, (5, 3))}
+        found.append(_line(f"plan of {label(vehicle)}" if several else "plan", plan, style))
+    for each in run.estimators:
+        if each.aligned is not None:
+            style = {"color": each.color, "lw": 1.3}
+            found.append(_line(label(each.name), each.aligned, style, each.lost))
+        if each.final is not None:
+            style = {"color": each.color, "lw": 1.3, "ls": (0, (2, 1.5))}
+            found.append(_line(f"{label(each.name)} after loop closures", each.final, style))
+    return found
+
+
+def _line(
+    name: str, poses: Trajectory, style: dict[str, Any], lost: Sequence[Interval] = ()
+) -> _Line:
+    some = thin(len(poses))
+    stamps = poses.stamps[some]
+    return _Line(name, stamps, _shown(broken(poses.positions[some], stamps, lost)), style)
+
+
+def _shown(positions: Floats) -> Floats:
+    """Return NED positions as east, north, up, shape (n, 3)."""
+    return positions[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
+def _bounds(lines: list[_Line]) -> tuple[Floats, Floats]:
+    """Return the corners of what is drawn, with a margin; no side is all too thin.
+
+    An estimate that goes astray is followed only so far: as far again as the truth is wide.
+    """
+    points = np.concatenate([line.points for line in lines])
+    true = [line.points for line in lines if line.style["color"] in TRUTHS]
+    if true:
+        first = np.concatenate(true)
+        low, high = first.min(axis=0), first.max(axis=0)
+        beyond = max(float((high - low).max()), 0.5)
+        points = np.clip(points, low - beyond, high + beyond)
+    # A vehicle that hovers, or one that goes straight ahead, still has a figure of some shape.
+    return bounds(points, (0.4, 0.4, 0.12))
+
+
+def _layout(
+    east: float, north: float, up: float, top: float
+) -> tuple[float, Rectangle, Rectangle, Rectangle]:
+    """Return the figure's height, and the places of: above, from the side, over time; inches.
+
+    What is broad has its views one below the other; what is tall has them side by side.
+
+    Args:
+        east: Metres to show.
+        north: Likewise.
+        up: Likewise.
+        top: Inches above all axes.
+    """
+    across = WIDTH - _LEFT - _RIGHT
+    if north < 0.7 * east:
+        scale = min(across / east, _TALLEST / north)
+        width, view, side = east * scale, north * scale, up * scale
+        left = _LEFT + (across - width) / 2
+        second = _BOTTOM + _TIME + _BETWEEN
+        first = second + side + _BETWEEN
+        return (
+            first + view + top,
+            (left, first, width, view),
+            (left, second, width, side),
+            (left, _BOTTOM, width, _TIME),
+        )
+    scale = min((across - _ASIDE) / (2 * east), _TALLEST / north)
+    width, view, side = east * scale, north * scale, up * scale
+    right = _LEFT + width + _ASIDE
+    rest = max(view - side - _BETWEEN, _TIME)
+    tall = max(view, side + _BETWEEN + rest)
+    return (
+        _BOTTOM + tall + top,
+        (_LEFT, _BOTTOM + tall - view, width, view),
+        (right, _BOTTOM + tall - side, width, side),
+        (right, _BOTTOM, WIDTH - _RIGHT - right, rest),
+    )
+
+
+def _ends(above: Any, beside: Any, line: _Line, *, main: bool) -> None:
+    """Mark where a line ends, and where the main one starts."""
+    known = line.points[~np.isnan(line.points[:, 0])]
+    if len(known):
+        (first, last), color = known[[0, -1]].tolist(), line.style["color"]
+        for axis, row in ((above, 1), (beside, 2)):
+            start = (first[0], first[row]) if main else None
+            mark_ends(axis, start, (last[0], last[row]), color)

@@ -1,5 +1,0 @@
-"""Prints the folder of `visnav_link.hpp` and `client.py`: ``c++ -I"$(python -m nodes.link)" …``."""
-
-from pathlib import Path
-
-print(Path(__file__).parent)

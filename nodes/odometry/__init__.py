@@ -1,5 +1,0 @@
-"""What the odometries share: images, optical flow, poses from landmarks, relocalization.
-
-Plain functions on arrays, made for worker processes: no asyncio, and no node. The odometries
-themselves are `nodes.visual_odometry` (a camera with depth) and `nodes.monocular_odometry`.
-"""

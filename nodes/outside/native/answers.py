@@ -1,0 +1,113 @@
+"""What comes from the program of a link, checked field by field."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from nodes.outside.native.client import COVARIANCE, DONE_BODY, POSE_HEAD, STATUS, VELOCITY
+from runtime.errors import VisnavError
+
+TOLERANCE = 1e-4
+"""By which a rotation of single precision may miss orthonormality."""
+
+FARTHEST = 1e9
+"""Metres from the start beyond which no pose is taken."""
+
+MATRIX, POINT = 12 * 8, 2 * 4 + 1
+"""Bytes of a pose, and of a point with its flag."""
+
+FOLLOWS = (COVARIANCE, 36), (VELOCITY, 3)
+"""What may follow a pose, and the numbers that it has."""
+
+
+class LinkError(VisnavError):
+    """A program is missing, or does not keep to the protocol; or a run has the socket already."""
+
+
+class LinkAnswer(msgspec.Struct, frozen=True, eq=False):
+    """The answer to a frame.
+
+    Attributes:
+        sequence: Number of the frame.
+        stamp: Stamp of the frame (ns).
+        status: ``done``: the program says no more about this frame.
+        pose: The optical camera 0 in the optical camera 0 of the program's first pose, shape
+            (4, 4); `None` if the status is not ``tracked``.
+        covariance: Of the error of that pose: a shift of the camera and a rotation about it, along
+            the axes of the optical camera of the first pose, shape (6, 6); `None` without any.
+        velocity: Along the same axes, m/s, shape (3,); `None` without any.
+        points: Features that were tracked: column and row, float32 pixels, shape (n, 2).
+        inliers: Which of them agree with the pose: bool, shape (n,).
+    """
+
+    sequence: int
+    stamp: int
+    status: Literal["tracked", "lost", "initialising", "done"]
+    pose: npt.NDArray[np.float64] | None = None
+    covariance: npt.NDArray[np.float64] | None = None
+    velocity: npt.NDArray[np.float64] | None = None
+    points: npt.NDArray[np.float32] = np.empty((0, 2), np.float32)
+    inliers: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
+
+
+def read_done(body: bytearray) -> LinkAnswer:
+    """Read the body of a DONE.
+
+    Raises:
+        LinkError: It is not as the protocol says.
+    """
+    if len(body) != DONE_BODY.size:
+        raise LinkError(f"DONE: expected {DONE_BODY.size} bytes, found {len(body)}")
+    sequence, stamp = DONE_BODY.unpack(body)
+    return LinkAnswer(sequence, stamp, "done")
+
+
+def read_pose(body: bytearray) -> LinkAnswer:
+    """Read the body of a POSE; pose, covariance and velocity are as the program gave them.
+
+    Raises:
+        LinkError: It is not as the protocol says, or not finite, or has no rotation.
+    """
+    if len(body) < POSE_HEAD.size + MATRIX:
+        raise LinkError(f"POSE: expected {POSE_HEAD.size + MATRIX} bytes, found {len(body)}")
+    sequence, stamp, number, follows, count, _ = POSE_HEAD.unpack_from(body)
+    status = next((name for name, code in STATUS.items() if code == number), None)
+    if status is None:
+        raise LinkError(f"POSE.status: expected one of {[*STATUS.values()]}, found {number}")
+    if follows > COVARIANCE | VELOCITY:
+        raise LinkError(f"POSE.follows: expected 0 to 3, found {follows}")
+    numbers = sum(n for flag, n in FOLLOWS if follows & flag)
+    expected = POSE_HEAD.size + MATRIX + 8 * numbers + count * POINT
+    if len(body) != expected:
+        raise LinkError(f"POSE: expected {expected} bytes for {count} points, found {len(body)}")
+    pose, at = None, POSE_HEAD.size
+    if status == "tracked":
+        pose = np.eye(4)
+        pose[:3] = np.frombuffer(body, "<f8", 12, at).reshape(3, 4)
+        _finite("POSE.pose", pose)
+        if (far := np.abs(pose).max()) > FARTHEST:
+            raise LinkError(f"POSE.pose: expected at most {FARTHEST:g} m, found {far:g}")
+        turn = pose[:3, :3]
+        miss = max(np.abs(turn @ turn.T - np.eye(3)).max(), 1.0 - np.linalg.det(turn))
+        if miss > TOLERANCE:
+            raise LinkError(f"POSE.pose: expected a rotation within {TOLERANCE:g}, off by {miss:g}")
+    at += MATRIX
+    given = np.split(np.frombuffer(body, "<f8", numbers, at), [36] if follows & COVARIANCE else [])
+    covariance = given[0].reshape(6, 6) if follows & COVARIANCE else None
+    velocity = given[-1] if follows & VELOCITY else None
+    _finite("POSE.covariance", covariance)
+    _finite("POSE.velocity", velocity)
+    at += 8 * numbers
+    points = np.frombuffer(body, "<f4", 2 * count, at).reshape(-1, 2)
+    _finite("POSE.points", points)
+    inliers = np.frombuffer(body, "u1", count, at + 8 * count) != 0
+    return LinkAnswer(sequence, stamp, status, pose, covariance, velocity, points, inliers)  # type: ignore[arg-type]
+
+
+def _finite(field: str, values: npt.NDArray[np.floating] | None) -> None:
+    if values is not None and not (good := np.isfinite(values)).all():
+        raise LinkError(f"{field}: expected finite numbers, found {values[~good][0]}")

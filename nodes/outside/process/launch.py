@@ -1,0 +1,138 @@
+"""How a program is started: where, with which variables, and what is written for it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from nodes.data.dataset.recording import templates
+from nodes.outside import native
+from nodes.outside.process.program import Program
+from nodes.outside.process.settings import ProcessConfig
+from runtime.errors import VisnavError
+
+_LONGEST = 100
+"""Bytes of a socket's path; Linux allows 107."""
+
+
+class ProgramError(VisnavError):
+    """A program cannot be started, does not connect, or has ended."""
+
+
+class Launch:
+    """How a program is started.
+
+    Args:
+        config: Settings of its node.
+        bridge: Settings of the bridge that feeds it, if one does.
+        folder: Where it may write; `None` for a folder that is removed afterwards.
+
+    Attributes:
+        working: Its working folder.
+        socket: Where it has to connect: in its folder, if the path is not too long for one.
+    """
+
+    def __init__(self, config: ProcessConfig, bridge: Any, folder: Path | None) -> None:
+        self.working = Path(config.folder).absolute()
+        self._config = config
+        self._temporary: Path | None = None
+        self._folder = folder and folder.absolute()
+        self.folder = self._folder or Path("folder")
+        self.socket = self.folder / "link.socket"
+        if bridge is None:
+            self._ours = {}
+        else:
+            router = [*(bridge.listen or bridge.connect or ["tcp/localhost:7447"])]
+            self._ours = {
+                "ROS_DOMAIN_ID": str(bridge.domain_id),
+                "RMW_IMPLEMENTATION": "rmw_zenoh_cpp",
+                "ZENOH_CONFIG_OVERRIDE": f"connect/endpoints={json.dumps(router)}",
+            }
+
+    def missing(self, what: str, command: Sequence[str]) -> str:
+        """Return what keeps a command from being started; empty if nothing does."""
+        if not self.working.is_dir():
+            return f"folder: expected a folder, found none at {self.working}"
+        word = self._expanded(command[0])
+        place = str(self.working / word) if "/" in word else word
+        if shutil.which(place, path=self.environment().get("PATH")) is not None:
+            return ""
+        return f"{what}: expected a program that can be executed, found none at {place}"
+
+    def make_folder(self, *, anew: bool) -> None:
+        """Make the program's folder; `anew` removes what is there, which it might read."""
+        if self._folder is None or len(os.fsencode(self.socket)) > _LONGEST:
+            self._temporary = Path(tempfile.mkdtemp(prefix="visnav-"))
+            self.socket = self._temporary / "link.socket"
+        self.folder = self._folder or self.socket.parent
+        if anew and self._temporary is None and self.folder.is_dir():
+            shutil.rmtree(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def start(
+        self,
+        command: Sequence[str],
+        printed: Callable[[str], None],
+        ended: Callable[[str], None] = lambda _: None,
+    ) -> Program:
+        """Start a command; see `Program`."""
+        return Program(
+            [self._expanded(word) for word in command],
+            self.working,
+            self.environment(),
+            grace=self._config.grace,
+            printed=printed,
+            ended=ended,
+        )
+
+    def close(self) -> None:
+        """Remove what is of no use after the run."""
+        if self._temporary is not None:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def environment(self) -> dict[str, str]:
+        """Return all variables of the program."""
+        places = {
+            "VISNAV_FOLDER": str(self.folder),
+            "VISNAV_SOCKET": str(self.socket),
+            "VISNAV_INCLUDE": str(Path(native.__file__).parent),
+            "VISNAV_PYTHON": sys.executable,
+        }
+        return {**os.environ, **places, **self._ours, **self._config.environment}
+
+    def _expanded(self, word: str) -> str:
+        known = self.environment()
+        return re.sub(r"\$(?:(\w+)|{(\w+)})", lambda m: known.get(m[1] or m[2], m[0]), word)
+
+    def texts(self, known: Mapping[str, Any]) -> dict[Path, str]:
+        """Return the files that are to be written, with their texts.
+
+        Args:
+            known: What templates may use, by name.
+
+        Raises:
+            ProgramError: A template is missing or wrong.
+        """
+        found = {}
+        for file in self._config.files:
+            template = Path(file.template)
+            try:
+                ready = templates(template.parent).get_template(template.name)
+                found[self.folder / file.path] = ready.render(known)
+            except jinja2.TemplateNotFound as error:
+                missing = template.parent / str(error.name)
+                raise ProgramError(f"files: {missing}: expected a template, found none") from None
+            except (jinja2.TemplateError, ValueError, TypeError, ArithmeticError) as error:
+                line = getattr(error, "lineno", None)
+                where = f"{template}: line {line}" if line else str(template)
+                raise ProgramError(f"files: {where}: {error}") from None
+        return found

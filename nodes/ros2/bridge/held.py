@@ -1,0 +1,340 @@
+"""Estimators in ROS 2 that owe an answer to each image: what they are sent, and what they say.
+
+They get all messages of the node, complete and in the order of its events: an image after the IMU
+and the ``/clock`` of the time at which it arrived. Their answers are read in the thread that takes
+them, and given to a `Hold`. Nothing here decides by real time what is sent, or when.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import functools
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from events import Event
+from nodes.ros2.bridge.attachment import Message
+from nodes.ros2.bridge.incoming_topic import IncomingTopic
+from nodes.ros2.bridge.keys import Token
+from nodes.ros2.bridge.publisher import Publisher
+from nodes.ros2.bridge.session import Session
+from nodes.ros2.bridge.settings import Ros2BridgeConfig
+from nodes.ros2.messages.publications import IMAGES, publication
+from nodes.ros2.messages.stamps import Stamps
+from nodes.ros2.messages.topics import Topic, topic_name
+from runtime import Node
+from runtime.channels.hold import Hold
+from runtime.channels.owed import Owed
+from runtime.errors import MissingAnswerError, suggest
+
+WAITING = 64
+"""Messages that may wait to be published in real time; with so many, images are dropped."""
+
+SETTLED = 0.3
+"""Real seconds without a further subscription, after those that are needed, until it begins."""
+
+CLOSING = 2.0
+"""Real seconds that the end of the run waits for what is still to be published."""
+
+_LOOK = 0.01
+"""Real seconds between two looks at who has subscribed."""
+
+
+class HeldEstimator:
+    """One estimator: whether it is there, to which images it owes answers, and what it answers.
+
+    Its `topics` are that of its estimates, and the one that says what it is done with, if any.
+    """
+
+    def __init__(
+        self,
+        topics: Sequence[IncomingTopic],
+        hold: Hold[Event],
+        stamps: Stamps,
+        config: Ros2BridgeConfig,
+    ) -> None:
+        self.hold = hold
+        self.subscription = topics[0].subscription
+        self._topics, self._stamps = topics, stamps
+        self._max_size = config.max_message_size
+        self._needs = [topic_name(config.namespace, each) for each in self.subscription.needs]
+        found = [publication(kind, self.subscription.answers_to, config) for kind in IMAGES]
+        self._images = [each.topic for each in found if each is not None]
+        self._owed = -1  # stamp of the newest image
+        self._sequences: dict[bytes, int] = {}  # by GID
+        self._there: dict[str, None] = {}  # tokens of its publishers
+        self._came = self._gone = False
+        self._answerers: set[bytes] = set()  # GIDs
+
+    def follow(self, session: Session) -> None:
+        """Take its answers from now on, and note when it comes and goes; may wait."""
+        takes = [(each.topic, functools.partial(self._take, each)) for each in self._topics]
+        session.subscribe_in_order(takes)
+        session.watch(self._topics[0].topic.name, "MP", self._changed)
+
+    def missing(self, matched: Sequence[str]) -> str:
+        """Return what is not there of it, in words, given the topics that are subscribed to."""
+        found = [] if self._there else [f"a publisher of {self._topics[0].topic.name}"]
+        if lacking := [each for each in self._needs if each not in matched]:
+            found.append(f"a subscription to {' and '.join(lacking)}")
+        elif not self._needs and not any(each in matched for each in self._images):
+            found.append(f"a subscription to {' or '.join(self._images)}")
+        self._came = self._came or not found
+        return " and ".join(found)
+
+    def owe(self, image: Event, matched: Callable[[], Sequence[str]]) -> Owed[Event] | None:
+        """Return the answer that is owed to an image which goes out now; `None` if none is.
+
+        Of several images of one exposure, it is owed to the first.
+        """
+        if image.source != self.subscription.answers_to or image.stamp <= self._owed:
+            return None
+        self._owed = image.stamp
+        if self._gone and not self.missing(matched()):
+            self._gone = False
+            self._answerers.clear()
+            self.hold.back()
+        return self.hold.owe(image.stamp)
+
+    def _take(self, incoming: IncomingTopic, message: Message) -> None:
+        """Take a message, in any thread."""
+        try:
+            if not self._is_next(incoming, message):
+                return
+            if message.size > self._max_size:
+                expected = f"expected {self._max_size} bytes or less, found {message.size}"
+                incoming.complain("message too large", expected)
+            elif (answer := incoming.answer(message.read(), self._stamps)) is not None:
+                self.hold.answer(*answer)
+        except Exception as error:  # nobody looks at this thread
+            self.hold.fail(error)
+
+    def _is_next(self, incoming: IncomingTopic, message: Message) -> bool:
+        """Tell whether a message is a new one; if some are missing before it, the run ends."""
+        if (attached := message.attachment) is None:
+            return True
+        number = attached.sequence
+        expected = self._sequences.get(attached.gid, number - 1) + 1
+        if number < expected:
+            incoming.complain("message repeated", f"number {number} again")
+            return False
+        self._sequences[attached.gid] = number
+        if incoming is self._topics[0]:
+            self._answerers.add(attached.gid)
+            if len(self._answerers) > 1:
+                self.hold.doubt(f"several publishers answer at {incoming.topic.name}")
+        if number > expected:
+            raise MissingAnswerError(
+                f"{self.hold.name}: {incoming.topic.name}: expected message {expected} of its "
+                f"publisher, found {number}: messages were lost on the way"
+            )
+        return True
+
+    def _changed(self, there: bool, token: Token) -> None:
+        """Take note that a publisher of its estimates has come or gone, in any thread."""
+        if there:
+            self._there[token.key] = None
+            return
+        self._there.pop(token.key, None)
+        if self._came and not self._there:
+            self._gone = True
+            self.hold.gone(f"nobody publishes {self._topics[0].topic.name} any more")
+
+
+def held_estimators(
+    node: Node[Ros2BridgeConfig], incoming: Sequence[IncomingTopic], stamps: Callable[[], Stamps]
+) -> list[HeldEstimator]:
+    """Return the estimators among a node's subscriptions that owe answers, each with its hold."""
+    found = []
+    for each in incoming:
+        given = each.subscription
+        if given.use == "estimate" and given.answers_to:
+            told = [other for other in incoming if given.is_told_by(other.subscription)]
+            hold = node.hold(each.source, given.hold, given.latency)
+            found.append(HeldEstimator([each, *told], hold, stamps(), node.config))
+    return found
+
+
+class HeldLine:
+    """Publishes in a thread, one message after the other, in the order of asking.
+
+    In lockstep nothing is dropped: what is to be published before the estimators are there waits
+    for them, as does simulated time. In real time that is left out, and so are images when too many
+    messages wait.
+
+    Args:
+        node: Whose messages these are.
+        session: Whose publishers are made complete: reliable, and waiting for who reads slowly.
+        estimators: Who is sent it all.
+        deliver: Sends the event of an answer, at its time.
+
+    Attributes:
+        dropped: Images that were left out.
+    """
+
+    def __init__(
+        self,
+        node: Node[Any],
+        session: Session,
+        estimators: Sequence[HeldEstimator],
+        deliver: Callable[[Event], None],
+    ) -> None:
+        self.dropped = 0
+        self._node, self._session = node, session
+        self._estimators, self._deliver = estimators, deliver
+        self._publishers: list[Publisher] = []
+        self._early: list[Callable[[], object]] | None = []
+        self._waiting: queue.SimpleQueue[tuple[Callable[..., object], object] | None]
+        self._waiting = queue.SimpleQueue()
+        self._there: concurrent.futures.Future[str] = concurrent.futures.Future()
+        self._there.set_running_or_notify_cancel()  # a run that ends meanwhile does not cancel it
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="publishes", daemon=True)
+
+    def publisher(self, topic: Topic) -> Publisher:
+        """Declare a topic."""
+        made = self._session.publisher(topic, held=True)
+        made.note = self._note
+        self._publishers.append(made)
+        return made
+
+    async def begin(self, first: Callable[[], object]) -> None:
+        """Wait for the estimators, while time stands, and begin to publish.
+
+        Args:
+            first: Puts what holds for the whole run.
+
+        Raises:
+            FatalError: They are not there in time.
+        """
+        self._thread.start()
+        if missing := await self._node.clock.beside(self._there):
+            self._node.log.fatal("expected %s, found none", missing)
+        self._waiting.put((lambda _: first(), None))
+        early, self._early = self._early or [], None
+        for publish in early:
+            publish()
+
+    def publish(self, put: Callable[..., object], what: object) -> None:
+        """Put something in its turn."""
+        self._once_there(self._waiting.put, (put, what))
+
+    def publish_image(
+        self, image: Event, put: Callable[[Any], object], clock: Callable[[int], object]
+    ) -> None:
+        """Put an image or a point cloud in its turn, and the time before it; hold for its answers.
+
+        Args:
+            image: The event, which arrives now.
+            put: Puts its messages.
+            clock: Puts the time (ns).
+        """
+        self._once_there(self._publish_image, image, put, clock)
+
+    async def close(self) -> None:
+        """Publish what is still to be, unless a peer that does not read keeps it for `CLOSING`."""
+        self._closed.set()
+        self._waiting.put(None)
+        if self._thread.is_alive():
+            await self._node.offload(self._thread.join, CLOSING)
+
+    def _once_there(self, call: Callable[..., object], *args: object) -> None:
+        if self._early is None:
+            call(*args)
+        elif self._node.clock.kind == "lockstep":
+            self._early.append(functools.partial(call, *args))
+
+    def _publish_image(
+        self, image: Event, put: Callable[[Any], object], clock: Callable[[int], object]
+    ) -> None:
+        node = self._node
+        if node.clock.kind == "real" and self._waiting.qsize() >= WAITING:
+            self.dropped += 1
+            return
+        for each in self._estimators:
+            if (owed := each.owe(image, self._matched)) is not None:
+                node.start(self._answer(owed))
+        self._waiting.put((clock, node.clock.now()))
+        self._waiting.put((put, image))
+
+    async def _answer(self, owed: Owed[Event]) -> None:
+        event = await owed
+        if event is not None:
+            self._deliver(msgspec.structs.replace(event, stamp=owed.stamp))
+
+    # In the thread.
+
+    def _work(self) -> None:
+        try:
+            for each in self._estimators:
+                each.follow(self._session)
+            self._there.set_result(self._wait())
+        except Exception as error:
+            self._there.set_exception(error)
+        for put, what in iter(self._waiting.get, None):
+            try:
+                put(what)
+            except Exception as error:  # nobody looks at this thread
+                for each in self._estimators:
+                    each.hold.fail(error)
+
+    def _wait(self) -> str:
+        """Return, in words, who is not there in time; wait until no further subscription comes."""
+        begin = since = time.monotonic()
+        end = begin + max(each.subscription.timeout for each in self._estimators)
+        matched: list[str] = []
+        while True:
+            now, before, matched = time.monotonic(), matched, self._matched()
+            since = since if matched == before else now
+            missing = "; ".join(filter(None, (each.missing(matched) for each in self._estimators)))
+            if not missing and now > since + SETTLED:
+                return ""
+            if now > end or self._closed.wait(_LOOK):
+                return f"{missing or 'no further subscriptions'} within {end - begin:g} s"
+
+    def _matched(self) -> list[str]:
+        """Return the topics that somebody subscribes to."""
+        return [each.topic.name for each in self._publishers if each.matched()]
+
+    def _note(self, publisher: Publisher, message: bytearray) -> None:
+        """Take what was put into the digest of what estimators are sent."""
+        name = publisher.topic.name
+        for each in self._estimators:
+            each.hold.sent(name, message)
+        if publisher.failed and not self._closed.is_set():
+            raise MissingAnswerError(
+                f"{name}: expected subscribers that read, found one that does not"
+            )
+
+
+def why_no_answers(
+    config: Ros2BridgeConfig, rates: Mapping[str, float], *, lockstep: bool
+) -> Iterator[str]:
+    """Yield why estimators could never answer, given the announced rates of cameras and lidars."""
+    for each in config.subscriptions:
+        source, latency = each.answers_to, float(each.latency)
+        if not source or each.use == "done":
+            continue
+        if source not in rates:
+            yield (
+                f"{each.topic}: answers_to: expected a camera or lidar that is announced, found "
+                f'"{source}" (there are: {", ".join(rates) or "none"}){suggest(source, rates)}'
+            )
+        elif any(each.is_told_by(other) for other in config.subscriptions):
+            continue
+        elif (
+            (lockstep and each.hold.skips == "allowed")
+            and not each.hold.latencies
+            and 0 < rates[source] * latency <= 1
+        ):
+            yield (
+                f'{each.topic}: skips = "allowed": expected a latency above the period of {source} '
+                f"({1e3 / rates[source]:.4g} ms), found {latency * 1e3:g} ms: that an image was "
+                "skipped is known by the answer to a later one, which is not sent while time "
+                'stands for the first; or have a topic say what is done (as = "done")'
+            )

@@ -1,0 +1,383 @@
+"""The bridge as a node: events of the run become messages in ROS 2, and messages become events."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import msgspec
+
+from events import (
+    Announcement,
+    CameraAnnouncement,
+    Command,
+    DepthImage,
+    Event,
+    FluidPressure,
+    Image,
+    Imu,
+    LidarAnnouncement,
+    MagneticField,
+    NavSatFix,
+    Odometry,
+    PoseEstimate,
+    Range,
+    Setpoint,
+    VehicleAnnouncement,
+    VehicleEvent,
+)
+from nodes.ros2.bridge.complaints import Complaints
+from nodes.ros2.bridge.held import HeldLine, held_estimators, why_no_answers
+from nodes.ros2.bridge.inbox import Inbox
+from nodes.ros2.bridge.incoming_topic import IncomingTopic
+from nodes.ros2.bridge.keys import NodeName
+from nodes.ros2.bridge.mappings import event_type
+from nodes.ros2.bridge.outgoing_topic import OutgoingTopic
+from nodes.ros2.bridge.publisher import Publisher
+from nodes.ros2.bridge.services import Services
+from nodes.ros2.bridge.session import Session, SessionError
+from nodes.ros2.bridge.settings import Ros2BridgeConfig
+from nodes.ros2.messages.publishing import LARGE, SMALL, Publishing
+from nodes.ros2.messages.stamps import Stamps
+from nodes.ros2.messages.typestore import TypeStore
+from runtime import Node, Output, Stream, Tick, every, on
+from runtime.channels.ports import Handles
+from runtime.errors import FatalError, UncheckableError
+
+WAITING = 8
+"""Images of one kind that wait to be published; the oldest is dropped, and counted."""
+
+
+class Ros2Bridge(Node[Ros2BridgeConfig]):
+    """Makes the run a node of ROS 2 with ordinary topics, and topics of ROS 2 events of the run.
+
+    ::
+
+        [[nodes]]
+        name = "ros2"
+        type = "Ros2Bridge"
+
+        [[nodes.subscriptions]]
+        topic = "/cmd_vel"
+        type = "geometry_msgs/msg/Twist"
+        as = "velocity"
+
+    What is announced has its topics from the start; what is not, from its first event. Messages
+    from outside that make no sense are counted, logged now and then, and left out.
+
+    An ``estimate`` that `answers_to` a camera is held: simulated time waits for the answer to each
+    image. All that this node publishes is then reliable and complete, whatever `sensor_qos` says,
+    and in one order: a subscriber that reads slowly slows the run down.
+    """
+
+    reads_truth = "showing"
+    ends_run = "hand"
+    estimates = Output(PoseEstimate)
+    setpoints = Output(Setpoint)
+    images = Output(Image)
+    depth_images = Output(DepthImage)
+    imu = Output(Imu)
+    odometry = Output(Odometry)
+    ranges = Output(Range)
+    pressures = Output(FluidPressure)
+    magnetic_fields = Output(MagneticField)
+    fixes = Output(NavSatFix)
+    commands = Output(Command)
+    mapped_events = Output(Event)
+    """What mappings of the user's own make."""
+
+    def __init__(self) -> None:
+        self._session: Session | None = None
+        self._publishing: Publishing[Publisher] | None = None
+        self._queues: dict[type[Event], Stream[Any]] = {
+            kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
+            for kind in LARGE
+        }
+        self._incoming: list[IncomingTopic] = []
+        self._unread: list[Stream[bytes]] = []
+        """Images from ROS that wait to be read."""
+        self._outgoing: list[OutgoingTopic] = []
+        self._cameras: list[CameraAnnouncement] = []
+        self._vehicles: list[str] = []
+        self._services: Services | None = None
+        self._stamps: Stamps | None = None
+        self._open = False
+        self._line: HeldLine | None = None
+        """On which all is published, in order, if there are such estimators."""
+        self._rates: dict[str, float] = {}
+        """Of announced cameras and lidars."""
+        if self.config.publications:
+            self._declare_mapped_events()
+        # Messages of ROS come at their own time, unless time waits for them.
+        self._unheld = [each.topic for each in self.config.subscriptions if not each.answers_to]
+        steered = bool(self._unheld) or "vehicle" in self.config.services
+        self.deterministic = not steered  # type: ignore[misc]
+
+    async def on_startup(self) -> None:
+        """Join the network, and wait for the cameras that ROS has.
+
+        Raises:
+            MissingDependencyError: rosbags is not installed.
+            FatalError: The settings make no sense together, or there is no session to be had.
+        """
+        config = self.config
+        if config.time == "wall" and self.clock.kind != "real":
+            self.log.fatal('time = "wall" needs clock = "real", found "%s"', self.clock.kind)
+        if config.paused and (why := self.stepping.fixed()):
+            self.log.fatal("paused: %s", why)
+        if self._unheld and self.clock.kind != "real":
+            self.log.warning(
+                "messages of ROS on %s come at their own time, so runs in lockstep will differ; "
+                'such subscriptions are for clock = "real"',
+                ", ".join(self._unheld),
+            )
+        self._complaints = Complaints(self.log.warning)
+        try:
+            self._store = await self.offload(TypeStore, config.distribution, config.definitions)
+            self._incoming = [
+                IncomingTopic(each, config, self._store, self.name, self._complaints)
+                for each in config.subscriptions
+            ]
+            self._outgoing = [
+                OutgoingTopic(each, config, self._store, self._complaints)
+                for each in config.publications
+            ]
+            if self.checking:
+                if any(topic.subscription.use == "camera" for topic in self._incoming):
+                    raise UncheckableError("which cameras there are is known to ROS only")
+                return
+            session = await self.offload(
+                Session,
+                NodeName(
+                    name=config.node_name, namespace=config.namespace, domain_id=config.domain_id
+                ),
+                keys=config.keys,
+                connect=config.connect,
+                listen=config.listen,
+                file=config.zenoh_config,
+                max_wait=max((each.hold.max_wait for each in config.subscriptions), default=5.0),
+            )
+        except (ValueError, SessionError) as error:
+            self.log.fatal("%s", error)
+        self._session = session
+        estimators = held_estimators(self, self._incoming, self._fix_time)
+        if estimators:
+            self._line = HeldLine(self, session, estimators, self._send)
+        self._publishing = Publishing(
+            self._line or session, self._store, config, lambda stamp: self._fix_time().out(stamp)
+        )
+        await self.offload(self._publishing.warm_up)
+        try:
+            for topic in self._incoming:
+                if topic.subscription.use == "camera":
+                    await self._find_camera(session, topic)
+        except FatalError:
+            await self.offload(session.close)
+            raise
+
+    def announce(self) -> Iterable[Announcement]:
+        """Announce the estimators, cameras and pilots that are in ROS."""
+        yield from self._cameras
+        for incoming in self._incoming:
+            yield from incoming.announce()
+
+    def on_announcement(self, announcement: Announcement) -> None:
+        """Declare the topics of what is announced."""
+        ours = {incoming.source for incoming in self._incoming}
+        if isinstance(announcement, CameraAnnouncement | LidarAnnouncement):
+            self._rates[announcement.source] = announcement.rate
+        if isinstance(announcement, VehicleAnnouncement):
+            self._vehicles.append(announcement.source)
+        if self._publishing is not None and announcement.source not in ours:
+            self._publishing.announced(announcement)
+
+    def check(self) -> Iterable[str]:
+        """Return why an estimator could never answer."""
+        return why_no_answers(self.config, self._rates, lockstep=self.clock.kind == "lockstep")
+
+    async def run(self) -> None:
+        """Subscribe, and publish images and point clouds beside the loop, each kind in order."""
+        publishing, session = self._publishing, self._session
+        assert publishing is not None
+        assert session is not None
+        self._open = True
+        if self.config.paused:  # before anybody can ask for anything
+            self.stepping.pause()
+        self._fix_time()
+        if self._line is None:
+            publishing.begin()
+        for text in publishing.unannounced():
+            self.log.warning("%s", text)
+        for kind, events in self._queues.items():
+            self.start(self._publish_all(events, publishing.large[kind]))
+        for outgoing in self._outgoing:
+            outgoing.publisher = (self._line or session).publisher(outgoing.topic)
+            put = functools.partial(outgoing.put, publishing.builder)
+            self.start(self._publish_all(outgoing.waiting, put))
+        for incoming in self._incoming:
+            if not incoming.subscription.answers_to and incoming.subscription.use != "camera":
+                await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).take)
+        if self.config.services:
+            self._services = Services(self._send, self, session, self._store, self._complaints)
+            await self.offload(self._services.offer, self._vehicles)
+        if self._line is not None:
+            await self._line.begin(publishing.begin)
+
+    async def on_shutdown(self) -> None:
+        """Leave the network, and log how many messages were published and received."""
+        self._open = False
+        publishing, session = self._publishing, self._session
+        if publishing is None or session is None:
+            return
+        if self._line is not None:
+            await self._line.close()
+        mapped = [each.publisher for each in self._outgoing if each.publisher is not None]
+        sent = [each for each in publishing.publishers + mapped if each.sent]
+        refused = sum(self._complaints.counts.values()) + sum(each.dropped for each in self._unread)
+        self.log.info(
+            "%d messages published on %d topics (%d images, %d others dropped); "
+            "%d received, %d refused or dropped",
+            sum(each.sent for each in sent),
+            len(sent),
+            sum(each.dropped for each in (*self._queues.values(), self._line) if each),
+            sum(each.waiting.dropped for each in self._outgoing),
+            sum(incoming.received for incoming in self._incoming),
+            refused,
+        )
+        for line in publishing.unused():
+            self.log.warning("%s", line)
+        if self._services is not None:
+            await self._services.close()
+        if not await self.offload(session.close):
+            self.log.warning("a peer that stands still keeps the session from closing")
+
+    @on(*LARGE)
+    def images_and_clouds(self, event: Event) -> None:
+        """Publish an image or a point cloud beside the loop."""
+        kind = next(kind for kind in self._queues if isinstance(event, kind))
+        if self._line is None:
+            self._queues[kind].offer(event)
+        elif self._publishing is not None:
+            put = self._publishing.large[kind]
+            self._line.publish_image(event, put, self._publishing.clock)
+
+    @on(*SMALL)
+    def measurements(self, event: Event) -> None:
+        """Publish what is small, at once."""
+        if self._publishing is not None:
+            self._publish(self._publishing.small, event)
+
+    @on(VehicleEvent)
+    def vehicle_events(self, event: VehicleEvent) -> None:
+        """Answer who asked a vehicle for what it now says is done."""
+        if self._services is not None:
+            self._services.told(event)
+
+    def publications(self, event: Event) -> None:
+        """Publish, beside the loop, what a mapping of the user's own makes of an event."""
+        for outgoing in self._outgoing:
+            if outgoing.wants(event):
+                if self._line is None or self._publishing is None:
+                    outgoing.waiting.offer(event)
+                else:
+                    put = functools.partial(outgoing.put, self._publishing.builder)
+                    self._line.publish(put, event)
+
+    @every(hz="clock_rate")
+    def publish_clock(self, tick: Tick) -> None:  # noqa: ARG002
+        """Publish ``/clock``."""
+        if self._publishing is not None:
+            self._publish(self._publishing.clock, self.clock.now())
+
+    def _declare_mapped_events(self) -> None:
+        """Have `publications` called with the events that the file's publications are of.
+
+        Raises:
+            FatalError: One is of no type of event.
+        """
+        try:
+            events = tuple({event_type(each) for each in self.config.publications})
+        except ValueError as error:
+            self.log.fatal("%s", error)
+        declared = self.declared
+        # Which events these are differs from node to node, so it is not declared in the class.
+        self.declared = msgspec.structs.replace(  # type: ignore[misc]
+            declared,
+            handlers={**declared.handlers, "publications": Handles(events, None)},
+            listening=[*declared.listening, "publications"],
+        )
+
+    def _publish(self, put: Callable[[Any], None], what: Any) -> None:
+        """Publish what is small, at once or in its turn."""
+        if self._line is None:
+            put(what)
+        else:
+            self._line.publish(put, what)
+
+    async def _publish_all(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
+        async for event in events:
+            await self.offload(put, event)
+
+    async def _read_images(self, incoming: IncomingTopic, waiting: Stream[bytes]) -> None:
+        """Read images beside the loop."""
+        async for data in waiting:
+            event = await self.offload(incoming.event, data, self.clock.now(), self._fix_time())
+            if event is not None:
+                self._send(event)
+
+    def _inbox(self, incoming: IncomingTopic) -> Inbox:
+        subscription = incoming.subscription
+
+        def deliver(data: bytes) -> None:
+            if self._open:
+                event = incoming.event(data, self.clock.now(), self._fix_time())
+                if event is not None:
+                    self._send(event)
+
+        take: Callable[[bytes], object] = deliver
+        if subscription.use in {"image", "depth"}:
+            name = f"{self.name}.{incoming.topic.name}"
+            waiting = Stream[bytes](name, subscription.depth, "drop_oldest", soon=True)
+            self._unread.append(waiting)
+            self.start(self._read_images(incoming, waiting))
+            take = waiting.offer
+        return Inbox(
+            asyncio.get_running_loop(),
+            take,
+            depth=subscription.depth,
+            max_rate=subscription.max_rate,
+            max_size=self.config.max_message_size,
+            complain=incoming.complain,
+        )
+
+    def _send(self, event: Event) -> None:
+        """Send an event by the first output that is for its type."""
+        outputs = self.declared.outputs.items()
+        port = next(port for port, output in outputs if isinstance(event, output.event))
+        getattr(self, port).send(event)
+
+    async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
+        """Wait for a camera's calibration, and remember to announce it."""
+        timeout, most = incoming.subscription.timeout, self.config.max_message_size
+        kinds = {"image": "rgb", "depth": "depth"}
+        uses = [each.subscription.use for each in self._incoming if each.source == incoming.source]
+        images = tuple(kinds[use] for use in uses if use in kinds)
+        found = await self.offload(incoming.find_camera, session, images, most)
+        try:
+            self._cameras.append(await self.offload(found.result, timeout))
+        except TimeoutError:
+            self.log.fatal(
+                "%s: expected a calibration within %g s, found none", incoming.topic.name, timeout
+            )
+        finally:
+            found.cancel()
+
+    def _fix_time(self) -> Stamps:
+        """Return how stamps become times in messages, which is fixed with the first message."""
+        if self._stamps is None:
+            wall = self.config.time == "wall"
+            self._stamps = Stamps(time.time_ns() - self.clock.now() if wall else 0)
+        return self._stamps

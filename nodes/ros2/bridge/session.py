@@ -1,0 +1,357 @@
+"""A Zenoh session as a ROS 2 node: the only module that imports zenoh.
+
+Zenoh has threads of its own and no asyncio: what it calls runs there, and must not wait.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import itertools
+import json
+import math
+import queue
+import re
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import zenoh
+
+from nodes.ros2.bridge.attachment import Message, gid
+from nodes.ros2.bridge.keys import (
+    Kind,
+    NodeName,
+    Token,
+    data_key,
+    endpoint_token,
+    endpoints_key,
+    node_token,
+    parse_token,
+    ros2dds_key,
+)
+from nodes.ros2.bridge.publisher import Publisher
+from nodes.ros2.messages.topics import Topic
+
+Take = Callable[[Message], None]
+"""Called in a thread with each message."""
+
+Answer = Callable[[bytearray | str, bytes], None]
+"""Answers a request, in any thread: with a message and its attachment, or with an error."""
+
+WAIT_BEFORE_DROP = 300
+"""Microseconds that a put waits for a peer that does not read; Zenoh's default is 1000."""
+
+WAITING = 64
+"""Messages that Zenoh keeps until they are read; it lets the sender wait when there are more."""
+
+PAUSE = 0.001
+"""Seconds between two looks at what has come: what comes faster is taken in handfuls."""
+
+CLOSING = 3.0
+"""Seconds."""
+
+_QUEUE = "transport/link/tx/queue/congestion_control"
+_OURS: dict[str, Any] = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": True,
+    "connect/endpoints": ["tcp/localhost:7447"],
+    "listen/endpoints": ["tcp/localhost:0"],
+    "connect/timeout_ms": -1,  # try for ever,
+    "connect/exit_on_failure": False,  # but beside the run; and again if a router goes
+    f"{_QUEUE}/drop/wait_before_drop": WAIT_BEFORE_DROP,
+}
+"""Instead of Zenoh's own defaults, which are to listen on all addresses, and to use multicast."""
+
+_IN_ZENOH = re.compile(r" at /\S+\.rs:\d+\.?")
+_IN_FILE = re.compile(r'Message \{ msg: "(.*)", location: .*line: (\d+), column: (\d+).*')
+"""Where in Zenoh an error arose; how Rust shows one of JSON5, and where that is."""
+
+
+class SessionError(Exception):
+    """A session cannot be opened; the message says why."""
+
+
+class Session:
+    """A session with one ROS node.
+
+    Args:
+        node: As whom to appear.
+        keys: How topics are named.
+        connect: Endpoints to connect to, again and again until they answer.
+        listen: Endpoints to listen on.
+        file: A Zenoh configuration. What it leaves out, and the two endpoints if they are `None`,
+            is as without a file: that of rmw_zenoh_cpp.
+        max_wait: Real seconds for which a held message waits for a peer that does not read; then
+            it counts as failed, and the connection to that peer is given up.
+
+    Raises:
+        SessionError: It cannot be opened.
+    """
+
+    def __init__(
+        self,
+        node: NodeName,
+        *,
+        keys: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh",
+        connect: tuple[str, ...] | None = None,
+        listen: tuple[str, ...] | None = None,
+        file: str = "",
+        max_wait: float = 5.0,
+    ) -> None:
+        self._node = node
+        self._keys = keys
+        self._max_wait = max_wait
+        configuration = _configuration(connect, listen, file)
+        configuration.insert_json5(f"{_QUEUE}/block/wait_before_close", f"{max_wait * 1e6:.0f}")
+        try:
+            self._session = zenoh.open(configuration)
+        except (zenoh.ZError, OSError) as error:
+            raise SessionError(
+                "expected a Zenoh session that listens on "
+                f"{configuration.get_json('listen/endpoints')}, found: {_reason(error)}"
+            ) from error
+        self.zid = str(self._session.info.zid())
+        self._ids = itertools.count(1)
+        self._kept: list[Any] = []
+        if keys == "rmw_zenoh":
+            self._keep(node_token(node, self.zid, 0))
+
+    def publisher(self, topic: Topic, *, held: bool = False) -> Publisher:
+        """Declare a publisher, and show it to ROS.
+
+        Args:
+            topic: Its topic.
+            held: Whether every message must arrive: it is reliable, keeps all, and a put waits
+                (up to `max_wait`) for a peer that reads slowly rather than drop a message.
+        """
+        if held:
+            qos = msgspec.structs.replace(topic.qos, reliable=True, keep_all=True)
+            topic = msgspec.structs.replace(topic, qos=qos)
+        qos, key, reliability = topic.qos, self._key(topic), zenoh.Reliability
+        block, drop = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+        waits = qos.reliable and qos.keep_all
+        options: dict[str, Any] = {
+            "congestion_control": block if waits else drop,
+            "reliability": reliability.RELIABLE if qos.reliable else reliability.BEST_EFFORT,
+        }
+        plain: Any = self._session.declare_publisher(key, **options)
+        declared = plain
+        if qos.transient_local:
+            # So often it is told what the last message was, as in rmw_publisher_data.cpp.
+            heartbeat = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
+            declared = zenoh.ext.declare_advanced_publisher(
+                self._session,
+                key,
+                cache=zenoh.ext.CacheConfig(max_samples=qos.depth),
+                sample_miss_detection=heartbeat if qos.reliable else None,
+                publisher_detection=True,
+                **options,
+            )
+        publisher = Publisher(
+            topic,
+            functools.partial(_put, declared.put),
+            lambda: plain.matching_status.matching,  # an advanced publisher does not know
+            self._show(topic, "MP"),
+            self._max_wait if waits else math.inf,
+        )
+        if qos.transient_local:
+            answer = functools.partial(_answer, publisher, key)
+            self._kept.append(self._session.declare_queryable(key, answer, complete=True))
+        return publisher
+
+    def subscribe(self, topic: Topic, take: Take, *, late: bool = False) -> None:
+        """Declare a subscription, and show it to ROS.
+
+        With `late`, messages that were sent before and are kept come too, as for transient local.
+        """
+        # Not called by Zenoh for each message: each call takes the interpreter from the loop, and
+        # under a flood the loop would wait for it again and again.
+        ext, key, qos = zenoh.ext, self._key(topic), topic.qos
+        channel: Any = zenoh.handlers.FifoChannel(WAITING)
+        if late or qos.transient_local:
+            recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+            subscriber: Any = ext.declare_advanced_subscriber(
+                self._session,
+                key,
+                channel,
+                history=ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth),
+                recovery=recovery if qos.reliable else None,
+                subscriber_detection=True,
+            )
+        else:
+            subscriber = self._session.declare_subscriber(key, channel)
+        self._kept.append(subscriber)
+        threading.Thread(
+            target=_read, args=(subscriber, take), name=f"reads {topic.name}", daemon=True
+        ).start()
+        self._show(topic, "MS")
+
+    def subscribe_in_order(self, takes: Sequence[tuple[Topic, Take]]) -> None:
+        """Subscribe to topics whose messages are taken one by one, in the order in which they came.
+
+        So what a process says on one of them after another is taken after it. They are read as they
+        come, and cost the loop more than with `subscribe`.
+        """
+        came: queue.Queue[tuple[Take, zenoh.Sample] | None] = queue.Queue(WAITING)
+
+        def queue_for(take: Take) -> Any:
+            put, closed = lambda sample: came.put((take, sample)), lambda: came.put(None)
+            return zenoh.handlers.Callback(put, closed, indirect=False)
+
+        def read() -> None:
+            for _ in takes:  # until each is closed
+                for take, sample in iter(came.get, None):
+                    take(_message(sample))
+
+        for topic, take in takes:
+            subscriber = self._session.declare_subscriber(self._key(topic), queue_for(take))
+            self._kept.append(subscriber)
+            self._show(topic, "MS")
+        threading.Thread(target=read, name=f"reads {takes[0][0].name}", daemon=True).start()
+
+    def watch(self, topic_name: str, kind: Kind, changed: Callable[[bool, Token], None]) -> None:
+        """Be told which endpoints of other sessions a topic has, now and whenever that changes.
+
+        Those of a process that is killed disappear at once; tokens that make no sense are left out.
+
+        Args:
+            topic_name: With its leading slash.
+            kind: Of the endpoints: ``MP`` for publishers, ``MS`` for subscriptions.
+            changed: Called in any thread with whether one is there (else it is gone), and which.
+        """
+
+        def tell(sample: zenoh.Sample) -> None:
+            try:
+                token = parse_token(str(sample.key_expr))
+            except ValueError:
+                return
+            if token.zid != self.zid:
+                changed(sample.kind == zenoh.SampleKind.PUT, token)
+
+        key = endpoints_key(self._node.domain_id, kind, topic_name)
+        liveliness = self._session.liveliness()
+        self._kept.append(liveliness.declare_subscriber(key, tell, history=True))
+
+    def serve(self, service: Topic, take: Callable[[Message, Answer], None]) -> None:
+        """Declare a service, and show it to ROS.
+
+        Args:
+            service: Its name, type, hash and quality of service.
+            take: Called in a thread of Zenoh's with each request; must not wait.
+        """
+        key = data_key(self._node.domain_id, service)
+
+        def answer(query: zenoh.Query, reply: bytearray | str, attachment: bytes) -> None:
+            with contextlib.suppress(zenoh.ZError), query:  # whoever asked may have gone
+                if isinstance(reply, str):
+                    query.reply_err(reply)
+                else:
+                    query.reply(key, reply, attachment=attachment)
+
+        def ask(query: zenoh.Query) -> None:
+            take(_message(query), functools.partial(answer, query))
+
+        self._kept.append(self._session.declare_queryable(key, ask, complete=True))
+        self._show(service, "SS")
+
+    def close(self) -> bool:
+        """Leave, and tell whether that was done within `CLOSING`.
+
+        A peer that stands still can keep Zenoh waiting for longer (10 s). Then a thread goes
+        on with it, and the process ends after that: to end before would crash in Zenoh.
+        """
+        thread = threading.Thread(target=self._session.close, name="zenoh close")
+        thread.start()
+        thread.join(CLOSING)
+        return not thread.is_alive()
+
+    def _key(self, topic: Topic) -> str:
+        if self._keys == "ros2dds":
+            return ros2dds_key(topic)
+        return data_key(self._node.domain_id, topic)
+
+    def _show(self, topic: Topic, kind: Kind) -> bytes | None:
+        """Show an endpoint to ROS, and return its GID; ``None`` if no ROS speaks these keys."""
+        if self._keys != "rmw_zenoh":
+            return None
+        token = endpoint_token(self._node, self.zid, 0, next(self._ids), kind, topic)
+        self._keep(token)
+        return gid(token)
+
+    def _keep(self, token: str) -> None:
+        self._kept.append(self._session.liveliness().declare_token(token))
+
+
+def _put(put: Any, message: bytearray, attachment: bytes | None) -> bool:
+    try:
+        put(message, attachment=attachment)
+    except zenoh.ZError:
+        return False
+    return True
+
+
+def _answer(publisher: Publisher, key: str, query: zenoh.Query) -> None:
+    """Answer who joins late and asks for the topic's key, as those do that know no `@adv`."""
+    for message, attachment in tuple(publisher.kept):
+        with contextlib.suppress(zenoh.ZError):  # whoever asked may have gone
+            query.reply(key, message, attachment=attachment)
+
+
+def _read(subscriber: Any, take: Take) -> None:
+    """Take messages, in a thread, until the subscription or the session is closed."""
+    with contextlib.suppress(zenoh.ZError):
+        sample = subscriber.recv()
+        while True:
+            while sample is not None:
+                take(_message(sample))
+                sample = subscriber.try_recv()
+            time.sleep(PAUSE)
+            sample = subscriber.recv()
+
+
+def _message(sample: zenoh.Sample | zenoh.Query) -> Message:
+    payload = sample.payload
+    attached = functools.partial(getattr, sample, "attachment")
+    if payload is None:  # a query needs none
+        return Message(0, bytes, attached)
+    return Message(len(payload), payload.to_bytes, attached)
+
+
+def _configuration(
+    connect: tuple[str, ...] | None, listen: tuple[str, ...] | None, file: str
+) -> zenoh.Config:
+    """Return the configuration of a peer as rmw_zenoh_cpp opens it, or as `file` says."""
+    plain, configuration = zenoh.Config(), zenoh.Config()
+    if file:
+        if not Path(file).is_file():
+            raise SessionError(f"zenoh_config: expected a file, found none at {file}")
+        try:
+            configuration = zenoh.Config.from_file(file)
+        except zenoh.ZError as error:
+            raise SessionError(
+                f"zenoh_config: {file}: expected a Zenoh configuration, found: {_reason(error)}"
+            ) from error
+    for key, value in _OURS.items():
+        if configuration.get_json(key) == plain.get_json(key):
+            configuration.insert_json5(key, json.dumps(value))
+    # The cache of an advanced publisher needs it.
+    configuration.insert_json5("timestamping/enabled", "true")
+    for way, endpoints in (("connect", connect), ("listen", listen)):
+        if endpoints is not None:
+            try:
+                configuration.insert_json5(f"{way}/endpoints", json.dumps(endpoints))
+            except zenoh.ZError as error:
+                raise SessionError(
+                    f'{way}: expected endpoints such as "tcp/127.0.0.1:7447", '
+                    f"found {list(endpoints)}: {_reason(error)}"
+                ) from error
+    return configuration
+
+
+def _reason(error: Exception) -> str:
+    return _IN_FILE.sub(r"\1 (line \2, column \3)", _IN_ZENOH.sub("", str(error)))

@@ -1,0 +1,228 @@
+"""The bridge's settings in a run's file."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+import msgspec
+
+from nodes.ros2.messages.incoming import READERS
+from nodes.ros2.messages.settings import Positive, PublishingConfig, Rate, check_name
+from nodes.ros2.messages.topics import Qos, dds_type, topic_name
+from nodes.ros2.messages.typestore import Distribution
+from runtime.channels.hold import HoldConfig
+from runtime.paths import InputPath
+from runtime.units import Duration, Latency
+
+ServiceGroup = Literal["simulation", "vehicle"]
+
+
+class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A topic to subscribe to, and what its messages become.
+
+    Attributes:
+        topic: Relative to the namespace, or with a leading slash.
+        type: ``geometry_msgs/msg/PoseStamped``.
+        use: ``as`` in the file: what a message becomes. ``estimate`` (from PoseStamped,
+            PoseWithCovarianceStamped, Odometry or the end of a Path), ``odometry`` (Odometry),
+            ``velocity`` (Twist, TwistStamped), ``position``, ``pose`` (PoseStamped), ``image``,
+            ``depth`` (Image), ``imu`` (Imu), ``range`` (Range), ``pressure`` (FluidPressure),
+            ``magnetic_field`` (MagneticField), ``fix`` (NavSatFix), ``camera`` (CameraInfo; the
+            run waits for the first one, and a camera is announced), ``done`` (Header or Time: an
+            estimator will say no more about the image of this stamp).
+        mapping: Instead: ``module:function``, which takes a message and a `MessageContext` and
+            returns an event, or None.
+        source: Of the events; if empty, the node's name and the topic.
+        vehicle: Which vehicle a ``velocity``, ``position`` or ``pose`` is for; empty for the only
+            one.
+        frame_id: If set, the frame that events name, whatever the message says.
+        scale_free: Whether an estimate's unit of length is its own.
+        reliable: Quality of service, as ROS shows it.
+        depth: How many messages wait at most.
+        max_rate: Messages a second at most; what comes faster is dropped.
+        transient_local: Whether to get messages that were published before, and are kept
+            (``/map``, ``/tf_static``); a ``camera`` always does.
+        timeout: Seconds that the run's start waits for a ``camera``, or for the estimator that
+            `answers_to` images.
+        answers_to: Source of the images whose stamps the messages of an ``estimate`` or ``done``
+            bear. Each image is then owed an answer, for which simulated time waits, and nothing
+            between the two is dropped; `depth` and `max_rate` do not apply. See
+            `runtime.channels.hold`.
+        latency: Time on the run's clock from the arrival of an image to its answer's event.
+        hold: How long is waited for an answer, and what if none comes.
+        needs: Topics of this node that the estimator must have subscribed to before the first
+            image is sent; if empty, that of the images.
+    """
+
+    topic: str
+    type: str
+    use: str = msgspec.field(name="as", default="")
+    mapping: str = ""
+    source: str = ""
+    vehicle: str = ""
+    frame_id: str = ""
+    scale_free: bool = False
+    reliable: bool = True
+    depth: Positive = 10
+    max_rate: Rate = 1000.0
+    transient_local: bool = False
+    timeout: Annotated[float, msgspec.Meta(ge=0, le=86_400)] = 10.0
+    answers_to: str = ""
+    latency: Latency = Latency(0.015)  # immutable
+    hold: HoldConfig = HoldConfig()
+    needs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        dds_type(self.type)
+        topic_name("/", self.topic)
+        if bool(self.use) == bool(self.mapping):
+            raise ValueError(f'{self.topic}: expected either as = "…" or mapping = "…"')
+        if self.mapping:
+            _importable(self.topic, "mapping", "module:function", self.mapping)
+        if self.use and (self.type, self.use) not in READERS:
+            known = [f"{use} from {type_}" for type_, use in READERS]
+            raise ValueError(
+                f"{self.topic}: expected one of: {', '.join(known)}; "
+                f"found {self.use} from {self.type}"
+            )
+        if self.use == "velocity" and self.frame_id not in {"", "map", "heading"}:
+            raise ValueError(
+                f'{self.topic}: frame_id: expected "map" or "heading" for a velocity, '
+                f"found {self.frame_id!r}"
+            )
+        if self.answers_to and (self.use not in {"estimate", "done"} or not self.reliable):
+            raise ValueError(
+                f'{self.topic}: answers_to: expected as = "estimate" or "done", and reliable, '
+                f'found as = "{self.use}", reliable = {str(self.reliable).lower()}'
+            )
+        if not self.answers_to and (self.needs or self.hold != HoldConfig()):
+            raise ValueError(
+                f"{self.topic}: needs, hold: expected answers_to beside them, found none"
+            )
+        if self.use == "done" and not self.answers_to:
+            raise ValueError(f'{self.topic}: as = "done": expected answers_to, found none')
+
+    @property
+    def qos(self) -> Qos:
+        """Return the quality of service."""
+        return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
+
+    def is_told_by(self, other: Subscription) -> bool:
+        """Tell whether this is an estimate of which another subscription says what is done."""
+        return (
+            (self.use, other.use) == ("estimate", "done")
+            and self.answers_to == other.answers_to
+            and other.source in {"", self.source}
+        )
+
+
+class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A topic to publish beyond those that the bridge has by itself.
+
+    Attributes:
+        topic: Relative to the namespace, or with a leading slash.
+        type: ``sensor_msgs/msg/BatteryState``.
+        event: ``module:Class`` of the events that become its messages; subclasses come too.
+        mapping: ``module:function``, which takes an event and a `MessageBuilder` and returns a
+            message of `type`, or None. It is called in a thread beside the loop.
+        source: Take only events of this source or below it.
+        reliable: Quality of service, as ROS shows it.
+        transient_local: Whether late joiners get the last `depth` messages.
+        depth: How many messages are kept, and how many events wait at most.
+    """
+
+    topic: str
+    type: str
+    event: str
+    mapping: str
+    source: str = ""
+    reliable: bool = True
+    transient_local: bool = False
+    depth: Positive = 10
+
+    def __post_init__(self) -> None:
+        dds_type(self.type)
+        topic_name("/", self.topic)
+        _importable(self.topic, "event", "module:Class", self.event)
+        _importable(self.topic, "mapping", "module:function", self.mapping)
+
+    @property
+    def qos(self) -> Qos:
+        """Return the quality of service."""
+        return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
+
+
+def _importable(topic: str, what: str, form: str, found: str) -> None:
+    if not re.fullmatch(r"\w+(\.\w+)*:\w+", found):
+        raise ValueError(f'{topic}: {what}: expected "{form}", found {found!r}')
+
+
+class Ros2BridgeConfig(PublishingConfig):
+    """Settings of the bridge, beside those of what is published (`PublishingConfig`).
+
+    Attributes:
+        domain_id: ROS_DOMAIN_ID.
+        node_name: As ``ros2 node list`` shows it.
+        distribution: Of ROS 2, on the other side.
+        keys: ``rmw_zenoh``, or ``ros2dds`` for a bridge with zenoh-plugin-ros2dds.
+        connect: Zenoh endpoints; if not given, those of `zenoh_config`, or else
+            ``tcp/localhost:7447``, where ``rmw_zenohd`` listens.
+        listen: The same for listening; or else any port of the loopback.
+        zenoh_config: A Zenoh configuration file (JSON5) for whatever else: TLS, access control,
+            shared memory. What it leaves out is as without it: no multicast, for one.
+        clock_rate: Messages a second on ``/clock``, on the run's clock.
+        max_message_size: Bytes of a message from outside at most.
+        definitions: Types that ROS 2 does not come with, and the ``.msg`` file of each.
+        subscriptions: Topics of ROS 2 whose messages become events.
+        publications: Topics to publish by functions of the user's own.
+        services: Groups of services to offer. ``simulation``: simulation_interfaces, by which ROS
+            pauses, steps and ends the run. ``vehicle``: ``std_srvs/Trigger`` as ``arm``,
+            ``disarm``, ``take_off`` and ``land`` below each vehicle's name.
+        step: Simulated time of one step of ``step_simulation`` and ``simulate_steps``.
+        paused: Whether simulated time stands from the run's start until a service lets it go on.
+    """
+
+    domain_id: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
+    node_name: str = "visnav"
+    distribution: Distribution = "jazzy"
+    keys: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
+    connect: tuple[str, ...] | None = None
+    listen: tuple[str, ...] | None = None
+    zenoh_config: InputPath = ""
+    clock_rate: Rate = 100.0
+    max_message_size: Positive = 64 * 1024 * 1024
+    definitions: dict[str, InputPath] = msgspec.field(default_factory=dict)
+    subscriptions: tuple[Subscription, ...] = ()
+    publications: tuple[OwnPublication, ...] = ()
+    services: tuple[ServiceGroup, ...] = ()
+    step: Duration = Duration(0.001)  # immutable
+    paused: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.services and self.keys != "rmw_zenoh":
+            raise ValueError(f'services: expected keys = "rmw_zenoh" for them, found "{self.keys}"')
+        if self.step < 1e-9:
+            raise ValueError(f"step: expected 1 ns or more, found {self.step:g} s")
+        if self.paused and "simulation" not in self.services:
+            raise ValueError('paused: expected services = ["simulation"] too, to let time go on')
+        if "/" in self.node_name:
+            raise ValueError(f"node_name: expected no slash, found {self.node_name!r}")
+        check_name("node_name", f"/{self.node_name}")
+        for type_ in self.definitions:
+            try:
+                dds_type(type_)
+            except ValueError as error:
+                raise ValueError(f"definitions: {error}") from None
+        if any(each.answers_to for each in self.subscriptions) and self.keys != "rmw_zenoh":
+            raise ValueError(
+                'answers_to: expected keys = "rmw_zenoh", whose messages are numbered and whose '
+                f'nodes are seen to go, found keys = "{self.keys}"'
+            )
+        for done in (each for each in self.subscriptions if each.use == "done"):
+            if len([each for each in self.subscriptions if each.is_told_by(done)]) != 1:
+                raise ValueError(
+                    f'{done.topic}: as = "done": expected one estimate with the same answers_to, '
+                    "and of the same source if there are several"
+                )

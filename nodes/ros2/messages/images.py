@@ -1,0 +1,269 @@
+"""Images and point clouds as messages, and images back as events. An image is copied once at most.
+
+Nearly all of such a message is its data, so the rest is serialised once by `typestore`, and then
+only stamp, length and data are written, into a buffer that is used again. The bytes are those
+that rosbags would make. A writer belongs to one topic and one thread at a time.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from events import DepthImage, Image, LidarScan
+from nodes.ros2.messages.encoding import depth_in_steps, encode_image
+from nodes.ros2.messages.stamps import Time
+from nodes.ros2.messages.typestore import TypeStore
+
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+
+_STAMP = struct.Struct("<iI")
+_STAMP_AT = 4
+"""A header is the first field of each of these messages, and begins with the stamp."""
+_LENGTH = struct.Struct("<I")
+
+_NONE = np.zeros(0, np.uint8)
+
+POINT = np.dtype([("xyz", "<f4", 3), ("bgr", "u1", 3), ("_", "u1")])
+"""A point of a cloud's PointCloud2: its colour is one field, ``rgb``, as PCL packs it."""
+
+LIDAR_POINT = np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
+"""A point of a lidar's PointCloud2, with the fields that Velodyne's driver writes, and that LIO-SAM
+and FAST-LIO read: ``time`` is seconds after the message's stamp, which is that of the first ray."""
+
+_FLOAT32, _UINT16 = 7, 4
+"""Of sensor_msgs/msg/PointField."""
+
+_XYZ = [("x", 0, _FLOAT32), ("y", 4, _FLOAT32), ("z", 8, _FLOAT32)]
+_COLOURED = [*_XYZ, ("rgb", 12, _FLOAT32)]
+_MEASURED = [*_XYZ, ("intensity", 12, _FLOAT32), ("ring", 16, _UINT16), ("time", 18, _FLOAT32)]
+
+_PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
+_TURNS = {
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "8UC3": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+}
+
+
+class ImageWriter:
+    """Writes ``sensor_msgs/msg/Image``.
+
+    Args:
+        store: Of the types.
+        frame_id: Optical frame.
+        encoding: ``rgb8``, ``mono8``, ``32FC1``, ``32SC1``; ``16UC1``: metres to millimetres.
+    """
+
+    def __init__(self, store: TypeStore, frame_id: str, encoding: str) -> None:
+        self._store = store
+        self.frame_id = frame_id
+        self.encoding = encoding
+        self._shape: tuple[int, ...] | None = None
+        self._buffer = bytearray()
+
+    def write(self, time: Time, data: npt.NDArray[Any]) -> bytearray:
+        """Return the message; it is overwritten by the next.
+
+        Args:
+            time: Seconds and nanoseconds.
+            data: Pixels, shape (height, width) or (height, width, channels).
+        """
+        if self.encoding == "16UC1":
+            data = depth_in_steps(data, 1000.0)
+        if data.shape != self._shape:
+            self._begin(data)
+        _STAMP.pack_into(self._buffer, _STAMP_AT, *time)
+        np.copyto(self._pixels, data)
+        return self._buffer
+
+    def _begin(self, data: npt.NDArray[Any]) -> None:
+        message = self._store.message("sensor_msgs/msg/Image")
+        head = self._store.serialize(
+            message(
+                header=self._store.header((0, 0), self.frame_id),
+                height=data.shape[0],
+                width=data.shape[1],
+                encoding=self.encoding,
+                is_bigendian=0,
+                step=data.nbytes // max(data.shape[0], 1),
+                data=_NONE,
+            )
+        )
+        _LENGTH.pack_into(head, len(head) - 4, data.nbytes)
+        self._shape = data.shape
+        self._buffer = head + bytearray(data.nbytes)
+        flat = np.frombuffer(self._buffer, data.dtype.newbyteorder("<"), data.size, len(head))
+        self._pixels = flat.reshape(data.shape)
+
+
+class CompressedWriter:
+    """Writes ``sensor_msgs/msg/CompressedImage`` as image_transport's plugin does.
+
+    Args:
+        store: Of the types.
+        frame_id: Optical frame.
+        format_: Of the encoded image.
+        quality: Of a JPEG, 1 to 100.
+    """
+
+    def __init__(
+        self, store: TypeStore, frame_id: str, format_: Literal["jpeg", "png"], quality: int
+    ) -> None:
+        self._store = store
+        self._frame_id = frame_id
+        self._format = format_
+        self._quality = quality
+
+    def write(self, time: Time, data: npt.NDArray[np.uint8]) -> bytearray:
+        """Return the message.
+
+        Args:
+            time: Seconds and nanoseconds.
+            data: Pixels, shape (height, width, 3) in RGB, or (height, width).
+        """
+        colour = data.ndim == 3
+        format_ = f"{'rgb8' if colour else 'mono8'}; {self._format} compressed "
+        message = self._store.message(COMPRESSED)
+        return self._store.serialize(
+            message(
+                header=self._store.header(time, self._frame_id),
+                format=format_ + ("bgr8" if colour else "mono8"),
+                data=encode_image(data, self._format, self._quality),
+            )
+        )
+
+
+class CloudWriter:
+    """Writes ``sensor_msgs/msg/PointCloud2``."""
+
+    def __init__(self, store: TypeStore, frame_id: str) -> None:
+        self._store = store
+        self._frame_id = frame_id
+
+    def cloud(
+        self, time: Time, points: npt.NDArray[np.float32], colors: npt.NDArray[np.uint8]
+    ) -> bytearray:
+        """Return the message of a cloud, with the fields x, y, z and rgb.
+
+        Args:
+            time: Seconds and nanoseconds.
+            points: Metres in ROS's axes, shape (n, 3).
+            colors: Red, green, blue, shape (n, 3), or (0, 3) for none: then all are white.
+        """
+        frame, rows = self._rows(time, points, POINT, _COLOURED)
+        rows["bgr"] = colors[:, ::-1] if len(colors) else 255
+        return frame
+
+    def scan(self, time: Time, points: npt.NDArray[np.float32], scan: LidarScan) -> bytearray:
+        """Return the message of a lidar's turn, with the fields of `LIDAR_POINT`.
+
+        Args:
+            time: Seconds and nanoseconds.
+            points: Metres in ROS's axes, shape (n, 3).
+            scan: Whose points they are.
+        """
+        frame, rows = self._rows(time, points, LIDAR_POINT, _MEASURED)
+        rows["intensity"], rows["ring"], rows["time"] = scan.intensities, scan.rings, scan.times
+        return frame
+
+    def _rows(
+        self,
+        time: Time,
+        points: npt.NDArray[np.float32],
+        kind: np.dtype[np.void],
+        fields: list[tuple[str, int, int]],
+    ) -> tuple[bytearray, npt.NDArray[np.void]]:
+        """Return a message with its points, and a view of its rows for the rest."""
+        count = len(points)
+        message = self._store.message("sensor_msgs/msg/PointCloud2")
+        field = self._store.message("sensor_msgs/msg/PointField")
+        frame = self._store.serialize(
+            message(
+                header=self._store.header(time, self._frame_id),
+                height=1,
+                width=count,
+                fields=[field(name=n, offset=at, datatype=t, count=1) for n, at, t in fields],
+                is_bigendian=False,
+                point_step=kind.itemsize,
+                row_step=kind.itemsize * count,
+                data=_NONE,
+                is_dense=bool(np.isfinite(points).all()),
+            )
+        )
+        dense = frame.pop()  # follows the data
+        begin, size = len(frame), count * kind.itemsize
+        _LENGTH.pack_into(frame, begin - 4, size)
+        frame += bytearray(size + 1)
+        frame[-1] = dense
+        rows = np.frombuffer(frame, kind, count, begin)
+        rows["xyz"] = points
+        return frame, rows
+
+
+def read_image(message: Any, source: str, stamp: int, frame_id: str) -> Image:
+    """Read a colour or grey image.
+
+    Raises:
+        ValueError: The encoding is another, or sizes do not fit each other.
+    """
+    channels = _PIXEL_BYTES.get(message.encoding)
+    if channels is None:
+        raise ValueError(
+            f"encoding: expected one of {', '.join(_PIXEL_BYTES)}, found {message.encoding!r:.80}"
+        )
+    pixels = _rows(message, channels).reshape(message.height, message.width, channels)
+    if channels == 1:
+        return Image(
+            stamp=stamp, source=source, frame_id=frame_id, encoding="mono8", data=pixels[:, :, 0]
+        )
+    turn = _TURNS.get(message.encoding)
+    rgb: Any = np.ascontiguousarray(pixels) if turn is None else cv2.cvtColor(pixels, turn)
+    return Image(stamp=stamp, source=source, frame_id=frame_id, data=rgb)
+
+
+def read_depth(message: Any, source: str, stamp: int, frame_id: str) -> DepthImage:
+    """Read depth in metres (``32FC1``) or millimetres (``16UC1``); what is not known is ``inf``.
+
+    Raises:
+        ValueError: The encoding is another, or sizes do not fit each other.
+    """
+    size = {"32FC1": 4, "16UC1": 2}.get(message.encoding)
+    if size is None:
+        raise ValueError(f"encoding: expected 32FC1 or 16UC1, found {message.encoding!r:.80}")
+    order = ">" if message.is_bigendian else "<"
+    rows = np.ascontiguousarray(_rows(message, size)).view(
+        f"{order}{'f' if size == 4 else 'u'}{size}"
+    )
+    metres = rows.astype(np.float32) * np.float32(1.0 if size == 4 else 0.001)
+    metres[~(metres > 0.0)] = np.inf
+    return DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=metres)
+
+
+def decoded_pixels(code: npt.NDArray[np.uint8]) -> npt.NDArray[Any]:
+    """Return the pixels of an encoded image, in RGB if it has colours.
+
+    Raises:
+        ValueError: It is no image.
+    """
+    pixels = cv2.imdecode(code, cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ValueError("not an image")
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if pixels.ndim == 3 else pixels
+
+
+def _rows(message: Any, pixel: int) -> npt.NDArray[np.uint8]:
+    """Return an image's bytes, shape (height, width * pixel), without what fills up its rows."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data: npt.NDArray[np.uint8] = message.data
+    if height < 1 or width < 1 or step < width * pixel or len(data) != height * step:
+        raise ValueError(
+            f"expected height * step bytes, and a step of {pixel} bytes a pixel or more, found "
+            f"{width} x {height} pixels, a step of {step} and {len(data)} bytes"
+        )
+    return data.reshape(height, step)[:, : width * pixel]

@@ -1,0 +1,306 @@
+"""ROS messages to events, in our frames. What makes no sense is refused with a ValueError.
+
+`READERS` has a function for each type of message and use; a mapping of the user's own is called
+alike. World ENU becomes NED, body FLU FRD; optical axes stay. See `frames`. Images are in
+`images`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf, isfinite
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from events import (
+    Event,
+    FluidPressure,
+    Imu,
+    MagneticField,
+    NavSatFix,
+    Odometry,
+    PoseEstimate,
+    PoseSetpoint,
+    PositionSetpoint,
+    Quaternion,
+    Range,
+    Vector3,
+    VelocitySetpoint,
+)
+from events.frames import axes_of, convert_covariance, convert_rotation, convert_vector
+from events.rotations import normalize, yaw_of
+from nodes.ros2.messages.images import read_depth, read_image
+from nodes.ros2.messages.stamps import Stamps
+
+
+class MessageContext(msgspec.Struct, frozen=True, kw_only=True):
+    """What a reader needs beside the message.
+
+    Attributes:
+        source: Of the event.
+        now: On the run's clock (ns).
+        stamps: How times in messages become stamps.
+        frame_id: If set, stands in the place of the message's own.
+        vehicle: Which a set-point is for.
+    """
+
+    source: str
+    now: int
+    stamps: Stamps = Stamps()
+    frame_id: str = ""
+    vehicle: str = ""
+
+    def stamp(self, header: Any) -> int:
+        """Return the time of a message with a header.
+
+        Raises:
+            ValueError: It is no time of this run.
+        """
+        return self.stamps.back(header.stamp.sec, header.stamp.nanosec, self.now)
+
+    def frame(self, header: Any, default: str) -> str:
+        """Return the frame that an event is to name."""
+        return self.frame_id or header.frame_id or default
+
+
+Reader = Callable[[Any, MessageContext], Event | None]
+
+
+def estimate(message: Any, context: MessageContext) -> Event:
+    """Read a PoseStamped as an estimate."""
+    return _estimate(message.header, message.pose, (), context)
+
+
+def estimate_with_covariance(message: Any, context: MessageContext) -> Event:
+    """Read a PoseWithCovarianceStamped, or an Odometry, as an estimate."""
+    covariance = message.pose.covariance
+    if not np.isfinite(covariance).all():
+        raise ValueError("covariance: expected finite numbers")
+    given = covariance if covariance.any() else ()
+    child = getattr(message, "child_frame_id", "") or "base_link"
+    return _estimate(message.header, message.pose.pose, given, context, child)
+
+
+def newest(message: Any, context: MessageContext) -> Event:
+    """Read the last pose of a Path, which each time holds all poses so far, as an estimate."""
+    if not message.poses:
+        raise ValueError("poses: expected one or more, found none")
+    pose = message.poses[-1]
+    pose.header.frame_id = pose.header.frame_id or message.header.frame_id
+    return estimate(pose, context)
+
+
+def odometry(message: Any, context: MessageContext) -> Event:
+    """Read an Odometry as a body's pose and twist."""
+    frame_id, child = context.frame(message.header, "odom"), message.child_frame_id or "base_link"
+    position, orientation = _pose(message.pose.pose, frame_id, child)
+    twist, axes = message.twist.twist, axes_of(child)
+    return Odometry(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=frame_id,
+        child_frame_id=child,
+        position=position,
+        orientation=orientation,
+        linear_velocity=convert_vector(axes, _vector(twist.linear)),
+        angular_velocity=convert_vector(axes, _vector(twist.angular)),
+    )
+
+
+def velocity(message: Any, context: MessageContext) -> Event:
+    """Read a Twist as a velocity along the vehicle's heading."""
+    return _velocity(message, context.now, context.frame_id or "heading", context)
+
+
+def stamped_velocity(message: Any, context: MessageContext) -> Event:
+    """Read a TwistStamped as a velocity in ``map``, or else along the vehicle's heading."""
+    frame_id = "map" if context.frame(message.header, "") == "map" else "heading"
+    return _velocity(message.twist, context.stamp(message.header), frame_id, context)
+
+
+def position(message: Any, context: MessageContext) -> Event:
+    """Read a PoseStamped as a place to be at, with its heading."""
+    place, orientation = _pose_in_map(message, context)
+    return PositionSetpoint(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        vehicle=context.vehicle,
+        position=place,
+        yaw=yaw_of(orientation),
+    )
+
+
+def pose(message: Any, context: MessageContext) -> Event:
+    """Read a PoseStamped as a place to be at in an attitude."""
+    place, orientation = _pose_in_map(message, context)
+    return PoseSetpoint(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        vehicle=context.vehicle,
+        position=place,
+        orientation=orientation,
+    )
+
+
+def imu(message: Any, context: MessageContext) -> Event:
+    """Read an Imu, without its orientation."""
+    frame_id = context.frame(message.header, "base_link")
+    axes = axes_of(frame_id)
+    return Imu(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=frame_id,
+        angular_velocity=convert_vector(axes, _vector(message.angular_velocity)),
+        linear_acceleration=convert_vector(axes, _vector(message.linear_acceleration)),
+    )
+
+
+def distance(message: Any, context: MessageContext) -> Event:
+    """Read a Range; what is not within its limits is out of reach."""
+    least, most, found = (
+        float(value) for value in (message.min_range, message.max_range, message.range)
+    )
+    return Range(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=context.frame(message.header, "base_link"),
+        range=found if least <= found <= most else inf,
+        field_of_view=float(message.field_of_view),
+        min_range=least,
+        max_range=most,
+    )
+
+
+def pressure(message: Any, context: MessageContext) -> Event:
+    """Read a FluidPressure."""
+    return FluidPressure(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        fluid_pressure=float(message.fluid_pressure),
+        variance=float(message.variance),
+    )
+
+
+def magnetic_field(message: Any, context: MessageContext) -> Event:
+    """Read a MagneticField, without its covariance."""
+    frame_id = context.frame(message.header, "base_link")
+    return MagneticField(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=frame_id,
+        magnetic_field=convert_vector(axes_of(frame_id), _vector(message.magnetic_field)),
+    )
+
+
+def fix(message: Any, context: MessageContext) -> Event:
+    """Read a NavSatFix.
+
+    Raises:
+        ValueError: The receiver has no fix.
+    """
+    if message.status.status < 0:
+        raise ValueError("status: expected a fix, found none")
+    known = message.position_covariance_type != message.COVARIANCE_TYPE_UNKNOWN
+    covariance = convert_covariance("world", message.position_covariance) if known else np.empty(0)
+    return NavSatFix(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        latitude=float(message.latitude),
+        longitude=float(message.longitude),
+        altitude=float(message.altitude),
+        position_covariance=tuple(covariance.tolist()),
+    )
+
+
+def image(message: Any, context: MessageContext) -> Event:
+    """Read an Image as a colour or grey image."""
+    header = message.header
+    return read_image(message, context.source, context.stamp(header), context.frame(header, ""))
+
+
+def depth(message: Any, context: MessageContext) -> Event:
+    """Read an Image as depth."""
+    header = message.header
+    return read_depth(message, context.source, context.stamp(header), context.frame(header, ""))
+
+
+def nothing(message: Any, context: MessageContext) -> None:
+    """Make no event of a message."""
+
+
+READERS: dict[tuple[str, str], Reader] = {
+    ("geometry_msgs/msg/PoseStamped", "estimate"): estimate,
+    ("geometry_msgs/msg/PoseWithCovarianceStamped", "estimate"): estimate_with_covariance,
+    ("nav_msgs/msg/Odometry", "estimate"): estimate_with_covariance,
+    ("nav_msgs/msg/Odometry", "odometry"): odometry,
+    ("nav_msgs/msg/Path", "estimate"): newest,
+    ("geometry_msgs/msg/Twist", "velocity"): velocity,
+    ("geometry_msgs/msg/TwistStamped", "velocity"): stamped_velocity,
+    ("geometry_msgs/msg/PoseStamped", "position"): position,
+    ("geometry_msgs/msg/PoseStamped", "pose"): pose,
+    ("sensor_msgs/msg/Image", "image"): image,
+    ("sensor_msgs/msg/Image", "depth"): depth,
+    ("sensor_msgs/msg/Imu", "imu"): imu,
+    ("sensor_msgs/msg/Range", "range"): distance,
+    ("sensor_msgs/msg/FluidPressure", "pressure"): pressure,
+    ("sensor_msgs/msg/MagneticField", "magnetic_field"): magnetic_field,
+    ("sensor_msgs/msg/NavSatFix", "fix"): fix,
+    ("sensor_msgs/msg/CameraInfo", "camera"): nothing,
+    ("std_msgs/msg/Header", "done"): nothing,
+    ("builtin_interfaces/msg/Time", "done"): nothing,
+}
+"""By type of message and use."""
+
+
+def _estimate(
+    header: Any, pose: Any, covariance: Any, context: MessageContext, child: str = "base_link"
+) -> Event:
+    frame_id = context.frame(header, "odom")
+    place, orientation = _pose(pose, frame_id, child)
+    given = convert_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
+    return PoseEstimate(
+        stamp=context.stamp(header),
+        source=context.source,
+        frame_id=frame_id,
+        child_frame_id=child,
+        position=place,
+        orientation=orientation,
+        covariance=tuple(given),
+    )
+
+
+def _velocity(twist: Any, stamp: int, frame_id: str, context: MessageContext) -> Event:
+    turned = convert_vector("world" if frame_id == "map" else "body", _vector(twist.linear))
+    return VelocitySetpoint(
+        stamp=stamp,
+        source=context.source,
+        vehicle=context.vehicle,
+        frame_id=frame_id,
+        velocity=turned,
+        yaw_rate=-_vector(twist.angular)[2],
+    )
+
+
+def _pose_in_map(message: Any, context: MessageContext) -> tuple[Vector3, Quaternion]:
+    frame_id = context.frame(message.header, "map")
+    if frame_id != "map":
+        raise ValueError(f'frame_id: expected "map", found {frame_id!r:.80}')
+    return _pose(message.pose, "map", "base_link")
+
+
+def _pose(pose: Any, parent: str, child: str) -> tuple[Vector3, Quaternion]:
+    q, axes = pose.orientation, axes_of(parent)
+    rotation = normalize((float(q.w), float(q.x), float(q.y), float(q.z)))
+    return (
+        convert_vector(axes, _vector(pose.position)),
+        convert_rotation(axes, axes_of(child), rotation),
+    )
+
+
+def _vector(vector: Any) -> Vector3:
+    x, y, z = float(vector.x), float(vector.y), float(vector.z)
+    if not isfinite(x + y + z):
+        raise ValueError(f"expected finite numbers, found {(x, y, z)}")
+    return (x, y, z)

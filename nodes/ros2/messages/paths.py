@@ -1,0 +1,158 @@
+"""The path of a vehicle, or of an estimate of it, as ``nav_msgs/msg/Path`` for RViz.
+
+A path is sent whole again and again, so its poses are kept as the bytes that they are sent as; the
+bytes are those that rosbags would make.
+"""
+
+from __future__ import annotations
+
+import struct
+from math import dist
+from typing import Any
+
+import numpy as np
+
+from events import Odometry, PoseEstimate, Quaternion, Vector3
+from events.frames import convert_rotation, convert_vector
+from nodes.ros2.messages.frame_names import FrameNames
+from nodes.ros2.messages.settings import PublishingConfig
+from nodes.ros2.messages.stamps import Time
+from nodes.ros2.messages.typestore import TypeStore
+from runtime.time.schedule import SECOND
+
+_COUNT = struct.Struct("<I")
+_CDR = 4
+"""Bytes before a message, from which alignment is not counted."""
+_POSE = 56
+"""Seven float64: position, and the quaternion's x, y, z, w."""
+
+
+class Paths:
+    """The paths of all vehicles and estimates.
+
+    Args:
+        store: Of the types.
+        names: Of frames, as ROS calls them.
+        config: How far apart poses are, how many there are, and how often a path is sent.
+    """
+
+    def __init__(self, store: TypeStore, names: FrameNames, config: PublishingConfig) -> None:
+        self._store = store
+        self._names = names
+        self._config = config
+        self._paths: dict[str, tuple[PathMessage, int]] = {}
+        """By source: the path, and when it is to be sent again (ns)."""
+
+    def message(self, event: Odometry | PoseEstimate, time: Time) -> bytearray | None:
+        """Add a pose to the path of its source; return the path if that is due.
+
+        Args:
+            event: The pose.
+            time: Of its stamp, in messages: seconds and nanoseconds.
+        """
+        config, frame = self._config, self._names.name(event.frame_id, event.source)
+        path, due = self._paths.get(event.source, (None, event.stamp))
+        if path is None or path.frame != frame:
+            path = PathMessage(self._store, frame, config.path_step, config.path_length)
+            self._paths[event.source] = (path, due)
+        axes = self._names.axes(event.frame_id)
+        position = convert_vector(axes, event.position)
+        far = path.far(position)
+        if not far and event.stamp < due:
+            return None
+        rotation = convert_rotation(axes, self._names.axes(event.child_frame_id), event.orientation)
+        if far:
+            path.add(time, position, rotation)
+        if event.stamp < due:
+            return None
+        self._paths[event.source] = (path, event.stamp + round(SECOND / config.path_rate))
+        return path.message(time, position, rotation)
+
+
+class PathMessage:
+    """The message of a path: poses of one body in one frame.
+
+    Args:
+        store: Of the types.
+        frame: The poses' parent, as ROS calls it.
+        step: Metres from one pose to the next that is kept.
+        length: Poses of a message at most. When there would be more, every other is left out and
+            the step is doubled: a path becomes coarser, but never loses its start.
+    """
+
+    def __init__(self, store: TypeStore, frame: str, step: float, length: int) -> None:
+        self.frame = frame
+        self.step = step
+        self._store = store
+        name = frame.encode()
+        head = 12 + len(name) + 1  # stamp, length of the name, the name, a zero
+        self._row = np.dtype(
+            {
+                "names": ["sec", "nanosec", "size", "name", "pose"],
+                "formats": ["<i4", "<u4", "<u4", f"S{len(name) + 1}", ("<f8", 7)],
+                "offsets": [0, 4, 8, 12, _aligned(head, 8)],
+                "itemsize": _aligned(head, 8) + _POSE,
+            }
+        )
+        self._rows = np.zeros(length, self._row)
+        self._rows["size"], self._rows["name"] = len(name) + 1, name
+        self._kept = 0
+        self._last: Vector3 = (0.0, 0.0, 0.0)
+        self._count_at = _CDR + _aligned(12 + len(name) + 1, 4)
+
+    def far(self, position: Vector3) -> bool:
+        """Tell whether a pose here would be kept."""
+        return not self._kept or dist(position, self._last) >= self.step
+
+    def add(self, time: Time, position: Vector3, orientation: Quaternion) -> None:
+        """Keep a pose.
+
+        Args:
+            time: Seconds and nanoseconds.
+            position: Metres in ROS's axes.
+            orientation: The same.
+        """
+        if self._kept == len(self._rows) - 1:  # the last is for the newest pose
+            half = self._rows[: self._kept : 2].copy()
+            self._rows[: len(half)] = half
+            self._kept, self.step = len(half), 2.0 * self.step
+        self._put(self._kept, time, position, orientation)
+        self._kept, self._last = self._kept + 1, position
+
+    def message(self, time: Time, position: Vector3, orientation: Quaternion) -> bytearray:
+        """Return the path up to a pose, which need not be kept.
+
+        Args:
+            time: Seconds and nanoseconds.
+            position: Metres in ROS's axes.
+            orientation: The same.
+        """
+        self._put(self._kept, time, position, orientation)
+        count = self._kept + (self._kept == 0 or dist(position, self._last) > 0.0)
+        data = self._first(time)
+        _COUNT.pack_into(data, self._count_at, count)
+        data += self._rows[1:count].tobytes()
+        return data
+
+    def _put(self, index: int, time: Time, position: Vector3, orientation: Quaternion) -> None:
+        row, (w, x, y, z) = self._rows[index], orientation
+        row["sec"], row["nanosec"] = time
+        row["pose"] = (*position, x, y, z, w)
+
+    def _first(self, time: Time) -> bytearray:
+        """Return a path of the first pose: after it, all poses are aligned alike."""
+        make, row = self._store.message, self._rows[0]
+        x, y, z, qx, qy, qz, qw = row["pose"].tolist()
+        pose: Any = make("geometry_msgs/msg/Pose")(
+            position=make("geometry_msgs/msg/Point")(x=x, y=y, z=z),
+            orientation=make("geometry_msgs/msg/Quaternion")(x=qx, y=qy, z=qz, w=qw),
+        )
+        stamp = int(row["sec"]), int(row["nanosec"])
+        header = self._store.header(stamp, self.frame)
+        first = make("geometry_msgs/msg/PoseStamped")(header=header, pose=pose)
+        path = make("nav_msgs/msg/Path")(header=self._store.header(time, self.frame), poses=[first])
+        return self._store.serialize(path)
+
+
+def _aligned(offset: int, size: int) -> int:
+    return -(-offset // size) * size

@@ -1,0 +1,171 @@
+"""The frames on ``/tf`` and ``/tf_static``: map, odom, base_link, camera_link, optical frames.
+
+REP 105: ``odom`` is where the vehicle started, so ``map → odom`` is fixed, and estimates that are
+in ``odom`` stand where they should. Poses in, transforms in ROS's names and axes out; no messages.
+"""
+
+from __future__ import annotations
+
+from events import (
+    Announcement,
+    BodyAnnouncement,
+    CameraAnnouncement,
+    ImuAnnouncement,
+    Odometry,
+    PoseEstimate,
+    PoseStamped,
+    SensorAnnouncement,
+    TransformStamped,
+    VehicleAnnouncement,
+)
+from events.frames import OPTICAL_TO_FLU, Axes, convert_rotation, convert_vector
+from events.poses import Pose, relative
+from events.rotations import inverse, multiply
+from nodes.ros2.messages.frame_names import FrameNames
+from nodes.ros2.messages.messages import Transform
+from nodes.ros2.messages.topics import ros_name
+
+_LINK_IN_OPTICAL = inverse(OPTICAL_TO_FLU)
+
+
+class Transforms:
+    """The tree of frames of all vehicles and cameras.
+
+    Args:
+        names: What ROS calls our frames.
+        vehicle: The only one whose frames are shown; if empty, all are.
+        body: ``truth``, or the source of the estimates that place its vehicle instead.
+    """
+
+    def __init__(self, names: FrameNames, vehicle: str, body: str) -> None:
+        self._names = names
+        self._only = vehicle
+        self._body = body
+        self._starts: dict[str, Pose] = {}
+        """By vehicle."""
+        self._fixed: dict[tuple[str, str], tuple[str, Pose]] = {}
+        """Vehicle (or sensor) and child to parent and pose; names are given when all are known."""
+        self._mounted: dict[str, tuple[str, str, Pose] | None] = {}
+        """Optical frame of a camera to source, parent and pose; none if nothing carries it."""
+        self._free: dict[str, str] = {}
+        """Sources of cameras that nothing carries, to their optical frame."""
+        self._bodies: set[str] = set()
+        """Sources of what moves by itself; each is its frame, too."""
+
+    def announced(self, announcement: Announcement) -> None:
+        """Add where a vehicle starts, or where a camera is mounted."""
+        if isinstance(announcement, VehicleAnnouncement):
+            source = announcement.source
+            if self._only in {"", source} and source not in self._starts:
+                self._names.vehicles.add(source)
+                self._starts[source] = announcement.position, announcement.orientation
+                self._fixed[source, "odom"] = "map", self._starts[source]
+        elif isinstance(announcement, CameraAnnouncement):
+            self._names.add(announcement)
+            optical, parent = announcement.frame_id, announcement.parent_frame_id
+            if parent == "map":
+                self._free[announcement.source] = optical
+                self._mounted[optical] = None
+            else:
+                mounting = announcement.position, announcement.orientation
+                self._mounted[optical] = announcement.source, parent, mounting
+        elif isinstance(announcement, SensorAnnouncement | ImuAnnouncement):
+            if announcement.frame_id != announcement.parent_frame_id:
+                mounting = announcement.position, announcement.orientation
+                key = announcement.source, announcement.frame_id
+                self._fixed[key] = announcement.parent_frame_id, mounting
+        elif isinstance(announcement, BodyAnnouncement):
+            self._bodies.add(announcement.source)
+
+    def add_static(self, event: TransformStamped) -> bool:
+        """Add a fixed transform that a node sent; tell whether it is new."""
+        vehicle, child = self._names.vehicles.of(event.source), event.child_frame_id
+        if self._names.camera(child) or self._is_fixed(vehicle, child):
+            return False
+        self._fixed[vehicle, child] = event.frame_id, (event.translation, event.rotation)
+        return True
+
+    def static(self) -> list[Transform]:
+        """Return all fixed transforms."""
+        found = [
+            self._turned(parent, child, pose, source)
+            for (source, child), (parent, pose) in self._fixed.items()
+        ]
+        for optical, mounted in self._mounted.items():
+            if mounted is not None:
+                source, parent, pose = mounted
+                found.append(self._link(parent, optical, pose, source))
+            frames = self._names.camera(optical)
+            assert frames is not None
+            found.append(Transform(frames.link, frames.optical, (0.0, 0.0, 0.0), OPTICAL_TO_FLU))
+        return found
+
+    def odometry(self, event: Odometry) -> list[Transform]:
+        """Return where a true pose puts a vehicle's body, or one that has a frame of its own."""
+        known = not self._starts or event.source in self._starts
+        if not known and (self._only or event.child_frame_id == "base_link"):
+            return []
+        if self._body != "truth" and self._of_body(event.source):
+            return []
+        return self._place(event)
+
+    def estimate(self, event: PoseEstimate) -> list[Transform]:
+        """Return where an estimate puts the body."""
+        return self._place(event) if event.source == self._body else []
+
+    def pose(self, event: PoseStamped) -> list[Transform]:
+        """Return where a free camera is, or a body that moves by itself."""
+        if event.source in self._bodies:
+            axes = self._names.axes(event.frame_id)
+            rotation = convert_rotation(axes, "body", event.orientation)
+            place = convert_vector(axes, event.position)
+            return [Transform(event.frame_id, ros_name(event.source), place, rotation)]
+        frame_id = self._free.get(event.source)
+        if frame_id is None:
+            return []
+        pose = event.position, event.orientation
+        return [self._link(event.frame_id, frame_id, pose, event.source)]
+
+    def moving(self, event: TransformStamped) -> list[Transform]:
+        """Return a moving transform that a node sent."""
+        child = event.child_frame_id
+        fixed = self._is_fixed(self._names.vehicles.of(event.source), child)
+        if fixed or self._names.camera(child) or child == "base_link":
+            return []
+        pose = event.translation, event.rotation
+        return [self._turned(event.frame_id, child, pose, event.source)]
+
+    def _is_fixed(self, vehicle: str, child: str) -> bool:
+        """Tell whether a frame of a vehicle has its place already."""
+        return any(
+            frame == child and self._names.vehicles.of(source) == vehicle
+            for source, frame in self._fixed
+        )
+
+    def _of_body(self, source: str) -> bool:
+        return self._names.vehicles.of(source) == self._names.vehicles.of(self._body)
+
+    def _place(self, event: Odometry | PoseEstimate) -> list[Transform]:
+        parent, child = event.frame_id, event.child_frame_id
+        vehicle = self._names.vehicles.of(event.source)
+        if self._is_fixed(vehicle, child) or self._names.camera(child):
+            return []
+        pose, start = (event.position, event.orientation), self._starts.get(vehicle)
+        if parent == "map" and start is not None:
+            parent, pose = "odom", relative(start, pose)
+        return [self._turned(parent, child, pose, event.source)]
+
+    def _turned(self, parent: str, child: str, pose: Pose, source: str) -> Transform:
+        to, of = self._names.axes(parent), self._names.axes(child)
+        rotation = convert_rotation(to, of, pose[1])
+        names = self._names.name(parent, source), self._names.name(child, source)
+        return Transform(*names, convert_vector(to, pose[0]), rotation)
+
+    def _link(self, parent: str, optical: str, pose: Pose, source: str) -> Transform:
+        """Return a camera's body in its parent, from its optical frame's pose."""
+        axes: Axes = self._names.axes(parent)
+        frames = self._names.camera(optical)
+        assert frames is not None
+        rotation = multiply(convert_rotation(axes, "optical", pose[1]), _LINK_IN_OPTICAL)
+        name = self._names.name(parent, source)
+        return Transform(name, frames.link, convert_vector(axes, pose[0]), rotation)

@@ -1,0 +1,265 @@
+"""Message types, their hashes, CDR, and bags: the only module that imports rosbags.
+
+Messages are objects of the classes that rosbags makes from the types' definitions; their fields
+have the names in ROS's files.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from nodes.ros2.messages.topics import NO_HASH, dds_type
+from runtime.errors import MissingDependencyError, suggest
+from runtime.extras import install_command
+
+Distribution = Literal["humble", "iron", "jazzy", "kilted"]
+
+
+def _hash_as_ros_2_does() -> None:
+    """Have rosbags hash ``char`` as ROS 2 has it in message files: as ``uint8``.
+
+    rosidl_adapter turns the one into the other before anything is hashed. rosbags takes it for
+    IDL's char, so that keys of such types would meet nobody, and bags with them be refused.
+    """
+    from rosbags.typesys.store import TIDMAP
+
+    TIDMAP["char"] = TIDMAP["uint8"]
+
+
+class MessageError(ValueError):
+    """Bytes are not the message that they should be; the message says what is wrong."""
+
+
+class TypeStore:
+    """The message types of one distribution of ROS 2.
+
+    Args:
+        distribution: Whose definitions hold; a few differ (``sensor_msgs/msg/Range``).
+        definitions: Further types, with the ``.msg`` file of each.
+
+    Raises:
+        MissingDependencyError: rosbags is not installed.
+        ValueError: A definition cannot be read.
+    """
+
+    def __init__(
+        self, distribution: Distribution = "jazzy", definitions: Mapping[str, str] | None = None
+    ) -> None:
+        try:
+            from rosbags.interfaces import Nodetype
+            from rosbags.serde import SerdeError
+            from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+            _hash_as_ros_2_does()
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"messages of ROS 2 need rosbags: {install_command('ros2')}"
+            ) from error
+        self._error = SerdeError
+        self._node, self._parse = Nodetype, get_types_from_msg
+        self._store = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
+        self._hashed = distribution != "humble"
+        for name, file in (definitions or {}).items():
+            dds_type(name)
+            try:
+                self._store.register(get_types_from_msg(Path(file).read_text("utf-8"), name))
+            except (OSError, UnicodeError, TypesysError) as error:
+                raise ValueError(
+                    f"definitions: {name}: expected a readable .msg file, found {file}: {error}"
+                ) from error
+
+    def add(self, type_: str, definition: str) -> None:
+        """Add a message, or a service, be they part of an action or not.
+
+        A service's messages are ``…_Request`` and ``…_Response``; its hash is that of a type with
+        these and an event as its fields (REP 2016).
+
+        Args:
+            type_: ``std_srvs/srv/Trigger``.
+            definition: As in its ``.msg`` or ``.srv`` file, without default values.
+        """
+        plain, node = f"{type_.split('/')[0]}/msg/Plain", self._node  # rosbags names it so
+        if "---" not in definition:
+            self._store.register({type_: self._parse(definition, plain)[plain]})
+            return
+        request, _, response = definition.partition("---")
+        types: Any = {
+            f"{type_}_Request": self._parse(request, plain)[plain],
+            f"{type_}_Response": self._parse(response, plain)[plain],
+        }
+        if self._hashed:
+            event: Any = [("info", (node.NAME, "service_msgs/msg/ServiceEventInfo"))]
+            event += [
+                (part.lower(), (node.SEQUENCE, ((node.NAME, f"{type_}_{part}"), 1)))
+                for part in ("Request", "Response")
+            ]
+            types[f"{type_}_Event"] = [], event
+        parts = [each.rpartition("_")[2] for each in types]
+        types[type_] = (
+            [],
+            [(f"{part.lower()}_message", (node.NAME, f"{type_}_{part}")) for part in parts],
+        )
+        self._store.register(types)
+
+    def check(self, type_: str) -> None:
+        """Make sure that a type is known, and what it is made of.
+
+        Raises:
+            ValueError: It is not known.
+        """
+        if type_ not in self._store.types:
+            raise ValueError(
+                f"expected a known message type, found {type_!r}"
+                + suggest(type_, self._store.types)
+            )
+        try:
+            self._store.get_msgdef(type_)
+        except KeyError as error:
+            raise ValueError(f"{type_}: expected a definition of {error} too, found none") from None
+
+    def hash(self, type_: str) -> str:
+        """Return a type's hash as it stands in keys (REP 2011: ``RIHS01_`` and 64 digits).
+
+        Raises:
+            ValueError: The type is not known.
+        """
+        self.check(type_)
+        return self._store.hash_rihs01(type_) if self._hashed else NO_HASH
+
+    def definition(self, type_: str) -> str:
+        """Return a type's definition with those of what it is made of, as recordings have it.
+
+        Raises:
+            ValueError: The type is not known.
+        """
+        self.check(type_)
+        text: str = self._store.generate_msgdef(type_, ros_version=2)[0]
+        return text
+
+    def message(self, type_: str) -> Any:
+        """Return the class of a type's messages."""
+        return self._store.types[type_]
+
+    def header(self, time: tuple[int, int], frame_id: str) -> Any:
+        """Return a ``std_msgs/msg/Header`` with a time in seconds and nanoseconds."""
+        stamp = self.message("builtin_interfaces/msg/Time")(sec=time[0], nanosec=time[1])
+        return self.message("std_msgs/msg/Header")(stamp=stamp, frame_id=frame_id)
+
+    def zero(self, type_: str) -> Any:
+        """Return a message of zeros, empty texts and empty sequences.
+
+        Raises:
+            ValueError: The type is not known.
+        """
+        self.check(type_)
+        _, fields = self._store.fielddefs[type_]
+        return self._store.types[type_](**{name: self._zero(*each) for name, each in fields})
+
+    def _zero(self, kind: Any, of: Any) -> Any:
+        """Return a field's zero, by what rosbags says of it."""
+        if kind.name == "NAME":
+            return self.zero(of)
+        if kind.name == "BASE":
+            texts = {"string": "", "wstring": "", "bool": False}
+            return texts.get(of[0], 0.0 if of[0].startswith("float") else 0)
+        inner, count = of
+        count = count if kind.name == "ARRAY" else 0  # of a sequence, the most there may be
+        if inner[0].name == "BASE" and "string" not in inner[1][0]:
+            name = inner[1][0]
+            return np.zeros(count, "uint8" if name in {"octet", "byte", "char"} else name)
+        return [self._zero(*inner) for _ in range(count)]
+
+    def serialize(self, message: Any) -> bytearray:
+        """Return a message as CDR, with its header of four bytes."""
+        written = self._store.serialize_cdr(message, message.__msgtype__, little_endian=True)
+        buffer = written.obj
+        return buffer if isinstance(buffer, bytearray) else bytearray(written)
+
+    def deserialize(self, data: bytes, type_: str) -> Any:
+        """Read a message. Its arrays are views of `data`.
+
+        Raises:
+            MessageError: The bytes are no message of that type.
+        """
+        try:
+            return self._store.deserialize_cdr(data, type_)
+        # rosbags means to raise its own error only; what comes from outside had better not test it.
+        except (self._error, ValueError, ArithmeticError, LookupError, MemoryError) as error:
+            raise MessageError(str(error)) from None
+
+
+class Bag:
+    """Reads a bag of ROS 2 (a folder, or an MCAP or SQLite file), or of ROS 1.
+
+    Raises:
+        MissingDependencyError: rosbags is not installed.
+        ValueError: It cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from rosbags.highlevel import AnyReader, AnyReaderError
+            from rosbags.typesys import Stores, get_typestore
+
+            _hash_as_ros_2_does()
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"bags need rosbags: {install_command('record')}"
+            ) from error
+        self._path = path
+        try:
+            # For bags that have no definitions, as SQLite's of before Iron.
+            store = get_typestore(Stores.ROS2_JAZZY)
+            self._reader = AnyReader([path], default_typestore=store)
+            self._reader.open()  # one that fails closes what it had opened
+        except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
+            raise ValueError(f"{path}: expected a bag of ROS, found: {error}") from error
+        self._errors = (AnyReaderError, ValueError, ArithmeticError, LookupError, MemoryError)
+        self.start = int(self._reader.start_time)
+        """When the first message was received (ns)."""
+        self.end = int(self._reader.end_time)
+
+    def topics(self) -> dict[str, tuple[str, int]]:
+        """Return the type and the number of messages of each topic; the type is empty if mixed."""
+        return {
+            name: (info.msgtype or "", int(info.msgcount))
+            for name, info in self._reader.topics.items()
+        }
+
+    def messages(
+        self,
+        topics: Collection[str],
+        start: int | None = None,
+        stop: int | None = None,
+        newest: bool = False,
+    ) -> Iterator[tuple[str, str, int, Any]]:
+        """Yield topic, type, time of receipt (ns) and message, in the order of receipt.
+
+        Args:
+            topics: Which.
+            start: Messages received before it (ns) are left out.
+            stop: So are those received at it and after.
+            newest: Only the last of all; no other is decoded.
+
+        Raises:
+            ValueError: A message, or the bag, is damaged.
+        """
+        chosen = [each for each in self._reader.connections if each.topic in topics]
+        if not chosen:
+            return
+        try:
+            found = self._reader.messages(chosen, start, stop)
+            for connection, time, data in deque(found, maxlen=1) if newest else found:
+                message = self._reader.deserialize(data, connection.msgtype)
+                yield connection.topic, connection.msgtype, time, message
+        except self._errors as error:
+            raise ValueError(f"{self._path}: expected a readable bag, found: {error}") from error
+
+    def close(self) -> None:
+        """Close it."""
+        self._reader.close()

@@ -1,0 +1,1 @@
+"""Viewers: windows and programs that show a run."""

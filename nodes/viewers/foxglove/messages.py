@@ -1,0 +1,89 @@
+"""Messages that Foxglove has and ROS has not: paths and bodies, features in images, the log.
+
+Paths and bodies are in ROS's frames and axes, as all else is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from events import Event, TrackedFeatures, TrackingLost, Vector3
+from events.frames import convert_vector
+from nodes.viewers.common.appearance import INLIER, OUTLIER, VEHICLE, Box, Colour, describe
+from nodes.viewers.common.paths import Trail
+from runtime.time.schedule import SECOND
+
+
+class Messages:
+    """Makes messages.
+
+    Args:
+        types: ``foxglove.messages``.
+    """
+
+    def __init__(self, types: Any) -> None:
+        self._m = types
+
+    def features(self, event: TrackedFeatures) -> Any:
+        """Return an ImageAnnotations: what agrees in green, the rest in red."""
+        groups = [
+            self._m.PointsAnnotation(
+                timestamp=self._time(event.stamp),
+                type=self._m.PointsAnnotationType.Points,
+                points=[self._m.Point2(x=x, y=y) for x, y in event.points[chosen].tolist()],
+                outline_color=self._colour(colour),
+                fill_color=self._colour(colour),
+                thickness=4.0,
+            )
+            for chosen, colour in ((event.inliers, INLIER), (~event.inliers, OUTLIER))
+        ]
+        return self._m.ImageAnnotations(points=groups)
+
+    def log(self, event: Event) -> Any:
+        """Return a Log."""
+        levels = self._m.LogLevel
+        return self._m.Log(
+            timestamp=self._time(event.stamp),
+            level=levels.Warning if isinstance(event, TrackingLost) else levels.Info,
+            message=describe(event),
+            name=event.source,
+        )
+
+    def scene(self, *entities: Any) -> Any:
+        """Return a SceneUpdate of what `line` and `body` return."""
+        return self._m.SceneUpdate(entities=list(entities))
+
+    def line(self, trail: Trail, name: str, piece: list[Vector3]) -> Any:
+        """Return a piece of a path as a SceneEntity."""
+        strip = self._m.LinePrimitive(
+            type=self._m.LinePrimitiveLineType.LineStrip,
+            thickness=trail.thickness,
+            points=[self._m.Point3(x=x, y=y, z=z) for x, y, z in piece],
+            color=self._colour(trail.colour),
+        )
+        return self._m.SceneEntity(frame_id=trail.frame_id, id=name, lines=[strip])
+
+    def body(self, name: str, frame_id: str, boxes: Sequence[Box] = VEHICLE) -> Any:
+        """Return a body as a SceneEntity that goes where its frame goes; by default a vehicle's."""
+        vector = self._m.Vector3
+        cubes = []
+        for centre, (length, width, height), colour in boxes:
+            x, y, z = convert_vector("body", centre)
+            cubes.append(
+                self._m.CubePrimitive(
+                    pose=self._m.Pose(
+                        position=vector(x=x, y=y, z=z), orientation=self._m.Quaternion(w=1.0)
+                    ),
+                    size=vector(x=length, y=width, z=height),
+                    color=self._colour(colour),
+                )
+            )
+        return self._m.SceneEntity(frame_id=frame_id, id=name, frame_locked=True, cubes=cubes)
+
+    def _colour(self, colour: Colour) -> Any:
+        r, g, b = colour
+        return self._m.Color(r=r / 255, g=g / 255, b=b / 255, a=1.0)
+
+    def _time(self, stamp: int) -> Any:
+        return self._m.Timestamp(sec=stamp // SECOND, nsec=stamp % SECOND)

@@ -1,0 +1,242 @@
+"""What becomes of each event: ROS's messages, as the bridge sends them, and Foxglove's own.
+
+Images and point clouds are put from threads beside the loop, one of each kind at a time; the
+rest takes some microseconds and is put at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from events import (
+    Announcement,
+    BodyAnnouncement,
+    CameraAnnouncement,
+    Event,
+    Odometry,
+    PlannedPose,
+    PointCloud,
+    PoseEstimate,
+    PositionSetpoint,
+    SegmentationImage,
+    TrackedFeatures,
+    TrackingEvent,
+    TransformStamped,
+    VehicleAnnouncement,
+    VehicleEvent,
+)
+from events.frames import convert_vector
+from events.poses import Pose
+from nodes.ros2.messages import publishing as ros
+from nodes.ros2.messages.settings import ALL_GROUPS, PublishingConfig
+from nodes.ros2.messages.stamps import Stamps
+from nodes.ros2.messages.topics import ros_name
+from nodes.ros2.messages.typestore import TypeStore
+from nodes.trajectory import RecentPoses
+from nodes.viewers.common.appearance import PLAN, Colour, estimate_colour, moving_body, truth_colour
+from nodes.viewers.common.paths import Trail, estimate_frame
+from nodes.viewers.common.selection import PlanSelection
+from nodes.viewers.foxglove.messages import Messages
+from nodes.viewers.foxglove.ros_topics import RosTopic, RosTopics
+from nodes.viewers.foxglove.server import Server
+from nodes.viewers.foxglove.settings import FoxgloveConfig
+
+LARGE: tuple[type[Event], ...] = (
+    *(kind for kind in ros.LARGE if kind is not SegmentationImage),
+    TrackedFeatures,
+)
+"""Events whose messages take long to make: `Publishing.large` has a function for each."""
+
+SMALL: tuple[type[Event], ...] = (
+    *(kind for kind in ros.SMALL if kind is not TrackedFeatures),
+    *(PlannedPose, PositionSetpoint, TrackingEvent, VehicleEvent),
+)
+"""Events that `Publishing.small` takes."""
+
+_LEFT_OUT = {"clock", "paths", "camera_poses", "body_poses", "segmentation_images"}
+"""Groups of ROS's topics that repeat what the protocol, the scene or transforms have, or that
+Foxglove cannot show."""
+
+
+class Publishing:
+    """Turns events into messages. To make one takes some tenths of a second: not on the loop."""
+
+    def __init__(self, server: Server, config: FoxgloveConfig) -> None:
+        self._server = server
+        self._make = Messages(server.types)
+        left_out = _LEFT_OUT | ({"depth_images"} if not config.depth else set())
+        if not config.image_rate:
+            left_out |= {"images", "depth_images"}
+        published = PublishingConfig(
+            publish=tuple(group for group in ALL_GROUPS if group not in left_out),
+            raw_images=not config.jpeg_quality,
+            compressed_images="jpeg" if config.jpeg_quality else "",
+            jpeg_quality=config.jpeg_quality,
+            raw_depth="millimetres",
+        )
+        store = TypeStore()
+        topics = RosTopics(server, store)
+        self._ros: ros.Publishing[RosTopic] = ros.Publishing(topics, store, published, Stamps().out)
+        self._ros.warm_up()
+        self._put = topics.stamped(self._ros.small)
+        self._names = self._ros.names
+        self._frames: dict[str, str] = {}  # sources of images, by optical frame
+        self._estimators: dict[str, str] = {}  # parent frames, by source
+        self._renamed: dict[str, str] = {}  # the same by what the estimators call them
+        self._truths: dict[str, RecentPoses] = {}  # by vehicle
+        self._trails: dict[str, Trail] = {}
+        self._bodies: dict[str, Callable[[], Any]] = {}
+        """What makes their entities, by source: their frames' names depend on who else there is."""
+        self._plan = PlanSelection()
+        self.large: dict[type[Event], Callable[[Any], None]] = {
+            kind: topics.stamped(put) for kind, put in self._ros.large.items() if kind in LARGE
+        }
+        self.large[PointCloud] = topics.stamped(self._cloud)
+        self.large[TrackedFeatures] = self._features
+        server.declare("/scene", "SceneUpdate")
+        server.declare("/log", "Log")
+
+    def announced(self, announcement: Announcement) -> None:
+        """Declare the topics of what is announced."""
+        source = announcement.source
+        self._ros.announced(announcement)
+        match announcement:
+            case VehicleAnnouncement():
+                self._vehicle(source, "base_link")
+            case CameraAnnouncement():
+                self._frames.setdefault(announcement.frame_id, source)
+            case BodyAnnouncement(kind=kind):
+                self._bodies[source] = lambda: self._make.body(
+                    source, ros_name(source), [moving_body(kind)]
+                )
+
+    def begin(self) -> None:
+        """Put what holds for the whole run."""
+        self._ros.begin()
+        self._server.latch("/scene", self._whole_scene, 0)
+
+    # Beside the loop.
+
+    def _features(self, event: TrackedFeatures) -> None:
+        """Put the features that an estimator tracks in an image."""
+        if (camera := self._frames.get(event.frame_id)) is not None:
+            topic = f"/{ros_name(camera)}/features/{ros_name(event.source)}"
+            self._server.declare(topic, "ImageAnnotations")
+            if self._server.wanted(topic):
+                self._server.log(topic, self._make.features(event), event.stamp)
+
+    def _cloud(self, event: PointCloud) -> None:
+        """Put a point cloud, in the frame of an estimator if it is that."""
+        frame = self._renamed.get(event.frame_id, event.frame_id)
+        self._ros.large[PointCloud](msgspec.structs.replace(event, frame_id=frame))
+
+    # At once.
+
+    def small(self, event: Event) -> None:
+        """Put the messages of an event that is no image and no point cloud."""
+        match event:
+            case Odometry():
+                self._odometry(event)
+            case PoseEstimate():
+                self._estimate(event)
+            case PlannedPose() | PositionSetpoint():
+                if self._plan.select(event):
+                    name = f"plan/{event.vehicle}" if event.vehicle else "plan"
+                    self._extend(name, "map", PLAN, event)
+            case TrackingEvent() | VehicleEvent():
+                self._server.log("/log", self._make.log(event), event.stamp)
+            case _:
+                self._put(event)
+
+    def _odometry(self, event: Odometry) -> None:
+        """Put where a vehicle truly is, and draw its path."""
+        source = event.source
+        self._vehicle(source, event.child_frame_id)
+        self._put(event)
+        self._truths[source].add(event.stamp, event.position, event.orientation)
+        colour = truth_colour(list(self._truths).index(source))
+        self._extend(f"truth/{source}", event.frame_id, colour, event)
+
+    def _estimate(self, event: PoseEstimate) -> None:
+        """Put an estimate, and the frame it places: ``<estimator>/<body>``.
+
+        Estimates that are not in ``map`` begin at the true pose of their time.
+        """
+        source, body = event.source, f"{event.source}/{event.child_frame_id}"
+        parent = self._estimators.get(source)
+        if parent is None:
+            parent = self._estimators[source] = self._parent_of(event)
+            self._names.own.add(body)
+        self._put(msgspec.structs.replace(event, frame_id=parent))
+        self._place(event, parent, body, (event.position, event.orientation))
+        colour = estimate_colour(list(self._estimators).index(source))
+        self._extend(f"estimate/{source}", parent, colour, event)
+
+    # What these share.
+
+    def _vehicle(self, source: str, frame_id: str) -> None:
+        if source not in self._truths:
+            self._truths[source] = RecentPoses()
+            self._bodies[source] = lambda: self._make.body(
+                source, self._names.name(frame_id, source)
+            )
+
+    def _parent_of(self, event: PoseEstimate) -> str:
+        """Return the frame that an estimator works in, aligned with the truth if it is its own."""
+        if event.frame_id == "map":
+            return "map"
+        frame_id = f"{event.source}/{event.frame_id}"
+        self._names.own.add(frame_id)
+        self._renamed.setdefault(event.frame_id, frame_id)
+        truth = self._truths.get(self._names.vehicles.of(event.source))
+        if (pose := estimate_frame(event, truth)) is not None:
+            self._place(event, "map", frame_id, pose, static=True)
+        return frame_id
+
+    def _place(
+        self, event: Event, parent: str, child: str, pose: Pose, *, static: bool = False
+    ) -> None:
+        """Put a transform."""
+        self._put(
+            TransformStamped(
+                stamp=event.stamp,
+                source=event.source,
+                frame_id=parent,
+                child_frame_id=child,
+                translation=pose[0],
+                rotation=pose[1],
+                static=static,
+            )
+        )
+
+    def _extend(
+        self,
+        name: str,
+        frame_id: str,
+        colour: Colour,
+        event: Odometry | PoseEstimate | PlannedPose | PositionSetpoint,
+    ) -> None:
+        """Draw on at a path."""
+        trail = self._trails.get(name)
+        if trail is None:
+            thickness = 0.04 if name.startswith("truth") else 0.02
+            frame = self._names.name(frame_id, event.source)
+            trail = self._trails[name] = Trail(name, frame, colour, thickness)
+        position = convert_vector(self._names.axes(frame_id), event.position)
+        piece = trail.add(event.stamp, position)
+        if piece is not None and self._server.wanted("/scene"):
+            line = self._make.line(trail, *piece)
+            self._server.log("/scene", self._make.scene(line), event.stamp)
+
+    def _whole_scene(self) -> Any:
+        """Return all that is drawn, for a viewer that connects; in any thread."""
+        bodies = [make() for make in list(self._bodies.values())]
+        lines = [
+            self._make.line(trail, name, piece)
+            for trail in list(self._trails.values())
+            for name, piece in trail.pieces()
+        ]
+        return self._make.scene(*bodies, *lines)

@@ -1,0 +1,256 @@
+"""Events to Rerun. For a worker's process, because the library holds Python's lock for long.
+
+    recorder = await self.worker(Recorder, config, name, file)
+    await recorder.call(Recorder.begin, announcements)
+    await recorder.call(Recorder.log, batch)
+
+There are two time lines: ``run``, an event's stamp, and ``event``, the order in which they came.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from events import (
+    Announcement,
+    BodyAnnouncement,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    ImuAnnouncement,
+    LidarScan,
+    Odometry,
+    PlannedPose,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    PositionSetpoint,
+    Score,
+    SegmentationImage,
+    SensorAnnouncement,
+    TrackedFeatures,
+    TrackingEvent,
+    VehicleAnnouncement,
+    VehicleEvent,
+    Wind,
+)
+from nodes.viewers.rerun.entities import EntityLog, Numbered
+from nodes.viewers.rerun.layout import Contents, Eye, layout
+from nodes.viewers.rerun.plots import GROUPS, PLOTS, Plots
+from nodes.viewers.rerun.sdk import Viewer, load
+from nodes.viewers.rerun.settings import RerunConfig
+from nodes.viewers.rerun.world import World
+
+_GATHERED = 500
+"""Events that are written into a file together."""
+
+_TIMEOUT = 3.0
+"""Real seconds that a viewer has to take what was logged. If it takes longer, all that comes is
+left out until it has: the library would first fill hundreds of megabytes, and then stand still."""
+
+_SECOND_TIMEOUT = 0.01
+"""Real seconds for the same, once it took longer."""
+
+
+_NO_DISTORTION = (
+    "its distortion is not shown: Rerun's pinhole has none, so points of the world do not fall on "
+    "their pixels"
+)
+
+
+class Recorder:
+    """One recording.
+
+    Args:
+        config: The node's settings.
+        name: Of the run, as the viewer lists it.
+        file: To write, in mode ``save``.
+
+    Raises:
+        MissingDependencyError: rerun is not installed, or there is no screen for its window.
+        VisnavError: A port cannot be had.
+    """
+
+    def __init__(self, config: RerunConfig, name: str, file: Path | None) -> None:
+        self._config = config
+        library = load()
+        self._rrb = library.blueprint
+        self._stream = library.log.RecordingStream("visnav")
+        self._viewer: Viewer | None = None
+        if config.mode == "save":
+            self._stream.save(file)
+        else:
+            self._viewer = Viewer(config)
+            self._stream.connect_grpc(self._viewer.data)
+        self._stream.send_recording_name(name)
+        self._entities = EntityLog(library.log, self._stream)
+        self._world = World(self._entities, config)
+        self._plots = Plots(self._entities, self._world.colours)
+        self._puts: dict[type[Event], Callable[[Any], None]] = {
+            Image: self._world.image,
+            DepthImage: self._world.depth,
+            SegmentationImage: self._world.segmentation,
+            TrackedFeatures: self._world.features,
+            LidarScan: self._world.scan,
+            PointCloud: self._world.cloud,
+            TrackingEvent: self._plots.logged,
+            VehicleEvent: self._plots.logged,
+        }
+        self._plotted: set[str] = set()
+        self._shown: tuple[int, ...] = ()
+        self._closed = False
+        self._behind = False
+        self._left_out = 0
+        self._waiting: list[Numbered[Event]] = []
+
+    def page(self) -> str:
+        """Return the address of the page that shows the run; empty if there is none."""
+        return "" if self._viewer is None else self._viewer.page
+
+    def begin(self, announcements: Iterable[Announcement]) -> None:
+        """Put what holds for the whole run."""
+        vehicles_first = sorted(announcements, key=lambda a: not isinstance(a, VehicleAnnouncement))
+        for each in vehicles_first:
+            match each:
+                case VehicleAnnouncement():
+                    self._world.vehicle(each.source)
+                case EstimatorAnnouncement():
+                    self._world.estimator(each.source)
+                    self._plotted.add("scores")
+                case ImuAnnouncement() | SensorAnnouncement():
+                    self._world.sensor(each)
+                case BodyAnnouncement():
+                    self._world.moving_body(each)
+                case CameraAnnouncement():
+                    self._world.camera(each)
+                    if not each.info.is_pinhole:
+                        self._plots.note(each.source, _NO_DISTORTION)
+        self._show()
+
+    def log(self, batch: Sequence[Numbered[Event]]) -> None:
+        """Put events, in the order in which they came.
+
+        What goes into a file is gathered first: each entity's rows have a head of their own.
+        """
+        if self._viewer is not None and not self._taken():
+            self._left_out += len(batch)
+            return
+        self._waiting += batch
+        if self._viewer is None and len(self._waiting) < _GATHERED:
+            return
+        batch, self._waiting = self._waiting, []
+        self._log(batch)
+
+    def _log(self, batch: Sequence[Numbered[Event]]) -> None:
+        for _, event in batch:
+            if isinstance(event, TrackedFeatures):
+                self._world.vehicles.tracked(event)  # before the estimates are placed
+        together: dict[tuple[type[Event], str], list[Any]] = {}
+        for number, event in batch:
+            kind = next((kind for kind in _IN_COLUMNS if isinstance(event, kind)), None)
+            if kind is not None:
+                together.setdefault((kind, event.source), []).append((number, event))
+        for kind in _IN_COLUMNS:  # the truth first: estimates are held against it
+            for (found, source), events in together.items():
+                if found is kind:
+                    self._put_columns(kind, source, events)
+        for number, event in batch:
+            self._entities.at(number, event.stamp)
+            self._put(number, event)
+        self._show()
+
+    def left_out(self) -> int:
+        """Return how many events were not logged because a viewer stood still or had gone."""
+        return self._left_out
+
+    def close(self) -> str:
+        """Write the rest, and end; return what went wrong with a viewer, or nothing.
+
+        Raises:
+            RuntimeError: The file could not be written.
+        """
+        if self._closed:
+            return ""
+        self._closed = True
+        self._log(self._waiting)
+        self._world.finish()
+        self._show(self._eye())
+        if self._viewer is None:
+            self._stream.flush()
+            self._stream.disconnect()
+            return ""
+        trouble = ""
+        if self._taken():
+            self._stream.disconnect()
+        else:  # a window that was closed, or a viewer that stands still: it would wait for that
+            trouble = self._viewer.last_words() or "it took nothing any more"
+        self._viewer.close()
+        return trouble
+
+    def _taken(self) -> bool:
+        """Tell whether a viewer has taken what was logged; wait for that, but only once."""
+        try:
+            self._stream.flush(timeout_sec=_SECOND_TIMEOUT if self._behind else _TIMEOUT)
+        except RuntimeError:
+            self._behind = True
+        else:
+            self._behind = False
+        return not self._behind
+
+    def _put_columns(self, kind: type[Event], source: str, events: list[Any]) -> None:
+        if kind is Odometry:
+            self._world.odometry(source, events)
+        elif kind is PoseEstimate:
+            self._world.estimates(source, events)
+        elif kind is Score:
+            self._plots.scores(events)
+            self._plotted.add("scores")
+        else:
+            self._plots.measurements(kind, source, events)
+            self._plotted.add(GROUPS[kind])
+            if kind is Wind:
+                self._world.wind(source, events)
+
+    def _put(self, number: int, event: Event) -> None:
+        if isinstance(event, PoseStamped):
+            self._world.pose(number, event)
+        elif isinstance(event, PlannedPose | PositionSetpoint):
+            self._world.plan(number, event)
+        else:
+            for kind, put in self._puts.items():
+                if isinstance(event, kind):
+                    put(event)
+                    return
+
+    def _show(self, eye: Eye | None = None) -> None:
+        """Send the layout if there is something new to show."""
+        images = self._world.images
+        found = (
+            len(self._world.trails),
+            len(self._plotted),
+            *(len(kinds) for kinds in images.values()),
+        )
+        if found == self._shown and eye is None:
+            return
+        self._shown = found
+        plots = {t: what for t, what in PLOTS.items() if what.split("/")[1] in self._plotted}
+        contents = Contents(trails=self._world.trails, cameras=images, plots=plots, eye=eye)
+        self._stream.send_blueprint(layout(self._rrb, contents))
+
+    def _eye(self) -> Eye | None:
+        """Return an eye that sees all of the flight from above, from south-west."""
+        low, high = self._world.bounds
+        if self._config.mode != "save" or not np.isfinite(low).all():
+            return None
+        centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 5.0)
+        x, y, z = centre.tolist()
+        return (x - 0.8 * size, y - 0.45 * size, z - size), (x, y, z)
+
+
+_IN_COLUMNS: tuple[type[Event], ...] = (Odometry, PoseEstimate, *GROUPS, Score)

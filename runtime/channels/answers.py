@@ -1,0 +1,241 @@
+"""What became of the frames that a system outside the process was sent: counts, times, digest.
+
+All that differs from run to run is in here, and nothing of it enters the run's digest.
+"""
+
+from __future__ import annotations
+
+import bisect
+import csv
+import math
+import threading
+from array import array
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, get_args
+
+import xxhash
+from typing_extensions import Buffer
+
+from runtime.channels.digest import combined, fingerprint
+from runtime.errors import ConfigError
+from runtime.paths import source_file
+from runtime.time.schedule import SECOND
+from runtime.workers.costs import Costs
+
+Outcome = Literal["answered", "empty", "initialising", "skipped", "lost"]
+"""What became of a frame: answered; answered without content; still initialising, as the system
+says, or as it says nothing yet; skipped, as a later answer says; lost, as its time was over."""
+
+Wrong = Literal["late", "repeated", "contradicting", "unknown"]
+"""Answers that belong to no frame which waits: after its time, a second one (or one that differs
+from the first), or of no frame."""
+
+COLUMNS = ("stamp_ns", "outcome", "latency_ms")
+FOLDER = "answers"
+
+
+class Answers:
+    """The record of one outside system, in all its lives during a run. For any thread.
+
+    Attributes:
+        counts: Frames by `Outcome`, and wrong answers by `Wrong`.
+        sent: Frames that went out.
+        received: Frames of which the system has confirmed that it has them; `None` if it has no
+            way to say so.
+        latency: Seconds declared from a frame to its answer; `None` if they vary.
+        lost_allowed: How many frames may be lost.
+        why_not: Why an equal run might differ, whatever the system's own answers do.
+        costs: What its answers cost, if its processes are known.
+    """
+
+    def __init__(self, latency: float | None = 0.0, lost_allowed: int = 0) -> None:
+        self.latency = latency
+        self.lost_allowed = lost_allowed
+        self.counts: Counter[str] = Counter()
+        self.sent = 0
+        self.received: int | None = None
+        self.why_not: dict[str, None] = {}
+        self.costs = Costs()
+        self._lock = threading.Lock()
+        self._stamps = array("q")
+        self._latencies = array("d")
+        self._outcomes: list[Outcome] = []
+        self._dues = array("q")
+        self._digests = array("Q")
+        self._says_lost = array("b")
+        self._first: int | None = None
+        self._initialised: int | None = None
+        self._inputs: dict[str, xxhash.xxh3_128] = {}
+
+    def owed(self, stamp: int) -> None:
+        """Note a frame that goes out."""
+        with self._lock:
+            self.sent += 1
+            if self._first is None:
+                self._first = stamp
+
+    @property
+    def says_lost(self) -> int:
+        """Answers that say that tracking is lost."""
+        return sum(self._says_lost)
+
+    def settled(
+        self,
+        stamp: int,
+        due: int,
+        outcome: Outcome,
+        latency: float = math.nan,
+        digest: int = 0,
+        says_lost: bool = False,
+    ) -> None:
+        """Note what became of a frame.
+
+        Args:
+            stamp: Of the frame (ns).
+            due: When its answer counts (ns).
+            outcome: What became of it.
+            latency: Real seconds that its answer took.
+            digest: Of what the answer holds.
+            says_lost: Whether it says that tracking is lost.
+        """
+        with self._lock:
+            self.counts[outcome] += 1
+            self._stamps.append(stamp)
+            self._latencies.append(latency)
+            self._outcomes.append(outcome)
+            self._dues.append(due)
+            self._digests.append(digest)
+            self._says_lost.append(says_lost)
+            if outcome == "answered" and self._initialised is None:
+                self._initialised = stamp
+
+    def end(self, now: int) -> None:
+        """Forget what came of frames that are not due by now (ns): nobody has received it.
+
+        Whether they were answered by now was up to real time, and no figure is.
+        """
+        with self._lock:
+            kept = [n for n, due in enumerate(self._dues) if due <= now]
+            for name in ("_stamps", "_latencies", "_dues", "_digests", "_says_lost"):
+                column = getattr(self, name)
+                setattr(self, name, array(column.typecode, [column[n] for n in kept]))
+            self._outcomes = [self._outcomes[n] for n in kept]
+            for outcome in get_args(Outcome):
+                self.counts[outcome] = self._outcomes.count(outcome)
+            self.counts = +self.counts
+
+    def wrong(self, kind: Wrong) -> None:
+        """Note an answer that belongs to no frame which waits."""
+        with self._lock:
+            self.counts[kind] += 1
+
+    def got(self, count: int = 1) -> None:
+        """Note frames that the system says it has received."""
+        with self._lock:
+            self.received = (self.received or 0) + count
+
+    def took_in(self, stream: str, data: Buffer) -> None:
+        """Take what the system was sent into the digest of its inputs.
+
+        Args:
+            stream: Topic, or kind of data: each has an order of its own.
+            data: The bytes, without anything that differs from run to run.
+        """
+        content = memoryview(data).cast("B")
+        with self._lock:
+            found = self._inputs.get(stream)
+            if found is None:
+                found = self._inputs[stream] = xxhash.xxh3_128()
+            found.update(content.nbytes.to_bytes(8, "little"))
+            found.update(content)
+
+    @property
+    def initialisation(self) -> float | None:
+        """Seconds from the first frame to the first that was answered; `None` if none was."""
+        if self._first is None or self._initialised is None:
+            return None
+        return (self._initialised - self._first) / SECOND
+
+    def inputs(self) -> str | None:
+        """Return the digest of all that was sent; `None` if nothing was noted."""
+        with self._lock:
+            digests = {name: each.hexdigest() for name, each in self._inputs.items()}
+        return combined(digests) if digests else None
+
+    def outputs(self) -> str | None:
+        """Return the digest of all answers, by their frames' stamps; `None` if there were none."""
+        with self._lock:
+            rows = sorted(zip(self._stamps, self._outcomes, self._digests, strict=True))
+        return f"{fingerprint(rows):016x}" if rows else None
+
+    def latency_quantiles(self, *quantiles: float) -> list[float | None]:
+        """Return quantiles of the real seconds that answers took; `None` if there were none."""
+        known = sorted(each for each in self._latencies if not math.isnan(each))
+        return [
+            known[min(int(q * len(known)), len(known) - 1)] if known else None for q in quantiles
+        ]
+
+    def write(self, folder: Path, name: str) -> None:
+        """Write a row for each frame into ``answers/<name>.csv``, which a run can replay.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        (folder / FOLDER).mkdir(exist_ok=True)
+        file = folder / FOLDER / f"{source_file(name)}.csv"
+        with file.open("w", newline="", encoding="utf-8") as out:
+            rows = csv.writer(out)
+            rows.writerow(COLUMNS)
+            for stamp, outcome, latency in zip(
+                self._stamps, self._outcomes, self._latencies, strict=True
+            ):
+                known = "" if math.isnan(latency) else f"{latency * 1e3:.6f}"
+                rows.writerow((stamp, outcome, known))
+
+
+def read_latencies(path: Path, factor: float = 1.0) -> Callable[[int], float]:
+    """Return the latencies that a run has measured, as a function of a frame's stamp.
+
+    Args:
+        path: An ``answers/<name>.csv``.
+        factor: By which each is multiplied: how much slower the machine is that is meant.
+
+    Returns:
+        From a stamp (ns) to seconds: those of the last answered frame up to then, or else of the
+        first one.
+
+    Raises:
+        ConfigError: The file cannot be read, or is none; the message says where.
+    """
+    stamps: list[int] = []
+    seconds: list[float] = []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = csv.reader(file)
+            if (head := next(rows, [])) != list(COLUMNS):
+                raise ValueError(f"expected columns {','.join(COLUMNS)}, found {','.join(head)!r}")
+            for line, row in enumerate(rows, 2):
+                try:
+                    stamp, _, latency = row
+                    if latency:
+                        stamps.append(int(stamp))
+                        seconds.append(factor * float(latency) / 1e3)
+                except ValueError as error:
+                    raise ValueError(f"line {line}: {error}") from None
+                if latency and not 0 <= seconds[-1] < math.inf:
+                    raise ValueError(f"line {line}: expected a latency ≥ 0, found {latency}")
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+        raise ConfigError(
+            f"latencies: {path}: expected measured latencies, found: {error}"
+        ) from None
+    if not stamps:
+        raise ConfigError(f"latencies: {path}: expected at least one answered frame, found none")
+    order = sorted(range(len(stamps)), key=stamps.__getitem__)  # answers may overtake each other
+    stamps, seconds = [stamps[n] for n in order], [seconds[n] for n in order]
+
+    def latency_at(stamp: int) -> float:
+        return seconds[max(bisect.bisect_right(stamps, stamp) - 1, 0)]
+
+    return latency_at

@@ -1,0 +1,437 @@
+"""Holds simulated time for the answers of a system outside the process.
+
+    self.slam = self.hold("slam", self.config.hold, self.config.latency)
+
+    owed = self.slam.owe(image.stamp)      # before it is sent; time goes no further than its due
+    await self.offload(send, image)
+    pose = await owed                      # exactly `latency` later on the clock, or None
+
+The answer comes from any thread, as `Hold.answer`. Up to its due, time runs on: with 40 ms the
+vehicle goes on flying while an estimator works, and at most ``latency × rate`` frames, rounded
+up, are on their way. What came when in real time decides nothing, so the run's digest depends on
+what the answers hold only. Whatever breaks that promise (`Answers.why_not`) is reported.
+
+The latency counts from the instant at which the frame goes out, as that of a worker's call does:
+the same estimator has the same digest as a worker and as a process of its own.
+
+In real time nothing is held: answers come when they come, no earlier than their latency, and an
+answer to a later frame says that those before it were skipped.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import msgspec
+from typing_extensions import Buffer
+
+from runtime.channels.answers import Answers, Outcome, Wrong, read_latencies
+from runtime.channels.digest import fingerprint
+from runtime.channels.owed import LET_GO, Owed, future
+from runtime.errors import MissingAnswerError
+from runtime.paths import InputPath
+from runtime.time.clock import Clock
+from runtime.time.schedule import SECOND
+from runtime.units import Duration
+
+T = TypeVar("T")
+
+BEHIND = 2.0
+"""Real seconds by which simulated time stays behind real time while a system initialises: so much
+an answer may take and is still the one that decides when the run begins to hold."""
+
+IN_A_ROW = 3
+"""Frames lost in a row after which a system is taken to hang, and is not waited for again before
+it answers something."""
+
+_LOOK = 0.02
+"""Real seconds between two looks at what has been waited for too long."""
+
+_REMEMBERED = 4096
+"""Settled frames that are known by their stamps: an answer to one of them is a repeated one."""
+
+
+class HoldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How long simulated time waits for the answers of an outside system, and what if none comes.
+
+    Attributes:
+        skips: ``refused``: each frame is answered, in any order. ``allowed``: an answer with a
+            later stamp says that no other will come for the frames before it.
+        initialise: For frames of this long, from the first, nothing is owed before the first
+            answer to any; until then simulated time goes no faster than real time.
+        max_wait: Real seconds without any answer after which one is missing.
+        on_missing: What happens then, or when the system is gone. ``error``: the run ends.
+            ``lost``: the frame is lost; it counts, and stands in the verdict. ``continue``: the
+            run goes on without waiting, and is marked as not reproducible.
+        lost_allowed: How many frames may be lost with the verdict still passed.
+        tolerance_ns: How far an answer's stamp may be from its frame's: stamps that went through
+            a double are not exact.
+        latencies: ``answers/<name>.csv`` of a run in real time, whose measured latencies take the
+            place of the declared one.
+        latency_factor: By which those are multiplied, for a slower or quicker machine.
+    """
+
+    skips: Literal["refused", "allowed"] = "refused"
+    initialise: Duration = Duration(0.0)  # immutable
+    max_wait: Duration = Duration(10.0)  # immutable
+    on_missing: Literal["error", "lost", "continue"] = "error"
+    lost_allowed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    tolerance_ns: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 1000
+    latencies: InputPath = ""
+    latency_factor: Annotated[float, msgspec.Meta(gt=0)] = 1.0
+
+
+class Hold(Generic[T]):
+    """The answers that one outside system owes.
+
+    Args:
+        name: Of the system.
+        clock: The run's clock.
+        config: How long is waited, and what if nothing comes.
+        latency: Seconds of the run's clock from a frame to its answer.
+        answers: Where to note what became of each frame.
+        log: Takes what the run's log should say, in any thread.
+        wall: Real seconds, but for those in which the run is paused.
+
+    Raises:
+        ConfigError: There are no latencies in the file that `config` names.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        config: HoldConfig,
+        latency: float,
+        *,
+        answers: Answers | None = None,
+        log: Callable[[str], None] = lambda _: None,
+        wall: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.name = name
+        self.config = config
+        self.answers = Answers() if answers is None else answers
+        self._latency_at: Callable[[int], float] = lambda _: latency
+        self.answers.latency = latency
+        self.answers.lost_allowed = config.lost_allowed
+        if config.latencies:
+            self._latency_at = read_latencies(Path(config.latencies), config.latency_factor)
+            self.answers.latency = None
+        self.answers.costs.latency = self.answers.latency
+        self._clock = clock
+        self._log = log
+        self._wall = wall
+        self._skips = config.skips == "allowed" or clock.kind == "real"
+        if clock.kind == "real":
+            self.answers.why_not["the clock is real"] = None
+        self._changed = threading.Condition()
+        self._owed: dict[int, Owed[T]] = {}  # by stamp, in the order of sending
+        self._settled: dict[int, tuple[Outcome, int | None]] = {}  # and digest of the answer
+        self._last: tuple[int, int] | None = None  # stamp and due of the newest frame
+        self._began: tuple[int, float] | None = None  # stamp and real time of the first frame
+        self._heard: float | None = None  # when it last answered anything
+        self._in_a_row = 0
+        self._let_go = False
+        self._gone = ""
+        self._error: Exception | None = None
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    # On the loop.
+
+    def owe(self, stamp: int) -> Owed[T]:
+        """Note that a frame goes out now, and return its answer to come.
+
+        Args:
+            stamp: Of the frame (ns); greater than that of the one before.
+
+        Raises:
+            ValueError: It is not.
+            MissingAnswerError: The system is gone, or hangs, and by the settings that is an error.
+        """
+        with self._changed:
+            if self._error is not None:
+                raise self._error
+            if self._last is not None and stamp <= self._last[0]:
+                raise ValueError(
+                    f"{self.name}: expected a frame after {_seconds(self._last[0])}, "
+                    f"found one of {_seconds(stamp)}"
+                )
+            # In the order of the frames, whatever latencies were measured.
+            due = self._clock.now() + round(self._latency_at(stamp) * SECOND)
+            due = max(due, self._last[1] if self._last else 0)
+            self._last = stamp, due
+            owed: Owed[T] = Owed(self._clock, stamp, due, self._wall())
+            if self._began is None:
+                self._began = stamp, owed.since
+            self.answers.owed(stamp)
+            self._owed[stamp] = owed
+            if not self.expects:
+                self._settle(owed, "lost")
+            elif self._let_go:
+                self._release(owed)
+            self._watch()
+            return owed
+
+    @property
+    def expects(self) -> bool:
+        """Whether answers are expected; if not, a frame need not be sent: it is lost already."""
+        return not (self._gone or (self._let_go and self.config.on_missing == "lost"))
+
+    # In any thread.
+
+    def sent(self, stream: str, data: Buffer) -> None:
+        """Take what the system was sent into the digest of its inputs; see `Answers.took_in`."""
+        self.answers.took_in(stream, data)
+
+    def received(self, count: int = 1) -> None:
+        """Note frames that the system says it has received."""
+        self.answers.got(count)
+
+    def answer(
+        self, stamp: int, value: T | None, says: Literal["", "initialising", "lost"] = ""
+    ) -> None:
+        """Take an answer.
+
+        Args:
+            stamp: Of the frame that it answers (ns).
+            value: What it holds, which is data; `None` if it is known only that there is no more
+                to come.
+            says: What it says of the system: nothing, that it still initialises, or that it has
+                lost track.
+        """
+        digest = None if says == "initialising" else fingerprint(value)  # no answer yet
+        with self._changed:
+            if self._closed:
+                return
+            now = self._wall()
+            unanswered = [each for each in self._owed if self._initialising(each)]
+            self._heard = now
+            owed = self._match(stamp)
+            if owed is None:
+                known = _nearest(stamp, self._settled, self.config.tolerance_ns)
+                before, earlier = (None, None) if known is None else self._settled[known]
+                kind: Wrong = "unknown"
+                if earlier is not None:
+                    same = value is None or digest == earlier  # no more to come, or the same
+                    kind = "repeated" if same else "contradicting"
+                elif before is not None:
+                    kind = "late"
+                self.answers.wrong(kind)
+                if kind == "contradicting":
+                    self._contradicted(stamp)
+                elif before == "initialising":
+                    self.doubt("its first answer came too late to be held for")
+            if self._let_go:
+                self._log(f"{self.name}: it answers again")
+            self._let_go, self._in_a_row = False, 0
+            if owed is None:
+                return
+            for each in [each for each in self._owed if each < owed.stamp]:
+                if each in unanswered:
+                    self._settle(self._owed[each], "initialising")
+                elif self._skips:
+                    self._settle(self._owed[each], "skipped")
+            outcome: Outcome = "empty" if value is None else "answered"
+            if says == "initialising":
+                outcome, value = "initialising", None
+            lost = says == "lost"
+            self._settle(owed, outcome, value, now - owed.since, digest, says_lost=lost)
+
+    def gone(self, why: str) -> None:
+        """Take note, at once, that the system is there no more.
+
+        Args:
+            why: What happened, for the log and for the error.
+        """
+        with self._changed:
+            if self._closed or self._gone:
+                return
+            self._gone = why
+            if self.config.on_missing == "error":
+                self._fail(MissingAnswerError(f"{self.name}: {why} ({self._story()})"))
+                return
+            self._log(f"{self.name}: {why}")
+            if self.config.on_missing == "continue":
+                self._not_reproducible("it was gone for a while")
+            for each in list(self._owed.values()):
+                self._settle(each, "lost")
+
+    def back(self) -> None:
+        """Take note that the system is there again: it may initialise anew."""
+        with self._changed:
+            if self._gone:
+                self._log(f"{self.name}: it is there again")
+                self._not_reproducible("when it came back was up to real time")
+            self._gone, self._let_go, self._in_a_row = "", False, 0
+            self._began = self._heard = None
+
+    def fail(self, error: Exception) -> None:
+        """Raise an error in whoever waits for an answer, and with the next frame."""
+        with self._changed:
+            self._fail(error)
+
+    def doubt(self, why: str) -> None:
+        """Take note, and say in the log, why an equal run might differ."""
+        if why not in self.answers.why_not:
+            self._log(f"{self.name}: an equal run may differ: {why}")
+        self._not_reproducible(why)
+
+    def close(self) -> None:
+        """Watch no more, and take no answers; what is owed still stays so."""
+        with self._changed:
+            if self._closed:
+                return
+            self._closed = True
+            self.answers.end(self._clock.now())
+            self._changed.notify_all()
+
+    def look(self) -> None:
+        """Give up what has been waited for too long; a thread calls it again and again."""
+        with self._changed:
+            now = self._wall()
+            while self._owed:
+                oldest = next(iter(self._owed.values()))
+                if oldest.later is not None:  # nobody waits for it
+                    return
+                if self._initialising(oldest.stamp):
+                    if now < self._real_time(oldest) + BEHIND:
+                        return
+                    self._settle(oldest, "initialising")
+                elif now < max(oldest.since, self._heard or 0.0) + self.config.max_wait:
+                    return
+                else:
+                    self._give_up(oldest)
+
+    # With the lock.
+
+    def _initialising(self, stamp: int) -> bool:
+        """Tell whether nothing is owed yet for a frame."""
+        if self._heard is not None or self._began is None:
+            return False
+        return stamp - self._began[0] < self.config.initialise * SECOND
+
+    def _real_time(self, owed: Owed[T]) -> float:
+        """Return when a frame's answer would be due if time had been real since the first one."""
+        assert self._began is not None
+        stamp, since = self._began
+        return since + (owed.stamp - stamp) / SECOND + self._latency_at(owed.stamp)
+
+    def _match(self, stamp: int) -> Owed[T] | None:
+        """Return the frame that an answer's stamp means."""
+        near = _nearest(stamp, self._owed, self.config.tolerance_ns)
+        return None if near is None else self._owed[near]
+
+    def _settle(
+        self,
+        owed: Owed[T],
+        outcome: Outcome,
+        value: T | None = None,
+        seconds: float = float("nan"),
+        digest: int | None = None,
+        *,
+        says_lost: bool = False,
+    ) -> None:
+        del self._owed[owed.stamp]
+        self._settled[owed.stamp] = outcome, digest
+        while len(self._settled) > _REMEMBERED:
+            del self._settled[next(iter(self._settled))]
+        found = digest or 0
+        self.answers.settled(owed.stamp, owed.due, outcome, seconds, found, says_lost)
+        (owed.work if owed.later is None else owed.later).set_result(value)
+
+    def _release(self, owed: Owed[T]) -> None:
+        """Let time go on without an answer, which may still come."""
+        owed.later = future()
+        owed.work.set_result(LET_GO)
+
+    def _give_up(self, owed: Owed[T]) -> None:
+        missing = (
+            f"expected an answer to the frame of {_seconds(owed.stamp)} within "
+            f"{self.config.max_wait:g} s (max_wait), found none"
+        )
+        if self.config.on_missing == "error":
+            self._fail(MissingAnswerError(f"{self.name}: {missing} ({self._story()})"))
+            return
+        if self.config.on_missing == "continue":
+            self._let_go = True
+            self._log(f"{self.name}: {missing}; the run goes on without")
+            self._not_reproducible("the run went on without an answer")
+            for each in self._owed.values():
+                if each.later is None:
+                    self._release(each)
+            return
+        self._log(f"{self.name}: {missing}: the frame is lost")
+        self._not_reproducible(f"frames were lost after {self.config.max_wait:g} s of real time")
+        self._heard = self._wall()
+        self._in_a_row += 1
+        self._settle(owed, "lost")
+        if self._in_a_row >= IN_A_ROW:
+            self._let_go = True
+            self._log(
+                f"{self.name}: {IN_A_ROW} frames in a row are lost: it is not waited for again "
+                "before it answers"
+            )
+            for each in list(self._owed.values()):
+                self._settle(each, "lost")
+
+    def _fail(self, error: Exception) -> None:
+        if self._error is not None or self._closed:
+            return
+        self._error = error
+        for owed in self._owed.values():
+            (owed.work if owed.later is None else owed.later).set_exception(error)
+        self._owed.clear()
+
+    def _contradicted(self, stamp: int) -> None:
+        """Take note of a second answer that differs: which one came first is up to real time."""
+        if self.answers.counts["contradicting"] == 1:
+            self._log(
+                f"{self.name}: expected one answer to the frame of {_seconds(stamp)}, found a "
+                "second one that differs (two that answer?): the first one counts"
+            )
+        self._not_reproducible("frames were answered twice, differently")
+
+    def _not_reproducible(self, why: str) -> None:
+        self.answers.why_not[why] = None
+
+    def _story(self) -> str:
+        counts = self.answers.counts
+        return (
+            f"{self.answers.sent} frames sent, {counts['answered']} answered, "
+            f"{counts['unknown']} answers of no frame"
+        )
+
+    def _watch(self) -> None:
+        """Have a thread look, from the first frame on."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._look_on, name=self.name, daemon=True)
+            self._thread.start()
+        self._changed.notify_all()
+
+    def _look_on(self) -> None:
+        while True:
+            with self._changed:
+                while not self._owed and not self._closed:
+                    self._changed.wait()
+                if not self._closed:
+                    self._changed.wait(_LOOK)
+                if self._closed:
+                    return
+            self.look()
+
+
+def _nearest(stamp: int, known: Mapping[int, Any], tolerance: int) -> int | None:
+    """Return the known stamp that another one means."""
+    if stamp in known:
+        return stamp
+    near = min(known, key=lambda each: abs(each - stamp), default=None)
+    return None if near is None or abs(near - stamp) > tolerance else near
+
+
+def _seconds(stamp: int) -> str:
+    return f"{stamp / SECOND:.6f} s"

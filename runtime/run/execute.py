@@ -1,0 +1,319 @@
+"""One whole run, from settings to results: loop, clock, signals, logging, progress and files."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import functools
+import gc
+import logging
+import signal
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from events import Event
+from runtime.channels.digest import Digest
+from runtime.channels.sender import Sender, Tap
+from runtime.config.model import Config, RunConfig
+from runtime.errors import NodeError, VisnavError
+from runtime.logs import file_handler, logging_to
+from runtime.node import Node
+from runtime.run import event_loop, results, task_factory
+from runtime.run.node_runner import log_error, with_place, wrap
+from runtime.run.private_results import private_results
+from runtime.run.summarise import summarise
+from runtime.run.supervisor import Supervisor
+from runtime.run.watchdogs import LoopWatchdog, ProgressWatchdog
+from runtime.summary import Stall, Summary
+from runtime.time import lockstep
+from runtime.time.clock import Clock
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.time.real_clock import RealClock
+
+if TYPE_CHECKING:
+    from runtime.peers.peers import Peers
+
+log = logging.getLogger("visnav.runtime")
+events_log = logging.getLogger("visnav.events")
+
+
+def execute(
+    config: Config,
+    out: Path | None = None,
+    *,
+    handlers: list[logging.Handler] | None = None,
+    log_events: bool = False,
+    watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None = None,
+    only: Collection[str] = (),
+    stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
+    digest: Digest | None = None,
+    complete: Callable[[Summary], Summary] = lambda summary: summary,
+) -> Summary:
+    """Run a configuration to its end.
+
+    Args:
+        config: What to run.
+        out: Folder for results, made if missing; `None` writes nothing.
+        handlers: Where log records go, besides ``log.txt`` in `out`.
+        log_events: Log every event that is sent.
+        watch: Given the supervisor, returns a context that lasts as long as the run: a progress
+            bar, a monitor.
+        only: Nodes to run here; the others run in other processes. All, if empty.
+        stand_ins: Classes that run in the place of some nodes' own, by the node's name.
+        digest: What takes in all events; by default one is made if the settings say so.
+        complete: Called with the summary before it is written; returns what is.
+
+    Raises:
+        VisnavError: Something went wrong; what was recorded until then is complete, and what is to
+            be written after a run has been.
+    """
+    handlers = list(handlers or [])
+    programs = any(spec.node.starts_programs for spec in config.nodes)
+    with contextlib.ExitStack() as stack:
+        folder = None if out is None else stack.enter_context(results.Folder(out))
+        if out is not None:
+            results.write_config(out, config)
+            handlers.append(file_handler(out / "log.txt"))
+        run = _Run(config, out, folder, log_events, watch, only, stand_ins, digest)
+        stack.enter_context(logging_to(handlers, config.run.log, run.now))
+        with contextlib.ExitStack() as private:
+            if out is not None and programs:
+                run.private = private.enter_context(private_results(out))
+            summary = complete(event_loop.run_to_end(run.loop, run.main(), run.escaped))
+        if out is not None:
+            run.conclude(out, summary)
+    if run.supervisor.state.error is not None:
+        raise run.supervisor.state.error
+    return summary
+
+
+def make_loop(run: RunConfig) -> asyncio.AbstractEventLoop:
+    """Return a new loop for the clock that a run asks for.
+
+    Raises:
+        UnsupportedInterpreterError: Time cannot be simulated on this interpreter.
+    """
+    if run.clock == "lockstep":
+        lockstep.check_interpreter()
+        return LockstepLoop(speed=None if run.speed in {None, "max"} else run.speed)  # type: ignore[arg-type]
+    try:
+        import uvloop
+    except ImportError:  # a platform that it does not serve
+        loop = asyncio.new_event_loop()
+    else:
+        loop = uvloop.new_event_loop()
+    # Named, so that the command line knows whose threads may be left behind.
+    loop.set_default_executor(concurrent.futures.ThreadPoolExecutor(thread_name_prefix="node"))
+    return loop
+
+
+def make_clock(run: RunConfig, loop: asyncio.AbstractEventLoop) -> Clock:
+    """Return the run's clock, at 0."""
+    if isinstance(loop, LockstepLoop):
+        return LockstepClock(loop)
+    return RealClock(loop, speed=1.0 if run.speed in {None, "max"} else run.speed)  # type: ignore[arg-type]
+
+
+class _Run:
+    """One run, from its loop to what is called when it is over; see `execute`."""
+
+    supervisor: Supervisor
+    private: Path | None = None
+    """Where nodes write that start no programs; `None` for the run's folder."""
+
+    def __init__(
+        self,
+        config: Config,
+        out: Path | None,
+        folder: results.Folder | None,
+        log_events: bool,
+        watch: Callable[[Supervisor], contextlib.AbstractContextManager[None]] | None,
+        only: Collection[str],
+        stand_ins: Mapping[str, type[Node[Any]]],
+        digest: Digest | None,
+    ) -> None:
+        self.loop = make_loop(config.run)
+        self._clock: Clock | None = None
+        self._config = config
+        self._out = out
+        self._folder = folder
+        self._watch = watch or contextlib.nullcontext
+        self._only = only
+        self._stand_ins = stand_ins
+        wanted = config.run.clock == "lockstep" if config.run.digest is None else config.run.digest
+        self._digest = digest or (Digest() if wanted else None)
+        self._taps: list[Tap] = [self._digest] if self._digest else []
+        if log_events:
+            self._taps.append(_log_event)
+
+    def now(self) -> int:
+        """Return the time of the run's clock (ns); 0 before there is one."""
+        return self._clock.now() if self._clock is not None else 0
+
+    async def main(self) -> Summary:
+        """Run the nodes to their end, and put together what there is to say of it."""
+        loop, run = asyncio.get_running_loop(), self._config.run
+        task_factory.install(loop)
+        clock = self._clock = make_clock(run, loop)
+        self.supervisor = supervisor = Supervisor(
+            self._config,
+            clock,
+            self._taps,
+            self.private or self._out,
+            self._only,
+            self._stand_ins,
+            self._out,
+        )
+        if self._folder is not None:
+            supervisor.state.before_first_update = self._folder.flown
+        # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
+        level = logging.DEBUG if run.clock == "lockstep" else logging.WARNING
+        watchdog = LoopWatchdog(loop, run.stall, functools.partial(_report_stall, level))
+        progress = ProgressWatchdog(supervisor.state, loop, run.progress_limit)
+        with (
+            _signals_stop(supervisor, loop),
+            _no_long_collections(),
+            progress,
+            self._watch(supervisor),
+        ):
+            watchdog.start()
+            try:
+                await supervisor.main()
+            finally:
+                watchdog.stop()
+            summary = summarise(
+                supervisor.state,
+                digest=self._digest,
+                stalls=watchdog.stalls,
+                longest_stalls=watchdog.longest,
+            )
+            if supervisor.peers is not None:
+                summary = await self._whole_summary(supervisor.peers, summary)
+        clock.close()
+        return summary
+
+    async def _whole_summary(self, peers: Peers, summary: Summary) -> Summary:
+        """Put the summary together with those of the other processes, if they can be had."""
+        try:
+            summary = await peers.shutdown.exchange_summaries(summary)
+            await peers.close()
+        except Exception as error:
+            self.failed(wrap("the other processes", error))
+        return summary
+
+    def escaped(self, error: BaseException) -> None:
+        """Deal with what came out of the loop."""
+        if not hasattr(self, "supervisor"):  # a Ctrl-C before there was anything to end
+            raise error
+        self.loop.call_soon(self.supervisor.escaped, error)
+
+    def failed(self, error: Exception) -> None:
+        """Note an error; the first one counts."""
+        first = self.supervisor.state.error is None
+        if isinstance(error, NodeError):
+            log_error(error, last=first)
+        else:
+            log.error("%s", error, extra={"reported": first})
+        if first:
+            self.supervisor.state.error = error
+
+    def conclude(self, out: Path, summary: Summary) -> None:
+        """Write the summary, and call what nodes want called after it, whatever goes wrong."""
+        if summary.error is None and self.supervisor.state.error is not None:
+            error = with_place(self.supervisor.state.error)
+            summary = msgspec.structs.replace(summary, error=error)
+        try:
+            results.write_summary(out, summary)
+        except VisnavError as error:
+            self.failed(error)
+        for call in self.supervisor.state.after_run:
+            owner = getattr(call, "__self__", None)
+            name = owner.name if isinstance(owner, Node) else getattr(call, "__module__", "runtime")
+            try:
+                call(out)
+            except BaseException as error:
+                self.failed(wrap(name, error))
+
+
+@contextlib.contextmanager
+def _signals_stop(supervisor: Supervisor, loop: asyncio.AbstractEventLoop) -> Iterator[None]:
+    """Let the first SIGINT, SIGTERM or SIGHUP end the run in order, and the second at once.
+
+    An ignored SIGHUP stays so: the run was begun under nohup.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
+
+    def stop(number: int, _: Any) -> None:
+        for each in before:
+            signal.signal(each, signal.SIG_DFL)
+        supervisor.state.stop_requested = names[signal.Signals(number)]
+        loop.call_soon_threadsafe(supervisor.stop, supervisor.state.stop_requested)
+
+    def interrupt(*_: Any) -> None:  # whoever blocks the loop; see `runtime.run.watchdogs`
+        error, supervisor.state.interruption = supervisor.state.interruption, None
+        if error is not None:
+            raise error
+
+    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in names}
+    # Not so the others: a shell has what it puts in the background ignore SIGINT, too.
+    if before[signal.SIGHUP] is signal.SIG_IGN:
+        del before[signal.SIGHUP]
+    for number in before:
+        signal.signal(number, stop)
+    usual = signal.signal(signal.SIGUSR2, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        signal.signal(signal.SIGUSR2, usual)
+
+
+@contextlib.contextmanager
+def _no_long_collections() -> Iterator[None]:
+    """Leave what is there already out of garbage collections, which delay ticks."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+def _report_stall(level: int, stall: Stall) -> None:
+    log.log(
+        level, "the loop stood for %.0f ms: %s, %s", stall.seconds * 1e3, stall.node, stall.line
+    )
+
+
+def _log_event(sender: Sender[Any] | None, event: Event) -> None:
+    fields = (
+        f"{name}={_brief(getattr(event, name))}"
+        for name in event.__struct_fields__
+        if name not in {"stamp", "source"}
+    )
+    events_log.info(
+        "%s %s %s: %s",
+        sender.name if sender else "announced",
+        type(event).__name__,
+        event.source,
+        " ".join(fields),
+    )
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, tuple) and value and isinstance(value[0], float):
+        return "(" + ", ".join(f"{v:.4g}" for v in value) + ")"
+    return f"{value:.6g}" if isinstance(value, float) else repr(value)

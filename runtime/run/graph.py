@@ -1,0 +1,230 @@
+"""Which listener receives which output: a pure function of the nodes, made before the first event.
+
+Every output of a node is connected to the inputs and handlers of all *other* nodes that know its
+type of event, in the order of the nodes in the file and of the declarations in each node.
+"""
+
+from __future__ import annotations
+
+import dis
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from events import Announcement, CameraAnnouncement, Odometry, PoseStamped, VehicleAnnouncement
+from runtime.channels.links import Link
+from runtime.channels.sender import Deliver, Listener, Tap, Voices
+from runtime.channels.tasks import Fault
+from runtime.node import Node, senders
+
+Sources = Mapping[str, Mapping[str, str]]
+"""Node to port to the source that the port is narrowed to."""
+
+Links = Mapping[str, Mapping[str, Link]]
+"""Node to port to the link that stands before it."""
+
+Wrap = Callable[[str, Deliver], Deliver]
+"""Given a node and a handler of it, returns what is called instead."""
+
+
+def unwrapped(_: str, deliver: Deliver) -> Deliver:
+    """Return a handler as it is."""
+    return deliver
+
+
+def listeners(
+    node: Node[Any],
+    sources: Mapping[str, str],
+    links: Mapping[str, Link],
+    fault: Fault | None = None,
+    wrap: Wrap = unwrapped,
+) -> list[Listener]:
+    """Return a node's inputs, fields of bundles and handlers, in order."""
+    found = []
+
+    def add(
+        port: str, deliver: Deliver, events: Any, source: str | None, stream: Any = None
+    ) -> None:
+        if port in links:
+            deliver, stream = _linked(links[port], wrap(node.name, deliver), fault), None
+        elif stream is None:  # a stream's reader is wrapped already, with its task
+            deliver = wrap(node.name, deliver)
+        found.append(Listener(node.name, deliver, events, source, stream))
+
+    for name in node.declared.listening:
+        if name in node.declared.handlers:
+            handles = node.declared.handlers[name]
+            add(name, getattr(node, name), handles.events, sources.get(name, handles.source))
+        elif name in node.declared.bundles:
+            matcher, declared = getattr(node, name), node.declared.bundles[name]
+            matcher.deliver = matcher.stream.offer
+            if name in links:
+                matcher.deliver = _linked(links[name], matcher.deliver, fault)
+            for field, slot in matcher.slots.items():
+                port = f"{name}.{field}"
+                of_all = None if slot.kind == "all" else sources.get(name, declared.source)
+                add(port, slot.take, (declared.fields[field].event,), sources.get(port, of_all))
+        else:
+            input_, stream = node.declared.inputs[name], getattr(node, name)
+            source = sources.get(name, input_.source)
+            add(name, stream.offer, (input_.event,), source, stream)
+    return found
+
+
+def no_listeners(_: str) -> Iterable[Listener]:
+    """Return the listeners of an output in other processes, where there are none."""
+    return ()
+
+
+def connect(
+    nodes: Sequence[Node[Any]],
+    sources: Sources,
+    links: Links | None = None,
+    taps: Iterable[Tap] = (),
+    fault: Fault | None = None,
+    last: Iterable[Listener] = (),
+    elsewhere: Callable[[str], Iterable[Listener]] = no_listeners,
+    wrap: Wrap = unwrapped,
+    voices: Voices | None = None,
+) -> list[Listener]:
+    """Freeze every output's listeners, and return all that are here.
+
+    May be called again when nodes come or go.
+
+    Args:
+        nodes: In the order in which they receive events.
+        sources: Ports narrowed by the file.
+        links: Ports whose events come late or not at all.
+        taps: See every event first.
+        fault: Called with listeners that raise; without it, `send` raises what they do.
+        last: Listeners after all nodes.
+        elsewhere: Given ``node.port``, returns its listeners in other processes.
+        wrap: Puts something round the nodes' handlers.
+        voices: Who may send in which name; without it, all in any.
+    """
+    connected = [
+        listener
+        for node in nodes
+        for listener in listeners(
+            node, sources.get(node.name, {}), (links or {}).get(node.name, {}), fault, wrap
+        )
+    ]
+    connected += last
+    for node in nodes:
+        others = [listener for listener in connected if listener.node != node.name]
+        for sender in senders(node).values():
+            sender.connect([*elsewhere(sender.name), *others], taps, fault, voices)
+    return connected
+
+
+def truth_readers(
+    nodes: Iterable[Node[Any]],
+    listeners: Iterable[Listener],
+    announcements: Iterable[Announcement],
+) -> set[str]:
+    """Return the nodes that receive true poses of vehicles or cameras, and do not say what for."""
+    truths = [
+        (Odometry if isinstance(each, VehicleAnnouncement) else PoseStamped, each.source)
+        for each in announcements
+        if isinstance(each, VehicleAnnouncement | CameraAnnouncement)
+    ]
+    said = {node.name for node in nodes if node.flies or node.reads_truth}
+    return {
+        each.node
+        for each in listeners
+        if each.node not in said and any(each.receives(*truth) for truth in truths)
+    } - {"run"}
+
+
+def edges(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str, str, str]]:
+    """Return the graph as (sender, output, event, receiver, input), from the classes alone."""
+    found = []
+    for sender, sending in nodes:
+        for output, declared in sending.declared.outputs.items():
+            for receiver, receiving in nodes:
+                if receiver == sender:
+                    continue
+                for port, events in input_types(receiving).items():
+                    listener = Listener(receiver, _nothing, events)
+                    if listener.may_receive(declared.event):
+                        found.append((sender, output, declared.event.__name__, receiver, port))
+    return found
+
+
+def input_types(cls: type[Node[Any]]) -> dict[str, tuple[Any, ...]]:
+    """Return the event types of a class's inputs, fields of bundles and handlers."""
+    found: dict[str, tuple[Any, ...]] = {}
+    for name in cls.declared.listening:
+        if name in cls.declared.handlers:
+            found[name] = cls.declared.handlers[name].events
+        elif name in cls.declared.bundles:
+            fields = cls.declared.bundles[name].fields
+            found |= {f"{name}.{field}": (each.event,) for field, each in fields.items()}
+        else:
+            found[name] = (cls.declared.inputs[name].event,)
+    return found
+
+
+def unconnected(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[tuple[str, str, str]]:
+    """Return the inputs that no node can send to, as (node, port, event).
+
+    A handler that is never called is nothing to warn of: most nodes can do more than is asked.
+    """
+    connected = {(receiver, port) for *_, receiver, port in edges(nodes)}
+    return [
+        (name, port, " or ".join(e.__name__ for e in events))
+        for name, cls in nodes
+        for port, events in input_types(cls).items()
+        if port not in cls.declared.handlers
+        and (name, port) not in connected
+        and port not in cls.declared.optional_fields()
+    ]
+
+
+def circles(nodes: Sequence[tuple[str, type[Node[Any]]]]) -> list[str]:
+    """Return the circles of handlers each of which always sends what the next one handles."""
+    after = {
+        (name, handler): [
+            (f"{name}.{output} → {other}.{another}", (other, another))
+            for output in _always_sends(cls, handler)
+            for other, receiving in nodes
+            for another, handles in receiving.declared.handlers.items()
+            if other != name
+            and handles.source is None
+            and issubclass(cls.declared.outputs[output].event, handles.events)
+        ]
+        for name, cls in nodes
+        for handler in cls.declared.handlers
+    }
+    found: dict[frozenset[str], str] = {}
+
+    def follow(place: tuple[str, str], way: dict[tuple[str, str], str]) -> None:
+        for step, following in after[place]:
+            if following in way:
+                steps = [*way.values(), step]
+                steps = steps[[*way].index(following) + 1 :]
+                found.setdefault(frozenset(steps), ", ".join(steps))
+            elif following > next(iter(way)):  # else it was found from there
+                follow(following, {**way, following: step})
+
+    for place in after:
+        follow(place, {place: ""})
+    return list(found.values())
+
+
+def _always_sends(cls: type[Node[Any]], handler: str) -> list[str]:
+    """Return the outputs by which a handler sends whatever the event is: it has no branches."""
+    code = list(dis.get_instructions(inspect.unwrap(getattr(cls, handler))))
+    names = {each.argval for each in code if each.opname in {"LOAD_ATTR", "LOAD_METHOD"}}
+    if "send" not in names or any(each.is_jump_target for each in code):
+        return []
+    return [output for output in cls.declared.outputs if output in names]
+
+
+def _linked(link: Link, deliver: Deliver, fault: Fault | None) -> Deliver:
+    """Put a link before a port; what its far end raises later is reported as its near end's is."""
+    return link.to(deliver, None if fault is None else lambda error: fault(deliver, error))
+
+
+def _nothing(_: Any) -> None:
+    pass

@@ -1,0 +1,153 @@
+"""Instruments: hooks by which a trace or a monitor looks at a run, at no cost when there are none.
+
+Attaching an instrument connects the run anew and exchanges what tickers and coroutines call;
+detaching puts back what was there. So a run without instruments does not even ask for them. What
+an instrument does with what it sees is its own business (`runtime.tools.tracing`,
+`runtime.tools.monitor`). The idea is trio's (https://trio.readthedocs.io, Instrument API).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from runtime.channels.sender import Deliver, Tap
+from runtime.channels.tasks import ResumableCoroutine
+from runtime.run.node_runner import NodeRunner
+from runtime.time.schedule import Ticker
+from runtime.workers.worker import Worker
+
+Call = Callable[[Any], Any]
+
+
+class Instrument:
+    """Base of all instruments: override the hooks that you need.
+
+    Attributes:
+        event_sent: Called with each event and its sender, before the event's listeners are.
+    """
+
+    event_sent: Tap | None = None
+
+    def wrap_call(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
+        """Return what is called instead of `call`, by which the loop gets into a node.
+
+        Args:
+            node: The node's name.
+            what: The handler, the tick or the coroutine.
+            call: Takes an event, a `Tick`, or what a coroutine is sent.
+        """
+        return call
+
+    def wrap_offload(
+        self,
+        node: str,  # noqa: ARG002
+        call: Callable[[], Any],
+        name: str,  # noqa: ARG002
+    ) -> Callable[[], Any]:
+        """Return what a thread calls instead of `call`, which a node offloads now.
+
+        Args:
+            node: The node's name.
+            call: Does the work.
+            name: Of the function.
+        """
+        return call
+
+    def worker_called(
+        self, process: str, method: str, answer: concurrent.futures.Future[Any]
+    ) -> None:
+        """Note that a worker's process is asked to run a method, and the answer to come."""
+
+
+class Instruments:
+    """The instruments of one run.
+
+    Args:
+        runners: The nodes that they look at.
+        reconnect: Connects the run's senders and listeners anew, if it is running.
+    """
+
+    def __init__(self, runners: Mapping[str, NodeRunner], reconnect: Callable[[], None]) -> None:
+        self._runners = runners
+        self._reconnect = reconnect
+        self._attached: tuple[Instrument, ...] = ()
+
+    def attach(self, instrument: Instrument) -> None:
+        """Let an instrument look from now on; on the loop, or before it runs."""
+        self._attached += (instrument,)
+        self._renew()
+
+    def detach(self, instrument: Instrument) -> None:
+        """Let it look no more."""
+        self._attached = tuple(each for each in self._attached if each is not instrument)
+        self._renew()
+
+    @property
+    def attached(self) -> tuple[Instrument, ...]:
+        """The instruments that look just now."""
+        return self._attached
+
+    # What the run asks while it connects senders and starts things.
+
+    @property
+    def taps(self) -> tuple[Tap, ...]:
+        """What sees every event before its listeners do."""
+        return tuple(each.event_sent for each in self._attached if each.event_sent is not None)
+
+    def listener(self, node: str, deliver: Deliver) -> Deliver:
+        """Return what is called instead of a handler, or of what is behind a link."""
+        if not self._attached:
+            return deliver
+        name = getattr(getattr(deliver, "__func__", None), "__name__", "handler")
+        wrapped = self._wrapped(node, name, deliver)
+        if wrapped is not deliver:  # the supervisor tells by this whose error a listener raised
+            wrapped.__self__ = getattr(deliver, "__self__", None)  # type: ignore[attr-defined]
+        return wrapped
+
+    def on_ticker(self, ticker: Ticker) -> None:
+        """Look at a ticker from now on."""
+        node, _, what = ticker.name.partition(".")
+        ticker.wrap_call(lambda call: self._wrapped(node, what, call))
+
+    def on_task(self, node: str, task: asyncio.Task[Any]) -> None:
+        """Look at a task of a node from now on, if streams can resume its coroutine."""
+        coro = task.get_coro()
+        if isinstance(coro, ResumableCoroutine):
+            what = coro.__name__.rpartition(".")[2]
+            coro.wrap_step(lambda step: self._wrapped(node, what, step))
+
+    def on_worker(self, worker: Worker[Any]) -> None:
+        """Look at the calls of a worker from now on."""
+        worker.called = self._worker_called if self._attached else None
+
+    def offloaded(self, node: str, call: Any) -> Callable[[], Any]:
+        """Return what a thread calls instead of a `functools.partial` that a node offloads."""
+        name = getattr(call.func, "__qualname__", type(call.func).__name__)
+        for each in self._attached:
+            call = each.wrap_offload(node, call, name)
+        return call  # type: ignore[no-any-return]
+
+    def _renew(self) -> None:
+        """Put the instruments round all that there is."""
+        for name, runner in self._runners.items():
+            for ticker in runner.tickers:
+                self.on_ticker(ticker)
+            for task in runner.tasks:
+                self.on_task(name, task)
+            for worker in runner.workers:
+                self.on_worker(worker)
+        self._reconnect()
+
+    def _wrapped(self, node: str, what: str, call: Call) -> Call:
+        for each in self._attached:
+            call = each.wrap_call(node, what, call)
+        return call
+
+    def _worker_called(
+        self, process: str, method: str, answer: concurrent.futures.Future[Any]
+    ) -> None:
+        for each in self._attached:
+            each.worker_called(process, method, answer)

@@ -1,0 +1,339 @@
+"""What belongs to one node while it runs, and how its errors are named and logged.
+
+A node may raise whatever it likes, `SystemExit` and the like included, and swallow its
+cancellation: each of its steps is a task, waited for within a limit and then left behind.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import time
+from collections.abc import Callable, Coroutine, Iterable
+from typing import Any
+
+from events import Announcement
+from runtime import code_location
+from runtime.channels.hold import Hold
+from runtime.channels.links import Link
+from runtime.config.model import NodeSpec
+from runtime.errors import NodeError, NodeTimeoutError, RefusedError, VisnavError
+from runtime.host import Host
+from runtime.json_values import plain
+from runtime.node import Node, make_node, streams
+from runtime.time.schedule import Ticker
+from runtime.time.time_limits import ended
+from runtime.workers.worker import Worker
+
+log = logging.getLogger("visnav.runtime")
+
+GRACE = 0.5
+"""Real seconds that a step which is over its limit, or not wanted any more, has to give up."""
+
+Create = Callable[[Coroutine[Any, Any, Any], str], asyncio.Task[Any]]
+
+
+class NodeRunner:
+    """What belongs to one node while it runs.
+
+    Args:
+        spec: Its table in the file.
+        create: Makes a task that the run owns.
+
+    Attributes:
+        phase: The step that the run waits for, if it does: ``on_startup``, ``its tasks``…
+    """
+
+    def __init__(self, spec: NodeSpec, create: Create) -> None:
+        self.spec = spec
+        self.node: Node[Any] | None = None
+        self.tasks: dict[asyncio.Task[None], None] = {}  # in the order in which they were made
+        self.tickers: list[Ticker] = []
+        self.workers: list[Worker[Any]] = []
+        self.holds: list[Hold[Any]] = []
+        self.links: dict[str, Link] = {}
+        self.started = False
+        self.starts = 0
+        self.failures = 0
+        self.running_since = 0
+        """When it last began to run, on the run's clock (ns)."""
+        self.restarting = False
+        self.shutting_down = False
+        self.shutdown_lock = asyncio.Lock()
+        self.phase = ""
+        self.phase_task: asyncio.Task[Any] | None = None
+        self._create = create
+        self._succeeded = False
+        self.first_error = False
+        """Whether what fails in a step of the end is the run's error, which is printed then."""
+
+    def awaited(self) -> list[asyncio.Task[Any]]:
+        """Return the tasks that the run waits for in this phase."""
+        return [self.phase_task] if self.phase_task is not None else list(self.tasks)
+
+    async def start_up(self, host: Host, limit: float) -> None:
+        """Make the node and the links before its ports, and start it up.
+
+        Args:
+            host: What the run does for it.
+            limit: Real seconds that `on_startup` may take.
+
+        Raises:
+            NodeError: Something went wrong in it.
+        """
+        spec = self.spec
+        self.shutting_down = False
+        try:
+            self.node = make_node(spec.node, spec.name, spec.config, host, spec.inputs, self.starts)
+            self.links = {
+                port: Link(
+                    f"{spec.name}.{port}", config, host.clock, host.seed, self.links.get(port)
+                )
+                for port, config in spec.links.items()
+            }
+            startup = self.node.on_startup()
+        except BaseException as error:
+            raise wrap(spec.name, error) from error
+        try:
+            await self._within(limit, "on_startup", startup)
+        finally:  # it may have ended well though the run did not want it any more
+            self.started = self._succeeded
+            self.starts += self._succeeded
+
+    def announcements(self) -> list[Announcement]:
+        """Return what the node announces.
+
+        Raises:
+            NodeError: Something went wrong in it, or it returns something else.
+        """
+        assert self.node is not None
+        name = self.spec.name
+        try:
+            given: Any = self.node.announce()
+            found: list[Any] = list(given) if isinstance(given, Iterable) else [given]
+            for each in found:
+                if not isinstance(each, Announcement):
+                    raise NodeError(
+                        name,
+                        "announce(): expected announcements, "
+                        f"found {each!r:.80} ({type(each).__name__})",
+                    )
+                plain(each, f"announce(): {type(each).__name__}")
+            return found
+        except BaseException as error:
+            raise wrap(name, error) from error
+
+    def receive_announcements(self, announcements: Iterable[Announcement]) -> None:
+        """Hand the node all announcements, then ask what it lacks.
+
+        Raises:
+            NodeError: Something went wrong in it; a `RefusedError` if it cannot work with one, or
+                lacks something.
+        """
+        assert self.node is not None
+        name = self.spec.name
+        for announcement in announcements:
+            try:
+                self.node.on_announcement(announcement)
+            except ValueError as error:
+                what = f"cannot work with {announcement.source}: {error}"
+                raise RefusedError(name, what) from error
+            except BaseException as error:
+                raise wrap(name, error) from error
+        try:
+            lacks = list(self.node.check())
+        except BaseException as error:
+            raise wrap(name, error) from error
+        if lacks:
+            raise RefusedError(name, "; ".join(lacks))
+
+    async def get_ready(self, limit: float) -> None:
+        """Let the node get ready with what was announced.
+
+        Args:
+            limit: Real seconds that `on_ready` may take.
+
+        Raises:
+            NodeError: Something went wrong in it.
+        """
+        assert self.node is not None
+        await self._within(limit, "on_ready", self.node.on_ready())
+
+    async def end(self, limit: float) -> list[NodeError]:
+        """Let the node say its last words, within so many real seconds; return what went wrong."""
+        node = self.node
+        if node is None or not self.started or type(node).on_end is Node.on_end:
+            return []
+        async with self.shutdown_lock:
+            return await self._last_step(limit, "on_end", node.on_end())
+
+    async def shut_down(self, limit: float) -> list[NodeError]:
+        """End ticks, tasks, node and workers; whatever goes wrong, the other steps follow.
+
+        Args:
+            limit: Real seconds that a step may take.
+
+        Returns:
+            What went wrong; it is logged.
+        """
+        node, wrong = self.node, []
+        self.shutting_down = True
+        for ticker in self.tickers:
+            ticker.stopped = True
+        self.tickers.clear()
+        for hold in self.holds:  # before the systems are told to end: what they leave is not lost
+            hold.close()
+        self.holds.clear()
+        wrong += await self._end_tasks(limit)
+        if node is not None and self.started:
+            wrong += await self._last_step(limit, "on_shutdown", node.on_shutdown())
+            wrong += await self._end_tasks(limit)  # those that it started meanwhile
+        workers = [asyncio.create_task(asyncio.to_thread(worker.close)) for worker in self.workers]
+        wrong += await self._end_by(limit, "its workers", workers)
+        self.workers.clear()
+        self.started = False
+        for link in self.links.values():
+            link.close()
+        if node is not None:
+            for stream in streams(node).values():
+                stream.close()
+        return wrong
+
+    async def _last_step(
+        self, limit: float, what: str, coro: Coroutine[Any, Any, Any]
+    ) -> list[NodeError]:
+        """Run a step of the end, which goes on whatever happens in it; return what went wrong."""
+        try:
+            await self._within(limit, what, coro)
+        except BaseException as error:
+            if isinstance(error, asyncio.CancelledError) and _is_cancelled():
+                raise
+            wrong = wrap(self.spec.name, error)
+            log_error(wrong, last=self.first_error)
+            self.first_error = False
+            return [wrong]
+        return []
+
+    async def _within(self, limit: float, what: str, coro: Coroutine[Any, Any, Any]) -> None:
+        """Run a step of the node as a task of its own, which is left behind if it does not end.
+
+        Raises:
+            NodeTimeoutError: It did not end within the limit.
+            NodeError: It raised something.
+        """
+        task = self._create(_outcome(coro), self.spec.name)
+        if inspect.iscoroutine(coro):  # which it may never begin, if it is cancelled at once
+            task.add_done_callback(lambda _: coro.close())
+        self.phase, self.phase_task = what, task
+        try:
+            late = await ended([task], limit)
+            place = code_location.of_task(task)[1] if late else ""
+        finally:
+            if not task.done():
+                task.cancel()
+                await ended([task], GRACE)
+            self.phase, self.phase_task = "", None
+            self._succeeded = task.done() and not task.cancelled() and task.result() is None
+        if late:
+            raise self._too_late(what, limit, place)
+        error = None if task.cancelled() else task.result()
+        if error is not None:
+            raise wrap(self.spec.name, error) from error
+
+    async def _end_tasks(self, limit: float) -> list[NodeError]:
+        """Cancel the node's tasks, and those that these start meanwhile, and wait for them."""
+        wrong: list[NodeError] = []
+        until = time.monotonic() + limit
+        while self.tasks:
+            tasks = list(self.tasks)
+            for task in tasks:
+                task.cancel()
+            wrong += await self._end_by(until - time.monotonic(), "its tasks", tasks, limit)
+            for task in tasks:
+                self.tasks.pop(task, None)
+        return wrong
+
+    async def _end_by(
+        self, seconds: float, what: str, tasks: list[asyncio.Task[Any]], limit: float = 0.0
+    ) -> list[NodeError]:
+        """Wait for tasks, leave behind those that do not end, and return what there is to say."""
+        self.phase = what if tasks else ""
+        late = await ended(tasks, max(seconds, 0.0))
+        self.phase = ""
+        wrong: list[NodeError] = [
+            self._too_late(what, limit or seconds, code_location.of_task(task)[1])
+            for task in late[:1]
+        ]
+        for error in wrong:
+            log_error(error, last=False)
+        return wrong
+
+    def _too_late(self, what: str, limit: float, place: str) -> NodeTimeoutError:
+        setting = "startup_limit" if what in {"on_startup", "on_ready"} else "shutdown_limit"
+        late = NodeTimeoutError(
+            self.spec.name,
+            f"expected {what} to end within {limit:.3g} s (run.{setting}), found it still running",
+        )
+        late.place = place
+        return late
+
+
+def log_error(error: NodeError, *, last: bool) -> None:
+    """Log a node's error, with the traceback of what is not an error of ours.
+
+    If it is the last thing that happens, the command line prints it, and the terminal need not
+    have it twice.
+    """
+    cause = error.__cause__
+    ours = isinstance(code_location.leaf(error if cause is None else cause), VisnavError)
+    log.error("%s", with_place(error), exc_info=None if ours else cause, extra={"reported": last})
+
+
+def with_place(error: Exception) -> str:
+    """Return an error's message, and the line that raised it if that is known."""
+    place = getattr(error, "place", "")
+    return f"{error} ({code_location.short(place)})" if place else str(error)
+
+
+def wrap(name: str, error: BaseException) -> NodeError:
+    """Return a node's exception as an error that names the node; such an error as it is."""
+    if isinstance(error, NodeError):
+        return error
+    found = code_location.leaf(error)
+    if isinstance(found, VisnavError):  # says all there is to say; others need their type
+        wrapped = NodeError(name, str(found).removeprefix(f"{name}: "))
+    else:
+        wrapped = NodeError(name, _described(found))
+        there = getattr(found, "place_in_worker", "")
+        wrapped.place = there or (code_location.of_error(found)[1] if found.__traceback__ else "")
+    wrapped.__cause__ = error
+    return wrapped
+
+
+def _described(error: BaseException) -> str:
+    """Return type and message of an exception in one line; of a group, those of its parts."""
+    if isinstance(error, BaseExceptionGroup):
+        parts = [_described(code_location.leaf(part)) for part in error.exceptions]
+        return f"{len(parts)} errors: " + "; ".join(parts)
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # its own fault, too
+        text = "a message that cannot be made"
+    if isinstance(error, SystemExit | KeyboardInterrupt):
+        text = f"{text} (expected self.stop(reason), which ends a run)".strip()
+    return f"{type(error).__name__}: {text}"
+
+
+async def _outcome(coro: Coroutine[Any, Any, Any]) -> BaseException | None:
+    """Await a step of a node, and return what it raises: a loop would not survive all of that."""
+    try:
+        await coro
+    except BaseException as error:
+        return error
+    return None
+
+
+def _is_cancelled() -> bool:
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0

@@ -1,0 +1,443 @@
+"""The life of a run's nodes: started in order, watched over, ended in reverse order.
+
+    construct → on_startup, in file order
+    announce, received by all; check; on_ready, in file order
+    connect; ticks and run() begin: the first update
+    …
+    on_end, in file order; cancel run(), on_shutdown, in reverse order: always, with time limits
+
+The run owns every task, and every wait for one has a limit: a node that does not end is named and
+left behind. What an exception in a node does is up to the node's `on_error`.
+Not here: loops, signals and files (`runtime.run.execute`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Collection, Coroutine, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from events import Announcement, EstimatorAnnouncement, Event, Shutdown, WindowClosed
+from runtime import code_location
+from runtime.channels.sender import Deliver, Listener, Tap, Voices
+from runtime.config.model import Config
+from runtime.errors import FatalError, NodeError, PeerError, VisnavError
+from runtime.host import RunEnd
+from runtime.node import Node
+from runtime.run import graph
+from runtime.run.instruments import Instruments
+from runtime.run.node_host import NodeHost
+from runtime.run.node_runner import NodeRunner, log_error, wrap
+from runtime.run.parameter_server import ParameterServer
+from runtime.run.run_state import RunState
+from runtime.run.startup import Announced, Phase, start_up
+from runtime.run.task_factory import RunTask
+from runtime.time.clock import Clock
+from runtime.time.schedule import SECOND, Once
+
+if TYPE_CHECKING:
+    from runtime.peers.peers import Peers
+
+log = logging.getLogger("visnav.runtime")
+
+FIRST_BACKOFF = 0.5
+"""Seconds of the clock before the first restart of a node; doubled at each failure."""
+
+LONGEST_BACKOFF = 30.0
+"""Seconds of the clock before a restart at most."""
+
+HEALTHY = 60.0
+"""Seconds of the clock after which a node that has not failed counts as one that never did."""
+
+
+class Supervisor:
+    """Runs the nodes of a configuration on the running loop.
+
+    Args:
+        config: What to run.
+        clock: The run's clock.
+        taps: See every event before its listeners do.
+        out: Folder for what nodes write, or `None`.
+        out_of_programs: That for nodes that start programs, if it is another one.
+        only: Nodes that run here, if others run in other processes.
+        stand_ins: Classes in the place of some nodes' own, by the node's name.
+        scripted: Nodes that may send in any name: scripts of tests.
+
+    Attributes:
+        state: What is known of the run.
+        instruments: What looks at the run.
+        parameters: Changes settings of nodes.
+        stepping: Pauses and steps simulated time.
+        peers: The other processes of the run, if there are any.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        clock: Clock,
+        taps: Sequence[Tap] = (),
+        out: Path | None = None,
+        only: Collection[str] = (),
+        stand_ins: Mapping[str, type[Node[Any]]] = MappingProxyType({}),
+        out_of_programs: Path | None = None,
+        scripted: Collection[str] = (),
+    ) -> None:
+        here = [spec for spec in config.nodes if not only or spec.name in only]
+        runners = {}
+        for spec in here:
+            node = stand_ins.get(spec.name, spec.node)
+            runners[spec.name] = NodeRunner(msgspec.structs.replace(spec, node=node), self._own)
+        several = len(runners) < len(config.nodes)
+        self.state = RunState(config, clock, runners, several_processes=several)
+        self.instruments = Instruments(runners, self._reconnect)
+        self.parameters = ParameterServer(self.state, self.fault)
+        self._host = NodeHost(
+            self.state,
+            out,
+            out_of_programs or out,
+            self.instruments,
+            self.parameters,
+            self._own,
+            lambda node, reason: self.stop(reason, by=node),
+            self.fault,
+        )
+        self.stepping = self._host.stepping
+        self._taps = tuple(taps)
+        self._voices = Voices([spec.name for spec in config.nodes], scripted)
+        self.peers: Peers | None = None
+        if several:
+            from runtime.peers.peers import Peers
+
+            self.peers = Peers(config, only, clock, self)
+        self._ended = asyncio.Event()
+        self._startup: asyncio.Task[None] | None = None
+        self._tasks: dict[asyncio.Task[Any], None] = {}
+        self._restarts: dict[asyncio.Task[Any], None] = {}
+
+    async def main(self) -> None:
+        """Run until something ends the run; the state's `reason` and `error` then say what did."""
+        self._startup = self._own(self._start_all(), "start")
+        try:
+            await self._ended.wait()
+            await asyncio.wait([self._startup])
+            await self._end_all()
+        finally:  # there are none left but those that would not end, unless this was cancelled
+            for task in self._tasks:
+                task.cancel()
+            self._host.close()
+
+    def _own(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
+        """Make a task of the run."""
+        task = asyncio.get_running_loop().create_task(coro, name=name)
+        if isinstance(task, RunTask):
+            task.protected = True
+        self._tasks[task] = None
+        task.add_done_callback(lambda _: self._tasks.pop(task, None))
+        return task
+
+    # What others ask of a run.
+
+    def stop(
+        self,
+        reason: str,
+        error: Exception | None = None,
+        *,
+        by: str = "user",
+        from_peer: bool = False,
+    ) -> None:
+        """End the run in order; the first reason counts.
+
+        Args:
+            reason: For the summary.
+            error: What went wrong, if anything did.
+            by: Who ends it, as in `RunEnd`.
+            from_peer: Whether another process reported it, and need not be notified.
+        """
+        if self._ended.is_set():
+            return
+        state = self.state
+        if state.stop_requested:
+            reason, by = state.stop_requested, "user"
+        by = "user" if error is None and self._ends_run(by) == "hand" else by
+        if self.peers is not None:
+            self.peers.stopping(reason, error, by=by, from_peer=from_peer)
+        state.reason = reason
+        state.error = error
+        state.stopped, state.stopped_at = time.monotonic(), state.clock.now()
+        state.end = RunEnd(
+            stamp=state.stopped_at,
+            reason=reason,
+            by=by,
+            error="" if error is None else str(error),
+            planned=error is None and self._is_planned(by),
+            duration=state.config.run.duration or None,
+            restarts={name: max(each.starts - 1, 0) for name, each in state.runners.items()},
+            truth_readers=frozenset(state.truth_readers),
+        )
+        if error is not None or state.stop_requested:
+            state.clock.hurry()
+        self._ended.set()
+        if self._startup is not None and not self._startup.done():
+            self._startup.cancel()
+
+    def _is_planned(self, by: str) -> bool:
+        """Tell whether the run's plan is over if `by` ends it without an error."""
+        if by != "user":
+            return not by or self._ends_run(by) == "plan"
+        config = self.state.config  # no simulator alone has a plan
+        return not config.run.duration and all(n.node.ends_run != "plan" for n in config.nodes)
+
+    def _ends_run(self, name: str) -> str:
+        """Return what is over if a node ends the run; see `Node.ends_run`."""
+        nodes = {spec.name: spec.node for spec in self.state.config.nodes}
+        if name not in nodes:
+            return ""
+        return nodes[name].ends_run or ("plan" if nodes[name].flies else "")
+
+    def escaped(self, error: BaseException) -> None:
+        """Deal with an exception that came out of the loop: some task or callback let it."""
+        name, place = code_location.of_error(error)
+        if name in self.state.runners:
+            self.fault(name, error)
+            return
+        wrapped = wrap("runtime", error)
+        log_error(wrapped, last=not self._ended.is_set())
+        self.state.note_error(wrapped)
+        self.stop(f"failed at {place}", wrapped, by="runtime")
+
+    def fault(self, name: str, error: BaseException) -> None:
+        """Deal with an exception in a node as its `on_error` says."""
+        runner = self.state.runners[name]
+        if runner.restarting:
+            return
+        wrapped = wrap(name, error)
+        fatal = (
+            isinstance(code_location.leaf(error), FatalError)
+            or runner.spec.on_error == "stop"
+            or not self.state.running
+        )
+        log_error(wrapped, last=fatal and not self._ended.is_set())
+        if self._ended.is_set():
+            self.state.note_error(wrapped)
+        elif fatal:
+            self.stop(f"{name} failed", wrapped, by=name)
+        else:
+            self.restart(name)
+
+    def restart(self, name: str, *, anyway: bool = False) -> None:
+        """Take a node out, and bring up a new one in its place if its `on_error` wants that.
+
+        Args:
+            name: Of the node.
+            anyway: Bring one up whatever that says: it was requested.
+        """
+        runner = self.state.runners[name]
+        runner.restarting = True
+        if self.state.clock.now() - runner.running_since > HEALTHY * SECOND:
+            runner.failures = 0
+        task = self._own(self._restart(runner, anyway), f"restart {name}")
+        self._restarts[task] = None
+        task.add_done_callback(lambda task: self._restarts.pop(task, None))
+
+    def connect(self) -> None:
+        """Freeze each output's listeners; anew whenever a node or another process comes or goes."""
+        runners = self.state.runners.values()
+        nodes = [runner.node for runner in runners if runner.node and runner.started]
+        taps = (*self._taps, *self.instruments.taps)
+        listeners = graph.connect(
+            nodes,
+            sources={node.name: node.sources for node in nodes},
+            links={runner.spec.name: runner.links for runner in runners},
+            taps=taps,
+            fault=self._listener_failed,
+            last=[Listener("run", self._receive_end, (Shutdown, WindowClosed))],
+            elsewhere=self.peers.listeners if self.peers is not None else graph.no_listeners,
+            wrap=self.instruments.listener,
+            voices=self._voices,
+        )
+        self.state.truth_readers |= graph.truth_readers(nodes, listeners, self.state.announcements)
+        if self.peers is not None:
+            self.peers.connect(listeners, self._listener_failed)
+        self.parameters.connect(listeners, taps, self._listener_failed)
+
+    def _reconnect(self) -> None:
+        if self.state.running:  # before, nodes must not be able to send
+            self.connect()
+
+    def _listener_failed(self, deliver: Deliver, error: BaseException) -> None:
+        owner: Any = deliver.__self__  # type: ignore[attr-defined]  # a node, or a stream of one
+        self.fault(owner.name.partition(".")[0], error)
+
+    def _receive_end(self, event: Event) -> None:
+        reason = getattr(event, "reason", "") or type(event).__name__
+        by = self._voices.owner(event.source) or event.source
+        self.stop(f"{event.source}: {reason}", by=by)
+
+    # Starting.
+
+    async def _start_all(self) -> None:
+        state = self.state
+        try:
+            announced = await self._start_nodes()
+            state.before_first_update()
+        except PeerError as error:
+            log.error("%s", error, extra={"reported": True})
+            self.stop("the processes of the run did not come together", error, by="runtime")
+            return
+        except asyncio.CancelledError:  # the run is to end
+            raise
+        except BaseException as error:
+            failed = wrap("runtime", error)
+            log_error(failed, last=True)
+            self.stop("start-up failed", failed, by=failed.node)
+            return
+        for announcement in announced:
+            for tap in self._taps:
+                tap(None, announcement)
+        self.connect()
+        for each in state.announcements:
+            node = self._voices.owner(each.source)
+            undeclared = isinstance(each, EstimatorAnnouncement) and "truth" not in each.reads
+            if undeclared and node in state.truth_readers:
+                log.warning("%s: receives true poses, and does not announce so", node)
+        state.running = True
+        state.first_update = time.monotonic()
+        if self.peers is None:
+            state.clock.start()
+        if state.config.run.duration:
+            end = state.clock.now() + round(state.config.run.duration * SECOND)
+            state.clock.schedule.add(end, Once(lambda: self.stop("duration", by="")))
+        for index, spec in enumerate(state.config.nodes):
+            if spec.name in state.runners:
+                state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
+                self._host.run_node(state.runners[spec.name])
+        if self.peers is not None:
+            self.peers.nodes_run()
+
+    async def _start_nodes(self) -> list[Announcement]:
+        """Bring the nodes here to where their first update is next; return their announcements."""
+        mine: list[Announcement] = []
+
+        async def start(runner: NodeRunner) -> None:
+            await self._start_node(runner)
+            self._check_wanted()
+
+        async def exchange(announced: Announced) -> list[Announcement]:
+            mine.extend(chain(*announced.values()))
+            self.state.announcements += await self.peers.announce(announced) if self.peers else mine
+            return self.state.announcements
+
+        async def ready(runner: NodeRunner) -> None:
+            await runner.get_ready(self.state.config.run.startup_limit)
+            self._check_wanted()
+
+        runners = self.state.runners.values()
+        if self.peers is not None:
+            before = await self.peers.meet()
+            for runner in runners:
+                runner.starts = before
+        await start_up(
+            runners,
+            start=start,
+            exchange=exchange,
+            ready=ready,
+            failed=_give_up,
+            voices=self._voices,
+        )
+        if self.peers is not None:
+            self.connect()  # so that each knows what the others receive
+            await self.peers.begin()
+        return mine
+
+    def _check_wanted(self) -> None:
+        """End the start-up if a node has stopped the run and did not wait for anything after."""
+        if self._ended.is_set():
+            raise asyncio.CancelledError
+
+    async def _start_node(self, runner: NodeRunner) -> None:
+        state = self.state
+        try:
+            await runner.start_up(self._host, state.config.run.startup_limit)
+        finally:
+            if runner.node is not None and runner.node not in state.all_nodes:
+                state.all_nodes.append(runner.node)
+            state.links |= {link.name: link for link in runner.links.values()}
+
+    async def _restart(self, runner: NodeRunner, anyway: bool) -> None:
+        name = runner.spec.name
+        # Shielded: the end of the run ends this task, but must not cut an on_shutdown short.
+        await asyncio.shield(self._own(self._shut_down(runner), name))
+        if runner.spec.on_error == "drop" and not anyway:
+            log.warning("%s: left out from here on", name)
+            return
+        while not self._ended.is_set():
+            pause = min(FIRST_BACKOFF * 2 ** min(runner.failures, 16), LONGEST_BACKOFF)
+            runner.failures += 1
+            log.warning("%s: restarts in %g s", name, pause)
+            await self.state.clock.sleep(pause)
+            try:
+                await self._start_node(runner)
+                runner.receive_announcements(self.state.announcements)
+                await runner.get_ready(self.state.config.run.startup_limit)
+            except NodeError as error:
+                if isinstance(code_location.leaf(error.__cause__ or error), FatalError):
+                    log_error(error, last=True)
+                    self.stop(f"{name} failed", error, by=name)
+                    return
+                log_error(error, last=False)
+                await asyncio.shield(self._own(self._shut_down(runner), name))
+                continue
+            runner.restarting = False
+            self.connect()
+            self._host.run_node(runner)
+            return
+
+    # Ending.
+
+    async def _end_all(self) -> None:
+        for ticker in self.state.tickers.values():
+            ticker.stopped = True
+        for task in self._restarts:
+            task.cancel()
+        if self._restarts:
+            await asyncio.wait(self._restarts)
+        if not self.state.running:  # what has started may still send farewells to what has, too
+            self.connect()
+        for runner in self.state.runners.values():
+            runner.first_error = self.state.error is None
+            for error in await runner.end(self.state.shutdown_limit()):
+                self.state.note_error(error)
+        for name, runner in reversed(self.state.runners.items()):
+            await self._wait_to_end(name)
+            await self._shut_down(runner)
+            if self.peers is not None:
+                self.peers.node_ended(name)
+        await self._wait_to_end("")
+
+    async def _wait_to_end(self, name: str) -> None:
+        """Let the nodes after this one end first, in whichever process they are."""
+        try:
+            if self.peers is not None:
+                await self.peers.shutdown.wait_to_end(name)
+        except VisnavError as error:
+            log.error("%s", error)
+            self.state.note_error(error)
+
+    async def _shut_down(self, runner: NodeRunner) -> None:
+        """End one node, unless that is done: it receives nothing afterwards."""
+        async with runner.shutdown_lock:
+            runner.first_error = self.state.error is None
+            for error in await runner.shut_down(self.state.shutdown_limit()):
+                self.state.note_error(error)
+            self.connect()
+
+
+def _give_up(_phase: Phase, _runner: NodeRunner, error: NodeError) -> None:
+    raise error

@@ -1,0 +1,1 @@
+"""Time: clocks, schedules, and the loop whose time jumps."""

@@ -1,0 +1,201 @@
+"""What is due when, in integer nanoseconds of the run's clock.
+
+Both clocks keep one `Schedule`; they differ in how they get from one due time to the next. Things
+due at the same time run in the order in which they were added, which for ticks is the order of
+the nodes in the file.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any, Protocol
+
+import msgspec
+
+from runtime.time.histogram import DurationHistogram
+
+SECOND = 1_000_000_000
+
+
+class Tick(msgspec.Struct, frozen=True, gc=False):
+    """One call of an `@every` method.
+
+    Attributes:
+        stamp: Nanoseconds at which it was due. After missed ticks, the last of them.
+        index: Periods since the first tick.
+        late: Nanoseconds from the first due time not yet served to this call.
+        missed: Ticks skipped because the last call or something else took too long.
+    """
+
+    stamp: int
+    index: int
+    late: int
+    missed: int
+
+
+class Entry(Protocol):
+    """Something in the schedule."""
+
+    def fire(self, due: int, now: int) -> int | None:
+        """Run, and return when to run again, or `None`."""
+
+
+class Schedule:
+    """A queue of due times."""
+
+    def __init__(self) -> None:
+        self.heap: list[tuple[int, int, Entry]] = []
+        self.order = 0
+        """Number of what is added next; of things due at one time, the lowest comes first."""
+        self.on_sooner: Callable[[int], None] = _ignore
+        """Called when something is added that is due before all else."""
+
+    def add(self, due: int, entry: Entry) -> None:
+        """Run `entry` at `due`, after all that was added for that time before."""
+        order = self.order
+        self.order = order + 1
+        self._push((due, order, entry))
+
+    def next_due(self) -> int | None:
+        """Return the earliest due time, or `None` if nothing is due ever."""
+        return self.heap[0][0] if self.heap else None
+
+    def run_first(self, now: int) -> None:
+        """Run the entry due first; it keeps its place among its equals when it comes again."""
+        heap = self.heap
+        item = due, order, entry = heap[0]
+        again = None
+        try:
+            again = entry.fire(due, now)
+        finally:
+            if heap[0] is not item:  # it added something for an earlier time
+                heap.remove(item)
+                heapq.heapify(heap)
+                heapq.heappush(heap, item := (-1, order, entry))
+            if again is None:
+                heapq.heappop(heap)
+            else:
+                heapq.heapreplace(heap, (again, order, entry))
+
+    def run_due(self, now: Callable[[], int]) -> None:
+        """Run all that is due by now, in order; what falls due meanwhile is left for later."""
+        limit = now()
+        while self.heap and self.heap[0][0] <= limit:
+            self.run_first(now())
+
+    def _push(self, item: tuple[int, int, Entry]) -> None:
+        heapq.heappush(self.heap, item)
+        if self.heap[0] is item:
+            self.on_sooner(item[0])
+
+
+class Once:
+    """Calls a function once, unless cancelled before."""
+
+    __slots__ = ("call",)
+
+    def __init__(self, call: Callable[[], Any]) -> None:
+        self.call: Callable[[], Any] | None = call
+
+    def fire(self, due: int, now: int) -> None:  # noqa: ARG002
+        """Call it."""
+        if self.call is not None:
+            self.call()
+
+    def cancel(self) -> None:
+        """Do nothing when the time comes."""
+        self.call = None
+
+
+class Ticker:
+    """Calls a function at a steady rate.
+
+    Args:
+        name: ``node.method``, for statistics.
+        hz: Rate; due times are exact multiples of its period, rounded down to nanoseconds.
+        call: Takes a `Tick`.
+        fault: Called with what `call` raises.
+        before: The ticker that this one replaces, whose statistics it carries on.
+    """
+
+    __slots__ = (
+        "_call",
+        "_fault",
+        "_function",
+        "_hz",
+        "_index",
+        "_period",
+        "_start",
+        "calls",
+        "late",
+        "missed",
+        "name",
+        "stopped",
+    )
+
+    def __init__(
+        self,
+        name: str,
+        hz: float,
+        call: Callable[[Tick], Any],
+        fault: Callable[[BaseException], None],
+        before: Ticker | None = None,
+    ) -> None:
+        self.name = name
+        self.calls: int = before.calls if before else 0
+        self.missed: int = before.missed if before else 0
+        self.late: DurationHistogram = before.late if before else DurationHistogram()
+        self.stopped = False
+        self._hz = Fraction(hz).limit_denominator(1_000_000) or Fraction(hz)
+        self._period = SECOND * self._hz.denominator  # times the numerator: an integer
+        self._function = self._call = call
+        self._fault = fault
+        self._start = 0
+        self._index = 0
+
+    def wrap_call(self, wrap: Callable[[Callable[[Tick], Any]], Callable[[Tick], Any]]) -> None:
+        """Call from now on what `wrap` returns for the function, in place of what was before."""
+        self._call = wrap(self._function)
+
+    def begin(self, start: int) -> None:
+        """Have the first tick at `start` (ns)."""
+        self._start = start
+        self._index = 0
+
+    @property
+    def hz(self) -> float:
+        """Ticks per second."""
+        return float(self._hz)
+
+    @property
+    def due(self) -> int:
+        """When the next tick is due (ns)."""
+        return self._start + self._index * self._period // self._hz.numerator
+
+    def fire(self, due: int, now: int) -> int | None:
+        """Call the function, and return when it is due again."""
+        if self.stopped:
+            return None
+        late = now - due
+        missed = 0
+        if late > 0:
+            last = (now - self._start) * self._hz.numerator // self._period
+            missed = max(last - self._index, 0)
+            if missed:
+                self._index += missed
+                self.missed += missed
+        tick = Tick(self.due if missed else due, self._index, late, missed)
+        self._index += 1
+        self.calls += 1
+        self.late.add(late)
+        try:
+            self._call(tick)
+        except BaseException as error:  # even that must not take the other ticks with it
+            self._fault(error)
+        return self.due
+
+
+def _ignore(_: int) -> None:
+    pass

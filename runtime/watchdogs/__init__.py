@@ -1,1 +1,0 @@
-"""What notices that an event loop is blocked, or that a run makes no progress."""

@@ -1,0 +1,72 @@
+"""Events through a pipe: what goes in comes out, whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import pytest
+
+from events import Event
+from nodes.data.recorder import pipe
+from runtime.wire import pack, unpack
+from tests.nodes.data.recorder.samples import announcements, image, imu, said, same
+
+
+def through(data: list[Event], cut: int = 0) -> list[pipe.Piece]:
+    """Send events through a pipe, without the last `cut` bytes."""
+    there, here = os.pipe()
+    buffers = [b for e in data for b in pipe.pieces(e.stamp + 1, pack(e), pipe.EVENT)]
+    if cut:
+        buffers = [b"".join(memoryview(b).cast("B") for b in buffers)[:-cut]]
+
+    def send() -> None:
+        pipe.write_all(here, buffers)
+        os.close(here)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    found = list(pipe.read_all(there, 10.0, lambda: None))
+    sender.join()
+    os.close(there)
+    return found
+
+
+def test_events_come_out_as_they_went_in() -> None:
+    """All kinds, with their times, at alignments of their arrays."""
+    events = [*announcements(), *said(3)]
+    found = through(events)
+    assert [each.time for each in found] == [each.stamp + 1 for each in events]
+    assert all(same(unpack(each.frame), event) for each, event in zip(found, events, strict=True))
+
+
+@pytest.mark.parametrize("cut", [1, 40, 200])
+def test_half_an_event_at_the_end_is_left_out(cut: int) -> None:
+    """The other side was killed: what came whole counts."""
+    found = through([imu(1), image(2)], cut)
+    assert [each.time for each in found] == [2]
+
+
+def test_silence_is_noticed() -> None:
+    """While nothing comes there is time to end a chunk."""
+    there, here = os.pipe()
+    calls: list[int] = []
+
+    def while_idle() -> None:
+        calls.append(1)
+        if len(calls) == 2:
+            pipe.write_all(here, [pipe.end(9)])
+            os.close(here)
+
+    assert [each.what for each in pipe.read_all(there, 0.001, while_idle)] == [pipe.END]
+    assert len(calls) == 2
+    os.close(there)
+
+
+def test_nobody_reading_is_an_error() -> None:
+    """It must not be taken for success."""
+    there, here = os.pipe()
+    os.close(there)
+    with pytest.raises(BrokenPipeError):
+        pipe.write_all(here, [b"x"])
+    os.close(here)

@@ -1,0 +1,125 @@
+"""What counts as lost, and how much of a flight was covered."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from events import PoseEstimate
+from nodes.judging.evaluation.coverage import Interval, answered, choose_frames, cover, seconds
+from nodes.judging.evaluation.judging import judge
+from nodes.judging.evaluation.record import EstimatorRecord
+from tests.nodes.judging.report.folders import walk
+
+MS = 1_000_000
+SECOND = 1000 * MS
+GAP = 500 * MS
+
+FRAMES = np.arange(0, 12 * SECOND, 50 * MS)
+
+
+def lost(poses: npt.NDArray[np.int64], frames: npt.NDArray[np.int64] = FRAMES) -> float:
+    return seconds(cover(frames, poses, GAP).lost)
+
+
+def test_silence_counts_at_the_start_in_the_middle_and_at_the_end() -> None:
+    last = FRAMES[-1] / SECOND
+    assert lost(FRAMES) == 0.0
+    assert lost(FRAMES[FRAMES >= 2 * SECOND]) == pytest.approx(2.0)
+    assert lost(FRAMES[FRAMES <= 9 * SECOND]) == pytest.approx(last - 9.0)
+    middle = (FRAMES <= 4 * SECOND) | (FRAMES >= 8 * SECOND)
+    assert lost(FRAMES[middle]) == pytest.approx(4.0)
+    assert lost(FRAMES[:0]) == pytest.approx(last)
+
+
+def test_a_slow_camera_makes_nobody_lost() -> None:
+    frames = np.arange(0, 10 * SECOND, SECOND)
+    assert lost(frames, frames) == 0.0
+    assert lost(np.delete(frames, 5), frames) == pytest.approx(2.0)
+
+
+def test_what_it_said_of_itself_counts_within_the_flight() -> None:
+    said = [
+        Interval(-SECOND, SECOND),
+        Interval(3 * SECOND, 4 * SECOND),
+        Interval(11 * SECOND, 10**15),
+    ]
+    coverage = cover(FRAMES, FRAMES, GAP, said)
+    assert seconds(coverage.lost) == pytest.approx(1.0 + 1.0 + FRAMES[-1] / SECOND - 11.0)
+
+
+def test_images_are_answered_by_poses_of_their_time() -> None:
+    shifted = FRAMES + 20 * MS
+    assert answered(FRAMES, shifted).all()
+    assert answered(FRAMES, FRAMES[::5]).mean() == pytest.approx(0.2)
+    assert not answered(FRAMES, FRAMES + 10**12).any()
+
+
+def test_the_camera_is_the_one_whose_stamps_the_poses_have() -> None:
+    slow, quick = np.arange(0, SECOND, 100 * MS), np.arange(0, SECOND, 10 * MS)
+    cameras = {"slow": slow, "quick": quick}
+    assert choose_frames(cameras, quick[1::2]) is quick
+    assert choose_frames(cameras, slow) is slow
+    assert choose_frames({}, slow) is None
+
+
+@st.composite
+def flights(draw: st.DrawFn) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    steps = draw(st.lists(st.integers(1, 900), min_size=1, max_size=40))
+    frames = np.cumsum(steps).astype(np.int64) * MS
+    kept = draw(st.lists(st.booleans(), min_size=len(frames), max_size=len(frames)))
+    return frames, np.array(kept)
+
+
+@given(flights())
+def test_every_image_without_a_pose_for_longer_than_the_gap_is_in_a_lost_interval(
+    flight: tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]],
+) -> None:
+    frames, kept = flight
+    poses = frames[kept]
+    coverage = cover(frames, poses, GAP)
+    edges = [int(frames[0]), *poses.tolist(), int(frames[-1])]
+    has_pose = answered(frames, poses)
+    for stamp in frames[~has_pose].tolist():
+        before = max(edge for edge in edges if edge <= stamp)
+        after = min(edge for edge in edges if edge >= stamp)
+        inside = any(start <= stamp <= end for start, end in coverage.lost)
+        assert inside or after - before <= GAP
+    for start, end in coverage.lost:
+        assert end - start > GAP
+        assert (~has_pose[(frames >= start) & (frames <= end)]).any()
+    assert 0.0 <= coverage.percent <= 100.0
+
+
+@given(flights(), st.data())
+def test_saying_less_never_looks_better(
+    flight: tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]], data: st.DataObject
+) -> None:
+    frames, kept = flight
+    poses = frames[kept]
+    fewer = poses[np.array([data.draw(st.booleans()) for _ in poses], dtype=bool)]
+    more, less = cover(frames, poses, GAP), cover(frames, fewer, GAP)
+    assert less.percent <= more.percent
+    assert less.answered <= more.answered
+    assert seconds(less.lost) >= seconds(more.lost)
+
+
+@pytest.mark.parametrize("late", [0.015, 0.3, 4.0])
+def test_being_late_hides_no_silence(late: float) -> None:
+    """One image on which it stood for four seconds makes no later silence shorter."""
+    truth = walk(12)
+    record = EstimatorRecord()
+    for stamp in range(0, 12 * SECOND, 50 * MS):
+        if 5 * SECOND < stamp < 7 * SECOND:
+            continue
+        delay = round((late if stamp == 5 * SECOND else 0.015) * SECOND)
+        x, y, z = truth.positions[truth.stamps.searchsorted(stamp)].tolist()
+        q = (1.0, 0.0, 0.0, 0.0)
+        event = PoseEstimate(stamp=stamp, source="e", position=(x, y, z), orientation=q)
+        record.add(event, stamp + delay)
+    figures = judge(record, truth, end=12 * SECOND).figures
+    assert figures["lost_seconds"] == pytest.approx(2.0)
+    assert figures["coverage_percent"] == pytest.approx(100 * 10 / 12, abs=0.1)

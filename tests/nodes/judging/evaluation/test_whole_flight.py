@@ -1,0 +1,248 @@
+"""No estimator looks better by giving up: in each pair the worse one has the worse figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+
+from nodes.judging.evaluation.coverage import cover
+from nodes.judging.evaluation.judging import judge
+from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.whole_flight import held_errors, interpolated_errors
+from nodes.trajectory import Trajectory
+from tests.nodes.judging.evaluation.flights import (
+    MS,
+    SECOND,
+    estimate,
+    heading,
+    lost,
+    place,
+    regained,
+)
+
+SECONDS = 20
+END = SECONDS * SECOND
+FRAMES = np.arange(0, END + 1, 50 * MS)
+GAP = SECOND // 2
+
+Say = Callable[[EstimatorRecord, int, float], None]
+"""Adds what an estimator says of an image: record, stamp (ns), share of the flight."""
+
+
+def flight() -> Trajectory:
+    """Two rounds on a circle of 2 m radius, 25 m in all: it ends where it began."""
+    stamps = np.arange(0, END + 1, 5 * MS)
+    places = [place(int(stamp)) for stamp in stamps]
+    return Trajectory(stamps, np.array(places), np.array([heading(int(s)) for s in stamps]))
+
+
+TRUTH = flight()
+PATH = TRUTH.length()
+
+
+def drifts(percent: float) -> Say:
+    """Be off by so many percent of the path flown, to the side."""
+
+    def say(record: EstimatorRecord, stamp: int, share: float) -> None:
+        error = (0.0, 0.0, percent / 100 * share * PATH)
+        record.add(estimate(stamp, error=error), stamp + MS)
+
+    return say
+
+
+def until(share: float, say: Say) -> Say:
+    return lambda record, stamp, now: say(record, stamp, now) if now < share else None
+
+
+def after(share: float, say: Say) -> Say:
+    return lambda record, stamp, now: say(record, stamp, now) if now >= share else None
+
+
+def silent(start: float, end: float, say: Say) -> Say:
+    return lambda record, stamp, now: None if start < now < end else say(record, stamp, now)
+
+
+def stuck(record: EstimatorRecord, stamp: int, share: float) -> None:
+    """Repeat the first place for ever: it is as far off as the circle is wide."""
+    x, y, z = place(stamp)
+    first = place(0)
+    record.add(estimate(stamp, error=(first[0] - x, first[1] - y, first[2] - z)), stamp + MS)
+
+
+def in_a_new_frame(share: float) -> Say:
+    """Begin anew in a frame of its own, without an error."""
+
+    def say(record: EstimatorRecord, stamp: int, now: float) -> None:
+        record.add(estimate(stamp, frame_id="map" if now < share else "odom_1"), stamp + MS)
+
+    return say
+
+
+def judged(say: Say, scale_free: bool = False, **options: Any) -> dict[str, Any]:
+    record = EstimatorRecord(scale_free)
+    for stamp in FRAMES.tolist():
+        say(record, stamp, stamp / END)
+    return judge(record, TRUTH, cameras={"c": FRAMES}, **options).figures
+
+
+def nothing(record: EstimatorRecord, stamp: int, share: float) -> None:
+    """Say nothing."""
+
+
+PAIRS: dict[str, tuple[Say, Say]] = {
+    "gives up half-way; drifts by 2 %": (until(0.5, drifts(0)), drifts(2)),
+    "gives up half-way; drifts by 30 %": (until(0.5, drifts(0)), drifts(30)),
+    "gives up earlier; later": (until(0.4, drifts(0)), until(0.6, drifts(0))),
+    "gives up at the end; does not": (until(0.95, drifts(1)), drifts(1)),
+    "never starts; drifts by 50 %": (nothing, drifts(50)),
+    "never starts; starts half-way": (nothing, after(0.5, drifts(0))),
+    "says one pose; drifts by 50 %": (until(0.001, drifts(0)), drifts(50)),
+    "starts late; drifts by 2 %": (after(0.3, drifts(0)), drifts(2)),
+    "restarts in a new frame; drifts by 2 %": (in_a_new_frame(0.5), drifts(2)),
+    "restarts earlier; later": (in_a_new_frame(0.3), in_a_new_frame(0.7)),
+    "is silent for a while; drifts by 2 %": (silent(0.4, 0.6, drifts(0)), drifts(2)),
+    "is silent for longer": (silent(0.3, 0.6, drifts(1)), silent(0.4, 0.5, drifts(1))),
+    "never starts; repeats the first place": (nothing, stuck),
+    "drifts more; less": (drifts(3), drifts(2)),
+}
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_worse_one_looks_worse(pair: str) -> None:
+    worse, better = (judged(say) for say in PAIRS[pair])
+    assert worse["held_ate_percent"] > 1.05 * better["held_ate_percent"]
+
+
+def test_the_figures_are_those_of_the_page() -> None:
+    assert judged(nothing)["held_ate_percent"] == pytest.approx(100 / np.sqrt(3), rel=0.01)
+    assert judged(until(0.5, drifts(0)))["held_ate_percent"] == pytest.approx(20.4, rel=0.02)
+    assert judged(drifts(2))["held_ate_percent"] == pytest.approx(2 / np.sqrt(3), rel=0.01)
+
+
+def test_without_a_loss_it_is_the_absolute_error() -> None:
+    for percent in (0.5, 7.0):
+        figures = judged(drifts(percent))
+        # But for the last image, whose answer may still be on its way.
+        assert figures["held_ate_rmse_m"] == pytest.approx(figures["ate_rmse_m"], rel=0.005)
+        assert figures["held_ate_percent"] == pytest.approx(figures["ate_percent"], rel=0.005)
+
+
+def test_a_slow_estimator_that_is_not_lost_is_not_charged() -> None:
+    """Two poses a second of twenty images: rate and latency have figures of their own."""
+    every_tenth: Say = lambda r, s, now: drifts(1)(r, s, now) if s % (500 * MS) == 0 else None  # noqa: E731
+    assert judged(every_tenth)["lost_seconds"] == 0.0
+    assert judged(every_tenth)["held_ate_percent"] == pytest.approx(
+        judged(drifts(1))["held_ate_percent"], rel=0.02
+    )
+
+
+@pytest.mark.parametrize("poses", [3, 4, 10])
+def test_an_alignment_of_few_poses_hides_nothing(poses: int) -> None:
+    """Sim(3) lays three poses on any others: the absolute error is nothing, the flight is lost."""
+    few = until(poses * 50 * MS / END - 1e-6, drifts(30))
+    figures = judged(few, scale_free=True)
+    assert figures["estimates"] == poses
+    assert figures["alignment"] == "sim3"
+    assert figures["ate_percent"] < 0.01
+    assert figures["held_ate_percent"] > 50.0
+
+
+def test_what_sim3_shrinks_to_a_point_is_no_motion() -> None:
+    random = np.random.default_rng(3)
+
+    def garbage(record: EstimatorRecord, stamp: int, share: float) -> None:
+        x, y, z = random.normal(0.0, 100.0, 3).tolist()
+        record.add(estimate(stamp, error=(x, y, z)), stamp + MS)
+
+    figures = judged(garbage, scale_free=True)
+    assert figures["rpe_mean_trans_percent"] > 80.0
+    assert figures["held_ate_percent"] > 5.0
+
+
+def test_poses_on_a_line_that_cannot_be_aligned_count_as_none() -> None:
+    def along(record: EstimatorRecord, stamp: int, share: float) -> None:
+        x, y, z = place(stamp)
+        record.add(estimate(stamp, error=(share - x, -y, -z)), stamp + MS)
+
+    figures = judged(along, scale_free=True)
+    assert "why" in figures
+    assert figures["held_ate_percent"] == pytest.approx(57.8, abs=0.1)
+
+
+def test_initialization_takes_until_the_first_pose_or_the_whole_flight() -> None:
+    assert judged(drifts(0))["initialization_seconds"] == 0.0
+    assert judged(after(0.25, drifts(0)))["initialization_seconds"] == pytest.approx(5.0)
+    assert judged(nothing)["initialization_seconds"] == pytest.approx(SECONDS, abs=0.1)
+
+
+def test_relocalization_takes_until_there_is_a_pose_again_or_to_the_end() -> None:
+    assert "relocalization_max_seconds" not in judged(drifts(0))
+    assert "relocalization_max_seconds" not in judged(after(0.25, drifts(0)))
+    twice = silent(0.2, 0.3, silent(0.6, 0.8, drifts(0)))
+    figures = judged(twice)
+    assert figures["relocalization_max_seconds"] == pytest.approx(4.0, abs=0.11)
+    assert figures["relocalization_p50_seconds"] == pytest.approx(3.0, abs=0.11)
+    figures = judged(until(0.25, drifts(0)))
+    assert figures["relocalization_max_seconds"] == pytest.approx(15.0, abs=0.11)
+
+
+def test_a_reported_loss_is_charged_only_where_there_is_no_pose() -> None:
+    def says_so(keeps_on: bool) -> Say:
+        def say(record: EstimatorRecord, stamp: int, share: float) -> None:
+            if stamp == 5 * SECOND:
+                record.note(lost(stamp), stamp)
+            if stamp == 7 * SECOND:
+                record.note(regained(stamp), stamp)
+            if keeps_on or not 5 * SECOND < stamp < 7 * SECOND:
+                drifts(0)(record, stamp, share)
+
+        return say
+
+    honest, quiet = judged(says_so(keeps_on=True)), judged(says_so(keeps_on=False))
+    assert honest["lost_seconds"] == quiet["lost_seconds"] == pytest.approx(2.0)
+    assert honest["held_ate_percent"] < 1e-9
+    assert quiet["held_ate_percent"] > 1.0
+
+
+stamps = st.lists(st.integers(0, 200), max_size=30, unique=True)
+
+
+@given(said=stamps, percent=st.floats(0.0, 20.0))
+@settings(deadline=None, max_examples=60)
+def test_to_say_less_never_looks_better(said: list[int], percent: float) -> None:
+    """Of two with the same drift, the one that falls silent earlier has no smaller error."""
+    poses = np.array(sorted(said), np.int64) * 100 * MS
+    errors: npt.NDArray[np.float64] = percent / 100 * PATH * (poses / END)
+
+    def root(count: int) -> float:
+        kept = poses[:count]
+        gaps = cover(FRAMES, kept, GAP).lost
+        found = held_errors(TRUTH, FRAMES, kept, errors[:count], gaps)
+        assert len(found) == len(FRAMES)
+        assert (found >= 0.0).all()
+        return float(np.sqrt(np.mean(found**2)))
+
+    every = [root(count) for count in range(len(poses) + 1)]
+    assert (np.diff(every) <= 0.05 * PATH / 100).all()  # of an image within the gap at the end
+
+
+def test_errors_of_no_image_are_none() -> None:
+    none = FRAMES[:0]
+    assert held_errors(TRUTH, none, FRAMES, np.zeros(len(FRAMES)), []).shape == (0,)
+    assert held_errors(TRUTH, none, none, np.zeros(0), []).shape == (0,)
+    assert interpolated_errors(TRUTH, none, TRUTH).shape == (0,)
+
+
+def test_images_after_the_truths_time_have_no_error() -> None:
+    record = EstimatorRecord()
+    for stamp in FRAMES.tolist():
+        drifts(2)(record, stamp, stamp / END)
+    figures = judge(record, TRUTH, cameras={"c": FRAMES + 2 * END}).figures
+    assert figures["held_ate_rmse_m"] is None
+    assert figures["ate_rmse_m"] > 0.0

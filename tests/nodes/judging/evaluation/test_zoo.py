@@ -1,0 +1,208 @@
+"""No bad estimator passes, and no good one fails, whatever is asked for; and which figure says so.
+
+Three sets of thresholds: none at all, those of `config.toml`, and strict ones.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from events import (
+    Announcement,
+    Collision,
+    EstimatorAnnouncement,
+    Event,
+    Image,
+    PoseEstimate,
+    TrackingEvent,
+    TrajectoryEstimate,
+)
+from nodes.judging.evaluation import Evaluation
+from nodes.judging.evaluation.judging import judge
+from nodes.judging.evaluation.record import EstimatorRecord
+from nodes.judging.evaluation.verdict import Thresholds, conclude, planned_end
+from nodes.trajectory import Trajectory
+from runtime import Input, Node, NodeConfig, Output
+from runtime.errors import NodeError
+from runtime.testing import run_nodes, spec
+from tests.nodes.judging.evaluation.flights import MS, SECOND, announced, heading, place, truth
+from tests.nodes.judging.evaluation.zoo import BAD, FRAMES, GOOD, SECONDS, STRICT, Animal, ended
+
+ROOT = Path(__file__).parents[4]
+
+
+def standard() -> dict[str, Any]:
+    """Return what `config.toml` asks for."""
+    settings = tomllib.loads((ROOT / "config.toml").read_text(encoding="utf-8"))
+    (found,) = (n["thresholds"] for n in settings["nodes"] if n["name"] == "evaluation")
+    return dict(found)
+
+
+SETS: dict[str, dict[str, Any]] = {"default": {}, "standard": standard(), "strict": STRICT}
+STAMPS = range(0, SECONDS * SECOND + 100 * MS + 1, 5 * MS)
+TRUTH = Trajectory(
+    np.array(STAMPS), np.array([*map(place, STAMPS)]), np.array([*map(heading, STAMPS)])
+)
+
+
+def judged(animal: Animal) -> dict[str, Any]:
+    """Return its figures."""
+    record = EstimatorRecord(animal.scale_free, "test", animal.reads)
+    for now, event in animal.sent:
+        if now > animal.end.stamp:
+            continue
+        if isinstance(event, PoseEstimate):
+            record.add(event, now)
+        elif isinstance(event, TrackingEvent):
+            record.note(event, now)
+        elif isinstance(event, TrajectoryEstimate):
+            record.add_final(event)
+    stop = animal.end.stamp
+    frames = np.array([t for t in FRAMES[:: 30 // animal.rate] if t + 40 * MS <= stop])
+    truth = TRUTH.take(TRUTH.stamps <= stop)
+    planned = planned_end(animal.end)
+    return judge(record, truth, cameras={"camera": frames}, end=stop, planned=planned).figures
+
+
+@pytest.mark.parametrize("name", [*GOOD, *BAD])
+def test_which_figure_tells(name: str) -> None:
+    animal = (GOOD | BAD)[name]
+    figures = judged(animal)
+    for which, limits in SETS.items():
+        thresholds = Thresholds(**limits, **((animal.asked or {}) if which == "strict" else {}))
+        declared = ["est"] * ("truth" in animal.reads)
+        found = conclude({"est": figures}, thresholds, (), animal.end, declared)
+        failed, expected = found["estimators"]["est"]["failed"], getattr(animal, which)
+        assert any(reason.startswith(expected) for reason in failed) or not expected, which
+        assert found["passed"] is (False if expected else True if limits else None), failed
+
+
+def images() -> list[Event]:
+    """30 small images a second."""
+    data = np.zeros((2, 2), np.uint8)
+    return [Image(stamp=t, source="c", frame_id="o", encoding="mono8", data=data) for t in FRAMES]
+
+
+class BeastConfig(NodeConfig):
+    kind: str = "good"
+
+
+class Beast(Node[BeastConfig]):
+    """Says of each image where it was, until something happens to it at 3 s."""
+
+    images = Input(Image)
+    estimates = Output(PoseEstimate)
+
+    def announce(self) -> Iterable[Announcement]:
+        yield EstimatorAnnouncement(stamp=0, source=self.name, method=self.config.kind)
+
+    async def run(self) -> None:
+        async for image in self.images:
+            place_, turn, kind = place(image.stamp), heading(image.stamp), self.config.kind
+            if image.stamp > 3 * SECOND:
+                if kind == "stops":
+                    self.stop("it gets dark")
+                elif kind == "crashes" and not self.restarts:
+                    raise RuntimeError("SVD did not converge")
+                elif kind == "not a number":
+                    place_ = (math.nan, 0.0, 0.0)
+                elif kind == "no rotation":
+                    turn = (0.0, 0.0, 0.0, 0.0)
+            frame = " " if kind == "no frame" else "map"
+            pose: dict[str, Any] = {"frame_id": frame, "position": place_, "orientation": turn}
+            self.estimates.send(PoseEstimate(stamp=image.stamp, source=self.name, **pose))
+
+
+def flown(
+    out: Path,
+    kinds: dict[str, str],
+    *more: Event,
+    limits: dict[str, float] | None = None,
+    on_error: Literal["stop", "restart", "drop"] = "drop",
+) -> dict[str, Any]:
+    """Fly 6 s with these estimators, by their names, and return the verdict."""
+    out.mkdir(exist_ok=True)
+    nodes = [spec(Beast, name, {"kind": kind}, on_error=on_error) for name, kind in kinds.items()]
+    asked = standard() if limits is None else limits
+    evaluation = spec(Evaluation, "evaluation", {"thresholds": asked})
+    script = sorted([*truth(6), *images()[:180], *more], key=lambda e: e.stamp)
+    with contextlib.suppress(NodeError):
+        run_nodes([*nodes, evaluation], inputs=[announced()[0], *script], duration=6.1, out=out)
+    found: dict[str, Any] = json.loads((out / "evaluation" / "verdict.json").read_text())
+    return found
+
+
+def test_one_that_raises_fails_and_the_good_one_beside_it_is_judged_as_if_alone(
+    tmp_path: Path,
+) -> None:
+    kinds = ("good", "not a number", "no rotation", "no frame", "crashes")
+    both = flown(tmp_path / "zoo", {kind.replace(" ", "_"): kind for kind in kinds})
+    alone = flown(tmp_path / "alone", {"good": "good"})
+    assert alone["passed"] is True
+    assert both["passed"] is False
+    passed = {name: each["passed"] for name, each in both["estimators"].items()}
+    assert passed.pop("good")
+    assert not any(passed.values())
+    assert both["estimators"]["good"] == alone["estimators"]["good"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "on_error", "figure", "other"),
+    [
+        (
+            "stops",
+            "stop",
+            "early_end: expected at most 0, found 3.067 (est ended the run: it",
+            ["early_end"],
+        ),
+        ("crashes", "stop", "ended_by: expected no error of its own, found: ", ["early_end"]),
+        ("crashes", "restart", "restarts: expected at most 0, found 1", []),
+    ],
+)
+def test_who_ends_the_run_or_begins_anew_has_failed(
+    tmp_path: Path, kind: str, on_error: Literal["stop", "restart"], figure: str, other: list[str]
+) -> None:
+    found = flown(tmp_path, {"est": kind, "other": "good"}, on_error=on_error, limits={})
+    estimators = found["estimators"]
+    assert found["passed"] is False
+    assert [reason for reason in estimators["est"]["failed"] if reason.startswith(figure)]
+    failed = [reason.partition(":")[0] for reason in estimators["other"]["failed"]]
+    assert [reason for reason in failed if reason != "coverage_percent"] == other
+    if other:
+        assert estimators["other"]["coverage_percent"] == pytest.approx(50.0, abs=1.0)
+
+
+@pytest.mark.parametrize(("limits", "passed"), [({"ate_percent": 1.0}, False), ({}, True)])
+def test_thresholds_that_nobody_is_there_to_meet_are_missed(
+    tmp_path: Path, limits: dict[str, float], passed: bool
+) -> None:
+    found = flown(tmp_path, {}, limits=limits)
+    assert found["passed"] is passed
+    assert ("expected an estimator" in str(found.get("failed"))) is not passed
+
+
+def test_what_the_user_ended_is_not_judged() -> None:
+    end = ended(by="user", reason="Ctrl-C", planned=False, stamp=3 * SECOND)
+    for found in ({"est": judged(BAD["mute"])}, {}):
+        verdict = conclude(found, Thresholds(ate_percent=1.0), (), end)
+        assert verdict["passed"] is None
+        assert "the user ended the run" in str(verdict)
+
+
+def test_a_vehicle_that_hits_something_fails(tmp_path: Path) -> None:
+    where: dict[str, Any] = {"position": (0.0, 0.0, 0.0), "normal": (1.0, 0.0, 0.0)}
+    hits = [
+        Collision(stamp=k * SECOND, source="drone", other="wall", speed=1.0, **where)
+        for k in (3, 4)
+    ]
+    figures = flown(tmp_path, {"good": "good"}, *hits)["estimators"]["good"]
+    assert figures["failed"] == ["collisions: expected at most 0, found 2"]

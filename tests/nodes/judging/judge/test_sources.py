@@ -1,0 +1,274 @@
+"""What is read, and the sentence for each thing that cannot be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from nodes.judging.evaluation.judging import Judgement
+from nodes.judging.judge import judging
+from nodes.judging.judge.sources import read, read_mounting, read_stamps, read_truth
+from nodes.trajectory import Trajectory
+from nodes.trajectory.formats import read_vslamlab, write_euroc, write_kitti, write_tum
+from tests.nodes.judging.judge import bags
+from tests.nodes.judging.judge.test_judge import said
+from tests.nodes.trajectory.samples import angle, walk
+from tests.nodes.trajectory.test_formats import assert_names, trajectories
+
+LAB = "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n"
+GOOD = "0.0 0 0 0 0 0 0 1\n"
+
+
+def write_lab(path: Path, trajectory: Trajectory) -> None:
+    rows = [
+        f"{stamp},{x!r},{y!r},{z!r},{i!r},{j!r},{k!r},{w!r}\n"
+        for stamp, (x, y, z), (w, i, j, k) in trajectory.poses()
+    ]
+    path.write_text("".join([LAB, *rows]))
+
+
+def write_all(path: Path, trajectory: Trajectory) -> None:
+    """Write a KITTI file, and its stamps beside it."""
+    write_kitti(path, trajectory)
+    stamps = [f"{stamp // 10**9}.{stamp % 10**9:09d}\n" for stamp in trajectory.stamps.tolist()]
+    path.with_name("times").write_text("".join(stamps))
+
+
+FORMATS = (write_tum, write_euroc, write_lab, write_all)
+
+
+@pytest.mark.parametrize("write", FORMATS)
+@given(trajectory=trajectories())
+@settings(max_examples=20, deadline=None)
+def test_each_format_is_recognized_and_read_as_it_was_written(
+    write: Callable[[Path, Trajectory], None], trajectory: Trajectory
+) -> None:
+    steps = np.concatenate([[0], np.minimum(np.diff(trajectory.stamps), 10**14)])
+    first = max(int(trajectory.stamps[0]), 0)
+    trajectory = Trajectory(first + np.cumsum(steps), trajectory.positions, trajectory.orientations)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "some.name"
+        write(path, trajectory)
+        found = read(str(path), "ned", str(Path(folder) / "times"))
+    assert (found.name, found.file) == ("some", str(path))
+    assert (found.poses.stamps == trajectory.stamps).all()
+    assert abs(found.poses.positions - trajectory.positions).max() <= 0.6e-9
+    assert angle(found.poses, trajectory) < 1e-9
+
+
+@pytest.mark.parametrize("write", FORMATS)
+@given(trajectory=trajectories(), data=st.data())
+@settings(max_examples=30, deadline=None)
+def test_damaged_files_are_errors_of_one_line(
+    write: Callable[[Path, Trajectory], None], trajectory: Trajectory, data: st.DataObject
+) -> None:
+    """Cut anywhere, with any bytes changed."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "file"
+        write(path, trajectory)
+        content = bytearray(path.read_bytes())
+        del content[data.draw(st.integers(0, len(content))) :]
+        for place in data.draw(st.lists(st.integers(0, max(len(content) - 1, 0)), max_size=4)):
+            content[place : place + 1] = bytes([data.draw(st.integers(0, 255))])
+        path.write_bytes(content)
+        wrong = ""
+        try:
+            read(str(path), None, str(Path(folder) / "times"))
+        except ValueError as error:
+            wrong = str(error)
+        if wrong and not wrong.startswith(str(path.with_name("times"))):
+            assert_names(wrong, path)
+
+
+@given(trajectory=trajectories())
+@settings(max_examples=20, deadline=None)
+def test_vslam_labs_files_are_read_as_written(trajectory: Trajectory) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "00000_KeyFrameTrajectory.csv"
+        write_lab(path, trajectory)
+        found = read_vslamlab(path)
+    assert (found.stamps == trajectory.stamps).all()
+    assert (found.positions == trajectory.positions).all()
+
+
+WRONG = [
+    ("1 2 3\n", r"t:1: expected a trajectory: rows of TUM \(8 fields.* found '1 2 3'"),
+    ("# only\n", r"t: expected a trajectory: .*, found no rows"),
+    ("7,1,2,3,1,0,0,0\n", r"t:1: expected a trajectory: .* under a header that names the col"),
+    (GOOD + "1.0 0 x 0 0 0 0 1\n", r"t:2: expected finite numbers, found '0 x 0 0 0 0 1'"),
+    (GOOD + "1.0 nan 0 0 0 0 0 1\n", r"t:2: expected finite numbers"),
+    (GOOD + GOOD, r"t:2: expected a stamp above 0 ns, found '0 ns'"),
+    ("2.0 0 0 0 0 0 0 1\n" + GOOD, r"t:2: expected a stamp above 2000000000 ns, found '0 ns'"),
+    (GOOD + "1 0 0 0 0 0 0 2\n", r"t:2: expected a quaternion of length 1"),
+    ("1403636579763555584.0 0 0 0 0 0 0 1\n", r"t:1: expected a stamp in seconds, not in nanos"),
+    (GOOD + "33333333 0 0 0 0 0 0 1\n", r"t: pose 2: expected stamps of one unit and one clock"),
+    (LAB + "1.5,0,0,0,0,0,0,1\n", r"t:2: expected a stamp in whole nanoseconds, found '1\.5'"),
+    (LAB + "1,0,0,0,0,0,0,0\n", r"t:2: expected a quaternion of length 1"),
+    (LAB + "1,0,0,0,0,0,0,1\n" * 2, r"t:3: expected a stamp above 1 ns, found '1 ns'"),
+    (LAB + "1,0,0\n", r"t:2: expected a trajectory: .* found '1,0,0'"),
+    ("1 0 0 0 0 1 0 0 0 0 1 0\n", r"t: expected --times beside KITTI's poses"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), WRONG)
+def test_each_bad_input_has_its_sentence(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "t").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read(str(tmp_path / "t"), None)
+    write_tum(tmp_path / "truth", walk(5))
+    done = said(tmp_path, "--truth", "truth", "--estimate", "t")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("missing", ["--truth", "--estimate", "--frames"])
+def test_a_file_that_is_not_there_is_named(missing: str, tmp_path: Path) -> None:
+    write_tum(tmp_path / "t", walk(5))
+    files = {"--truth": "t", "--estimate": "t", "--frames": "t"} | {missing: "nothing"}
+    done = said(tmp_path, *(word for pair in files.items() for word in pair))
+    assert (done.returncode, done.stderr) == (2, "error: nothing: No such file or directory\n")
+
+
+def test_kittis_poses_and_stamps_are_as_many(tmp_path: Path) -> None:
+    write_all(tmp_path / "k", walk(5))
+    (tmp_path / "times").write_text("0\n1\n2\n")
+    with pytest.raises(ValueError, match=r"k: expected 3 poses, as many as .*times has stamps, fo"):
+        read(str(tmp_path / "k"), None, str(tmp_path / "times"))
+    (tmp_path / "times").write_text("0\n1\n1\n2\n3\n")
+    with pytest.raises(ValueError, match=r"times:3: expected a stamp above 1000000000 ns"):
+        read(str(tmp_path / "k"), None, str(tmp_path / "times"))
+
+
+@pytest.mark.parametrize(
+    ("text", "stamps"),
+    [
+        ("0.0\n3.33e-2\n", [0, 33_300_000]),
+        ("# timestamp filename\n1.5 rgb/1.5.png\n2 rgb/2.png\n", [1_500_000_000, 2_000_000_000]),
+        ("#timestamp [ns],filename\n5,5.png\n7,7.png\n", [5, 7]),
+        ("ts_rgb_0 (ns),path_rgb_0\n5,rgb_0/5.png\n7,rgb_0/7.png\n", [5, 7]),
+    ],
+)
+def test_stamps_of_images_are_read_as_data_sets_have_them(
+    text: str, stamps: list[int], tmp_path: Path
+) -> None:
+    (tmp_path / "t").write_text(text)
+    assert read_stamps(tmp_path / "t").tolist() == stamps
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 2 3", r'--body-from-camera: expected "tx ty tz qx qy qz qw", a file, or a camera of'),
+        ("drone/front", r"--body-from-camera: expected .* found 'drone/front'"),
+        ("0 0 0 0 0 0 x", r"--body-from-camera: expected finite numbers"),
+        ("0 0 0 0 0 0 2", r"expected a quaternion of length 1, found \[2\.0, 0\.0, 0\.0, 0\.0\]"),
+    ],
+)
+def test_a_mounting_that_is_none_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_mounting(text, "truth.tum")
+
+
+def test_a_camera_that_the_run_has_not_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"expected 'drone/left' among the cameras on a body, fou"):
+        read_mounting("drone/left", str(tmp_path))
+
+
+def judged(tmp_path: Path, truth: Trajectory, estimate: Trajectory, **config: Any) -> Judgement:
+    write_tum(tmp_path / "truth", truth)
+    write_tum(tmp_path / "vo", estimate)
+    true, found = read_truth(str(tmp_path / "truth"), ""), read(str(tmp_path / "vo"), None)
+    judgements, _, _ = judging.judge_all(true, [found], None, judging.JudgeConfig(**config))
+    return judgements["vo"]
+
+
+def test_no_time_in_common_fails_and_says_why(tmp_path: Path) -> None:
+    truth = walk(50)
+    later = Trajectory(truth.stamps + 10**18, truth.positions, truth.orientations)
+    found = judged(tmp_path, truth, later).figures
+    assert "ate_rmse_m" not in found
+    assert "one is Unix time, the other counts from a run's beginning" in found["why"]
+
+
+def test_a_truth_too_sparse_to_judge_by_is_an_error(tmp_path: Path) -> None:
+    truth = walk(100)
+    ends = truth.take(np.array([0, 99]))
+    with pytest.raises(ValueError, match=r"vo: expected true poses within 0\.1 s of its"):
+        judged(tmp_path, ends, truth.take(slice(10, 90)))
+
+
+def test_two_estimates_of_one_name_need_another(tmp_path: Path) -> None:
+    write_tum(tmp_path / "vo.tum", walk(5))
+    one = read(str(tmp_path / "vo.tum"), None)
+    with pytest.raises(ValueError, match=r"vo\.tum: expected a name of its own, NAME=/"):
+        judging.judge_all(one, [one, one], None, judging.JudgeConfig())
+    truth = read(f"truth={tmp_path / 'vo.tum'}", None)  # whose file it would overwrite
+    with pytest.raises(ValueError, match="expected a name of its own"):
+        judging.judge_all(one, [truth], None, judging.JudgeConfig())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--alignment", "so3"], "judge.alignment: expected"),
+        (["--axes", "flu"], "judge.axes: expected"),
+        (["--gap", "soon"], "judge.gap: expected a duration"),
+        (["--threshold", "ate=1"], "judge.thresholds: found unknown key 'ate'"),
+        (["--threshold", "ate_percent=low"], "judge.thresholds.ate_percent: expected"),
+    ],
+)
+def test_wrong_options_are_named(words: list[str], message: str, tmp_path: Path) -> None:
+    write_tum(tmp_path / "t", walk(5))
+    done = said(tmp_path, "--truth", "t", "--estimate", "t", *words)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert message in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("topic", "change", "message"),
+    [
+        ("", None, r"topics: expected one of the bag's, found ''"),
+        ("/slam/pose", None, r"found '/slam/pose' \(did you mean '/slam/poses"),
+        ("/rosout", None, r"topics: /rosout: expected nav_msgs/msg/Odometry or .* found std_msgs"),
+        ("/slam/poses", (1.0, np.nan), r":/slam/poses: pose 3: expected finite numbers, found"),
+        (
+            "/slam/poses",
+            (2.0, 0.0),
+            r":/slam/poses: pose 3: expected a quaternion of length 1",
+        ),
+    ],
+)
+@pytest.mark.parametrize("type_", [bags.POSE, bags.PATH])
+def test_a_bad_topic_has_its_sentence(
+    topic: str, change: tuple[float, float] | None, message: str, type_: str, tmp_path: Path
+) -> None:
+    def wrong(number: int, each: Any) -> Any:
+        if number == 3 and change is not None:
+            turned, moved = change
+            if turned != 1.0:
+                each.pose.orientation.w += turned
+            each.pose.position.x += moved
+        return each
+
+    bag = bags.bag(tmp_path / "bag", type_, walk(10), change=wrong)
+    with pytest.raises(ValueError, match=message):
+        read(f"{bag}:{topic}" if topic else str(bag), None)
+
+
+def test_a_bag_that_is_cut_off_is_an_error_of_one_line(tmp_path: Path) -> None:
+    bag = bags.bag(tmp_path / "bag", bags.POSE, walk(100))
+    (file,) = bag.glob("*.mcap")
+    data = file.read_bytes()
+    for length in (0, 5, 100, len(data) // 2, len(data) - 5):
+        file.write_bytes(data[:length])
+        for where in (bag, file):
+            with pytest.raises(ValueError, match=str(where)) as error:
+                read(f"{where}:/slam/poses", None)
+            assert "\n" not in str(error.value)

@@ -1,0 +1,190 @@
+"""From bytes to events: whatever the bytes are, an event or nothing, and never an exception."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from events import Event, FluidPressure, MagneticField, NavSatFix, Range
+from nodes.ros2.bridge.complaints import Complaints
+from nodes.ros2.bridge.incoming_topic import IncomingTopic
+from nodes.ros2.bridge.settings import Ros2BridgeConfig, Subscription
+from nodes.ros2.messages.frame_names import FrameNames
+from nodes.ros2.messages.images import ImageWriter
+from nodes.ros2.messages.incoming import READERS
+from nodes.ros2.messages.messages import Messages
+from nodes.ros2.messages.stamps import Stamps
+from nodes.ros2.messages.typestore import MessageError, TypeStore
+from tests.nodes.ros2.bridge.mappings import Battery
+from tests.nodes.ros2.messages import samples
+
+HERE = "tests.nodes.ros2.bridge.mappings"
+NOW = 10_000_000_000
+
+
+class Ear:
+    """A incoming, and what it complained of."""
+
+    def __init__(self, type_: str, use: str = "", mapping: str = "") -> None:
+        self.said: list[str] = []
+        self.complaints = Complaints(self.said.append)
+        table = Subscription(topic="/t", type=type_, use=use, mapping=mapping)
+        self.incoming = IncomingTopic(
+            table, Ros2BridgeConfig(), samples.store(), "ros2", self.complaints
+        )
+
+    def hear(self, data: bytes) -> Event | None:
+        return self.incoming.event(data, NOW, Stamps())
+
+
+def valid(type_: str) -> bytes:
+    """Return a message of a type, as sane as can be."""
+    store, messages = samples.store(), Messages(samples.store(), FrameNames())
+    make: Any = store.message
+    vector = make("geometry_msgs/msg/Vector3")(x=1.0, y=2.0, z=3.0)
+    twist = make("geometry_msgs/msg/Twist")(linear=vector, angular=vector)
+    header = store.header((3, 7), "map")
+    match type_.rpartition("/")[2]:
+        case "Odometry":
+            return bytes(messages.odometry((3, 7), samples.odometry()))
+        case "Twist":
+            return bytes(store.serialize(twist))
+        case "TwistStamped":
+            return bytes(store.serialize(make(type_)(header=header, twist=twist)))
+        case "Image":
+            pixels = np.zeros((3, 4, 3), np.uint8)
+            return bytes(ImageWriter(store, "f", "rgb8").write((3, 7), pixels))
+        case "CameraInfo":
+            return bytes(messages.camera_info((3, 7), samples.camera()))
+        case "Imu":
+            orientation = make("geometry_msgs/msg/Quaternion")(x=0.0, y=0.0, z=0.0, w=1.0)
+            zeros = np.zeros(9)
+            return bytes(
+                store.serialize(
+                    make(type_)(header, orientation, zeros, vector, zeros, vector, zeros)
+                )
+            )
+        case "Range":
+            event = Range(stamp=1, source="s", range=1.5, min_range=0.5, max_range=4.0)
+            return bytes(messages.range((3, 7), event))
+        case "FluidPressure":
+            pressure = FluidPressure(stamp=1, source="s", fluid_pressure=1e5)
+            return bytes(messages.pressure((3, 7), pressure))
+        case "MagneticField":
+            field = MagneticField(stamp=1, source="s", magnetic_field=(1e-5, 2e-5, 3e-5))
+            return bytes(messages.magnetic_field((3, 7), field))
+        case "NavSatFix":
+            fix = NavSatFix(stamp=1, source="s", latitude=47.0, longitude=8.0, altitude=400.0)
+            return bytes(messages.fix((3, 7), fix))
+        case name:
+            data = messages.odometry((3, 7), samples.odometry())
+            odometry: Any = store.deserialize(bytes(data), "nav_msgs/msg/Odometry")
+            inner = odometry.pose if "Covariance" in name else odometry.pose.pose
+            if name == "Path":
+                pose = make("geometry_msgs/msg/PoseStamped")(header=header, pose=inner)
+                return bytes(store.serialize(make(type_)(header=header, poses=[pose])))
+            return bytes(store.serialize(make(type_)(header=header, pose=inner)))
+
+
+ALL = sorted(each for each in READERS if each[1] != "done")  # that becomes no event
+
+
+@pytest.mark.parametrize(("type_", "use"), ALL)
+def test_every_reader_reads_a_message_that_is_sane(type_: str, use: str) -> None:
+    ear = Ear(type_, use)
+    if use == "depth":  # an rgb8 image is none
+        assert ear.hear(valid(type_)) is None
+        assert ear.said[0].startswith("/t: message refused: encoding: expected 32FC1")
+    else:
+        assert (ear.hear(valid(type_)) is None) == (use == "camera")
+        assert ear.said == []
+
+
+@pytest.mark.parametrize(("type_", "use"), ALL)
+def test_a_message_cut_off_anywhere_is_refused(type_: str, use: str) -> None:
+    ear, data = Ear(type_, use), valid(type_)
+    for length in range(len(data) - 3):  # up to three bytes may be padding
+        assert ear.hear(data[:length]) is None
+    assert sum(ear.complaints.counts.values()) == len(data) - 3
+    assert len(ear.said) == 1
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+@given(st.sampled_from(ALL), st.data())
+def test_garbled_messages_become_events_or_nothing(
+    of: tuple[str, str], data: st.DataObject
+) -> None:
+    ear, message = Ear(*of), bytearray(valid(of[0]))
+    for _ in range(data.draw(st.integers(1, 8))):
+        place = data.draw(st.integers(0, len(message) - 1))
+        message[place] = data.draw(st.integers(0, 255))
+    message += data.draw(st.binary(max_size=16))
+    event = ear.hear(bytes(message))
+    assert event is None or isinstance(event, Event)
+    assert bool(ear.said) != (event is not None) or of[1] == "camera"
+
+
+@settings(max_examples=150)
+@given(st.sampled_from(ALL), st.binary(max_size=400))
+def test_noise_becomes_events_or_nothing(of: tuple[str, str], noise: bytes) -> None:
+    for data in (noise, b"\0\1\0\0" + noise, b"\0\0\0\0" + noise):
+        event = Ear(*of).hear(data)
+        assert event is None or isinstance(event, Event)
+
+
+def test_a_sequence_that_lies_about_its_length_takes_no_memory() -> None:
+    data = bytearray(valid("sensor_msgs/msg/Image"))
+    at = len(data) - 36 - 4
+    assert data[at : at + 4] == (36).to_bytes(4, "little")
+    data[at : at + 4] = b"\xff\xff\xff\xff"
+    with pytest.raises(MessageError, match="Invalid sequence length"):
+        samples.store().deserialize(bytes(data), "sensor_msgs/msg/Image")
+
+
+def battery(percentage: float) -> bytes:
+    make: Any = samples.store().message
+    header = samples.store().header((3, 7), "f")
+    nothing = np.zeros(0, np.float32)
+    fields = [12.0, 20.0, 1.0, 1.0, 1.0, 1.0, percentage, 0, 0, 0, True, nothing, nothing, "", ""]
+    return bytes(samples.store().serialize(make("sensor_msgs/msg/BatteryState")(header, *fields)))
+
+
+def test_a_mapping_of_the_user_s_own_makes_events() -> None:
+    ear = Ear("sensor_msgs/msg/BatteryState", mapping=f"{HERE}:battery")
+    assert ear.hear(battery(0.5)) == Battery(stamp=3_000_000_007, source="ros2/t", percentage=0.5)
+    assert ear.hear(battery(-1.0)) is None
+    assert ear.said == []
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("broken", "KeyError"), ("no_event", "expected an event, found str")]
+)
+def test_a_mapping_that_fails_is_left_out(name: str, found: str) -> None:
+    ear = Ear("sensor_msgs/msg/BatteryState", mapping=f"{HERE}:{name}")
+    assert ear.hear(battery(0.5)) is None
+    assert ear.said[0].startswith("/t: mapping failed")
+    assert found in ear.said[0]
+
+
+@pytest.mark.parametrize("name", ["no.such:thing", f"{HERE}:nothing", f"{HERE}:HERE"])
+def test_a_mapping_that_is_not_there_is_named(name: str) -> None:
+    with pytest.raises(ValueError, match=r"/t: mapping: expected (a function|something)"):
+        Ear("sensor_msgs/msg/BatteryState", mapping=name)
+
+
+def test_types_may_be_defined_by_files(tmp_path: Path) -> None:
+    file = tmp_path / "Wind.msg"
+    file.write_text("std_msgs/Header header\nfloat64 speed\n")
+    store = TypeStore("jazzy", {"weather_msgs/msg/Wind": str(file)})
+    make: Any = store.message("weather_msgs/msg/Wind")
+    data = store.serialize(make(header=store.header((1, 2), "f"), speed=3.5))
+    message = store.deserialize(bytes(data), "weather_msgs/msg/Wind")
+    assert message.speed == 3.5
+    assert len(store.hash("weather_msgs/msg/Wind")) == 71
+    with pytest.raises(ValueError, match=r"weather_msgs/msg/Rain: expected a readable"):
+        TypeStore("jazzy", {"weather_msgs/msg/Rain": str(tmp_path / "none.msg")})

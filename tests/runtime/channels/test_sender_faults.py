@@ -1,0 +1,130 @@
+"""Listeners that raise, and listeners that come and go while a delivery is going on."""
+
+from __future__ import annotations
+
+import pytest
+
+from events import Event
+from runtime.channels.sender import Deliver, Listener, Sender
+from runtime.channels.streams import Stream
+from runtime.errors import ChannelFullError
+from tests.runtime.small_events import Said, Shouted, shouted
+
+# A source filter on one listener makes a sender take the longer of its two ways of delivery.
+SOURCES = pytest.mark.parametrize("source", [None, "drone"], ids=["to all", "routed"])
+
+
+def handler(call: Deliver, source: str | None = None) -> Listener:
+    return Listener("n", call, (Event,), source)
+
+
+def fail(_: Event) -> None:
+    raise ValueError("broken")
+
+
+def fail_too(_: Event) -> None:
+    raise KeyError("broken too")
+
+
+@SOURCES
+def test_a_failing_listener_is_reported_and_the_rest_still_hear(source: str | None) -> None:
+    faults: list[tuple[Deliver, str]] = []
+    log: list[Event] = []
+    sender = Sender("n.p", Shouted)
+    listeners = [handler(fail, source), handler(fail_too), handler(log.append)]
+    sender.connect(listeners, (), lambda deliver, error: faults.append((deliver, repr(error))))
+    event = shouted()
+    assert sender.send(event) is False
+    assert faults == [(fail, "ValueError('broken')"), (fail_too, "KeyError('broken too')")]
+    assert log == [event]
+
+
+@SOURCES
+def test_true_ends_a_delivery_after_a_fault_too(source: str | None) -> None:
+    log: list[Event] = []
+    sender = Sender("n.p", Shouted)
+    listeners = [handler(fail, source), handler(lambda _: True), handler(log.append)]
+    sender.connect(listeners, (), lambda *_: None)
+    assert sender.send(shouted()) is True
+    assert log == []
+
+
+@SOURCES
+def test_without_anybody_to_report_to_the_sender_gets_the_error(source: str | None) -> None:
+    log: list[Event] = []
+    sender = Sender("n.p", Shouted)
+    sender.connect([handler(fail, source), handler(log.append)])
+    with pytest.raises(ValueError, match="broken"):
+        sender.send(shouted())
+    assert log == []
+
+
+def test_a_full_stream_is_a_fault_of_the_stream() -> None:
+    stream = Stream[Said]("n.s", bound=1)
+    faults: list[tuple[Deliver, type[BaseException]]] = []
+    sender = Sender("n.p", Shouted)
+    listener = Listener("n", stream.offer, (Said,), None, stream)
+    sender.connect([listener], (), lambda who, error: faults.append((who, type(error))))
+    sender.send(shouted())
+    sender.send(shouted())
+    assert faults == [(stream.offer, ChannelFullError)]
+
+
+@SOURCES
+def test_a_running_delivery_keeps_its_listeners_and_the_next_has_the_new(
+    source: str | None,
+) -> None:
+    log: list[str] = []
+    sender = Sender("n.p", Shouted)
+    old = handler(lambda _: log.append("old"))
+    new = handler(lambda _: log.append("new"))
+
+    def swap(_: Event) -> None:
+        sender.connect([handler(lambda _: None, source), new])
+
+    sender.connect([handler(swap, source), old])
+    sender.send(shouted())
+    assert log == ["old"]
+    sender.send(shouted())
+    assert log == ["old", "new"]
+
+
+@SOURCES
+def test_a_fault_after_a_change_of_listeners_ends_the_old_delivery_in_order(
+    source: str | None,
+) -> None:
+    log: list[str] = []
+    faults: list[Deliver] = []
+    sender = Sender("n.p", Shouted)
+    old = handler(lambda _: log.append("old"))
+    new = handler(lambda _: log.append("new"))
+
+    def report(deliver: Deliver, _: BaseException) -> None:
+        faults.append(deliver)
+
+    def leave_and_fail(event: Event) -> None:
+        sender.connect([handler(lambda _: None, source), new], (), report)
+        fail(event)
+
+    sender.connect([handler(leave_and_fail, source), old], (), report)
+    sender.send(shouted())
+    assert (log, faults) == (["old"], [leave_and_fail])
+
+
+@SOURCES
+def test_a_nested_delivery_has_its_own_faults(source: str | None) -> None:
+    faults: list[Deliver] = []
+    log: list[str] = []
+    outer, inner = Sender("n.outer", Shouted), Sender("n.inner", Shouted)
+
+    def report(deliver: Deliver, _: BaseException) -> None:
+        faults.append(deliver)
+
+    def pass_on(event: Shouted) -> None:
+        inner.send(event)
+        log.append("passed on")
+
+    inner.connect([handler(fail, source)], (), report)
+    outer.connect([handler(pass_on, source)], (), report)
+    outer.send(shouted())
+    assert (faults, log) == ([fail], ["passed on"])
