@@ -73,7 +73,6 @@ def measure(
     """Measure quiet windows and others, in turns.
 
     Args:
-        rounds: Windows of each case.
         progress: Called with what is being measured.
     """
     progress(f"airsim: {2 * rounds * len(CASES)} windows of {WINDOW:g} s")

@@ -100,11 +100,8 @@ def measure_all(
     """Measure one case with all systems that are installed.
 
     Args:
-        case: Which.
-        nodes: The numbers of nodes.
         samples: Round trips of each measurement, fewer for slow systems: see `budget`.
         warm_up: Round trips left out before them.
-        repeats: Rounds.
         only: Parts of names; systems whose name has none of them are left out. Empty: all.
         budget: About how many seconds of round trips one measurement may take.
         progress: Called with what is measured, and the share that is done.

@@ -52,8 +52,6 @@ def measure(
     """Measure, interleaved.
 
     Args:
-        seconds: Simulated, of each flight.
-        repeats: Flights of each side.
         progress: Called with what is being measured.
     """
     outside: list[Summary] = []

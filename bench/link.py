@@ -27,7 +27,7 @@ import uvloop
 
 from nodes.outside.native import Endpoint, LinkAnswer
 from nodes.outside.native.client import Link
-from runtime.time.real_clock import RealClock
+from runtime.time.clock import RealClock
 from runtime.workers.worker import Worker
 
 WARM_UP = 30

@@ -72,7 +72,6 @@ def measure(
 
     Args:
         seconds: Simulated, without cameras; a fifth of it with.
-        repeats: Of each.
         progress: Called with what is being measured.
     """
     bare, run, cameras = [], [], []

@@ -17,10 +17,10 @@ from bench.systems.parts import payloads
 from runtime import Input, Node, NodeConfig, Output, on
 from runtime.channels.digest import Digest
 from runtime.config.model import Config, RunConfig
-from runtime.run import task_factory
+from runtime.run import event_loop as task_factory
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
-from runtime.time.real_clock import RealClock
+from runtime.time.clock import RealClock
 
 
 class OneConfig(NodeConfig):

@@ -19,7 +19,6 @@ def write(results: Results, out: Path, page_path: Path) -> None:
     """Write the page of results, its plots, and the figures themselves.
 
     Args:
-        results: What was measured.
         out: Folder for results.json and the plots, made if missing.
         page_path: The page, Markdown.
     """

@@ -54,7 +54,6 @@ def measure(*, seconds: float = 10.0, repeats: int = 3) -> list[PartRow]:
 
     Args:
         seconds: Simulated, by which the longer run is longer.
-        repeats: Pairs of runs.
     """
     wholes, workers = [], []
     for _ in range(repeats):

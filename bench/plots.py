@@ -17,8 +17,6 @@ def draw(rows: Sequence[Row], out: Path, boxes: Iterable[int]) -> dict[str, list
     """Draw the plots of each case into a folder, made if missing; return their names by case.
 
     Args:
-        rows: What was measured.
-        out: Where to.
         boxes: Numbers of nodes that get a box plot, where there are rows with so many.
     """
     out.mkdir(parents=True, exist_ok=True)

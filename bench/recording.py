@@ -66,8 +66,6 @@ def measure(
     """Measure all cases, in turns.
 
     Args:
-        seconds: Of each run.
-        repeats: Runs of each case.
         rate: Of the camera, Hz.
         progress: Called with what is measured.
     """

@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from runtime.run.environment import commit
-from runtime.run.environment import environment as versions
+from runtime.run.summarise import commit
+from runtime.run.summarise import environment as versions
 
 
 def environment() -> dict[str, str]:

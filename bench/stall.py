@@ -206,7 +206,6 @@ def measure(
     Args:
         seconds: Of each run, after a second of warm-up.
         repeats: Runs of each mode; their order is shuffled in each round.
-        modes: Which to measure.
         rate: Hertz of the camera.
         size: Width and height of its images.
         progress: Called with what is being measured.

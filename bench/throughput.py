@@ -17,8 +17,8 @@ from bench.system import Ping
 from events import Event, Image, PoseEstimate, Quaternion, Vector3
 from runtime.channels.sender import Listener, Sender
 from runtime.channels.streams import Stream
-from runtime.run import task_factory
-from runtime.time.real_clock import RealClock
+from runtime.run import event_loop as task_factory
+from runtime.time.clock import RealClock
 from runtime.workers.worker import Worker
 
 

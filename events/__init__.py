@@ -2,7 +2,7 @@
 
 No asyncio, no input or output, no imports from the other rooms. A node's own events subclass
 `Event`; those here are shared, so that two people's nodes fit together. They are checked when they
-are made (`events.checks`): integer stamps, finite numbers, unit quaternions.
+are made (`events.base`): integer stamps, finite numbers, unit quaternions.
 """
 
 from events.announcements import (
@@ -22,28 +22,36 @@ from events.announcements import (
     VehicleAnnouncement,
     WindAnnouncement,
 )
-from events.base import Category, Event, Quaternion, Vector3
+from events.base import Category, Event, ParameterChanged, Quaternion, Shutdown, Vector3
 from events.camera_info import CameraInfo
 from events.control import (
     Arm,
+    Armed,
     AttitudeSetpoint,
     BodyRateSetpoint,
+    Collision,
     Command,
     Disarm,
+    Disarmed,
     Hover,
     Land,
+    Landed,
     MotorSetpoint,
     PlannedPose,
     PoseSetpoint,
     PositionSetpoint,
     Reset,
     Setpoint,
+    TakenOff,
     Takeoff,
     Teleport,
+    VehicleEvent,
     VelocitySetpoint,
 )
 from events.estimates import (
+    PointCloud,
     PoseEstimate,
+    Score,
     TrackedFeatures,
     TrackingEvent,
     TrackingLost,
@@ -51,9 +59,6 @@ from events.estimates import (
     TrajectoryEstimate,
 )
 from events.geometry import Odometry, PoseStamped, TransformStamped, Wind
-from events.lifecycle import ParameterChanged, Shutdown
-from events.maps import PointCloud
-from events.scores import Score
 from events.sensors import (
     DepthImage,
     FluidPressure,
@@ -65,7 +70,6 @@ from events.sensors import (
     Range,
     SegmentationImage,
 )
-from events.vehicle import Armed, Collision, Disarmed, Landed, TakenOff, VehicleEvent
 from events.window import KeyPressed, KeyReleased, WindowClosed, WindowResized
 
 __all__ = [

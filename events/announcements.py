@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from events.base import Category, Event, Quaternion, Vector3
+from events.base import Category, Event, Quaternion, Vector3, check, check_pose
 from events.camera_info import CameraInfo
-from events.checks import check, check_pose
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 """The matrix of a sensor without errors of scale and alignment, row by row."""
@@ -74,7 +73,7 @@ class CameraAnnouncement(Announcement):
         reference_exposure: Exposure time, seconds, at which an image of gain 1 is as bright as its
             scene is drawn; 0 if brightness does not depend on the exposure time.
         response: Light of each of the 256 grey levels, as a ``pcalib.txt`` of TUM's monoVO data
-            set has it: rising, of any scale. Empty: that of sRGB (`events.photometry`).
+            set has it: rising, of any scale. Empty: that of sRGB (`events.camera_info`).
         vignette: Coefficients a1, a2, … of the share of light ``1 + a1 r² + a2 r⁴ + …`` at the
             distance r from the principal point, in halves of the image's diagonal.
         depth_noise: k in ``sigma = k z²``, the standard deviation of depth z, 1/m.

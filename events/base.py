@@ -1,8 +1,18 @@
-"""What every event is: frozen data with a time, a source and a category."""
+"""What every event is: frozen data with a time, a source and a category.
+
+Events about the run itself.
+
+What the events of this package are held to when they are made, so that nothing wrong gets about.
+
+A stamp is an `int`; vectors, angles and the like are finite; an orientation is a unit quaternion.
+What is not raises in the node that makes the event, and names the field; it never reaches those
+who would have received it.
+"""
 
 from __future__ import annotations
 
 import enum
+from math import hypot, inf, isfinite
 from typing import Any, ClassVar, dataclass_transform
 
 import msgspec
@@ -58,3 +68,141 @@ class Event(msgspec.Struct, metaclass=EventMeta, frozen=True, kw_only=True):
 
     stamp: int
     source: str
+
+
+class Shutdown(Event):
+    """Asks the run to end in order, as Ctrl-C would.
+
+    Attributes:
+        reason: Why, for the log and the summary.
+    """
+
+    category: ClassVar[Category] = Category.LIFECYCLE
+
+    reason: str = ""
+
+
+class ParameterChanged(Event):
+    """A setting of a node has changed during the run.
+
+    Its source is the node, its stamp the moment from which on the new value holds.
+
+    Attributes:
+        key: The setting, as it stands in the file: ``gain``, ``cameras.front.loss``.
+        value: The new value, as TOML.
+    """
+
+    category: ClassVar[Category] = Category.LIFECYCLE
+
+    key: str
+    value: str
+
+
+UNIT_TOLERANCE = 1e-3
+"""By how much the norm of a quaternion may differ from 1."""
+
+_LEAST, _MOST = 1.0 - UNIT_TOLERANCE, 1.0 + UNIT_TOLERANCE
+_LENGTHS = {
+    tuple[float, float, float]: 3,
+    tuple[float, float, float] | None: 3,
+    tuple[float, float, float, float]: 4,
+    float: 0,
+}
+
+
+def check(event: Any, *vectors: tuple[float, ...]) -> None:
+    """Check the stamp of an event, and that all its numbers in `vectors` are finite.
+
+    Raises:
+        TypeError: The stamp is no `int`, or a field is no tuple of as many numbers as it holds.
+        ValueError: A number is not finite, or a quaternion not a unit one.
+    """
+    if event.stamp.__class__ is int:
+        for vector in vectors:
+            if not (vector.__class__ is tuple and len(vector) == 3 and _norm(vector) < inf):
+                break
+        else:
+            return
+    _check_all(event)
+
+
+def check_pose(event: Any, position: tuple[float, ...], orientation: tuple[float, ...]) -> None:
+    """Check the stamp of an event, its position and its orientation; raises as `check` does."""
+    # All in one expression: most events have a pose, and this is half of what making one costs.
+    if not (
+        event.stamp.__class__ is int
+        and position.__class__ is tuple
+        and orientation.__class__ is tuple
+        and len(position) == 3
+        and len(orientation) == 4
+        and _norm(position) < inf
+        and _LEAST <= _norm(orientation) <= _MOST
+    ):
+        _check_all(event)
+
+
+def check_frames(event: Any, *names: str) -> None:
+    """Check that names of frames are not blank.
+
+    Raises:
+        ValueError: One of them is.
+    """
+    for name in names:
+        if not name.strip():
+            raise ValueError(
+                f"{type(event).__name__}: expected names of frames, found {_show(name)}"
+            )
+
+
+def check_covariance(event: Any, field: str, size: int) -> None:
+    """Check that a covariance is empty, or has `size` rows of `size` finite numbers in one tuple.
+
+    Raises:
+        TypeError: It is something else.
+        ValueError: A number is not finite.
+    """
+    numbers = getattr(event, field)
+    if numbers.__class__ is not tuple or numbers:
+        _check_numbers(f"{type(event).__name__}.{field}", numbers, size * size)
+
+
+def _norm(numbers: tuple[float, ...]) -> float:
+    try:
+        return hypot(*numbers)
+    except TypeError:
+        return inf
+
+
+def _check_all(event: Any) -> None:
+    """Look at each field: this decides, and says what is wrong."""
+    where = type(event).__name__
+    if type(event.stamp) is not int:
+        raise TypeError(
+            f"{where}.stamp: expected nanoseconds as an int, found {_show(event.stamp)}"
+        )
+    for field in msgspec.structs.fields(event):
+        length = _LENGTHS.get(field.type)
+        value = getattr(event, field.name)
+        if length is not None and not (value is None and field.default is None):
+            _check_numbers(f"{where}.{field.name}", value, length)
+
+
+def _check_numbers(where: str, value: Any, length: int) -> None:
+    numbers = value if length else (value,)
+    if not isinstance(numbers, tuple) or len(numbers) != (length or 1):
+        raise TypeError(f"{where}: expected a tuple of {length} numbers, found {_show(value)}")
+    try:
+        finite = all(isfinite(n) for n in numbers)
+    except TypeError:
+        raise TypeError(f"{where}: expected numbers, found {_show(value)}") from None
+    if not finite:
+        raise ValueError(f"{where}: expected finite numbers, found {_show(value)}")
+    if length == 4 and not _LEAST <= hypot(*numbers) <= _MOST:
+        raise ValueError(
+            f"{where}: expected a unit quaternion (w, x, y, z), found {_show(value)}, "
+            f"whose norm is {hypot(*numbers):.6g}"
+        )
+
+
+def _show(value: Any) -> str:
+    return f"{value!r:.80} ({type(value).__name__})"

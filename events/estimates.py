@@ -1,4 +1,9 @@
-"""Events of estimators: poses, tracking, features."""
+"""Events of estimators: poses, tracking, features.
+
+How well something did.
+
+Maps that nodes build.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +12,17 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from events.base import Category, Event, Quaternion, Vector3
-from events.checks import UNIT_TOLERANCE, check, check_covariance, check_frames, check_pose
+from events.base import (
+    UNIT_TOLERANCE,
+    Category,
+    Event,
+    Quaternion,
+    Vector3,
+    check,
+    check_covariance,
+    check_frames,
+    check_pose,
+)
 from events.sensors import publish
 
 
@@ -141,3 +155,45 @@ class TrackedFeatures(Event, eq=False):
                 f"TrackedFeatures.points: expected shape ({len(self.inliers)}, 2), as many as "
                 f"inliers, found {self.points.shape}"
             )
+
+
+class Score(Event):
+    """One number about one estimate.
+
+    Attributes:
+        subject: Source of what is scored.
+        metric: ``position_error``, ``rotation_error``, ``ate_rmse``, …
+        value: In `unit`.
+        unit: ``m``, ``rad``, ``m^2``, ``s``, …
+    """
+
+    category: ClassVar[Category] = Category.SCORE
+
+    subject: str
+    metric: str
+    value: float
+    unit: str
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+class PointCloud(Event, eq=False):
+    """Points with colours, as ROS's ``sensor_msgs/PointCloud2`` would carry them.
+
+    Attributes:
+        frame_id: Frame of the points.
+        points: float32 metres, shape (n, 3).
+        colors: uint8 red, green, blue, shape (n, 3); shape (0, 3) if there are none.
+    """
+
+    category: ClassVar[Category] = Category.MAP
+
+    frame_id: str = "map"
+    points: npt.NDArray[np.float32]
+    colors: npt.NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        check(self)
+        publish("PointCloud", "points", self.points, np.float32, {2})
+        publish("PointCloud", "colors", self.colors, np.uint8, {2})

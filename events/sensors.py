@@ -2,6 +2,8 @@
 
 Arrays are checked and made read-only when the event is made: what has been sent does not change,
 and an image passes from node to node by reference.
+
+What the small sensors measure: which fields of their events are numbers, and in which unit.
 """
 
 from __future__ import annotations
@@ -11,8 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from events.base import Category, Event, Vector3
-from events.checks import check, check_covariance
+from events.base import Category, Event, Vector3, check, check_covariance
+from events.geometry import Wind
 
 
 def publish(owner: str, name: str, array: Any, dtype: type, ndim: set[int]) -> None:
@@ -234,3 +236,25 @@ class LidarScan(Event, eq=False):
     def end(self) -> int:
         """Stamp of the last ray that gave a point (ns)."""
         return self.stamp + (round(float(self.times[-1]) * 1e9) if len(self.times) else 0)
+
+
+MEASURED: dict[type[Event], dict[str, str]] = {
+    Imu: {"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
+    FluidPressure: {"fluid_pressure": "Pa"},
+    MagneticField: {"magnetic_field": "T"},
+    NavSatFix: {"latitude": "°", "longitude": "°", "altitude": "m", "velocity": "m/s"},
+    Range: {"range": "m"},
+    Wind: {"velocity": "m/s"},
+}
+"""Fields and their units, by type of event; the field of a vector has x, y and z."""
+
+
+def fields_of(kind: type[Event]) -> dict[str, str]:
+    """Return what events of a type measure, with units; nothing if it is no such type."""
+    return next((fields for known, fields in MEASURED.items() if issubclass(kind, known)), {})
+
+
+def numbers(event: Event, field: str) -> tuple[float, ...]:
+    """Return what an event measures in a field: one number, or x, y and z."""
+    value = getattr(event, field)
+    return value if isinstance(value, tuple) else (value,)

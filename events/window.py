@@ -1,7 +1,11 @@
-"""Events from a window and its keyboard."""
+"""Events from a window and its keyboard.
+
+Names of keys, as `KeyPressed` and `KeyReleased` carry them.
+"""
 
 from __future__ import annotations
 
+import string
 from typing import ClassVar
 
 from events.base import Category, Event
@@ -49,3 +53,33 @@ class WindowResized(Event):
 
     width: int
     height: int
+
+
+LABELS = {letter: letter for letter in string.ascii_lowercase} | {
+    "'": "apostrophe",
+    ",": "comma",
+    "-": "minus",
+    ".": "period",
+    "/": "slash",
+    ";": "semicolon",
+    "=": "equal",
+    "[": "left_bracket",
+    "\\": "backslash",
+    "]": "right_bracket",
+    "`": "grave_accent",
+}
+"""Names of the keys that are called by the label which the user's layout puts on them."""
+
+_BY_POSITION = """
+    escape enter tab space backspace insert delete right left down up page_up page_down home end
+    caps_lock scroll_lock num_lock print_screen pause menu world_1 world_2
+    left_shift left_control left_alt left_super right_shift right_control right_alt right_super
+    kp_decimal kp_divide kp_multiply kp_subtract kp_add kp_enter kp_equal
+"""
+
+KEYS = frozenset(
+    [*LABELS.values(), *string.digits, *_BY_POSITION.split()]
+    + [f"kp_{n}" for n in range(10)]
+    + [f"f{n}" for n in range(1, 26)]
+)
+"""Names of all keys. Any other key of a keyboard is called ``scancode_`` and a number."""

@@ -2,11 +2,16 @@
 
 Of a thread (by its frame), of a task that waits, of an exception. Not here: watching over a loop
 (`runtime.run.watchdogs`) or a run (`runtime.run.watchdogs`).
+
+The frame in which a thread of this process is.
 """
 
 from __future__ import annotations
 
 import asyncio
+import gc
+import sys
+import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -95,3 +100,25 @@ def _innermost(frames: Iterable[tuple[FrameType, int]]) -> tuple[str, str]:
         if isinstance(owner, Node) and not frame.f_code.co_filename.endswith("runtime/node.py"):
             return owner.name, line(frame, number)
     return "runtime", innermost
+
+
+_one_at_a_time = threading.Lock()
+
+
+def frame_of(thread_id: int) -> FrameType | None:
+    """Return the frame in which a thread is; `None` if there is no such thread.
+
+    Up to Python 3.11, `sys._current_frames` collects garbage while it holds a lock that every
+    thread takes as it starts and ends; if a finalizer gives up the GIL then, the process stands
+    still for ever (https://github.com/python/cpython/issues/106883). So nothing is collected.
+    """
+    if sys.version_info >= (3, 12):
+        return sys._current_frames().get(thread_id)
+    with _one_at_a_time:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return sys._current_frames().get(thread_id)
+        finally:
+            if collects:
+                gc.enable()

@@ -13,7 +13,6 @@ def plain(value: Any, where: str) -> Any:
 
     Args:
         value: Numbers, texts, lists, mappings, events, and what else msgspec knows.
-        where: Begins the message.
 
     Raises:
         TypeError: JSON knows nothing like it.

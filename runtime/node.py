@@ -28,8 +28,7 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from events import Announcement, Event
-from runtime.channels.bundles import Matcher
-from runtime.channels.declarations import Declared, read_declarations
+from runtime.channels.bundles import Declared, Matcher, read_declarations
 from runtime.channels.hold import Hold, HoldConfig
 from runtime.channels.ports import MAX_HZ
 from runtime.channels.sender import Listener, Sender
@@ -109,7 +108,7 @@ class Node(Generic[C]):
     other node, the run ends early."""
     starts_programs: ClassVar[bool] = False
     """Whether it starts programs, which are judged: what other nodes write is not in the run's
-    folder before its end then (`runtime.run.private_results`)."""
+    folder before its end then (`runtime.run.results`)."""
     reads_truth: ClassVar[str] = ""
     """What it receives true poses for, if not to fly or to estimate: ``judging``, ``recording``,
     ``showing``. All others that do are named in the summary."""
@@ -193,9 +192,6 @@ class Node(Generic[C]):
 
         Called between two steps. Only settings marked as `runtime.Changeable` change.
 
-        Args:
-            before: The settings until now.
-
         Raises:
             ValueError: The node cannot do with it; the message says why, and `before` holds again.
         """
@@ -273,7 +269,6 @@ class Node(Generic[C]):
 
         Args:
             factory: A class of an importable module.
-            args: Its arguments.
             options: `processes`, `latency`, `timeout`, `env`, `niceness`; see `Worker`.
 
         Raises:
@@ -285,7 +280,6 @@ class Node(Generic[C]):
         """Hold simulated time for the answers of a system outside the process.
 
         Args:
-            name: Of the system, in summary and report.
             config: How long is waited, and what if nothing comes.
             latency: Seconds of the run's clock from a frame to its answer.
 
@@ -328,7 +322,6 @@ class Node(Generic[C]):
 
         Args:
             subject: What was judged: the source of an estimator.
-            figures: Numbers and words about it.
             passed: Whether it met its thresholds; `None` if nothing was asked of it.
 
         Raises:

@@ -56,7 +56,6 @@ def resolve(table: Any, type_: Any, folder: Path) -> Any:
 
     Args:
         table: Of a node or of the network; what is of the wrong type stays as it is.
-        type_: The type of its settings.
         folder: Where relative paths start.
     """
 

@@ -24,7 +24,7 @@ from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, OnError, RunConfig
 from runtime.config.reading import convert
 from runtime.node import Node
-from runtime.run import task_factory
+from runtime.run import event_loop as task_factory
 from runtime.run.summarise import count_drops, tick_summaries
 from runtime.run.supervisor import Supervisor
 from runtime.summary import StreamSummary, TickSummary
@@ -87,13 +87,9 @@ def run_node(
     """Run one node on the jumping clock.
 
     Args:
-        node: Its class.
         inputs: Events to send to it, each at its own stamp; announcements before all.
         config: Its settings, as they would stand in the file.
         duration: Seconds after which the run ends, if nothing ends it before.
-        name: Its name.
-        seed: Of its random numbers.
-        out: Folder for its files.
 
     Raises:
         ConfigError: The settings are wrong.

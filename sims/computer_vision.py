@@ -23,7 +23,7 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from events.rotations import from_rpy, from_yaw, multiply, normalize, rotate, rotate_inverse, yaw_of
+from events.frames import from_rpy, from_yaw, multiply, normalize, rotate, rotate_inverse, yaw_of
 from runtime import Tick, every, on
 from runtime.paths import InputPath
 from sims.addressing import Addressee

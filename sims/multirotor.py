@@ -30,7 +30,7 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
-from events.rotations import rotate_inverse
+from events.frames import rotate_inverse
 from runtime import Output, Tick, every, on
 from sims.addressing import Addressee
 from sims.cameras import CameraSpec, add_camera, check_cameras

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from events import DepthImage, Event, Image, Imu, LidarScan, SegmentationImage
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from runtime.config.reading import load
 from runtime.testing import run_nodes
 from sims.cameras import (

@@ -43,8 +43,7 @@ def main() -> None:
 
 
 async def _look(folder: Path, browser: str) -> None:
-    from runtime.tools.monitor.address import runs
-    from runtime.tools.monitor.client import Client
+    from runtime.tools.monitor.client import Client, runs
     from runtime.tools.monitor.command import Set
     from runtime.tools.monitor.screen import Screen
 

@@ -8,8 +8,7 @@ import msgspec
 
 from bench.estimators.plan import Entrant, Suite
 from runtime.tools.sweep.plan import Plan
-from runtime.tools.sweep.rows import Row
-from runtime.tools.sweep.tables import Spread, in_order, numbers, summarise
+from runtime.tools.sweep.tables import Row, Spread, in_order, numbers, summarise
 
 COLUMNS = {
     "held_ate_percent": "error, whole flight, %",

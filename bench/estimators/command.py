@@ -41,7 +41,7 @@ def suite(
     """
     from bench.estimators.page import write_page
     from bench.estimators.plan import make_plan, read_suite
-    from runtime.run.environment import command_line
+    from runtime.run.summarise import command_line
     from runtime.tools.cli.sweep import carry_out
 
     chosen = (read_suite(file) if file else read_suite()).only(scenario or [], estimator or [])

@@ -12,21 +12,18 @@ import jinja2
 from bench.estimators.cells import COLUMNS, cells
 from bench.estimators.pictures import draw, pictures
 from bench.estimators.plan import Suite
-from runtime.run.environment import commit, environment
 from runtime.run.results import write
+from runtime.run.summarise import commit, environment
 from runtime.tools.sweep.plan import Plan
-from runtime.tools.sweep.rows import Row
+from runtime.tools.sweep.tables import Row
 
 
 def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, command: str) -> None:
     """Write the page and its pictures.
 
     Args:
-        suite: What was to be measured.
         plan: The runs; their folders are where they were made.
-        rows: What came of them.
         path: Of the page; its pictures go into a folder ``suite`` beside it.
-        command: That made it.
     """
     folder = path.parent / "suite"
     folder.mkdir(parents=True, exist_ok=True)

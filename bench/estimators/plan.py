@@ -10,11 +10,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from runtime.config.override import override
+from runtime.config.messages import override
 from runtime.config.reading import parse
 from runtime.errors import CommandError, ConfigError, suggest
-from runtime.tools.sweep.plan import Plan, make_job, sharing
-from runtime.tools.sweep.values import Parameter
+from runtime.tools.sweep.plan import Parameter, Plan, make_job, sharing
 
 FOLDER = Path(__file__).parent
 LEVELS = ("easy", "medium", "hard", "brutal")

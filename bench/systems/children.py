@@ -86,7 +86,6 @@ class Crew:
 
         Args:
             since: `time.perf_counter_ns` when the waiting began.
-            awaited: What for.
 
         Raises:
             PeerError: A process has ended, or the waiting has taken too long.
@@ -156,7 +155,6 @@ def reply_to(node: int, ping: Any) -> bytes | None:
     """Return the pong with which a node answers a ping, if it is to.
 
     Args:
-        node: Its number.
         ping: Bytes that begin with a `PING`.
     """
     stamp, _, receiver, number = PING.unpack_from(ping)

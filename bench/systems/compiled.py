@@ -92,7 +92,6 @@ def run(command: Sequence[str | Path], deadline: float, env: dict[str, str] | No
     """Run a program, end it with this process or when the deadline is over; return its output.
 
     Args:
-        command: With arguments.
         deadline: Seconds.
         env: More variables for its environment.
 

@@ -33,7 +33,6 @@ def config(zenoh: Any, **endpoints: str) -> Any:
     """Return the configuration of a peer that finds nobody but by an endpoint.
 
     Args:
-        zenoh: The module.
         endpoints: ``listen`` or ``connect``, as locators.
     """
     made = zenoh.Config()

@@ -93,7 +93,6 @@ def noise(imu: ImuAnnouncement, samples: dict[str, Floats]) -> Iterator[tuple[Cu
     """Yield the curve and the figures of the gyroscope and the accelerometer.
 
     Args:
-        imu: What is announced.
         samples: Of each, while it stands, shape (n, 3).
     """
     for name, rows in samples.items():

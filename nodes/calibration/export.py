@@ -25,9 +25,8 @@ from events import (
 )
 from events.frames import flip_yz, rotation_to_nwu
 from nodes.calibration.formats import DEPTH_FACTOR, write_files
-from nodes.data.dataset.recording import ImageFile, Recording, in_colour
-from nodes.data.dataset.rig import Rig, choose
-from nodes.ros2.messages.encoding import depth_in_steps
+from nodes.data.dataset.recording import ImageFile, Recording, Rig, choose, in_colour
+from nodes.ros2.messages.images import depth_in_steps
 from nodes.trajectory.table import EPOCH, epoch_of
 from runtime.run.results import claim
 
@@ -44,7 +43,6 @@ def export_calibration(
     ``vslamlab`` also gets images, IMU and ground truth, if the run has a recording.
 
     Args:
-        run: The run's folder.
         form: One of `nodes.calibration.formats.FORMATS`.
         out: Folder for the files; ``export/<form>`` in the run's folder if None.
         epoch: The run's time 0 in the data: a date (ISO 8601), or nanoseconds of Unix time.

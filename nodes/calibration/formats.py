@@ -26,11 +26,10 @@ import numpy.typing as npt
 
 from events import CameraAnnouncement
 from events.frames import axes_of
-from events.poses import inverse, pose_matrix, pose_tuples
-from nodes.data.dataset.recording import real, templates
-from nodes.data.dataset.rig import Rig
+from events.geometry import inverse, pose_matrix, pose_tuples
+from nodes.data.dataset.recording import Rig, real, templates
 from nodes.ros2.messages.publications import TopicKind, publication
-from nodes.ros2.messages.settings import PublishingConfig
+from nodes.ros2.messages.topics import PublishingConfig
 
 DEPTH_FACTOR = 5000.0
 """Steps of an exported depth image per metre, as TUM's."""

@@ -17,12 +17,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, Imu, ImuAnnouncement
-from events.poses import pose_matrix
-from nodes.calibration.collector import Floats, Motion, _Collector
+from events.geometry import pose_matrix
 from nodes.calibration.formats import FORMATS, GRAVITY, imu_axes, write_files
-from nodes.calibration.readers import read
-from nodes.calibration.room import NEAREST, hits, spheres
-from nodes.data.dataset.rig import Rig
+from nodes.calibration.readers import NEAREST, Floats, Motion, _Collector, hits, read, spheres
+from nodes.data.dataset.recording import Rig
 
 INTEGRATED = 5.0
 """Seconds over which the IMU is integrated."""

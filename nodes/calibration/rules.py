@@ -19,7 +19,7 @@ from events import (
     LidarAnnouncement,
 )
 from runtime.config.model import Config, NodeSpec
-from runtime.tools.lint import Finding
+from runtime.tools.preflight import Finding
 
 Announced = Sequence[Announcement]
 

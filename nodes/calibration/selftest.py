@@ -12,13 +12,12 @@ import msgspec
 import numpy as np
 
 from events import CameraAnnouncement, Image, ImuAnnouncement, Odometry
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from nodes.calibration import proofs
 from nodes.calibration.allan import Curve, needed, noise
-from nodes.calibration.collector import Motion, _Collector
 from nodes.calibration.proofs import Figure, Points
-from nodes.calibration.room import CENTRE, mjcf
-from nodes.data.dataset.rig import choose
+from nodes.calibration.readers import CENTRE, Motion, _Collector, mjcf
+from nodes.data.dataset.recording import choose
 from nodes.trajectory.formats import tum_row
 from runtime.config.model import Config, NodeSpec, to_builtins
 from runtime.config.reading import parse
@@ -104,8 +103,6 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
     """Fly one vehicle of a file, and return what that proves.
 
     Args:
-        config: The file.
-        spec: The vehicle's node.
         folder: For the room, the exported files and a free camera's path.
         standing: Seconds of simulated time that the IMU may stand for proof 2, at most.
 

@@ -5,18 +5,18 @@ from nodes.estimators.estimator import (
     Estimator,
     EstimatorConfig,
 )
-from nodes.estimators.frames import (
+from nodes.estimators.lidar import LidarEstimator
+from nodes.estimators.result import TrackingResult
+from nodes.estimators.rig import (
     MonocularFrame,
     MonocularInertialFrame,
+    Mount,
     RgbdFrame,
     RgbdInertialFrame,
     StereoFrame,
     StereoInertialFrame,
     sample_rows,
 )
-from nodes.estimators.lidar import LidarEstimator
-from nodes.estimators.mount import Mount
-from nodes.estimators.result import TrackingResult
 
 __all__ = [
     "WORKER_ENVIRONMENT",

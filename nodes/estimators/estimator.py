@@ -37,7 +37,6 @@ from events import (
     VehicleEvent,
 )
 from events.camera_info import COEFFICIENTS
-from nodes.estimators.mount import Mount
 from nodes.estimators.rectification import ALIGNED, Rectification, misalignment
 from nodes.estimators.result import (
     TrackingResult,
@@ -45,7 +44,7 @@ from nodes.estimators.result import (
     check_shape,
     check_transform,
 )
-from nodes.estimators.rig import SensorChoice
+from nodes.estimators.rig import Mount, SensorChoice
 from runtime import Bundle, Node, NodeConfig, Output, on
 from runtime.errors import DeclarationError, NodeError, suggest
 from runtime.extras import why_missing
@@ -353,8 +352,6 @@ class Estimator(Node[C], ABC):
         """Send what a tracker found in an image: features, pose, and whether tracking was lost.
 
         Args:
-            image: The image.
-            result: What the tracker found in it.
             origin: When the image was exposed at which the tracker's poses start (ns); if `None`,
                 the first image that is published with a pose.
 
@@ -425,7 +422,6 @@ class Estimator(Node[C], ABC):
         Args:
             stamps: When the images were exposed (`exposed_at`), ns, strictly rising, shape (n,).
             poses: The optical camera as in `TrackingResult`, shape (n, 4, 4).
-            number: Of the map that they are in.
         """
         try:
             check_shape("poses", poses, (len(stamps), 4, 4))

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, CameraInfo, DepthImage, Image
-from events.poses import pose_matrix, pose_tuples
+from events.geometry import pose_matrix, pose_tuples
 
 Floats = npt.NDArray[np.float64]
 F = TypeVar("F", bound=tuple[Any, ...])

@@ -20,11 +20,11 @@ from events import (
     PoseStamped,
     TransformStamped,
 )
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 from nodes.estimators import WORKER_ENVIRONMENT
 from nodes.mapping.cloud import Mapper
 from nodes.mapping.transforms import TransformError, TransformTree
-from nodes.trajectory.growing import part_name
+from nodes.trajectory.table import part_name
 from runtime import Bundle, Duration, Node, NodeConfig, Output, on
 from runtime.paths import OutputPath
 from runtime.units import Latency

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Odometry, TransformStamped
-from events.poses import Pose, pose_matrix
+from events.geometry import Pose, pose_matrix
 from nodes.trajectory import RecentPoses
 
 Floats = npt.NDArray[np.float64]
@@ -97,8 +97,6 @@ class TransformTree:
         rotation with quaternion curves", 1985); beyond them nothing is guessed.
 
         Args:
-            target: Frame.
-            source: Frame.
             stamp: Nanoseconds.
 
         Returns:

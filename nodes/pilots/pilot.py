@@ -35,9 +35,17 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
-from events.rotations import yaw_of
-from nodes.pilots.manoeuvres import Excitation, FigureEight, Heading, excited, headed, joined
-from nodes.pilots.waypoint_path import WaypointPath, plan
+from events.frames import yaw_of
+from nodes.pilots.waypoint_path import (
+    Excitation,
+    FigureEight,
+    Heading,
+    WaypointPath,
+    excited,
+    headed,
+    joined,
+    plan,
+)
 from runtime import Duration, Node, NodeConfig, Output, on
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]

@@ -26,7 +26,7 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from nodes.viewers.window.keys import KEYS
+from events.window import KEYS
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from runtime.config.parameters import Changeable
 from runtime.errors import suggest

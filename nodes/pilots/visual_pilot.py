@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from events import Hover, PlannedPose, PoseEstimate, Vector3, VelocitySetpoint
-from events.rotations import yaw_of
+from events.frames import yaw_of
 from nodes.pilots.pilot import Pilot, PilotConfig, Positive
 from nodes.pilots.waypoint_path import WaypointPath
 from runtime import Duration, Output, on

@@ -39,7 +39,6 @@ def read_tum(path: Path, *, whole: bool = True, in_order: bool = True) -> Trajec
     """Read a TUM file; stamps keep every nanosecond that is written.
 
     Args:
-        path: The file.
         whole: Whether its last line counts though nothing ends it. That of a run that was killed
             may be cut off.
         in_order: Whether stamps have to rise. If not, the rows are sorted, and of several with one
@@ -60,8 +59,6 @@ def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
     """Write a TUM file.
 
     Args:
-        path: The file.
-        trajectory: What to write.
         comment: Lines for its head, such as the names of the frames.
 
     Raises:
@@ -120,8 +117,6 @@ def write_euroc(path: Path, trajectory: Trajectory, comment: str = "") -> None:
     """Write a EuRoC ground truth, poses as they are; velocities by differences, biases zero.
 
     Args:
-        path: The file.
-        trajectory: What to write.
         comment: Lines to go before the header.
 
     Raises:

@@ -1,14 +1,23 @@
-"""Text files of numbers in rows: what all trajectory files have in common."""
+"""Text files of numbers in rows: what all trajectory files have in common.
+
+Files of a run that outlast what happens to it.
+
+Text files grow with a run, so that a run that is killed leaves all but its last second; and what a
+node wrote before it was restarted is never overwritten.
+"""
 
 from __future__ import annotations
 
 import datetime as dt
 import decimal
 import math
+import threading
+from collections import deque
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
+from runtime import Node
 from runtime.time.schedule import SECOND
 
 _TOO_LATE = 1 << 63
@@ -126,10 +135,8 @@ def read_rows(
     """Yield the rows of a file.
 
     Args:
-        path: The file.
         separator: Between fields; None for blanks.
         columns: How many fields a row may have.
-        meaning: What they are, for messages.
         whole: Whether a last line without its end counts.
         header: Whether a first line that begins with a letter is passed over.
 
@@ -163,3 +170,59 @@ def seconds_text(stamp: int) -> str:
     """Return nanoseconds as seconds with nine decimals, exactly."""
     whole, rest = divmod(abs(stamp), SECOND)
     return f"{'-' if stamp < 0 else ''}{whole}.{rest:09d}"
+
+
+_INTERVAL = 500_000_000
+"""Nanoseconds of the run's clock between two writes."""
+
+
+def part_name(node: Node[Any], name: str) -> str:
+    """Return the name of a node's file or folder; after a restart one beside those of before.
+
+    ``flight.png`` is followed by ``flight-2.png``, ``dataset`` by ``dataset-2``.
+    """
+    path = Path(name)
+    number = f"-{node.restarts + 1}" if node.restarts else ""
+    return str(path.with_name(f"{path.stem}{number}{path.suffix}"))
+
+
+class GrowingFile:
+    """A file of lines: they are added on the loop, and written beside it twice a second.
+
+    Args:
+        path: The file; made anew, unless the node was restarted: then it goes on.
+    """
+
+    def __init__(self, node: Node[Any], path: Path, head: str = "") -> None:
+        self._node = node
+        self._file = path.open("ab" if node.restarts else "wb", buffering=0)
+        self.begin = self._file.tell()
+        """Bytes that were there before."""
+        self._lines = deque([] if self.begin else [head])
+        self._due = 0
+        self._writing = False
+        self._lock = threading.Lock()
+
+    def add(self, line: str) -> None:
+        """Add a line, with its end."""
+        self._lines.append(line)
+        now = self._node.clock.now()
+        if now >= self._due and not self._writing:
+            self._due, self._writing = now + _INTERVAL, True
+            self._node.start(self._node.offload(self._write))
+
+    def close(self) -> None:
+        """Write what is left, and close the file."""
+        try:
+            self._write()
+        finally:
+            self._file.close()
+
+    def _write(self) -> None:
+        with self._lock:  # the run's end does not wait for a write that it cancels
+            if not self._file.closed:
+                lines = [self._lines.popleft() for _ in range(len(self._lines))]
+                rest = memoryview("".join(lines).encode("ascii"))
+                while rest:
+                    rest = rest[self._file.write(rest) :]
+        self._writing = False

@@ -2,11 +2,14 @@
 
 Pure numpy and scipy. Files are in `nodes.trajectory.formats`; errors between two trajectories in
 `nodes.judging.evaluation.metrics`.
+
+The poses of the last seconds, for nodes that look them up while a run goes on.
 """
 
 from __future__ import annotations
 
 import tempfile
+from bisect import bisect_left
 from collections.abc import Iterable
 from typing import IO, Any
 
@@ -16,6 +19,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from events import Quaternion, Vector3
+from events.frames import slerp
+from events.geometry import Pose
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
@@ -297,7 +302,6 @@ def associate(
     Args:
         truth: True poses, as densely as there are: they are interpolated, and only estimates
             before their start or after their end are left out.
-        estimate: Estimated poses.
         name: What the message of an error begins with, such as the estimate's file.
 
     Raises:
@@ -357,3 +361,59 @@ def _floats(name: str, array: Any, shape: tuple[int, int]) -> Floats:
             f"found {copy[wrong[0]].tolist()}"
         )
     return copy
+
+
+HISTORY = 10_000_000_000
+"""Nanoseconds for which poses are kept, if nothing else is asked for."""
+
+
+class RecentPoses:
+    """Poses of one frame in another, by time.
+
+    Args:
+        history: Nanoseconds for which poses are kept, back from the newest; `None` keeps all.
+    """
+
+    def __init__(self, history: int | None = HISTORY) -> None:
+        self._history = history
+        self._stamps: list[int] = []
+        self._poses: list[Pose] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, stamp: int, position: Vector3, orientation: Quaternion) -> None:
+        """Take in a pose (ns, metres, w x y z), in any order; one of the same stamp is replaced."""
+        stamps, poses = self._stamps, self._poses
+        place = bisect_left(stamps, stamp)
+        if place < len(stamps) and stamps[place] == stamp:
+            poses[place] = position, orientation
+            return
+        stamps.insert(place, stamp)
+        poses.insert(place, (position, orientation))
+        if self._history is not None:
+            old = bisect_left(stamps, stamps[-1] - self._history)
+            del stamps[:old], poses[:old]
+
+    def span(self) -> tuple[int, int] | None:
+        """Return the first and the last stamp (ns) that are kept; `None` if there is none."""
+        return (self._stamps[0], self._stamps[-1]) if self._stamps else None
+
+    def at(self, stamp: int) -> Pose | None:
+        """Return the pose at a time (ns): positions linear, orientations by slerp.
+
+        A stamp that is kept gives its very pose. Before the first and after the last stamp nothing
+        is guessed, and the result is `None`.
+        """
+        stamps, poses = self._stamps, self._poses
+        after = bisect_left(stamps, stamp)
+        if after == len(stamps):
+            return None
+        if stamps[after] == stamp:
+            return poses[after]
+        if after == 0:
+            return None
+        (p, q), (r, s) = poses[after - 1 : after + 1]
+        share = (stamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+        x, y, z = (a + share * (b - a) for a, b in zip(p, r, strict=True))
+        return (x, y, z), slerp(q, s, share)

@@ -95,10 +95,7 @@ class Answers:
         Args:
             stamp: Of the frame (ns).
             due: When its answer counts (ns).
-            outcome: What became of it.
             latency: Real seconds that its answer took.
-            digest: Of what the answer holds.
-            says_lost: Whether it says that tracking is lost.
         """
         with self._lock:
             self.counts[outcome] += 1

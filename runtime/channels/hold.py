@@ -16,13 +16,17 @@ the same estimator has the same digest as a worker and as a process of its own.
 
 In real time nothing is held: answers come when they come, no earlier than their latency, and an
 answer to a later frame says that those before it were skipped.
+
+The answer to one frame for a system outside the process, to be awaited.
 """
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -31,7 +35,6 @@ from typing_extensions import Buffer
 
 from runtime.channels.answers import Answers, Outcome, Wrong, read_latencies
 from runtime.channels.digest import fingerprint
-from runtime.channels.owed import LET_GO, Owed, future
 from runtime.errors import MissingAnswerError
 from runtime.paths import InputPath
 from runtime.time.clock import Clock
@@ -39,6 +42,47 @@ from runtime.time.schedule import SECOND
 from runtime.units import Duration
 
 T = TypeVar("T")
+
+LET_GO: Any = object()
+"""The outcome of a wait that has ended without an answer, which may still come."""
+
+
+class Owed(Generic[T]):
+    """The answer to one frame, to be awaited once: its content, or `None` if there is none.
+
+    Raises:
+        MissingAnswerError: There is none, and by `HoldConfig.on_missing` that is an error.
+    """
+
+    __slots__ = ("_clock", "due", "later", "since", "stamp", "work")
+
+    def __init__(self, clock: Clock, stamp: int, due: int, since: float) -> None:
+        self._clock = clock
+        self.stamp = stamp
+        self.due = due
+        self.since = since
+        self.work = future()
+        self.later: concurrent.futures.Future[Any] | None = None
+        """Its answer, once time waits for it no more."""
+
+    def __await__(self) -> Generator[Any, None, T | None]:
+        return self._answer().__await__()
+
+    async def _answer(self) -> T | None:
+        latency = max(self.due - self._clock.now(), 0)
+        result = await self._clock.beside(self.work, latency)
+        if self.later is not None and result is LET_GO:
+            result = await asyncio.wrap_future(self.later)
+        found: T | None = result
+        return found
+
+
+def future() -> concurrent.futures.Future[Any]:
+    """Return a future that a reader who stops waiting does not cancel."""
+    made: concurrent.futures.Future[Any] = concurrent.futures.Future()
+    made.set_running_or_notify_cancel()
+    return made
+
 
 BEHIND = 2.0
 """Real seconds by which simulated time stays behind real time while a system initialises: so much
@@ -89,8 +133,6 @@ class Hold(Generic[T]):
     """The answers that one outside system owes.
 
     Args:
-        name: Of the system.
-        clock: The run's clock.
         config: How long is waited, and what if nothing comes.
         latency: Seconds of the run's clock from a frame to its answer.
         answers: Where to note what became of each frame.

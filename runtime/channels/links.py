@@ -48,9 +48,6 @@ class Link:
 
     Args:
         name: ``node.port``.
-        config: What it does.
-        clock: The run's clock.
-        seed: Of the run.
         before: The link that this one replaces, whose figures it carries on.
     """
 

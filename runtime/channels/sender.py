@@ -42,7 +42,6 @@ class Voices:
     replay does) speaks for all for whom nobody else does.
 
     Args:
-        nodes: All nodes' names.
         scripted: Those that may send in any name: scripts of tests.
     """
 
@@ -105,7 +104,6 @@ class Sender(Generic[T]):
 
     Args:
         name: ``node.port``.
-        event: The declared type of event.
         outside: What its node does in threads just now. While there is something, each event is
             checked to be sent by the loop's thread; else the first only.
     """
@@ -319,8 +317,6 @@ class Listener:
     """One handler or stream, and which events it receives.
 
     Args:
-        node: Name of the node it belongs to.
-        deliver: What to call with an event.
         events: The types that it receives, with their subclasses.
         source: Only this source and those below it; `None` for all.
         stream: The stream, if it is one.

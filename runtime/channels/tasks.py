@@ -8,7 +8,7 @@ coroutine waits for anything but a stream, ends, or is cancelled. The task is as
 coroutine is stepped in the task's own context with the task as the current one, so it cannot
 tell in which of the two ways it was resumed.
 
-`runtime.run.task_factory` makes every task of a loop such a task. Not here: buffers
+`runtime.run.event_loop` makes every task of a loop such a task. Not here: buffers
 (`runtime.channels.streams`).
 """
 
@@ -47,7 +47,7 @@ if sys.version_info >= (3, 14):
     current_tasks: Any = _CurrentTasks()
 else:
     # One dictionary access is a tenth of `_leave_task` and `_enter_task` together. Where there is
-    # no such dictionary, `runtime.run.task_factory` finds that this one does not serve.
+    # no such dictionary, `runtime.run.event_loop` finds that this one does not serve.
     current_tasks = getattr(asyncio.tasks, "_current_tasks", {})
 
 

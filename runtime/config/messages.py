@@ -1,13 +1,19 @@
-"""Saying what is wrong with a setting: msgspec's messages as place, expected, found."""
+"""Saying what is wrong with a setting: msgspec's messages as place, expected, found.
+
+Changing settings from the command line: ``--set drone.cameras.front.rate=10``.
+"""
 
 from __future__ import annotations
 
+import itertools
 import re
+import tomllib
 from typing import Any, Literal, get_args, get_origin
 
 import msgspec
 
-from runtime.errors import suggest
+from runtime.errors import ConfigError, suggest
+from runtime.paths import GivenHere
 
 _LONGEST_TEXT = 300
 """Letters of a text that a message shows."""
@@ -100,3 +106,99 @@ def show(value: Any) -> str:
         return str(value).lower()
     text = str(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def override(table: dict[str, Any], change: str) -> None:
+    """Change one setting of a table, as `tomllib` gives it.
+
+    Args:
+        change: ``node.key=value`` or ``run.key=value``; the value in TOML, or a bare word. For
+            ``drone.cameras.front.rate`` there is ``front.rate``, if nothing else has that name.
+
+    Raises:
+        ConfigError: There is no such node, or nothing to set there.
+    """
+    path, equals, text = change.partition("=")
+    keys = path.strip().split(".")
+    where = f"--set {show(change)[1:-1]}"
+    if not equals or len(keys) < 2 or not all(keys):
+        raise ConfigError(f"{where}: expected node.key=value or run.key=value")
+    try:
+        value = given(text)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    nodes = _by_name(table.get("nodes"))
+    if keys[0] in {"run", "network"}:
+        target = table.setdefault(keys[0], {})
+    elif keys[0] in nodes:
+        target = nodes[keys[0]]
+    else:
+        target = _part(nodes, keys[0], where)
+    for before, key in itertools.pairwise(keys[:-1]):
+        if isinstance(target, list):  # an entry of a list of tables, by its name
+            target = _entry(target, key, f"{where}: {before}")
+        elif isinstance(target, dict):
+            target = target.setdefault(key, {})
+    if isinstance(target, list):
+        _entry(target, keys[-1], f"{where}: {keys[-2]}")
+    if not isinstance(target, dict):
+        raise ConfigError(
+            f"{where}: {keys[-2]}: expected a table, since .{keys[-1]} follows, "
+            f"found {show(target)}"
+        )
+    target[keys[-1]] = value
+
+
+def given(text: str) -> Any:
+    """Return what a text of the command line means: its value in TOML, or itself.
+
+    Raises:
+        ValueError: It is no value that a file could have.
+    """
+    try:
+        found = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return GivenHere(text.strip())
+    except ValueError:  # of Python's int()
+        raise ValueError("expected a number of a usual size") from None
+    except RecursionError:
+        raise ValueError("expected a value, found brackets nested too deep") from None
+    if len(found) > 1:
+        raise ValueError("expected one setting, found more lines")
+    value = found["value"]
+    return GivenHere(value) if isinstance(value, str) else value
+
+
+def _part(nodes: dict[str, dict[str, Any]], name: str, where: str) -> dict[str, Any]:
+    """Return the one table of this name in the lists of all nodes, such as a camera's."""
+    parts = {
+        f"{node}.{key}.{part}": entry
+        for node, table in nodes.items()
+        for key, entries in table.items()
+        for part, entry in _by_name(entries).items()
+    }
+    found = [path for path in parts if path.endswith(f".{name}")]
+    if len(found) == 1:
+        return parts[found[0]]
+    if found:
+        raise ConfigError(f"{where}: expected one of {', '.join(found)}; found {show(name)}")
+    known = ["run", *nodes, *(path.rpartition(".")[2] for path in parts)]
+    raise ConfigError(
+        f"{where}: expected run or a node ({', '.join(nodes)}), found {show(name)}"
+        + suggest(name, known)
+    )
+
+
+def _entry(entries: list[Any], name: str, where: str) -> dict[str, Any]:
+    named = _by_name(entries)
+    if name not in named:
+        listed = ", ".join(named) or "a table with a name"
+        raise ConfigError(
+            f"{where}: expected one of {listed}; found {show(name)}" + suggest(name, named)
+        )
+    return named[name]
+
+
+def _by_name(entries: Any) -> dict[str, dict[str, Any]]:
+    tables = [e for e in entries if isinstance(e, dict)] if isinstance(entries, list) else []
+    return {str(table["name"]): table for table in tables if "name" in table}

@@ -20,9 +20,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar, get_origin
 import msgspec
 import tomli_w
 
-from runtime.config.messages import struct_in
+from runtime.config.messages import override, struct_in
 from runtime.config.model import without_none
-from runtime.config.override import override
 from runtime.config.reading import convert
 from runtime.errors import ConfigError
 from runtime.node import NodeConfig
@@ -56,7 +55,6 @@ def change(configs: Mapping[str, NodeConfig], text: str) -> Change:
     """Change a setting of one of several nodes.
 
     Args:
-        configs: The nodes' settings, by name.
         text: ``node.key=value``, as for ``--set``; ``front.loss`` does for
             ``drone.cameras.front.loss`` if nothing else has that name.
 

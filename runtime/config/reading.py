@@ -34,9 +34,8 @@ import msgspec
 
 from runtime.channels.links import LinkConfig
 from runtime.channels.ports import MAX_HZ
-from runtime.config.messages import explain, show
+from runtime.config.messages import explain, override, show
 from runtime.config.model import Config, NetworkConfig, NodeSpec, OnError, RunConfig
-from runtime.config.override import override
 from runtime.config.plugins import CONFIGURATIONS, NODES, offers
 from runtime.errors import ConfigError, DeclarationError, VisnavError, suggest
 from runtime.node import Node
@@ -58,7 +57,6 @@ def load_configuration(path: Path, overrides: Sequence[str] = ()) -> Config:
     """Read a file that says what to run: TOML, or what a package reads by its suffix.
 
     Args:
-        path: The file.
         overrides: As of `load`.
 
     Raises:
@@ -136,7 +134,6 @@ def parse(table: Mapping[str, Any], where: str, folder: Path | None = None) -> C
     """Turn a table, as `tomllib` gives it, into settings.
 
     Args:
-        table: Of the whole file.
         where: Begins the message of an error.
         folder: Where relative paths start; the working directory if not given.
 

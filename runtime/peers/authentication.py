@@ -8,15 +8,28 @@
 
 A hello is sealed with the key of the run. It carries a nonce, and once it answers another hello,
 that one's nonce; so an old hello proves nothing. From both nonces comes the key of a session.
+
+The secret of a run: a process that has it may take part, and no other.
+
+On one machine it is a random key in a file that only its user can read, made when it is first
+needed; so nobody has to think of it. Processes on several machines, or of several users, are given
+one by `network.secret`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
+import os
+import secrets
+import stat
 import struct
+import tempfile
+from pathlib import Path
 
-from runtime.errors import PeerError, WireError
+from runtime.errors import CommandError, PeerError, WireError
+from runtime.paths import user_folder
 
 VERSION = 3
 """Of the messages of `runtime.peers.messages`; processes of different ones do not meet."""
@@ -87,9 +100,7 @@ class Sealing:
     """The seals of one session, in both directions.
 
     Args:
-        key: Of the run.
         mine: Id and nonce of this process.
-        other: Those of the other one.
 
     Attributes:
         nonce: Of this process.
@@ -125,3 +136,69 @@ def hello_seal(key: bytes, sender: str, receiver: str) -> Seal:
 def is_hello(sealed: bytes) -> bool:
     """Return whether a message claims to be a hello."""
     return sealed[1:9] == bytes(8)
+
+
+SHORTEST = 16
+"""Characters of a secret at least."""
+
+
+def secret_of(setting: str) -> bytes:
+    """Return the secret that all processes of a run share.
+
+    Args:
+        setting: `network.secret`: ``env:NAME``, ``file:PATH``, the secret itself, or nothing for
+            that of this user on this machine.
+
+    Raises:
+        PeerError: There is none, or others may read it.
+    """
+    kind, _, name = setting.partition(":")
+    if kind == "env":
+        found = os.environ.get(name, "")
+    elif kind == "file":
+        found = _read(Path(name).expanduser())
+    else:
+        found = setting or _of_this_user()
+    if len(found) < SHORTEST:
+        where = setting if kind in {"env", "file"} else "the file"
+        raise PeerError(
+            f"network.secret: expected at least {SHORTEST} characters in {where}, found "
+            f"{len(found)}"
+        )
+    return found.encode()
+
+
+def _of_this_user() -> str:
+    try:
+        path = user_folder() / "network.key"
+        if not path.exists():
+            _make(path)
+        return _read(path)
+    except (CommandError, OSError) as error:
+        raise PeerError(
+            f"network.secret: expected a private folder for the key of this machine, found: "
+            f"{error}; name a secret"
+        ) from None
+
+
+def _make(path: Path) -> None:
+    """Write a new key; of several processes that do so at once, one succeeds."""
+    with tempfile.NamedTemporaryFile("w", dir=path.parent) as file:  # mode 0600
+        file.write(secrets.token_hex(32))
+        file.flush()
+        with contextlib.suppress(FileExistsError):
+            os.link(file.name, path)
+
+
+def _read(path: Path) -> str:
+    try:
+        with path.open(encoding="utf-8") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            if stat.S_IMODE(mode) & 0o077:
+                raise PeerError(
+                    f"network.secret: expected a file that only its user may read, found mode "
+                    f"{stat.S_IMODE(mode):o}: {path}"
+                )
+            return file.read().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PeerError(f"network.secret: expected a secret in {path}, found: {error}") from None

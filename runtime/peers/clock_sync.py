@@ -11,10 +11,9 @@ import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from runtime.peers.clock_offsets import KEPT
-from runtime.peers.member import Member
+from runtime.peers.member import KEPT, Member
 from runtime.peers.messages import Ping
-from runtime.time.real_clock import RealClock
+from runtime.time.clock import RealClock
 from runtime.time.schedule import SECOND
 
 PERIOD = 0.1
@@ -33,7 +32,6 @@ async def compare(
     """Learn how far the monotonic clock of another process is from ours, unless that is lost.
 
     Args:
-        member: The process.
         until: Waits for something that other processes bring about.
     """
     for _ in range(KEPT):
@@ -67,7 +65,6 @@ class PhaseLockedLoop:
 
         Args:
             late: Seconds by which our clock is late.
-            seconds: Since the last time.
         """
         drift = self.drift + self.INTEGRAL * late * seconds
         wanted = drift + self.PROPORTIONAL * late
@@ -77,12 +74,7 @@ class PhaseLockedLoop:
 
 
 class ClockFollower:
-    """Keeps our clock with that of another process.
-
-    Args:
-        clock: Ours.
-        member: The other process.
-    """
+    """Keeps our clock with that of another process."""
 
     def __init__(self, clock: RealClock, member: Member) -> None:
         self.member = member

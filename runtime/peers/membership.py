@@ -20,17 +20,16 @@ import msgspec
 from events import Event
 from runtime.config.model import Config
 from runtime.errors import PeerError, VisnavError, WireError
-from runtime.peers.authentication import ForgedError, derive, is_hello
-from runtime.peers.clock_offsets import Exchange
-from runtime.peers.compatibility import (
+from runtime.peers.authentication import ForgedError, derive, is_hello, secret_of
+from runtime.peers.handshake import (
+    Handshakes,
     check_fits,
     missing,
     missing_message,
     name_of,
     what_all_share,
 )
-from runtime.peers.handshake import Handshakes
-from runtime.peers.member import Member
+from runtime.peers.member import Exchange, Member
 from runtime.peers.messages import (
     Ack,
     EventMessage,
@@ -44,7 +43,6 @@ from runtime.peers.messages import (
     Stop,
     decode,
 )
-from runtime.peers.secret import secret_of
 from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.peers.waiting import Waiting
 from runtime.peers.zenoh_session import Session, certified
@@ -76,8 +74,6 @@ class Membership:
     """The processes of a run.
 
     Args:
-        config: The whole file.
-        only: Nodes that run here.
         peers: Notified, on the loop, of messages and losses.
 
     Attributes:

@@ -16,9 +16,8 @@ from runtime.channels.tasks import Fault
 from runtime.config.model import Config
 from runtime.errors import ChannelFullError, PeerError, VisnavError, WireError
 from runtime.peers.clock_sync import ClockFollower
-from runtime.peers.compatibility import name_of
-from runtime.peers.joint_shutdown import JointShutdown
-from runtime.peers.joint_start import JointStart
+from runtime.peers.handshake import name_of
+from runtime.peers.joint import JointShutdown, JointStart
 from runtime.peers.member import Member
 from runtime.peers.membership import Membership
 from runtime.peers.messages import (
@@ -41,9 +40,8 @@ from runtime.peers.messages import (
 )
 from runtime.peers.remote_events import RemoteEvents, subscriptions
 from runtime.peers.time_token import TimeTokenHolder
-from runtime.time.clock import Clock
+from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.real_clock import RealClock
 
 log = logging.getLogger("visnav.runtime")
 
@@ -67,12 +65,6 @@ class Run(Protocol):
 
 class Peers:
     """All processes of a run but this one.
-
-    Args:
-        config: The whole file.
-        only: Nodes that run here.
-        clock: The run's clock here.
-        run: The run here.
 
     Attributes:
         shutdown: Our part in the end of it.

@@ -22,10 +22,7 @@ class RemoteEvents:
     """What crosses between this process and the others.
 
     Args:
-        specs: All nodes of the file.
         owners: The number of the process that has each node.
-        me: The number of this one.
-        leave: Sends an event to a process.
     """
 
     def __init__(

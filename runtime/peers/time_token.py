@@ -52,8 +52,6 @@ class TimeTokenHolder:
     Args:
         me: Number of this process; they are numbered in the order of their first nodes.
         count: How many there are.
-        timeline: This process's time.
-        send: Sends a message to a process.
         deliver: Given the messages of others, in order, at this process's turn.
     """
 

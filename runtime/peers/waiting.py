@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 
 from runtime.errors import PeerError, VisnavError
-from runtime.peers.compatibility import name_of
+from runtime.peers.handshake import name_of
 from runtime.peers.member import Member
 from runtime.peers.messages import Key
 from runtime.time.lockstep import LockstepLoop

@@ -2,17 +2,164 @@
 
 Unlike `asyncio.Runner`, this survives a `SystemExit` or `KeyboardInterrupt` that some task or
 callback lets out of the loop, and waits a limited time for tasks that swallow their cancellation.
+
+Tasks whose coroutines streams can resume at once, if this interpreter's asyncio allows it.
+
+`runtime.channels.tasks` and `runtime.channels.streams` rely on how asyncio's tasks work inside. At
+the first use in a process, a self-test tries it; where the interpreter differs, tasks stay
+asyncio's own, which streams wake through the loop: slower, with the same results.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import contextvars
+import functools
+import logging
+import sys
 import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
-from runtime.run.task_factory import RunTask
+from runtime import code_location
+from runtime.channels import tasks
+from runtime.channels.streams import Stream
+from runtime.channels.tasks import Nesting, ResumableCoroutine
+from runtime.errors import NodeError
+from runtime.time.lockstep import PYTHON, passes
+
+log = logging.getLogger("visnav.runtime")
+
+Factory = Callable[..., asyncio.Task[Any]]
+
+
+def install(loop: asyncio.AbstractEventLoop) -> None:
+    """Make every task created on `loop` from now on one that streams can resume.
+
+    If the interpreter does not allow it, its tasks stay as they are, and the log says so once.
+    """
+    if resumable():
+        loop.set_task_factory(functools.partial(_task_factory, Nesting()))
+
+
+@functools.cache
+def resumable() -> bool:
+    """Return whether streams can resume tasks at once here; what cannot be done is logged."""
+    if not works(None):
+        Stream.use_futures()
+        log.warning("%s: streams wait on futures, since its tasks accept nothing else", PYTHON)
+    found = works(functools.partial(_task_factory, Nesting()))
+    if not found:
+        log.warning("%s: streams wake tasks through the loop, which is slower", PYTHON)
+    return found
+
+
+def works(factory: Factory | None) -> bool:
+    """Return whether streams and tasks of a factory work together; `None` for asyncio's own."""
+    return passes(asyncio.SelectorEventLoop, functools.partial(_exercise, factory))
+
+
+async def _exercise(factory: Factory | None, loop: asyncio.AbstractEventLoop) -> bool:
+    """Resume, suspend, cancel and fail readers of a stream, and return whether all went well."""
+    me, at_once = asyncio.current_task(), factory is not None
+    loop.set_task_factory(factory)
+    numbers: Stream[int] = Stream("self-test")
+    read: list[tuple[int, bool]] = []
+
+    async def reader() -> None:
+        own = asyncio.current_task()
+        async for number in numbers:
+            if number == 2:
+                await asyncio.sleep(0)
+            read.append((number, asyncio.current_task() is own))
+            if number == 4:
+                raise LookupError
+
+    async def turns() -> None:
+        for _ in range(4):
+            await asyncio.sleep(0)
+
+    failing = loop.create_task(reader())
+    await turns()
+    numbers.offer(1)
+    good = (read == [(1, True)]) == at_once and asyncio.current_task() is me
+    await turns()
+    numbers.offer(2)  # which waits for the loop, so the task takes over
+    numbers.offer(3)
+    await turns()
+    numbers.offer(4)
+    await turns()
+    good &= read == [(1, True), (2, True), (3, True), (4, True)] and failing.done()
+    good &= isinstance(failing.exception(), LookupError)
+    cancelled = loop.create_task(reader())
+    await turns()
+    cancelled.cancel()
+    numbers.offer(5)  # kept for the next reader
+    await turns()
+    return good and cancelled.cancelled() and numbers.receive_nowait() == 5
+
+
+class RunTask(asyncio.Task[Any]):
+    """A task whose place in a set does not depend on its address, and that the run may protect.
+
+    Code that goes through a set of tasks (a `TaskGroup` that cancels them, a caller of
+    `asyncio.wait`) does so in the same order in equal runs.
+    """
+
+    tasks = 0
+    """How many this one has made: its own count, so that no observer changes it."""
+
+    protected = False
+    """Whether nodes cannot cancel it, but for the one whose name it has: it is the run's."""
+
+    def __init__(self, number: int, coro: Coroutine[Any, Any, Any], **options: Any) -> None:
+        self._number = number
+        super().__init__(coro, **options)
+
+    def __hash__(self) -> int:
+        return self._number
+
+    def cancel(self, msg: Any | None = None) -> bool:
+        """Cancel it, as `asyncio.Task` does.
+
+        Raises:
+            NodeError: It is protected, and a node that is not its own cancels it.
+        """
+        caller = sys._getframe(1)
+        if self.protected and not caller.f_globals.get("__name__", "").startswith("runtime."):
+            node, place = code_location.of_thread(caller)
+            if node not in {"runtime", self.get_name()}:
+                error = NodeError(
+                    node,
+                    "expected it to cancel no tasks but its own, found it cancelling "
+                    f"that of {self.get_name()}",
+                )
+                error.place = place
+                raise error
+        return super().cancel(msg)
+
+
+def _task_factory(
+    nesting: Nesting,
+    loop: asyncio.AbstractEventLoop,
+    coro: Coroutine[Any, Any, Any],
+    context: contextvars.Context | None = None,
+    **options: Any,
+) -> asyncio.Task[Any]:
+    """Make a task whose coroutine streams can step.
+
+    A task that is given a context shares it, and a context cannot be entered twice; such a task
+    stays a stock one, which streams wake through the loop.
+    """
+    if context is None:
+        context = contextvars.copy_context()
+        coro = ResumableCoroutine(coro, loop, context, nesting)
+    parent: Any = tasks.current_tasks.get(loop)
+    counter = parent if isinstance(parent, RunTask) else nesting
+    counter.tasks += 1
+    return RunTask(counter.tasks, coro, loop=loop, context=context, **options)
+
 
 R = TypeVar("R")
 
@@ -35,7 +182,6 @@ def run_to_end(
 
     Args:
         loop: Not running yet.
-        main: What to run.
         escaped: Called with errors of the loop while `main` is not done; the loop then goes on,
             unless this raises.
 

@@ -25,17 +25,17 @@ from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError, VisnavError
 from runtime.logs import file_handler, logging_to
 from runtime.node import Node
-from runtime.run import event_loop, results, task_factory
+from runtime.run import event_loop, results
+from runtime.run import event_loop as task_factory
 from runtime.run.node_runner import log_error, with_place, wrap
-from runtime.run.private_results import private_results
+from runtime.run.results import private_results
 from runtime.run.summarise import summarise
 from runtime.run.supervisor import Supervisor
 from runtime.run.watchdogs import LoopWatchdog, ProgressWatchdog
 from runtime.summary import Stall, Summary
 from runtime.time import lockstep
-from runtime.time.clock import Clock
+from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.real_clock import RealClock
 
 if TYPE_CHECKING:
     from runtime.peers.peers import Peers
@@ -59,10 +59,8 @@ def execute(
     """Run a configuration to its end.
 
     Args:
-        config: What to run.
         out: Folder for results, made if missing; `None` writes nothing.
         handlers: Where log records go, besides ``log.txt`` in `out`.
-        log_events: Log every event that is sent.
         watch: Given the supervisor, returns a context that lasts as long as the run: a progress
             bar, a monitor.
         only: Nodes to run here; the others run in other processes. All, if empty.

@@ -95,9 +95,7 @@ def connect(
         nodes: In the order in which they receive events.
         sources: Ports narrowed by the file.
         links: Ports whose events come late or not at all.
-        taps: See every event first.
         fault: Called with listeners that raise; without it, `send` raises what they do.
-        last: Listeners after all nodes.
         elsewhere: Given ``node.port``, returns its listeners in other processes.
         wrap: Puts something round the nodes' handlers.
         voices: Who may send in which name; without it, all in any.

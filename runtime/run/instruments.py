@@ -35,7 +35,6 @@ class Instrument:
         """Return what is called instead of `call`, by which the loop gets into a node.
 
         Args:
-            node: The node's name.
             what: The handler, the tick or the coroutine.
             call: Takes an event, a `Tick`, or what a coroutine is sent.
         """
@@ -47,13 +46,7 @@ class Instrument:
         call: Callable[[], Any],
         name: str,  # noqa: ARG002
     ) -> Callable[[], Any]:
-        """Return what a thread calls instead of `call`, which a node offloads now.
-
-        Args:
-            node: The node's name.
-            call: Does the work.
-            name: Of the function.
-        """
+        """Return what a thread calls instead of `call`, which a node offloads now."""
         return call
 
     def worker_called(
@@ -66,7 +59,6 @@ class Instruments:
     """The instruments of one run.
 
     Args:
-        runners: The nodes that they look at.
         reconnect: Connects the run's senders and listeners anew, if it is running.
     """
 

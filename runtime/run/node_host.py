@@ -22,8 +22,7 @@ from runtime.host import RunEnd, Sibling
 from runtime.node import Node
 from runtime.run.instruments import Instruments
 from runtime.run.node_runner import Create, NodeRunner
-from runtime.run.parameter_server import ParameterServer
-from runtime.run.run_state import RunState
+from runtime.run.run_state import ParameterServer, RunState
 from runtime.time.schedule import Tick, Ticker
 from runtime.time.stepping import Stepping
 from runtime.workers.costs import Costs
@@ -38,11 +37,7 @@ class NodeHost:
     """The `Host` of a run's nodes.
 
     Args:
-        state: Of the run.
         out: Folder for what nodes write, or `None`.
-        out_of_programs: That for nodes that start programs.
-        instruments: What looks on.
-        parameters: Changes settings of nodes.
         create: Makes a task that the run owns.
         stop: Ends the run, for a reason of a node.
         fault: Called with the node and what it raised.

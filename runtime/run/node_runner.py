@@ -2,6 +2,12 @@
 
 A node may raise whatever it likes, `SystemExit` and the like included, and swallow its
 cancellation: each of its steps is a task, waited for within a limit and then left behind.
+
+The phases of nodes up to the first update, the same in a run and in a check of its file.
+
+construct → on_startup, in file order
+announce → on_announcement, check
+on_ready, in file order
 """
 
 from __future__ import annotations
@@ -10,15 +16,22 @@ import asyncio
 import inspect
 import logging
 import time
-from collections.abc import Callable, Coroutine, Iterable
-from typing import Any
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
+from typing import Any, Literal
 
 from events import Announcement
 from runtime import code_location
 from runtime.channels.hold import Hold
 from runtime.channels.links import Link
+from runtime.channels.sender import Voices
 from runtime.config.model import NodeSpec
-from runtime.errors import NodeError, NodeTimeoutError, RefusedError, VisnavError
+from runtime.errors import (
+    ChannelSourceError,
+    NodeError,
+    NodeTimeoutError,
+    RefusedError,
+    VisnavError,
+)
 from runtime.host import Host
 from runtime.json_values import plain
 from runtime.node import Node, make_node, streams
@@ -38,7 +51,6 @@ class NodeRunner:
     """What belongs to one node while it runs.
 
     Args:
-        spec: Its table in the file.
         create: Makes a task that the run owns.
 
     Attributes:
@@ -76,7 +88,6 @@ class NodeRunner:
         """Make the node and the links before its ports, and start it up.
 
         Args:
-            host: What the run does for it.
             limit: Real seconds that `on_startup` may take.
 
         Raises:
@@ -337,3 +348,63 @@ async def _outcome(coro: Coroutine[Any, Any, Any]) -> BaseException | None:
 def _is_cancelled() -> bool:
     task = asyncio.current_task()
     return task is not None and task.cancelling() > 0
+
+
+Phase = Literal["on_startup", "announce", "check", "on_ready"]
+
+Announced = dict[str, list[Announcement]]
+"""What nodes announced, by the node's name."""
+
+Step = Callable[[NodeRunner], Awaitable[None]]
+
+
+async def start_up(
+    runners: Collection[NodeRunner],
+    *,
+    start: Step,
+    exchange: Callable[[Announced], Awaitable[list[Announcement]]],
+    ready: Step | None = None,
+    failed: Callable[[Phase, NodeRunner, NodeError], None],
+    voices: Voices,
+    give_up: Callable[[], bool] = lambda: False,
+) -> None:
+    """Take nodes through their phases up to the first update.
+
+    Args:
+        start: Constructs a node and runs its `on_startup`.
+        exchange: Given what the nodes here announce, returns what all nodes of the run announce.
+        ready: Runs a node's `on_ready`; without it, that phase is left out.
+        failed: Called when a node fails; if it returns, the next node follows.
+        give_up: Asked, once all nodes had their `on_startup`, whether to leave out what follows.
+    """
+    announced: Announced = {}
+    for runner in runners:
+        try:
+            await start(runner)
+        except NodeError as error:
+            failed("on_startup", runner, error)
+    if give_up():
+        return
+    for runner in runners:
+        try:
+            announced[runner.spec.name] = found = runner.announcements()
+            for announcement in found:
+                try:
+                    voices.announce(runner.spec.name, announcement)
+                except ChannelSourceError as error:
+                    raise wrap(runner.spec.name, error) from error
+        except NodeError as error:
+            failed("announce", runner, error)
+    everything = await exchange(announced)
+    for runner in runners:
+        try:
+            runner.receive_announcements(everything)
+        except NodeError as error:
+            failed("check", runner, error)
+    if ready is None:
+        return
+    for runner in runners:
+        try:
+            await ready(runner)
+        except NodeError as error:
+            failed("on_ready", runner, error)

@@ -32,13 +32,11 @@ from runtime.errors import FatalError, NodeError, PeerError, VisnavError
 from runtime.host import RunEnd
 from runtime.node import Node
 from runtime.run import graph
+from runtime.run.event_loop import RunTask
 from runtime.run.instruments import Instruments
 from runtime.run.node_host import NodeHost
-from runtime.run.node_runner import NodeRunner, log_error, wrap
-from runtime.run.parameter_server import ParameterServer
-from runtime.run.run_state import RunState
-from runtime.run.startup import Announced, Phase, start_up
-from runtime.run.task_factory import RunTask
+from runtime.run.node_runner import Announced, NodeRunner, Phase, log_error, start_up, wrap
+from runtime.run.run_state import ParameterServer, RunState
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND, Once
 
@@ -61,8 +59,6 @@ class Supervisor:
     """Runs the nodes of a configuration on the running loop.
 
     Args:
-        config: What to run.
-        clock: The run's clock.
         taps: See every event before its listeners do.
         out: Folder for what nodes write, or `None`.
         out_of_programs: That for nodes that start programs, if it is another one.
@@ -155,7 +151,6 @@ class Supervisor:
         """End the run in order; the first reason counts.
 
         Args:
-            reason: For the summary.
             error: What went wrong, if anything did.
             by: Who ends it, as in `RunEnd`.
             from_peer: Whether another process reported it, and need not be notified.
@@ -235,7 +230,6 @@ class Supervisor:
         """Take a node out, and bring up a new one in its place if its `on_error` wants that.
 
         Args:
-            name: Of the node.
             anyway: Bring one up whatever that says: it was requested.
         """
         runner = self.state.runners[name]

@@ -26,8 +26,8 @@ from types import FrameType, TracebackType
 from typing import Any
 
 from runtime import code_location
+from runtime.code_location import frame_of
 from runtime.errors import NodeTimeoutError
-from runtime.frames import frame_of
 from runtime.run.run_state import RunState
 from runtime.summary import Stall
 from runtime.time import lockstep
@@ -50,7 +50,6 @@ class LoopWatchdog:
     """Watches the loop of the thread that makes it.
 
     Args:
-        loop: The loop.
         limit: Real seconds without a turn that are a stall; 0 watches nothing.
         report: Called with each stall once it is over; from the watchdog's thread.
     """
@@ -135,8 +134,6 @@ class ProgressWatchdog:
     """Watches a run of the thread that makes it; a context as long as the run.
 
     Args:
-        state: Of the run.
-        loop: Its loop.
         limit: Real seconds without progress after which this is reported; 0 for never.
     """
 

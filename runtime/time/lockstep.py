@@ -10,6 +10,10 @@ the same events on any machine.
 Sockets and threads of other libraries are served too, but when their answers arrive is not
 simulated; only `Clock.beside` (that is, `Node.offload` and workers), `asyncio.to_thread` and
 `loop.run_in_executor` are.
+
+Trying once per process whether this interpreter's asyncio works as this project relies on.
+
+What is tried, and what is done if it does not: `runtime.run.event_loop`, `runtime.time.lockstep`.
 """
 
 from __future__ import annotations
@@ -21,15 +25,50 @@ import contextvars
 import functools
 import heapq
 import itertools
+import platform
 import selectors
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any, Literal, Protocol, TypeVar
 
 from runtime.errors import UnsupportedInterpreterError
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND, Once, Schedule
-from runtime.time.self_test import PYTHON, passes
+
+LIMIT = 20.0
+"""Real seconds after which a test that has not ended has failed; busy machines take their time."""
+
+PYTHON = f"{platform.python_implementation()} {platform.python_version()}"
+
+
+def passes(
+    make_loop: Callable[[], asyncio.AbstractEventLoop],
+    test: Callable[[asyncio.AbstractEventLoop], Coroutine[Any, Any, bool]],
+) -> bool:
+    """Return whether a test succeeds on a loop of its own, with nothing reported to that.
+
+    It runs in a thread, because another loop may run in this one, and costs 3 ms.
+    """
+    found: list[bool] = []
+
+    def run() -> None:
+        reported: list[Any] = []
+        try:
+            loop = make_loop()
+            loop.set_exception_handler(lambda _, context: reported.append(context))
+            try:
+                found.append(loop.run_until_complete(test(loop)) and not reported)
+            finally:
+                loop.close()
+        except Exception:  # whatever another interpreter may raise
+            found.append(False)
+
+    thread = threading.Thread(target=run, name="self-test", daemon=True)
+    thread.start()
+    thread.join(LIMIT)
+    return found == [True]
+
 
 R = TypeVar("R")
 _Work = concurrent.futures.Future[Any]

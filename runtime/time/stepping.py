@@ -25,7 +25,6 @@ class Stepping:
     All of its methods are called on the run's loop.
 
     Args:
-        clock: The run's clock.
         over: Tells whether the run is ending, which takes simulated time and cannot be paused.
         wall: Real seconds.
     """

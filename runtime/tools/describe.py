@@ -106,7 +106,6 @@ def describe(cls: type[Node[Any]], type_name: str = "") -> NodeDescription:
     """Describe a class of node.
 
     Args:
-        cls: The class.
         type_name: How a file names it; ``module:Class`` if empty.
     """
     declared, docs = cls.declared, attribute_docs(cls)

@@ -28,9 +28,6 @@ log = logging.getLogger("visnav.runtime")
 class Track(Digest):
     """A digest of all events that remembers each, to be compared with those of an equal run.
 
-    Args:
-        before: That of the first run.
-
     Attributes:
         first: The first event that is not as it was then: output, event, and metres between the
             positions, if it has one.
@@ -63,9 +60,7 @@ def run_twice(config: Config, out: Path | None, only: Collection[str], **options
     """Run a configuration twice, and compare.
 
     Args:
-        config: What to run.
         out: Folder for the results of the second run.
-        only: Nodes to run here: all.
         options: Of `execute`, for the second run.
 
     Raises:

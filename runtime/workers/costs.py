@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from runtime.time.histogram import DurationHistogram
+from runtime.time.schedule import DurationHistogram
 
 _CPUCLOCK_SCHED = 2
 """Kind of clock in the numbers of processes' clocks; see ``clock_getcpuclockid(3)`` and Linux's

@@ -57,7 +57,6 @@ class Arena:
     (first fit's bound, by Robson, 1977), and in practice less than twice as much.
 
     Args:
-        fd: The file.
         limit: Bytes to which it may grow.
     """
 
@@ -156,7 +155,6 @@ class SharedPipe:
     Args:
         connection: Carries the messages: one end of a pair of stream sockets.
         out_fd: File for the arrays that this side sends.
-        in_fd: File for those it receives.
     """
 
     def __init__(self, connection: socket.socket, out_fd: int, in_fd: int) -> None:

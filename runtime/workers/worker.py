@@ -59,10 +59,7 @@ class Worker(Generic[W]):
     The processes begin with `ready` and end with `close`, whatever is cancelled in between.
 
     Args:
-        name: For messages.
-        clock: The run's clock.
         factory: A class (or function) of an importable module; called in the process.
-        args: Its arguments.
         processes: How many; each call goes to the one with the fewest calls outstanding.
         latency: Seconds of the run's clock from a call to its result.
         timeout: Real seconds after which a call that has no answer is a `WorkerTimeoutError`.

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from events.photometry import srgb_light
+from events.camera_info import srgb_light
 from sims.cameras.noise import gaussian, grey_of
 
 Depths = npt.NDArray[np.float32]

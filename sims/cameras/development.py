@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from events.photometry import response_light, srgb_light, vignette_map
+from events.camera_info import response_light, srgb_light, vignette_map
 from sims.cameras.depth_sensor import DepthMeter
 from sims.cameras.noise import noise_steps, noisy_depth, noisy_image
 from sims.cameras.response import defocused, mean, read_response

@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Quaternion, Vector3
-from events.frames import flip_yz, flip_yz_rotation
-from events.rotations import normalize
+from events.frames import flip_yz, flip_yz_rotation, normalize
 from sims.cameras.spec import CameraSpec, add_camera
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Quaternion, Vector3
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 from sims.cameras.development import Development
 from sims.cameras.frame import Frame, Shot
 from sims.cameras.graphics import gl_renderer, keep_memory

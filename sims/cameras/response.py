@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from events.photometry import response_light
+from events.camera_info import response_light
 
 _GAMMA = 2.2
 

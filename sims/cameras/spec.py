@@ -16,9 +16,8 @@ import numpy as np
 
 import events
 from events.base import Quaternion, Vector3
-from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation
-from events.photometry import response_light
-from events.rotations import from_rpy, multiply, rotate
+from events.camera_info import response_light
+from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation, from_rpy, multiply, rotate
 from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency

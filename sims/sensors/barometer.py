@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from events import BarometerAnnouncement, FluidPressure
-from events.rotations import rotate
+from events.frames import rotate
 from runtime.units import Duration
 from sims.sensors.sensor import GaussMarkov, NonNegative, Place, Sensor, SensorSpec, Truth
 

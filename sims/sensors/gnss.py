@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from events import NavSatAnnouncement, NavSatFix
-from events.geodesy import to_geodetic
-from events.rotations import rotate
+from events.frames import rotate, to_geodetic
 from runtime.units import Duration, Latency
 from sims.sensors.sensor import GaussMarkov, NonNegative, Place, Positive, Sensor, SensorSpec, Truth
 

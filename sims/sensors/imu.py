@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import ImuAnnouncement, Quaternion, Vector3
-from events.rotations import cross, inverse, multiply, rotate, rotate_inverse, slerp
+from events.frames import cross, inverse, multiply, rotate, rotate_inverse, slerp
 from sims.sensors.sensor import Mount, NonNegative
 
 _BLOCK = 512

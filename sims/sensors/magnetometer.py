@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from events import MagneticField, MagnetometerAnnouncement, Vector3
-from events.rotations import multiply, rotate_inverse
+from events.frames import multiply, rotate_inverse
 from sims.sensors.sensor import NonNegative, Place, Positive, Sensor, SensorSpec, Truth
 
 Geodetic = tuple[float, float, float]

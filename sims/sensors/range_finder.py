@@ -9,8 +9,7 @@ import msgspec
 import numpy as np
 
 from events import Quaternion, Range, RangeAnnouncement
-from events.frames import flip_yz, flip_yz_rotation
-from events.rotations import multiply, rotate
+from events.frames import flip_yz, flip_yz_rotation, multiply, rotate
 from sims.sensors.rays import Floats, Rays
 from sims.sensors.sensor import Name, NonNegative, Place, Positive, Sensor, SensorSpec, Truth
 

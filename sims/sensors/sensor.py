@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from events import Event, Quaternion, SensorAnnouncement, Vector3
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from runtime.units import Duration, Latency
 
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]

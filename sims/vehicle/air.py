@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from events import Vector3
-from events.frames import flip_yz
-from events.rotations import multiply, rotate, rotate_inverse
+from events.frames import flip_yz, multiply, rotate, rotate_inverse
 from sims.vehicle.model import TIMESTEP_NS
 from sims.worlds.wind import Turbulence, WindSpec, turned
 

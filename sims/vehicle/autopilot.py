@@ -48,7 +48,7 @@ from events import (
     VehicleEvent,
     VelocitySetpoint,
 )
-from events.rotations import yaw_of
+from events.frames import yaw_of
 from sims.vehicle.control import Controller, Motors, fault
 from sims.vehicle.gains import Gains, Limits
 from sims.vehicle.model import VehicleParameters

@@ -14,7 +14,7 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from events.rotations import normalize, yaw_of
+from events.frames import normalize, yaw_of
 from sims.vehicle.attitude import AttitudeController, BodyRateController
 from sims.vehicle.gains import Gains, Limits
 from sims.vehicle.mixer import Mixer

@@ -14,8 +14,7 @@ import mujoco
 import numpy as np
 
 from events import Vector3
-from events.frames import flip_yz, flip_yz_rotation
-from events.rotations import from_yaw
+from events.frames import flip_yz, flip_yz_rotation, from_yaw
 from sims.worlds.loading import WorldError
 
 TIMESTEP_NS = 1_000_000

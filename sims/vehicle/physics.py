@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Quaternion, Vector3
-from events.frames import flip_yz, flip_yz_rotation
-from events.rotations import cross, normalize, rotate_inverse
+from events.frames import cross, flip_yz, flip_yz_rotation, normalize, rotate_inverse
 from sims.vehicle.model import TIMESTEP_NS, VehicleParameters, mover_of, read_parameters
 from sims.vehicle.simulation import Simulation
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import asin, atan2, cos, pi, sin, sqrt, tan
 
 from events import Quaternion, Vector3
-from events.rotations import from_rpy, yaw_of
+from events.frames import from_rpy, yaw_of
 from sims.vehicle.gains import Gains, Limits
 from sims.vehicle.model import VehicleParameters
 from sims.vehicle.physics import State

@@ -17,8 +17,7 @@ import msgspec
 import mujoco
 
 from events import Quaternion, Vector3
-from events.frames import flip_yz, flip_yz_rotation
-from events.rotations import from_yaw
+from events.frames import flip_yz, flip_yz_rotation, from_yaw
 from runtime.units import Duration
 from sims.worlds.curves import Path, interpolated, path_through
 from sims.worlds.dynamics import Dynamics, Scene

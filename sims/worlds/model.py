@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from sims.worlds.patterns import Image, to_bytes
 from sims.worlds.shapes import Surface, Window
 

@@ -21,10 +21,11 @@ from events.frames import (
     convert_vector,
     flip_yz,
     flip_yz_rotation,
+    normalize,
+    rotate,
     rotation_to_ned,
     rotation_to_nwu,
 )
-from events.rotations import normalize, rotate
 
 AXES: list[Axes] = list(get_args(Axes))
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from events.geodesy import (
+from events.frames import (
     Geodetic,
     from_ecef,
     from_geodetic,

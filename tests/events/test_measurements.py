@@ -8,7 +8,7 @@ from typing import get_type_hints
 import pytest
 
 from events import Event, Range, Vector3, Wind
-from events.measurements import MEASURED, fields_of, numbers
+from events.sensors import MEASURED, fields_of, numbers
 
 
 @pytest.mark.parametrize("kind", MEASURED)

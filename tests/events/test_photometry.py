@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from events import CameraInfo
-from events.photometry import response_light, srgb_light, vignette_map
+from events.camera_info import response_light, srgb_light, vignette_map
 
 
 def test_srgb_has_its_known_values() -> None:

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from events import Quaternion, Vector3
-from events.poses import inverse, pose_matrix, pose_tuples, relative
-from events.rotations import from_rpy, rotate
+from events.frames import from_rpy, rotate
+from events.geometry import inverse, pose_matrix, pose_tuples, relative
 
 numbers = st.floats(-1e3, 1e3)
 vectors = st.tuples(numbers, numbers, numbers)

@@ -10,7 +10,8 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from events import Quaternion, Vector3, rotations
+from events import Quaternion, Vector3
+from events import frames as rotations
 
 numbers = st.floats(-100.0, 100.0)
 vectors = st.tuples(numbers, numbers, numbers)

@@ -19,7 +19,7 @@ from events import (
     TrackingLost,
     TrackingRegained,
 )
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 from nodes.estimators import Estimator, TrackingResult
 from nodes.pilots import VisualPilot
 from runtime import Input

@@ -6,7 +6,7 @@ import functools
 
 import pytest
 
-from runtime.time import real_clock
+from runtime.time import clock as real_clock
 from tests.runtime.loops import LOOPS, Run
 from tests.runtime.walls import RunClock, Wall, on_clock
 

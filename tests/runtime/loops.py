@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import uvloop
 
-from runtime.run import task_factory
+from runtime.run import event_loop as task_factory
 from runtime.time.lockstep import LockstepLoop
 
 R = TypeVar("R")

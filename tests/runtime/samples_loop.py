@@ -16,7 +16,7 @@ from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.config.parameters import Changeable
 from runtime.node import senders
-from runtime.run import task_factory
+from runtime.run import event_loop as task_factory
 from runtime.run.execute import make_clock, make_loop
 from runtime.run.supervisor import Supervisor
 

@@ -11,7 +11,7 @@ from events import Event
 from runtime import Duration
 from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, RunConfig
-from runtime.run import task_factory
+from runtime.run import event_loop as task_factory
 from runtime.run.execute import make_clock, make_loop
 from runtime.run.supervisor import Supervisor
 

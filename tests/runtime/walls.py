@@ -7,10 +7,9 @@ import time
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol, TypeVar
 
-from runtime.run import task_factory
-from runtime.time.clock import Clock
+from runtime.run import event_loop as task_factory
+from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.real_clock import RealClock
 from runtime.time.schedule import SECOND
 from tests.runtime.loops import turns
 

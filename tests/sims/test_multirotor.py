@@ -31,8 +31,8 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
     VelocitySetpoint,
-    rotations,
 )
+from events import frames as rotations
 from runtime.config.model import NodeSpec
 from runtime.errors import ConfigError, NodeError
 from runtime.testing import NodeResult, run_node, run_nodes, spec

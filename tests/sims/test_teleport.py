@@ -26,8 +26,8 @@ from events import (
     Teleport,
     Vector3,
     VelocitySetpoint,
-    rotations,
 )
+from events import frames as rotations
 from runtime.testing import NodeResult, run_node
 from sims.multirotor import Multirotor
 from tests.sims.vehicle.flight import WORLD

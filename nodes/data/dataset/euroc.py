@@ -14,12 +14,10 @@ from typing import Any
 import numpy as np
 
 from events import CameraAnnouncement, DepthImage, Image, Imu, ImuAnnouncement, Odometry, Vector3
-from events.frames import flip_yz, rotation_to_nwu
-from events.poses import pose_matrix
-from events.rotations import rotate
-from nodes.data.dataset.recording import ImageFile, Recording, RowFile, in_grey
-from nodes.data.dataset.rig import WORLD_AXES, Rig
-from nodes.ros2.messages.encoding import depth_in_steps
+from events.frames import flip_yz, rotate, rotation_to_nwu
+from events.geometry import pose_matrix
+from nodes.data.dataset.recording import WORLD_AXES, ImageFile, Recording, Rig, RowFile, in_grey
+from nodes.ros2.messages.images import depth_in_steps
 from nodes.trajectory.formats import EUROC_HEADER, euroc_row
 
 _IMU_HEADER = (

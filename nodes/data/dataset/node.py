@@ -11,12 +11,9 @@ import msgspec
 
 from events import Announcement, DepthImage, Image, Imu, Odometry, PoseStamped
 from nodes.data.dataset.euroc import Euroc
-from nodes.data.dataset.recording import ImageFile, Recording
-from nodes.data.dataset.rig import choose
-from nodes.data.dataset.tum_mono import TumMono
-from nodes.data.dataset.tum_rgbd import TumRgbd
-from nodes.trajectory.growing import part_name
-from nodes.trajectory.table import EPOCH, epoch_of
+from nodes.data.dataset.recording import ImageFile, Recording, choose
+from nodes.data.dataset.tum import TumMono, TumRgbd
+from nodes.trajectory.table import EPOCH, epoch_of, part_name
 from runtime import Input, Node, NodeConfig, on
 from runtime.errors import ConfigError
 from runtime.paths import OutputPath

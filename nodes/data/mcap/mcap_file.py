@@ -18,8 +18,9 @@ from typing import IO, Literal, NamedTuple
 
 import msgspec
 
-from nodes.data.mcap import layout, records
-from nodes.data.mcap.disk import WholeWrites, open_anew, unwritable
+from nodes.data.mcap import layout
+from nodes.data.mcap import native as records
+from nodes.data.mcap.layout import WholeWrites, open_anew, unwritable
 
 Compression = Literal["zstd", "lz4", "none"]
 
@@ -65,11 +66,8 @@ class McapWriter:
     """Writes an MCAP file with ROS 2's profile.
 
     Args:
-        path: The file; made anew.
-        compression: Of chunks.
         chunk_size: Bytes after which a chunk is full.
         fsync: Wait for the disk at the end of each chunk.
-        open_file: Makes the file; for tests.
 
     Raises:
         RecordingError: It cannot be made.
@@ -119,10 +117,8 @@ class McapWriter:
         """Add a topic of CDR messages; return its number.
 
         Args:
-            topic: Its name.
             type_: ``sensor_msgs/msg/Image``.
             definition: Text of the type and of those it is made of.
-            metadata: More about the topic.
         """
         schema = self._schemas.get(type_)
         if schema is None:

@@ -7,6 +7,6 @@ in a file is for `nodes.data.mcap`, replays are for `nodes.data.replay`.
 """
 
 from nodes.data.recorder.node import McapRecorder
-from nodes.data.recorder.settings import McapRecorderConfig
+from nodes.data.recorder.pipe import McapRecorderConfig
 
 __all__ = ["McapRecorder", "McapRecorderConfig"]

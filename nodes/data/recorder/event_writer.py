@@ -19,12 +19,10 @@ from events import Announcement, Event
 from nodes.data.mcap import native
 from nodes.data.mcap.mcap_file import McapWriter
 from nodes.data.mcap.native import HOLDERS
-from nodes.data.recorder.settings import McapRecorderConfig
+from nodes.data.recorder.pipe import McapRecorderConfig
 from nodes.ros2.messages.publishing import Publishing
-from nodes.ros2.messages.settings import ALL_GROUPS, PublishingConfig
-from nodes.ros2.messages.stamps import Stamps
-from nodes.ros2.messages.topics import Topic, ros_name
-from nodes.ros2.messages.typestore import TypeStore
+from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, Topic, ros_name
+from nodes.ros2.messages.typestore import Stamps, TypeStore
 from runtime.errors import WireError
 from runtime.wire import event_type, unpack
 
@@ -48,8 +46,6 @@ class EventWriter:
     """Writes events to a file. It is a `Sink`: where `Publishing` puts ROS's messages.
 
     Args:
-        writer: Of the file.
-        config: The recorder's settings.
         complain: Called for events that are recorded as they are, but not as ROS's messages.
     """
 
@@ -82,7 +78,6 @@ class EventWriter:
         Args:
             time: When it was published (ns).
             frame: The event, as `runtime.wire` has it.
-            announcement: Whether it is one.
 
         Raises:
             WireError: It is no frame.

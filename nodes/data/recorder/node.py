@@ -8,12 +8,10 @@ import time
 from pathlib import Path
 
 from events import Announcement, Event
-from nodes.data.mcap.disk import RecordingError
-from nodes.data.recorder.backlog import Backlog
-from nodes.data.recorder.pipe import WriteRequest
-from nodes.data.recorder.settings import McapRecorderConfig
+from nodes.data.mcap.layout import RecordingError
+from nodes.data.recorder.pipe import Backlog, McapRecorderConfig, WriteRequest
 from nodes.data.recorder.writer_process import STANDSTILL, WriterProcess
-from nodes.trajectory.growing import part_name
+from nodes.trajectory.table import part_name
 from runtime import Input, Node
 from runtime.workers.worker import spare_cores
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from nodes.data.mcap.disk import RecordingError
+from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import McapWriter
 from nodes.data.recorder import pipe
 from nodes.data.recorder.event_writer import EventWriter

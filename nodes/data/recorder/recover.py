@@ -1,16 +1,21 @@
-"""Mends recordings of runs that were killed, or whose disk was full."""
+"""Mends recordings of runs that were killed, or whose disk was full.
+
+``recover``: a torn recording made whole.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+import typer
 
-from nodes.data.mcap import layout, records
-from nodes.data.mcap.disk import RecordingError, is_being_written, unwritable
+from nodes.data.mcap import layout
+from nodes.data.mcap import native as records
+from nodes.data.mcap.layout import RecordingError, is_being_written, unwritable
 from nodes.data.mcap.mcap_file import contents
 
 MENDED = "visnav_mended"
@@ -40,7 +45,6 @@ def recover_file(path: Path, out: Path | None = None) -> Recovery:
     """Write a whole, indexed file from what can be read of a torn one.
 
     Args:
-        path: The torn file.
         out: The whole one; if `None`, it takes the place of the torn one when it is complete, and
             the torn one is gone: all that could be read of it is in the new one. A file that has
             its index is left alone then, for what is damaged in it may yet be of use.
@@ -128,3 +132,32 @@ def _write_anew(path: Path, out: Path) -> tuple[int, list[str]]:
     except OSError as error:
         raise unwritable(out, error) from error
     return messages, trouble
+
+
+def recover(
+    file: Annotated[Path, typer.Argument(help="A recording: runs/<name>/recording.mcap.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="A new file to write; if not given, the whole file replaces the torn."),
+    ] = None,
+) -> None:
+    """Mend the recording of a run that was killed, or whose disk was full.
+
+    What can be read is written to a complete file with an index. Such a run has at most its last
+    second missing. A file that has its index is only looked through.
+    """
+    from runtime.errors import ConfigError
+
+    try:
+        done = recover_file(file, out)
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from None
+    for trouble in done.trouble:
+        print(f"{file}: {trouble}")
+    partial = "; what is named above is missing" if done.partial else ""
+    if done.mended:
+        print(f"{done.path}: {done.messages} messages, now with an index{partial}")
+    elif done.partial:
+        print(f"{done.path}: {done.messages} messages, has its index, left as it is{partial}")
+    else:
+        print(f"{done.path}: {done.messages} messages, complete, nothing to mend")

@@ -21,10 +21,9 @@ import msgspec
 from typing_extensions import Buffer
 
 from events import Announcement
-from nodes.data.mcap.disk import RecordingError
+from nodes.data.mcap.layout import RecordingError
 from nodes.data.recorder import pipe
-from nodes.data.recorder.backlog import Backlog, Waiting
-from nodes.data.recorder.pipe import Reply, WriteRequest, command
+from nodes.data.recorder.pipe import Backlog, Reply, Waiting, WriteRequest, command
 from runtime.errors import MissingDependencyError, WireError
 from runtime.wire import pack
 
@@ -52,8 +51,6 @@ class WriterProcess:
     """Hands a backlog to a process that writes it.
 
     Args:
-        request: The file to write, and how.
-        backlog: Where events come from.
         failed: Called in a thread, once, with what ended the writing.
         complain: Called in a thread with what could not be recorded.
 

@@ -6,6 +6,6 @@ thread. `reader` is what the readers have in common: `recorded` (ours), `rosbag`
 """
 
 from nodes.data.replay.node import Replay
-from nodes.data.replay.settings import ReplayConfig
+from nodes.data.replay.reader import ReplayConfig
 
 __all__ = ["Replay", "ReplayConfig"]

@@ -27,10 +27,9 @@ from events import (
     ImuAnnouncement,
     Odometry,
 )
-from events.checks import UNIT_TOLERANCE
-from events.frames import flip_yz, rotation_to_ned
-from events.poses import pose_tuples
-from events.rotations import rotate_inverse
+from events.base import UNIT_TOLERANCE
+from events.frames import flip_yz, rotate_inverse, rotation_to_ned
+from events.geometry import pose_tuples
 from nodes.data.replay.folders import (
     FolderReader,
     Rows,

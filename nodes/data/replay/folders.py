@@ -23,7 +23,7 @@ from events import (
     Odometry,
     VehicleAnnouncement,
 )
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 from nodes.data.replay.reader import Reader, ReplayError, Timed, Wants
 
 R = TypeVar("R", bound=tuple[int, Any] | tuple[int, Any, Any])
@@ -36,8 +36,6 @@ def while_seen(truth: list[R], first: int, last: int) -> list[R]:
 
     Args:
         truth: Rows, the first field of each its stamp (ns), in order.
-        first: The first stamp of any sensor.
-        last: The last.
     """
     begin = bisect.bisect_right(truth, first, key=lambda row: row[0]) - 1
     end = bisect.bisect_left(truth, last, key=lambda row: row[0]) + 1
@@ -93,7 +91,6 @@ class FolderReader(Reader):
     """Reads a data set in a folder, whose stamps are its times too.
 
     Args:
-        folder: Where it is.
         vehicle: Source of the truth; sensors are below it.
     """
 
@@ -153,10 +150,7 @@ def read_depth(path: Path, stamp: int, source: str, frame_id: str, factor: float
     """Read a depth image of 16 bits.
 
     Args:
-        path: The file.
         stamp: Of the event (ns).
-        source: Of the event.
-        frame_id: Of the event.
         factor: Steps per metre; a step of 0 is none, and becomes ``inf``.
 
     Raises:

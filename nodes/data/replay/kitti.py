@@ -21,7 +21,7 @@ import numpy as np
 
 from events import CameraAnnouncement, CameraInfo, Image, Odometry, Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD
-from events.poses import pose_matrix, pose_tuples
+from events.geometry import pose_matrix, pose_tuples
 from nodes.data.replay.folders import FolderReader, Rows, as_pair, read_image, vehicle_at
 from nodes.data.replay.reader import ReplayError
 from nodes.trajectory.formats import read_kitti

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from events import Announcement, CameraAnnouncement, Event
 from nodes.data.mcap import native
-from nodes.data.mcap.disk import RecordingError
+from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import Record, contents, read
 from nodes.data.mcap.native import HOLDERS, arrays
 from nodes.data.replay.reader import Reader, ReplayError, Timed, Wants
-from nodes.ros2.messages.frame_names import FrameNames
+from nodes.ros2.messages.topics import FrameNames
 from nodes.ros2.messages.typestore import TypeStore
 from runtime.errors import WireError
 from runtime.wire import event_type

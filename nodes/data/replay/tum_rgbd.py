@@ -25,8 +25,7 @@ from events import (
     Quaternion,
     Vector3,
 )
-from events.frames import OPTICAL_TO_FRD, flip_yz, rotation_to_ned
-from events.rotations import inverse, multiply
+from events.frames import OPTICAL_TO_FRD, flip_yz, inverse, multiply, rotation_to_ned
 from nodes.data.replay.euroc import noted_epoch, read_sensor
 from nodes.data.replay.folders import (
     FolderReader,
@@ -35,8 +34,7 @@ from nodes.data.replay.folders import (
     vehicle_at,
     while_seen,
 )
-from nodes.data.replay.reader import ReplayError
-from nodes.data.replay.settings import Pinhole
+from nodes.data.replay.reader import Pinhole, ReplayError
 from nodes.trajectory.formats import read_tum
 from nodes.trajectory.table import read_rows
 

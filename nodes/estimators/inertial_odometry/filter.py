@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.inertial_odometry.preintegration import (
     Floats,
     ImuModel,

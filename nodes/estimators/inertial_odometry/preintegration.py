@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from events import ImuAnnouncement
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 
 Floats = npt.NDArray[np.float64]
 

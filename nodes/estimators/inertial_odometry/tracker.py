@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, ImuAnnouncement
-from events.poses import inverse, pose_matrix
+from events.geometry import inverse, pose_matrix
 from nodes.estimators import TrackingResult
 from nodes.estimators.inertial_odometry.filter import POSE, G, InertialFilter, Sighting, V
 from nodes.estimators.inertial_odometry.preintegration import Floats, ImuModel, cross

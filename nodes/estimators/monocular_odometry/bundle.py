@@ -44,7 +44,6 @@ def adjust(
         matrix: K, shape (3, 3).
         fixed: Number of first poses that stay; two of them fix position, rotation and scale.
         noise: Standard deviation of an observation, pixels.
-        steps: Steps of Gauss-Newton.
 
     Returns:
         Poses, landmarks, and reprojection errors in pixels, shape (m,).

@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 
 from nodes.estimators.monocular_odometry.bundle import adjust
-from nodes.estimators.monocular_odometry.keyframes import new_corners
-from nodes.estimators.monocular_odometry.settings import MonocularSettings
 from nodes.estimators.monocular_odometry.views import (
+    MonocularSettings,
     hypotheses,
+    new_corners,
     parallax,
     reprojection_errors,
     triangulate,
@@ -44,7 +44,6 @@ class Initialization:
 
     Args:
         matrix: K, shape (3, 3).
-        settings: Settings of the odometry.
     """
 
     def __init__(self, matrix: Floats, settings: MonocularSettings) -> None:

@@ -8,12 +8,17 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.monocular_odometry.bundle import Indices, adjust
 from nodes.estimators.monocular_odometry.initialization import InitialMap
-from nodes.estimators.monocular_odometry.keyframes import Keyframe, new_corners
-from nodes.estimators.monocular_odometry.settings import MonocularSettings
-from nodes.estimators.monocular_odometry.views import parallax, reprojection_errors, triangulate
+from nodes.estimators.monocular_odometry.views import (
+    Keyframe,
+    MonocularSettings,
+    new_corners,
+    parallax,
+    reprojection_errors,
+    triangulate,
+)
 from nodes.estimators.odometry.images import Floats, Grey
 from nodes.estimators.odometry.pose import rays
 
@@ -119,7 +124,6 @@ class LocalMap:
             start: Pose of its first camera: camera to world, shape (4, 4).
             unit: Its unit of length in that of the world.
             matrix: K, shape (3, 3).
-            settings: Settings of the odometry.
         """
         second = found.second.copy()
         second[:3, 3] *= unit

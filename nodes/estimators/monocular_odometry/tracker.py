@@ -17,13 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators import TrackingResult
 from nodes.estimators.monocular_odometry.bundle import Indices
 from nodes.estimators.monocular_odometry.initialization import Initialization
-from nodes.estimators.monocular_odometry.keyframes import Keyframe
 from nodes.estimators.monocular_odometry.local_map import LocalMap
-from nodes.estimators.monocular_odometry.settings import MonocularSettings
+from nodes.estimators.monocular_odometry.views import Keyframe, MonocularSettings
 from nodes.estimators.odometry.images import (
     Floats,
     Grey,
@@ -50,7 +49,6 @@ class MonocularTracker:
 
     Args:
         info: Intrinsics of the images, which must be free of distortion.
-        settings: Settings of the method.
 
     Raises:
         ValueError: The images are distorted.

@@ -1,17 +1,22 @@
 """Geometry of several views: triangulation, reprojection, and the motion between two views.
 
 Poses are world to camera, shape (4, 4); lengths are in the map's own unit.
+
+Corners of an image, and key frames that are stored for relocalization.
+
+Settings of monocular odometry.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from nodes.estimators.odometry.images import Floats
+from nodes.estimators.odometry.images import Floats, Grey
 
 _PLANE = 3.0
 """Pixels up to which a corner fits a homography."""
@@ -23,7 +28,6 @@ def triangulate(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
     """Return the midpoints between pairs of rays where these are closest to each other.
 
     Args:
-        first: Pose of the first camera.
         second: Pose of the second camera.
         a: Rays in the first, shape (n, 3).
         b: Rays in the second, shape (n, 3).
@@ -55,7 +59,6 @@ def reprojection_errors(pose: Floats, points: Floats, pixels: Floats, matrix: Fl
     """Return the distances between projected points and their observed pixels.
 
     Args:
-        pose: Pose of the camera.
         points: Points in the world, shape (n, 3).
         pixels: Their observed pixels, shape (n, 2).
         matrix: K, shape (3, 3).
@@ -113,3 +116,76 @@ def _pose(turn: npt.NDArray[Any], shift: npt.NDArray[Any]) -> Floats:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, np.asarray(shift).ravel()
     return pose
+
+
+class Keyframe(msgspec.Struct, frozen=True, eq=False):
+    """An image and its landmarks.
+
+    Attributes:
+        image: Grey.
+        pose: World to camera, shape (4, 4).
+        landmarks: Points in the world, shape (n, 3).
+        pixels: Their pixels in the image, shape (n, 2).
+    """
+
+    image: Grey
+    pose: Floats
+    landmarks: Floats
+    pixels: Floats
+
+
+BORDER = 12
+"""Pixels at the edge of the image without new corners: optical flow needs a neighbourhood."""
+SPACING = 12
+"""Pixels between corners."""
+_QUALITY = 0.005
+
+
+def new_corners(image: Grey, taken: Floats, count: int) -> Floats:
+    """Return up to `count` corners that keep away from other ones.
+
+    Args:
+        image: Grey.
+        taken: The other corners: column and row, shape (k, 2).
+        count: At least one.
+
+    Returns:
+        Column and row, shape (n, 2).
+    """
+    mask = np.zeros_like(image)
+    mask[BORDER:-BORDER, BORDER:-BORDER] = 255
+    for column, row in np.rint(taken).astype(int).tolist():
+        cv2.circle(mask, (column, row), SPACING, 0, -1)
+    found: Any = cv2.goodFeaturesToTrack(image, count, _QUALITY, SPACING, mask=mask, blockSize=5)
+    return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
+
+
+class MonocularSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the method.
+
+    Attributes:
+        corners: Corners that are followed from a key frame.
+        window: Side of the neighbourhood that optical flow compares, pixels; odd.
+        levels: Times that flow halves the image for large motions between two images.
+        pixel_noise: Standard deviation of a followed corner, pixels.
+        keyframes: Key frames that are adjusted together.
+        keyframe_shift: A key frame is made, and initialization tried, at this median motion since
+            the last one, pixels,
+        keyframe_overlap: or when less than this share of the last one's corners, or of its
+            landmarks, is in view.
+        min_parallax: Angle between two views of a corner from which its point is computed, degrees.
+        min_inliers: Agreeing landmarks below which the camera is lost.
+        reset_timeout: Seconds for which a lost camera is only relocalized; then a new map is tried
+            as well, whose unit of length is a guess.
+    """
+
+    corners: Annotated[int, msgspec.Meta(ge=60, le=2000)] = 250
+    window: Annotated[int, msgspec.Meta(ge=5, le=51)] = 15
+    levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 4
+    pixel_noise: Annotated[float, msgspec.Meta(gt=0)] = 0.25
+    keyframes: Annotated[int, msgspec.Meta(ge=3, le=30)] = 8
+    keyframe_shift: Annotated[float, msgspec.Meta(gt=0)] = 25.0
+    keyframe_overlap: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.7
+    min_parallax: Annotated[float, msgspec.Meta(gt=0)] = 1.5
+    min_inliers: Annotated[int, msgspec.Meta(ge=8)] = 20
+    reset_timeout: Annotated[float, msgspec.Meta(ge=0)] = 1.0

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.odometry.images import Floats
 
 _HUBER = 2.0

@@ -20,7 +20,7 @@ from nodes.estimators import (
 )
 from nodes.estimators.orb_slam3.process import INSTALL, OrbSlam3Process
 from nodes.estimators.orb_slam3.settings import LENSES, Mode, OrbSettings, Settings, make_settings
-from nodes.estimators.orb_slam3.vocabulary_file import find_vocabulary
+from nodes.estimators.orb_slam3.vocabulary import find_vocabulary
 from runtime import Bundle, Duration
 from runtime.paths import InputPath
 

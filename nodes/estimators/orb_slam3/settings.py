@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraAnnouncement, CameraInfo, ImuAnnouncement
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 from nodes.data.dataset.recording import templates
 
 Mode = Literal[
@@ -97,9 +97,7 @@ def make_settings(
     """Return the settings for announced cameras, and an IMU if the mode is inertial.
 
     Args:
-        mode: The sensors that are used.
         cameras: The camera, or the left and the right one of a rectified stereo rig.
-        imu: The IMU.
         orb: ORB-SLAM3's own settings.
 
     Raises:

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.odometry.images import Depth, Floats, Grey, inside
 from nodes.estimators.odometry.pose import intrinsics, motion_between, moved, rays
 from nodes.estimators.visual_odometry.surfaces import surfaces_at

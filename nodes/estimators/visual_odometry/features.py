@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators import TrackingResult
 from nodes.estimators.odometry.images import (
     FLOW_CRITERIA,

@@ -13,7 +13,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.odometry.images import Depth, Floats, Grey
 from nodes.estimators.odometry.pose import rays
 from nodes.estimators.odometry.relocalization import DescribedPoints, detect_and_describe

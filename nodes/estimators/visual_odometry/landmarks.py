@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.odometry.images import Depth, Floats
 from nodes.estimators.odometry.pose import intrinsics, rays
 from nodes.estimators.visual_odometry.patches import Patches, Rows

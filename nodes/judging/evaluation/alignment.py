@@ -39,7 +39,6 @@ def align(estimate: Trajectory, truth: Trajectory, how: How) -> Alignment:
     """Move an estimate into the truth's frame.
 
     Args:
-        estimate: Estimated poses.
         truth: True poses at the same stamps; see `nodes.trajectory.associate`.
         how: See `How`.
 
@@ -68,10 +67,8 @@ def transform(
     """Return a trajectory in another frame: position ``scale · R · p + t``, orientation ``R · q``.
 
     Args:
-        trajectory: In the old frame.
         rotation: R, old frame to new, shape (3, 3).
         translation: t, metres in the new frame, shape (3,).
-        scale: Of lengths.
     """
     turned = Rotation.from_matrix(rotation) * trajectory.rotations()
     return Trajectory(

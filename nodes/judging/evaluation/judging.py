@@ -2,24 +2,45 @@
 
 Pure functions; `nodes.judging.evaluation.node` collects, and `nodes.judging.evaluation.results`
 writes.
+
+Errors over a whole flight, in which time without a pose counts as the worst dead reckoning.
+
+The errors of the poses there are (`nodes.judging.evaluation.metrics`) say nothing of those that are
+missing: an estimator that gives up when it gets difficult would look better than one that drifts.
+Here every image of the flight has an error. Where the estimator is lost, its last pose is held, and
+what it cannot know is added: the length of the true path since then. So being lost costs as much as
+a drift of 100 %, wherever the vehicle flies meanwhile: a tour that ends where it began makes nobody
+look good who stayed there.
+
+What a run says of one vehicle: where it truly was, where it was meant to be, what it hit.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from events import Collision, Odometry, PlannedPose, PositionSetpoint
+from events.frames import from_yaw
 from nodes.judging.evaluation.alignment import Alignment, How, align, transform, umeyama
-from nodes.judging.evaluation.consistency import consistency
-from nodes.judging.evaluation.coverage import Interval, Stamps, choose_frames, cover, seconds
+from nodes.judging.evaluation.coverage import (
+    Interval,
+    Stamps,
+    answered,
+    choose_frames,
+    cover,
+    seconds,
+)
 from nodes.judging.evaluation.metrics import (
+    Floats,
     absolute_errors,
+    consistency,
     drift_percent,
     interpolated,
     path_errors,
@@ -29,11 +50,75 @@ from nodes.judging.evaluation.metrics import (
     share_errors,
 )
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.whole_flight import held_errors, interpolated_errors
-from nodes.trajectory import Trajectory, associate
+from nodes.trajectory import PoseRows, RecentPoses, Trajectory, associate
 from runtime.time.schedule import SECOND
 
-Floats = npt.NDArray[np.float64]
+
+def held_errors(
+    truth: Trajectory, frames: Stamps, poses: Stamps, errors: Floats, lost: Sequence[Interval]
+) -> Floats:
+    """Return the position error at each image of a flight, as its estimator said at that time.
+
+    An image has the error of the worst pose that is nearer to it in time than to any other image,
+    so that nothing hides between images; if there is none, that of the nearest pose; or, if it has
+    no pose within a lost interval, that of the last pose before plus the true path length since.
+    Before the first pose, that is the path length since the first image.
+
+    Args:
+        truth: The true poses.
+        frames: Stamps of the flight's images (ns), strictly rising, within the truth's time.
+        poses: Stamps of the poses, strictly rising, shape (n,), n ≥ 0.
+        errors: Distance of each to the truth after alignment, metres, shape (n,).
+        lost: Intervals without a pose; see `nodes.judging.evaluation.coverage.cover`.
+
+    Returns:
+        Metres, one for each image.
+    """
+    path = _path_at(truth, frames)
+    if not len(poses) or not len(frames):
+        return np.asarray(path - path[:1])
+    missing = np.zeros(len(frames), np.bool_)
+    for start, end in lost:
+        missing |= (frames >= start) & (frames <= end)
+    missing &= ~answered(frames, poses)
+    after = np.clip(np.searchsorted(poses, frames), 1, max(len(poses) - 1, 1))
+    nearer = abs(poses[after - 1] - frames) <= abs(poses[after % len(poses)] - frames)
+    found = errors[np.where(nearer, after - 1, after % len(poses))]
+    own = np.searchsorted((frames[:-1] + frames[1:]) // 2, poses)  # the image of each pose
+    worst = np.full(len(frames), -np.inf)
+    np.maximum.at(worst, own, errors)
+    found = np.where(np.bincount(own, minlength=len(frames)) > 0, worst, found)
+    before = np.searchsorted(poses, frames, side="right") - 1
+    none = before < 0
+    since = np.where(none, path[:1], _path_at(truth, poses)[before])
+    held = np.where(none, 0.0, errors[before]) + path - since
+    return np.asarray(np.where(missing, held, found))
+
+
+def interpolated_errors(truth: Trajectory, frames: Stamps, estimate: Trajectory) -> Floats:
+    """Return the position error at each image of a flight, for poses that were corrected later.
+
+    Between two poses, key frames perhaps, the estimate is interpolated. Before the first and after
+    the last, the nearer one is held, and the true path length from there is added.
+
+    Args:
+        truth: The true poses.
+        frames: Stamps of the flight's images (ns), strictly rising, within the truth's time.
+
+    Returns:
+        Metres, one for each image.
+    """
+    first, last = int(estimate.stamps[0]), int(estimate.stamps[-1])
+    inside = np.clip(frames, first, last)
+    away = abs(_path_at(truth, frames) - _path_at(truth, inside))
+    true, said = (interpolated(t.stamps, t.positions, inside) for t in (truth, estimate))
+    return position_errors(true, said) + away
+
+
+def _path_at(truth: Trajectory, stamps: Stamps) -> Floats:
+    """Return the path length from the start of the truth to each time, metres."""
+    return interpolated(truth.stamps, truth.distances()[:, None], stamps)[:, 0]
+
 
 MILLISECOND = 1_000_000
 _MOST_TICKS = 100_000
@@ -308,7 +393,6 @@ def errors_at_ticks(
 
     Args:
         truth: True poses.
-        estimate: Aligned poses.
         arrivals: When each came (ns), shape (n,).
         rate: Ticks a second, from the first estimate's arrival to the end of the truth.
 
@@ -341,3 +425,54 @@ def errors_at_ticks(
         "available_rot_rmse_deg": math.degrees(math.sqrt(turned)),
         "available_age_ms": age / MILLISECOND,
     }
+
+
+class Flight:
+    """The flight of one vehicle, as far as it has gone.
+
+    Attributes:
+        truth: Its true poses.
+        recent: The last of them.
+        body: Frame of its body.
+        collisions: In the order in which they came.
+    """
+
+    def __init__(self) -> None:
+        self.truth = PoseRows()
+        self.recent = RecentPoses()
+        self.body = "base_link"
+        self.collisions: list[Collision] = []
+        self._plan = PoseRows()
+        self._setpoints = PoseRows()
+
+    def add(self, event: Odometry) -> None:
+        """Note where it is."""
+        self.body = event.child_frame_id
+        self.truth.add(event.stamp, event.position, event.orientation)
+        self.recent.add(event.stamp, event.position, event.orientation)
+
+    def add_plan(self, event: PlannedPose | PositionSetpoint) -> None:
+        """Note where its pilot means it to be."""
+        rows = self._plan if isinstance(event, PlannedPose) else self._setpoints
+        rows.add(event.stamp, event.position, from_yaw(event.yaw))
+
+    def plan(self) -> Trajectory | None:
+        """Return where it was meant to be: by planned poses, or else by set-points."""
+        rows = self._plan if len(self._plan) else self._setpoints
+        return rows.trajectory() if len(rows) else None
+
+    def figures(self, truth: Trajectory | None) -> dict[str, float]:
+        """Return how often it hit something, and how far it was from its planned poses."""
+        found: dict[str, float] = {"collisions": len(self.collisions)}
+        if truth is not None and len(self._plan):
+            found |= beside_the_plan(truth, self._plan.trajectory())
+        return found
+
+
+def collision_rows(collisions: Sequence[Collision]) -> str:
+    """Return collisions as a CSV file."""
+    rows = [
+        f"{c.stamp},{c.source},{c.other},{','.join(f'{p:.3f}' for p in c.position)},{c.speed:.3f}\n"
+        for c in collisions
+    ]
+    return "".join(["stamp_ns,vehicle,other,north_m,east_m,down_m,speed_m_s\n", *rows])

@@ -1,7 +1,11 @@
-"""Holds estimates against the truth, live and at the end."""
+"""Holds estimates against the truth, live and at the end.
+
+Errors of an estimator while a run goes on.
+"""
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
@@ -26,20 +30,47 @@ from events import (
     TrackingEvent,
     TrajectoryEstimate,
 )
-from nodes.judging.evaluation.album import Album
-from nodes.judging.evaluation.flight import Flight, collision_rows
-from nodes.judging.evaluation.judging import Judgement, judge
-from nodes.judging.evaluation.live import LiveErrors
+from events.frames import angle_between
+from events.geometry import Pose, pose_matrix, pose_tuples
+from nodes.judging.evaluation.judging import Flight, Judgement, collision_rows, judge
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.results import FRAMES, write_results
+from nodes.judging.evaluation.results import FRAMES, Album, write_results
 from nodes.judging.evaluation.verdict import Thresholds, conclude, planned_end
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row
-from nodes.trajectory.growing import GrowingFile
+from nodes.trajectory.table import GrowingFile
 from nodes.vehicles import Vehicles
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
 from runtime.paths import source_file
+
+
+class LiveErrors:
+    """Errors of one estimator so far. An estimate in ``odom`` is laid on the truth at its first."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.sum_of_squares = 0.0
+        self._origin: npt.NDArray[np.float64] | None = None
+
+    def of(self, event: PoseEstimate, truth: Pose) -> tuple[float, float]:
+        """Return the errors of an estimate: metres, radians."""
+        position, orientation = event.position, event.orientation
+        if event.frame_id != "map":
+            matrix = pose_matrix(position, orientation)
+            if self._origin is None:
+                self._origin = pose_matrix(*truth) @ np.linalg.inv(matrix)
+            position, orientation = pose_tuples(self._origin @ matrix)
+        distance = math.dist(truth[0], position)
+        self.count += 1
+        self.sum_of_squares += distance * distance
+        return distance, angle_between(truth[1], orientation)
+
+    @property
+    def mean_square(self) -> float:
+        """Mean square of the position errors so far, square metres."""
+        return self.sum_of_squares / self.count if self.count else 0.0
+
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 

@@ -52,7 +52,6 @@ class EstimatorRecord:
 
     Args:
         scale_free: Whether its unit of length is its own.
-        method: What it is.
         reads: Kinds of data that it computes with; see `events.EstimatorAnnouncement`.
 
     Attributes:

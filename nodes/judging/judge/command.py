@@ -60,12 +60,11 @@ def judge(
     from rich.console import Console
 
     from nodes.judging.judge import judging, sources
-    from runtime.config.override import given
+    from runtime.config.messages import given
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
-    from runtime.tools.cli.common import warn
     from runtime.tools.cli.run import print_verdict
-    from runtime.tools.cli.tables import verdict_table
+    from runtime.tools.cli.tables import verdict_table, warn
 
     try:
         said = {

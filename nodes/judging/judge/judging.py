@@ -22,15 +22,15 @@ from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.judging.evaluation.results import FRAMES, write_results
 from nodes.judging.evaluation.verdict import conclude
 from nodes.judging.judge.sources import Axes, Source
-from nodes.judging.report.contents import Facts, Verdict
 from nodes.judging.report.page import write_report
+from nodes.judging.report.tables import Facts, Verdict
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
 from runtime import Duration
 from runtime.errors import ResultsError
 from runtime.paths import source_file
 from runtime.run import results
-from runtime.run.environment import command_line, commit, environment
+from runtime.run.summarise import command_line, commit, environment
 from runtime.time.schedule import SECOND
 
 
@@ -60,9 +60,7 @@ def judge_all(
 
     Args:
         truth: The true poses.
-        estimates: What was said at the time.
         frames: Stamps of the images (ns), if they are known.
-        config: How to judge.
         finals: The trajectories after loop closures, by the name of the estimate.
 
     Returns:

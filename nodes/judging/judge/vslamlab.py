@@ -24,7 +24,6 @@ def arguments(
     """Return what a program gets: ``key:value``, or with `dashes` ``--key value``.
 
     Args:
-        sequence: Folder of the sequence.
         run: Folder of the experiment, and in it the name of the run.
         mode: ``mono``, ``rgbd``, ``stereo``, ``mono-vi`` or ``stereo-vi``.
         settings: Its settings_yaml, if it has one.

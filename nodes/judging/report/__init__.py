@@ -4,6 +4,6 @@
 others draw one figure each.
 """
 
-from nodes.judging.report.node import Report, ReportConfig
+from nodes.judging.report.page import Report, ReportConfig
 
 __all__ = ["Report", "ReportConfig"]

@@ -10,8 +10,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
 from nodes.judging.evaluation.metrics import path_pairs, relative_errors
-from nodes.judging.report.contents import Estimator, Run
-from nodes.judging.report.poses import Floats, broken
+from nodes.judging.report.folder import Floats, broken
 from nodes.judging.report.style import (
     Plot,
     label,
@@ -21,6 +20,7 @@ from nodes.judging.report.style import (
     thin,
     wide_range,
 )
+from nodes.judging.report.tables import Estimator, Run
 from nodes.trajectory import Trajectory
 
 SECOND = 1e9
@@ -283,8 +283,6 @@ def _scale(axis: Any, series: list[Floats], which: str, share: float = 100.0) ->
     """Start an axis at 0, or make it logarithmic where that would flatten all but one.
 
     Args:
-        axis: The axes.
-        series: What is drawn.
         which: ``x`` or ``y``.
         share: Percent of each series that is shown.
     """

@@ -1,19 +1,24 @@
-"""The page itself: everything in one file, that needs no network and no script."""
+"""The page itself: everything in one file, that needs no network and no script.
+
+The node that writes the report when a run is over.
+
+``report``: a run's folder as one page to read.
+"""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import jinja2
 import numpy as np
+import typer
 
 from nodes.judging.report import tables
 from nodes.judging.report.clouds import draw_clouds
-from nodes.judging.report.contents import Run
 from nodes.judging.report.curves import (
     draw_axes,
     draw_distributions,
@@ -22,9 +27,10 @@ from nodes.judging.report.curves import (
     draw_relative,
 )
 from nodes.judging.report.folder import read_run
-from nodes.judging.report.frames import draw_frames
 from nodes.judging.report.style import Plot, drawing
-from nodes.judging.report.trajectories import draw_trajectories
+from nodes.judging.report.tables import Run
+from nodes.judging.report.trajectories import draw_frames, draw_trajectories
+from runtime import Node, NodeConfig
 from runtime.summary import OUTSIDE_COLUMNS, WORKER_COLUMNS
 
 PAGE = "report.html"
@@ -169,3 +175,48 @@ def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
         "state": "not judged" if passed is None else "passed" if passed else "failed",
         "failed": [str(each) for each in failed] if isinstance(failed, list) else [],
     }
+
+
+class ReportConfig(NodeConfig):
+    """Settings of the report.
+
+    Attributes:
+        figures: Formats of the figures in ``plots``: png, svg, pdf. The page shows the PNGs; with
+            no format at all it has tables only, and takes no time to draw.
+    """
+
+    figures: tuple[Literal["png", "svg", "pdf"], ...] = ("png", "svg")
+
+
+class Report(Node[ReportConfig]):
+    """Writes ``report.html`` and its figures, of all that the other nodes left in the run's folder.
+
+    It comes last, after the summary, whether or not an evaluation judged anything. The command
+    ``report`` writes the same page anew from the folder.
+    """
+
+    files = ("plots", "report.html")
+
+    async def on_shutdown(self) -> None:
+        """Have the report written once the other nodes and the summary have left their files."""
+        if self.out is not None:
+            self.after_run(self._write)
+
+    def _write(self, out: Path) -> None:
+
+        write_report(out, self.config.figures)
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name>.")],
+) -> None:
+    """Write a run's report.html and its figures (plots/*) anew.
+
+    A run that was killed, or that nobody evaluated, gives a page that says what is missing.
+    """
+    from runtime.errors import ConfigError
+
+    try:
+        print(write_report(run))
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from None

@@ -129,7 +129,6 @@ def sheet(
         height: Inches, and as much more as the legend is higher than one row.
         names: What the legend above all will say.
         constrained: Whether axes find their places themselves.
-        width: Inches.
     """
     rows = -(-len(names) // legend_columns(names))
     size = (width, height + 0.2 * max(rows - 1, 0))
@@ -189,7 +188,6 @@ def wide_range(values: list[Floats], share: float = 95.0) -> bool:
     """Tell whether several series are so unlike that only a logarithmic axis shows all.
 
     Args:
-        values: The series.
         share: Percent of each that count, as a few values may be of any size.
     """
     tops = [top for v in values if len(v) and (top := float(np.nanpercentile(v, share))) > 0.0]

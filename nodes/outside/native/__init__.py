@@ -9,8 +9,7 @@
 docs/reference/link.md has the protocol, byte by byte.
 """
 
-from nodes.outside.native.answers import LinkAnswer, LinkError
-from nodes.outside.native.description import describe
+from nodes.outside.native.answers import LinkAnswer, LinkError, describe
 from nodes.outside.native.endpoint import Endpoint
 
 __all__ = ["Endpoint", "LinkAnswer", "LinkError", "describe"]

@@ -1,13 +1,19 @@
-"""What comes from the program of a link, checked field by field."""
+"""What comes from the program of a link, checked field by field.
+
+What a program is told about the run's cameras and IMU: the JSON text of WELCOME.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from events import CameraAnnouncement, ImuAnnouncement
+from events.geometry import pose_matrix
 from nodes.outside.native.client import COVARIANCE, DONE_BODY, POSE_HEAD, STATUS, VELOCITY
 from runtime.errors import VisnavError
 
@@ -111,3 +117,30 @@ def read_pose(body: bytearray) -> LinkAnswer:
 def _finite(field: str, values: npt.NDArray[np.floating] | None) -> None:
     if values is not None and not (good := np.isfinite(values)).all():
         raise LinkError(f"{field}: expected finite numbers, found {values[~good][0]}")
+
+
+def describe(
+    cameras: Sequence[tuple[CameraAnnouncement, Sequence[str]]],
+    imu: ImuAnnouncement | None,
+    clock: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the description of a run: the announcements' fields, and transforms to the body (FRD).
+
+    Args:
+        cameras: Each with the kinds of image that will be sent of it (``rgb8``, ``depth32f``, …).
+        imu: The IMU whose samples will be sent.
+        clock: ``kind`` of the run's clock (``lockstep`` or ``real``), and what else is known.
+    """
+    return {
+        "clock": dict(clock),
+        "cameras": [
+            {**_sensor(camera, "body_from_camera"), "images": list(kinds)}
+            for camera, kinds in cameras
+        ],
+        "imu": _sensor(imu, "body_from_imu") if imu else None,
+    }
+
+
+def _sensor(sensor: CameraAnnouncement | ImuAnnouncement, transform: str) -> dict[str, Any]:
+    matrix = pose_matrix(sensor.position, sensor.orientation).tolist()
+    return {**msgspec.to_builtins(sensor), transform: matrix}

@@ -231,7 +231,6 @@ class Link:
         """Answer a frame with a pose.
 
         Args:
-            frame: The frame.
             pose: Transform from the optical camera (or the body: see `ready`) to a frame that
                 stays the same, metres, shape (4, 4) or (3, 4).
             covariance: Of the pose's error: a shift along x, y, z and a rotation about them, all in

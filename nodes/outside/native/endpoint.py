@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.outside.native import client as wire
 from nodes.outside.native.answers import LinkAnswer, LinkError, read_done, read_pose
 from runtime.workers.output import plain_lines

@@ -16,20 +16,17 @@ import numpy.typing as npt
 
 from events import Announcement, CameraAnnouncement, DepthImage, Image, Imu, ImuAnnouncement
 from nodes.calibration.formats import variables
-from nodes.data.dataset.rig import Rig
+from nodes.data.dataset.recording import Rig
 from nodes.estimators import Estimator, TrackingResult
 from nodes.outside.native import LinkAnswer, LinkError, describe
 from nodes.outside.native.client import SAMPLE
-from nodes.outside.process.feed import KINDS, Feed
-from nodes.outside.process.launch import Launch, ProgramError
-from nodes.outside.process.program import Program
-from nodes.outside.process.settings import ProcessConfig
+from nodes.outside.process.launch import Launch, ProcessConfig, ProgramError
+from nodes.outside.process.program import KINDS, Feed, Program
 from nodes.ros2.messages.publications import TopicKind, publication
-from nodes.ros2.messages.settings import PublishingConfig
+from nodes.ros2.messages.topics import PublishingConfig
 from runtime import Node, on
 from runtime.channels.bundles import Field, Matcher, Slot
-from runtime.channels.hold import Hold
-from runtime.channels.owed import Owed
+from runtime.channels.hold import Hold, Owed
 from runtime.channels.streams import Stream
 from runtime.workers.output import Throttle
 

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from events import CameraAnnouncement, Image, Imu
 from nodes.calibration.formats import write_files
-from nodes.data.dataset.rig import Rig
+from nodes.data.dataset.recording import Rig
 from nodes.estimators import (
     Estimator,
     EstimatorConfig,
@@ -22,8 +22,7 @@ from nodes.estimators import (
 )
 from nodes.outside.vit.tracker import VitTracker
 from runtime import Bundle, Duration
-from runtime.channels.hold import Hold, HoldConfig
-from runtime.channels.owed import Owed
+from runtime.channels.hold import Hold, HoldConfig, Owed
 from runtime.paths import InputPath
 
 
@@ -69,7 +68,6 @@ def patience_left(patience: float, image: float, now: float) -> float:
     """Return the real seconds that an image gets for a first pose.
 
     Args:
-        patience: As set.
         image: Stamp of the image, seconds after that of the first.
         now: Real seconds since the first image came.
     """

@@ -18,18 +18,16 @@ from typing import Any
 import msgspec
 
 from events import Event
-from nodes.ros2.bridge.attachment import Message
 from nodes.ros2.bridge.incoming_topic import IncomingTopic
-from nodes.ros2.bridge.keys import Token
+from nodes.ros2.bridge.keys import Message, Token
 from nodes.ros2.bridge.publisher import Publisher
 from nodes.ros2.bridge.session import Session
 from nodes.ros2.bridge.settings import Ros2BridgeConfig
 from nodes.ros2.messages.publications import IMAGES, publication
-from nodes.ros2.messages.stamps import Stamps
 from nodes.ros2.messages.topics import Topic, topic_name
+from nodes.ros2.messages.typestore import Stamps
 from runtime import Node
-from runtime.channels.hold import Hold
-from runtime.channels.owed import Owed
+from runtime.channels.hold import Hold, Owed
 from runtime.errors import MissingAnswerError, suggest
 
 WAITING = 64
@@ -168,9 +166,7 @@ class HeldLine:
     messages wait.
 
     Args:
-        node: Whose messages these are.
         session: Whose publishers are made complete: reliable, and waiting for who reads slowly.
-        estimators: Who is sent it all.
         deliver: Sends the event of an answer, at its time.
 
     Attributes:
@@ -230,8 +226,6 @@ class HeldLine:
         """Put an image or a point cloud in its turn, and the time before it; hold for its answers.
 
         Args:
-            image: The event, which arrives now.
-            put: Puts its messages.
             clock: Puts the time (ns).
         """
         self._once_there(self._publish_image, image, put, clock)

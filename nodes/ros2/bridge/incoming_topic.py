@@ -1,10 +1,22 @@
-"""A topic that the bridge subscribes to: its messages to events, and all that may be wrong."""
+"""A topic that the bridge subscribes to: its messages to events, and all that may be wrong.
+
+Passes messages from the threads that read topics to the loop: bounded, one wake-up a burst.
+
+What comes faster than is allowed is dropped where it is read, before its bytes are copied. The
+loop is given back between messages when they have held it for `BUDGET`.
+
+A topic that is published by a mapping of the user's own, from events to messages of any type.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import concurrent.futures
 import contextlib
-from collections.abc import Iterator
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from events import (
@@ -14,27 +26,28 @@ from events import (
     Event,
     PilotAnnouncement,
 )
-from nodes.ros2.bridge.attachment import Message
-from nodes.ros2.bridge.complaints import Complaints
-from nodes.ros2.bridge.mappings import import_mapping
+from nodes.ros2.bridge.keys import Complaints, Message
+from nodes.ros2.bridge.publisher import Publisher
 from nodes.ros2.bridge.session import Session
-from nodes.ros2.bridge.settings import Ros2BridgeConfig, Subscription
+from nodes.ros2.bridge.settings import (
+    OwnPublication,
+    Ros2BridgeConfig,
+    Subscription,
+    event_type,
+    import_mapping,
+)
 from nodes.ros2.messages.calibration import camera_announcement
 from nodes.ros2.messages.incoming import READERS, MessageContext, Reader
-from nodes.ros2.messages.stamps import Stamps
 from nodes.ros2.messages.topics import Qos, Topic, ros_name, topic_name
-from nodes.ros2.messages.typestore import MessageError, TypeStore
+from nodes.ros2.messages.typestore import MessageBuilder, MessageError, Stamps, TypeStore
+from runtime import Stream
 
 
 class IncomingTopic:
     """Makes the events of one subscription.
 
     Args:
-        subscription: As the file says.
-        config: The bridge's settings.
-        store: Of the types.
         node: The bridge's name, for the events' source.
-        complaints: Notes what is wrong.
 
     Raises:
         ValueError: The type is not known, or the mapping cannot be imported.
@@ -164,3 +177,147 @@ def _reader(subscription: Subscription) -> Reader:
     if subscription.use:
         return READERS[subscription.type, subscription.use]
     return import_mapping(subscription.topic, subscription.mapping)
+
+
+BUDGET = 0.0005
+"""Seconds for which one turn of the loop may be held."""
+
+
+class Inbox:
+    """What waits to be read on one topic.
+
+    Args:
+        deliver: Called there with the bytes of each; must not raise.
+        depth: How many wait at most; the oldest is dropped.
+        max_rate: Messages a second at most; a burst of `depth` may come at once.
+        max_size: Bytes of a message at most.
+        complain: Called, in the thread that reads, with why a message is dropped.
+        now: Real seconds.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        deliver: Callable[[bytes], object],
+        *,
+        depth: int,
+        max_rate: float,
+        max_size: int,
+        complain: Callable[[str, str], None],
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._loop = loop
+        self._deliver = deliver
+        self._depth = depth
+        self._max_rate = max_rate
+        self._max_size = max_size
+        self._complain = complain
+        self._now = now
+        self._waiting: deque[bytes] = deque()
+        self._lock = threading.Lock()
+        self._allowed, self._asked = float(depth), now()
+        self._woken = False
+        self.wake_ups = 0
+
+    def take(self, message: Message) -> None:
+        """Take a message, in any thread; never waits."""
+        if message.size > self._max_size:
+            found = f"expected {self._max_size} bytes or less, found {message.size}"
+            self._complain("message too large", found)
+            return
+        if not self._within_rate():
+            self._complain("too many messages", f"expected {self._max_rate:g} a second or less")
+            return
+        data = message.read()
+        with self._lock:
+            full = len(self._waiting) == self._depth
+            if full:
+                self._waiting.popleft()
+            self._waiting.append(data)
+            wake, self._woken = not self._woken, True
+        if full:
+            self._complain("more messages than wait here", f"the oldest of {self._depth} dropped")
+        if wake:
+            with contextlib.suppress(RuntimeError):  # the loop has been closed
+                self._loop.call_soon_threadsafe(self._drain)
+
+    def _within_rate(self) -> bool:
+        """Tell whether one more message fits; every second allows for `max_rate` more."""
+        with self._lock:
+            now = self._now()
+            more = (now - self._asked) * self._max_rate
+            self._allowed, self._asked = min(self._allowed + more, float(self._depth)), now
+            if self._allowed < 1.0:
+                return False
+            self._allowed -= 1.0
+            return True
+
+    def _drain(self) -> None:
+        self.wake_ups += 1
+        end = time.perf_counter() + BUDGET
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    self._woken = False
+                    return
+                data = self._waiting.popleft()
+            self._deliver(data)
+            if time.perf_counter() > end:
+                self._loop.call_soon(self._drain)
+                return
+
+
+class OutgoingTopic:
+    """Makes the messages of one publication.
+
+    Attributes:
+        waiting: Events that wait to be published.
+        publisher: Of the topic, once it is declared.
+
+    Raises:
+        ValueError: The type is not known, or the event or the mapping cannot be imported.
+    """
+
+    def __init__(
+        self,
+        publication: OwnPublication,
+        config: Ros2BridgeConfig,
+        store: TypeStore,
+        complaints: Complaints,
+    ) -> None:
+        self.publication = publication
+        self.waiting = Stream[Event](publication.topic, publication.depth, "drop_oldest", soon=True)
+        self.publisher: Publisher | None = None
+        name = topic_name(config.namespace, publication.topic)
+        self.topic = topic(store, name, publication.type, publication.qos)
+        self._store = store
+        self._complaints = complaints
+        self.event = event_type(publication)
+        self._map = import_mapping(publication.topic, publication.mapping)
+
+    def wants(self, event: Event) -> bool:
+        """Tell whether an event becomes a message."""
+        source = self.publication.source
+        return isinstance(event, self.event) and (
+            not source or event.source == source or event.source.startswith(f"{source}/")
+        )
+
+    def put(self, builder: MessageBuilder, event: Event) -> None:
+        """Put the message of an event, if there is one."""
+        if self.publisher is not None and (message := self.message(event, builder)) is not None:
+            self.publisher.put(message)
+
+    def message(self, event: Event, builder: MessageBuilder) -> bytearray | None:
+        """Return the message of an event; `None` if there is none, or none can be made."""
+        try:
+            message = self._map(event, builder)
+            if message is None:
+                return None
+            type_ = getattr(message, "__msgtype__", type(message).__name__)
+            if type_ != self.topic.type:
+                raise TypeError(f"expected a {self.topic.type}, found {type_}")
+            return self._store.serialize(message)
+        except Exception as error:  # a mapping is the user's own
+            detail = f"{type(error).__name__}: {error}"
+            self._complaints.add(self.topic.name, "mapping failed", detail)
+            return None

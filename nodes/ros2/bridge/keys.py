@@ -2,14 +2,26 @@
 
 Source: rmw_zenoh, docs/design.md and liveliness_utils.cpp. zenoh-plugin-ros2dds names topics
 otherwise (`ros2dds_key`). Nothing here talks to Zenoh.
+
+What goes with every message: its number, when it was sent, and by whom.
+
+A ROS process that gets a malformed attachment ends, so there is one place that makes them.
+
+What is wrong with messages from outside: it is always counted, and seldom logged.
 """
 
 from __future__ import annotations
 
 import re
-from typing import Any, Literal
+import struct
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import msgspec
+import xxhash
 
 from nodes.ros2.messages.topics import Topic, dds_type
 
@@ -102,12 +114,8 @@ def endpoint_token(
     """Return the liveliness token of a publisher or subscription.
 
     Args:
-        node: To which it belongs.
         zid: The session's id as text.
-        node_id: The node's number in the session.
         id_: Its own number in the session.
-        kind: What it is.
-        topic: Its topic.
     """
     head = _token(node, zid, node_id, id_, kind)
     return f"{head}/{mangle(topic.name)}/{dds_type(topic.type)}/{topic.hash}/{topic.qos.text()}"
@@ -122,3 +130,115 @@ def _token(node: NodeName, zid: str, node_id: int, id_: int, kind: Kind) -> str:
     namespace = mangle("" if node.namespace == "/" else node.namespace)
     ids = f"{zid}/{node_id}/{id_}"
     return f"{ADMIN_SPACE}/{node.domain_id}/{ids}/{kind}/%/{namespace}/{mangle(node.name)}"
+
+
+_LAYOUT = struct.Struct("<qqB16s")
+"""Two numbers, and a buffer of 16 bytes after its length, in Zenoh's own serialisation."""
+
+SIZE = _LAYOUT.size
+
+
+class Attachment(NamedTuple):
+    """What an attachment says.
+
+    Attributes:
+        sequence: Number of the message from its publisher, from 1.
+        stamp: Wall clock, nanoseconds since 1970.
+        gid: The 16 bytes by which ROS tells one publisher from another.
+    """
+
+    sequence: int
+    stamp: int
+    gid: bytes
+
+
+class Message(NamedTuple):
+    """A message that has come; its bytes are not copied before they are asked for.
+
+    Attributes:
+        size: Bytes.
+        read: Returns them.
+        attached: Returns what becomes those of its attachment, if there is one.
+    """
+
+    size: int
+    read: Callable[[], bytes]
+    attached: Callable[[], Any] = bytes
+
+    @property
+    def attachment(self) -> Attachment | None:
+        """Return its attachment; ``None`` if there is none, or what came is none."""
+        try:
+            return unpack(bytes(self.attached() or b""))
+        except ValueError:
+            return None
+
+
+def gid(token: str) -> bytes:
+    """Return the GID of the owner of a liveliness token, as rmw_zenoh_cpp makes it.
+
+    It is the token's XXH3 hash of 128 bits, its low 64 bits first, little endian.
+    """
+    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
+
+
+def pack(attachment: Attachment) -> bytes:
+    """Return the attachment's 33 bytes.
+
+    Raises:
+        ValueError: The GID has not 16 bytes.
+    """
+    if len(attachment.gid) != 16:
+        raise ValueError(f"gid: expected 16 bytes, found {len(attachment.gid)}")
+    return _LAYOUT.pack(attachment.sequence, attachment.stamp, 16, attachment.gid)
+
+
+def unpack(data: bytes) -> Attachment:
+    """Read an attachment.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if len(data) != SIZE or data[16] != 16:
+        raise ValueError(f"attachment: expected {SIZE} bytes with a GID of 16, found {data!r:.80}")
+    sequence, stamp, _, gid = _LAYOUT.unpack(data)
+    return Attachment(sequence, stamp, gid)
+
+
+LOG_INTERVAL = 5.0
+"""Real seconds between two log lines about the same."""
+
+
+class Complaints:
+    """Counts of what went wrong, by topic and kind. For any thread.
+
+    Args:
+        now: Real seconds.
+    """
+
+    def __init__(
+        self, log: Callable[[str], None], now: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self._log = log
+        self._now = now
+        self._logged: dict[tuple[str, str], tuple[float, int]] = {}
+        self._lock = threading.Lock()
+
+    def add(self, where: str, kind: str, detail: str = "") -> None:
+        """Count something; log it if nothing like it was logged for `LOG_INTERVAL`.
+
+        Args:
+            kind: Of trouble, in few words; there are only a few.
+        """
+        with self._lock:
+            key, now = (where, kind), self._now()
+            self.counts[key] += 1
+            when, before = self._logged.get(key, (-LOG_INTERVAL, 0))
+            if now - when < LOG_INTERVAL:
+                return
+            count = self.counts[key]
+            self._logged[key] = (now, count)
+            since = count - before
+        times = f" ({since} times since the last such line)" if since > 1 else ""
+        self._log(f"{where}: {kind}{': ' if detail else ''}{detail:.300}{times}")

@@ -29,20 +29,15 @@ from events import (
     VehicleAnnouncement,
     VehicleEvent,
 )
-from nodes.ros2.bridge.complaints import Complaints
 from nodes.ros2.bridge.held import HeldLine, held_estimators, why_no_answers
-from nodes.ros2.bridge.inbox import Inbox
-from nodes.ros2.bridge.incoming_topic import IncomingTopic
-from nodes.ros2.bridge.keys import NodeName
-from nodes.ros2.bridge.mappings import event_type
-from nodes.ros2.bridge.outgoing_topic import OutgoingTopic
+from nodes.ros2.bridge.incoming_topic import Inbox, IncomingTopic, OutgoingTopic
+from nodes.ros2.bridge.keys import Complaints, NodeName
 from nodes.ros2.bridge.publisher import Publisher
-from nodes.ros2.bridge.services import Services
 from nodes.ros2.bridge.session import Session, SessionError
-from nodes.ros2.bridge.settings import Ros2BridgeConfig
+from nodes.ros2.bridge.settings import Ros2BridgeConfig, event_type
+from nodes.ros2.bridge.simulation_services import Services
 from nodes.ros2.messages.publishing import LARGE, SMALL, Publishing
-from nodes.ros2.messages.stamps import Stamps
-from nodes.ros2.messages.typestore import TypeStore
+from nodes.ros2.messages.typestore import Stamps, TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
 from runtime.channels.ports import Handles
 from runtime.errors import FatalError, UncheckableError

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from nodes.ros2.bridge.attachment import Attachment, pack
+from nodes.ros2.bridge.keys import Attachment, pack
 from nodes.ros2.messages.topics import Topic
 
 
@@ -14,7 +14,6 @@ class Publisher:
     """Puts messages on a topic.
 
     Args:
-        topic: Which.
         put: Puts a message with its attachment, and tells whether the session is still open.
         matched: Tells whether somebody subscribes to the topic.
         gid_: Of the endpoint; if ``None``, messages have no attachment.

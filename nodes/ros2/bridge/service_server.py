@@ -14,8 +14,7 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from nodes.ros2.bridge.attachment import Attachment, Message, pack
-from nodes.ros2.bridge.complaints import Complaints
+from nodes.ros2.bridge.keys import Attachment, Complaints, Message, pack
 from nodes.ros2.bridge.session import Answer, Session
 from nodes.ros2.bridge.settings import Ros2BridgeConfig
 from nodes.ros2.messages.topics import Qos, Topic, topic_name
@@ -33,14 +32,7 @@ WAITING = 64
 
 
 class ServiceServer:
-    """Answers requests for one bridge.
-
-    Args:
-        node: The bridge, whose tasks answer requests.
-        session: Where requests come from.
-        store: Of the types.
-        complaints: Notes what is wrong.
-    """
+    """Answers requests for one bridge."""
 
     def __init__(
         self,

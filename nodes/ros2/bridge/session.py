@@ -21,14 +21,15 @@ from typing import Any, Literal
 import msgspec
 import zenoh
 
-from nodes.ros2.bridge.attachment import Message, gid
 from nodes.ros2.bridge.keys import (
     Kind,
+    Message,
     NodeName,
     Token,
     data_key,
     endpoint_token,
     endpoints_key,
+    gid,
     node_token,
     parse_token,
     ros2dds_key,
@@ -80,10 +81,8 @@ class Session:
     """A session with one ROS node.
 
     Args:
-        node: As whom to appear.
         keys: How topics are named.
         connect: Endpoints to connect to, again and again until they answer.
-        listen: Endpoints to listen on.
         file: A Zenoh configuration. What it leaves out, and the two endpoints if they are `None`,
             is as without a file: that of rmw_zenoh_cpp.
         max_wait: Real seconds for which a held message waits for a peer that does not read; then
@@ -125,7 +124,6 @@ class Session:
         """Declare a publisher, and show it to ROS.
 
         Args:
-            topic: Its topic.
             held: Whether every message must arrive: it is reliable, keeps all, and a put waits
                 (up to `max_wait`) for a peer that reads slowly rather than drop a message.
         """
@@ -220,7 +218,6 @@ class Session:
         Those of a process that is killed disappear at once; tokens that make no sense are left out.
 
         Args:
-            topic_name: With its leading slash.
             kind: Of the endpoints: ``MP`` for publishers, ``MS`` for subscriptions.
             changed: Called in any thread with whether one is there (else it is gone), and which.
         """

@@ -1,15 +1,28 @@
-"""The bridge's settings in a run's file."""
+"""The bridge's settings in a run's file.
+
+Imports what a file names: mappings of the user's own, and the events that they are of.
+"""
 
 from __future__ import annotations
 
+import pkgutil
 import re
-from typing import Annotated, Literal
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
 
 import msgspec
 
+from events import Event
 from nodes.ros2.messages.incoming import READERS
-from nodes.ros2.messages.settings import Positive, PublishingConfig, Rate, check_name
-from nodes.ros2.messages.topics import Qos, dds_type, topic_name
+from nodes.ros2.messages.topics import (
+    Positive,
+    PublishingConfig,
+    Qos,
+    Rate,
+    check_name,
+    dds_type,
+    topic_name,
+)
 from nodes.ros2.messages.typestore import Distribution
 from runtime.channels.hold import HoldConfig
 from runtime.paths import InputPath
@@ -226,3 +239,40 @@ class Ros2BridgeConfig(PublishingConfig):
                     f'{done.topic}: as = "done": expected one estimate with the same answers_to, '
                     "and of the same source if there are several"
                 )
+
+
+def import_mapping(topic: str, path: str) -> Callable[[Any, Any], Any]:
+    """Return a function.
+
+    Args:
+        path: ``module:function``.
+
+    Raises:
+        ValueError: It cannot be imported, or is no function.
+    """
+    found = _imported(topic, "mapping", path)
+    if not callable(found):
+        raise ValueError(f"{topic}: mapping: expected a function, found {found!r}")
+    function: Callable[[Any, Any], Any] = found
+    return function
+
+
+def event_type(publication: OwnPublication) -> type[Event]:
+    """Return the type of the events that a publication is of.
+
+    Raises:
+        ValueError: It cannot be imported, or is no event's.
+    """
+    found = _imported(publication.topic, "event", publication.event)
+    if not (isinstance(found, type) and issubclass(found, Event)):
+        raise ValueError(f"{publication.topic}: event: expected a type of event, found {found!r}")
+    return found
+
+
+def _imported(topic: str, setting: str, path: str) -> Any:
+    try:
+        return pkgutil.resolve_name(path)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"{topic}: {setting}: expected something that can be imported, found {path!r}: {error}"
+        ) from None

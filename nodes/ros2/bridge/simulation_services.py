@@ -2,16 +2,41 @@
 
 Source: https://github.com/ros-simulation/simulation_interfaces. There is no reset: a run has one
 beginning. GetSimulatorFeatures says so.
+
+The action SimulateSteps of simulation_interfaces 2.1: steps of time, and news of how far it is.
+
+An action is three services and two topics (https://design.ros2.org/articles/actions.html). A goal
+that cannot be pursued is accepted and aborted at once: a rejection could not say why.
+
+Services that arm, disarm, take off and land: ``std_srvs/Trigger``, for each vehicle.
+
+The services that a bridge offers to ROS 2, as its settings say.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+import contextlib
+import functools
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 
+import events
+from events import Command, VehicleEvent
 from nodes.ros2.bridge.service_server import ServiceServer
-from nodes.ros2.messages.services import SIMULATION
+from nodes.ros2.messages.topics import (
+    CANCEL_GOAL,
+    DEFINITIONS,
+    SIMULATION,
+    STEPS,
+    TRIGGER,
+    Qos,
+    ros_name,
+)
 from runtime.time.schedule import SECOND
 
 # Of SimulatorFeatures.msg.
@@ -112,3 +137,214 @@ class SimulationServices:
 
     def _make(self, kind: str, **fields: Any) -> Any:
         return self._server.store.message(f"simulation_interfaces/msg/{kind}")(**fields)
+
+
+# Of GoalStatus.msg, and of CancelGoal.srv.
+UNKNOWN, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = 0, 2, 3, 4, 5, 6
+NO_ERROR, UNKNOWN_GOAL, GOAL_TERMINATED = 0, 2, 3
+
+KEPT, PERIOD = 16, 0.2
+"""Goals whose results can be asked for; real seconds between two messages of feedback."""
+
+
+class _Goal:
+    """Steps that a client wants from simulated time `begin` (ns); `info` is its GoalInfo."""
+
+    def __init__(self, info: Any, steps: int, begin: int) -> None:
+        self.info, self.steps, self.begin = info, steps, begin
+        self.status, self.result, self.over = EXECUTING, dict[str, Any](), asyncio.Event()
+
+
+class SimulateSteps:
+    """Steps time for one goal at a time."""
+
+    def __init__(self, server: ServiceServer, simulation: SimulationServices) -> None:
+        self._server, self._simulation = server, simulation
+        self._clock, self._stepping = server.node.clock, server.node.stepping
+        self._message = server.store.message
+        self._goals: dict[bytes, _Goal] = {}
+        """By id, the oldest first; at most one is not over."""
+
+    def declare(self) -> None:
+        """Declare topics and services; called in any thread."""
+        below, array = "simulate_steps/_action", "action_msgs/msg/GoalStatusArray"
+        declare, publisher = self._server.declare, self._server.publisher
+        self._status = publisher(f"{below}/status", array, Qos(transient_local=True, depth=1))
+        self._news = publisher(f"{below}/feedback", f"{STEPS}_FeedbackMessage", Qos())
+        declare(f"{below}/cancel_goal", CANCEL_GOAL, self._cancel)
+        declare(f"{below}/get_result", f"{STEPS}_GetResult", self._get_result)
+        declare(f"{below}/send_goal", f"{STEPS}_SendGoal", self._send_goal)
+
+    async def _send_goal(self, request: Any) -> dict[str, Any]:
+        now, id_, steps = self._clock.now(), bytes(request.goal_id.uuid), request.goal.steps
+        sec, nanosec = divmod(now, SECOND)
+        stamp = self._message("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
+        if id_ in self._goals:
+            return {"accepted": False, "stamp": stamp}
+        if len(self._goals) == KEPT:
+            del self._goals[next(each for each, goal in self._goals.items() if goal.over.is_set())]
+        info = self._message("action_msgs/msg/GoalInfo")(goal_id=request.goal_id, stamp=stamp)
+        goal = self._goals[id_] = _Goal(info, steps, now)
+        if refusal := self._simulation.refusal(steps):
+            self._set(goal, ABORTED, *refusal)
+        else:
+            self._set(goal, EXECUTING)
+            stepped = self._stepping.step(steps * self._simulation.step)
+            stepped.add_done_callback(functools.partial(self._stepped, goal))
+            threading.Thread(target=self._tell_often, args=(goal,), daemon=True).start()
+        return {"accepted": True, "stamp": stamp}
+
+    def _tell_often(self, goal: _Goal) -> None:
+        """Have feedback published while steps go on, by a thread: the loop's time is simulated."""
+        with contextlib.suppress(RuntimeError):  # the loop has been closed
+            while not goal.over.is_set():
+                time.sleep(PERIOD)
+                gone = self._clock.now() - goal.begin
+                self._server.loop.call_soon_threadsafe(self._tell, goal, gone)
+
+    def _tell(self, goal: _Goal, gone: int) -> int:
+        """Publish how many steps are done after `gone` ns, and return that."""
+        done = min(gone // self._simulation.step, goal.steps)
+        if not goal.over.is_set():
+            counts = {"completed_steps": done, "remaining_steps": goal.steps - done}
+            feedback = self._message(f"{STEPS}_Feedback")(**counts)
+            self._news(goal_id=goal.info.goal_id, feedback=feedback)
+        return done
+
+    def _stepped(self, goal: _Goal, stepped: asyncio.Future[int]) -> None:
+        done = self._tell(goal, stepped.result())
+        what = f"after {done} of {goal.steps} steps"
+        if done == goal.steps:
+            self._set(goal, SUCCEEDED, OK)
+        elif goal.status == CANCELING:
+            self._set(goal, CANCELED, OPERATION_FAILED, f"canceled {what}")
+        else:
+            self._set(goal, ABORTED, OPERATION_FAILED, f"ended from elsewhere {what}")
+
+    def _set(self, goal: _Goal, status: int, *result: Any) -> None:
+        """Publish a status; with a result the goal is over, once and for all."""
+        if goal.over.is_set():
+            return
+        if result:
+            goal.result = self._simulation.result(*result)
+            goal.over.set()
+        goal.status = status
+        make, goals = self._message("action_msgs/msg/GoalStatus"), self._goals.values()
+        self._status(status_list=[make(goal_info=it.info, status=it.status) for it in goals])
+
+    async def _get_result(self, request: Any) -> dict[str, Any]:
+        status, result = UNKNOWN, self._simulation.result(OPERATION_FAILED, "no such goal is known")
+        if goal := self._goals.get(bytes(request.goal_id.uuid)):
+            try:
+                await goal.over.wait()
+            except asyncio.CancelledError:  # whoever asked must not wait for ever
+                self._set(goal, ABORTED, OPERATION_FAILED, "the run has ended")
+            status, result = goal.status, goal.result
+        return {"status": status, "result": self._message(f"{STEPS}_Result")(**result)}
+
+    async def _cancel(self, request: Any) -> dict[str, Any]:
+        """Cancel the goal of an id, or accepted up to a time; if neither is given, any."""
+        id_, stamp = bytes(request.goal_info.goal_id.uuid), request.goal_info.stamp
+        until = stamp.sec * SECOND + stamp.nanosec
+        for each, goal in self._goals.items():
+            before = goal.begin <= until if until else not any(id_)
+            if not goal.over.is_set() and (each == id_ or before):
+                self._set(goal, CANCELING)
+                self._stepping.pause()
+                return {"return_code": NO_ERROR, "goals_canceling": [goal.info]}
+        code = GOAL_TERMINATED if id_ in self._goals else UNKNOWN_GOAL
+        return {"return_code": code if any(id_) else NO_ERROR, "goals_canceling": []}
+
+
+class _Order(NamedTuple):
+    """What is sent, what the vehicle says when it is done, and within how many seconds.
+
+    It is superfluous if the vehicle is armed (true), or if it is not (false).
+    """
+
+    command: type[Command]
+    done: type[VehicleEvent]
+    limit: float
+    superfluous: bool | None = None
+
+
+_ORDERS = {
+    "arm": _Order(events.Arm, events.Armed, 1.0, superfluous=True),
+    "disarm": _Order(events.Disarm, events.Disarmed, 1.0, superfluous=False),
+    "take_off": _Order(events.Takeoff, events.TakenOff, 60.0),
+    "land": _Order(events.Land, events.Landed, 300.0, superfluous=False),
+}
+
+
+class VehicleServices:
+    """Sends commands to vehicles, and waits until they are carried out."""
+
+    def __init__(self, server: ServiceServer, send: Callable[[Command], None]) -> None:
+        self._server = server
+        self._node = server.node
+        self._send = send
+        self._armed: dict[str, bool] = {}
+        """Of vehicles of which it is known."""
+        self._waiting: set[tuple[str, type[VehicleEvent], asyncio.Future[None]]] = set()
+
+    def declare(self, vehicle: str) -> None:
+        """Declare the services of a vehicle; called in any thread."""
+        if not self._node.restarts:
+            self._armed[vehicle] = False
+        for name, order in _ORDERS.items():
+
+            async def serve(_: Any, order: _Order = order) -> dict[str, Any]:
+                success, message = await self._give(vehicle, order)
+                return {"success": success, "message": message}
+
+            self._server.declare(f"{ros_name(vehicle)}/{name}", TRIGGER, serve)
+
+    def told(self, event: VehicleEvent) -> None:
+        """Note what a vehicle says has happened."""
+        if isinstance(event, events.Armed | events.Disarmed):
+            self._armed[event.source] = isinstance(event, events.Armed)
+        for vehicle, done, waiter in self._waiting:
+            if vehicle == event.source and isinstance(event, done) and not waiter.done():
+                waiter.set_result(None)
+
+    async def _give(self, vehicle: str, order: _Order) -> tuple[bool, str]:
+        """Return whether a command was carried out, and what there is to say of it."""
+        if self._armed.get(vehicle) is order.superfluous is not None:
+            return True, f"{vehicle} is {'armed' if order.superfluous else 'disarmed'} already"
+        waiter = asyncio.get_running_loop().create_future()
+        waiting = (vehicle, order.done, waiter)
+        self._waiting.add(waiting)
+        try:
+            now, source = self._node.clock.now(), self._node.name
+            self._send(order.command(stamp=now, source=source, vehicle=vehicle))
+            if self._node.stepping.state == "paused":  # whoever asked is the one who steps
+                return True, f"{order.command.__name__} is sent; time stands"
+            async with asyncio.timeout(order.limit):
+                await waiter
+        except TimeoutError:
+            name, done = order.command.__name__, order.done.__name__
+            return False, f"{vehicle} did not say {done} within {order.limit:g} s of {name}"
+        finally:
+            self._waiting.discard(waiting)
+        return True, order.done.__name__
+
+
+class Services(ServiceServer):
+    """The services of one bridge; of vehicles they send commands by `send`."""
+
+    def __init__(self, send: Callable[[Command], None], *server: Any) -> None:
+        super().__init__(*server)
+        self._vehicles = VehicleServices(self, send)
+        self.told = self._vehicles.told
+
+    def offer(self, vehicles: Iterable[str]) -> None:
+        """Declare all that are wanted, of these vehicles; called in a thread."""
+        for type_, definition in DEFINITIONS.items():
+            self.store.add(type_, definition)
+        if "simulation" in self.node.config.services:
+            simulation = SimulationServices(self)
+            SimulateSteps(self, simulation).declare()
+            simulation.declare()
+        if "vehicle" in self.node.config.services:
+            for vehicle in vehicles:
+                self._vehicles.declare(vehicle)

@@ -26,7 +26,6 @@ def camera_announcement(
 
     Args:
         message: A ``sensor_msgs/msg/CameraInfo``.
-        source: Of the camera's images.
         images: Which kinds of them there are.
         frame_id: If set, stands in the place of the message's own.
 

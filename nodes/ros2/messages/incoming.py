@@ -29,10 +29,16 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from events.frames import axes_of, convert_covariance, convert_rotation, convert_vector
-from events.rotations import normalize, yaw_of
+from events.frames import (
+    axes_of,
+    convert_covariance,
+    convert_rotation,
+    convert_vector,
+    normalize,
+    yaw_of,
+)
 from nodes.ros2.messages.images import read_depth, read_image
-from nodes.ros2.messages.stamps import Stamps
+from nodes.ros2.messages.typestore import Stamps
 
 
 class MessageContext(msgspec.Struct, frozen=True, kw_only=True):

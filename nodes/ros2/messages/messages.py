@@ -28,9 +28,8 @@ from events import (
 )
 from events.frames import Axes, convert_covariance, convert_rotation, convert_vector
 from nodes.ros2.messages.calibration import projection_matrix
-from nodes.ros2.messages.frame_names import FrameNames
-from nodes.ros2.messages.stamps import Time
-from nodes.ros2.messages.typestore import TypeStore
+from nodes.ros2.messages.topics import FrameNames
+from nodes.ros2.messages.typestore import Time, TypeStore
 
 _ZEROS_9, _ZEROS_36 = np.zeros(9), np.zeros(36)
 _UNKNOWN = np.array([-1.0, *[0.0] * 8])

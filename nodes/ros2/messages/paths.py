@@ -14,10 +14,8 @@ import numpy as np
 
 from events import Odometry, PoseEstimate, Quaternion, Vector3
 from events.frames import convert_rotation, convert_vector
-from nodes.ros2.messages.frame_names import FrameNames
-from nodes.ros2.messages.settings import PublishingConfig
-from nodes.ros2.messages.stamps import Time
-from nodes.ros2.messages.typestore import TypeStore
+from nodes.ros2.messages.topics import FrameNames, PublishingConfig
+from nodes.ros2.messages.typestore import Time, TypeStore
 from runtime.time.schedule import SECOND
 
 _COUNT = struct.Struct("<I")
@@ -31,7 +29,6 @@ class Paths:
     """The paths of all vehicles and estimates.
 
     Args:
-        store: Of the types.
         names: Of frames, as ROS calls them.
         config: How far apart poses are, how many there are, and how often a path is sent.
     """
@@ -47,7 +44,6 @@ class Paths:
         """Add a pose to the path of its source; return the path if that is due.
 
         Args:
-            event: The pose.
             time: Of its stamp, in messages: seconds and nanoseconds.
         """
         config, frame = self._config, self._names.name(event.frame_id, event.source)
@@ -73,7 +69,6 @@ class PathMessage:
     """The message of a path: poses of one body in one frame.
 
     Args:
-        store: Of the types.
         frame: The poses' parent, as ROS calls it.
         step: Metres from one pose to the next that is kept.
         length: Poses of a message at most. When there would be more, every other is left out and

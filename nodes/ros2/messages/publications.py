@@ -19,8 +19,7 @@ from events import (
     RangeAnnouncement,
     VehicleAnnouncement,
 )
-from nodes.ros2.messages.settings import PublishingConfig, TopicGroup
-from nodes.ros2.messages.topics import Qos, ros_name, topic_name
+from nodes.ros2.messages.topics import PublishingConfig, Qos, TopicGroup, ros_name, topic_name
 
 TopicKind = str
 """A kind of topic: a key of `TOPICS`."""

@@ -37,10 +37,12 @@ from events import (
     Wind,
 )
 from events.frames import convert_points
-from nodes.ros2.messages.builder import MessageBuilder
-from nodes.ros2.messages.depth import CompressedDepthWriter
-from nodes.ros2.messages.frame_names import FrameNames
-from nodes.ros2.messages.images import CloudWriter, CompressedWriter, ImageWriter
+from nodes.ros2.messages.images import (
+    CloudWriter,
+    CompressedDepthWriter,
+    CompressedWriter,
+    ImageWriter,
+)
 from nodes.ros2.messages.messages import Messages, Transform
 from nodes.ros2.messages.paths import Paths
 from nodes.ros2.messages.publications import (
@@ -50,11 +52,9 @@ from nodes.ros2.messages.publications import (
     announced_topics,
     publication,
 )
-from nodes.ros2.messages.settings import PublishingConfig
-from nodes.ros2.messages.stamps import Time
-from nodes.ros2.messages.topics import Topic, topic_name
+from nodes.ros2.messages.topics import FrameNames, PublishingConfig, Topic, topic_name
 from nodes.ros2.messages.transforms import Transforms
-from nodes.ros2.messages.typestore import TypeStore
+from nodes.ros2.messages.typestore import MessageBuilder, Time, TypeStore
 
 LARGE: tuple[type[Event], ...] = (
     Image,
@@ -103,9 +103,6 @@ class Publishing(Generic[P]):
     """Makes messages of events, and puts them where they belong.
 
     Args:
-        sink: Where messages go.
-        store: Of the types.
-        config: What is published, and how.
         time: Returns the time in messages of a stamp (ns).
     """
 

@@ -1,10 +1,27 @@
-"""Topics: their names as ROS allows them, their types and their quality of service."""
+"""Topics: their names as ROS allows them, their types and their quality of service.
+
+What is published of a run, and how: the settings that all who make ROS messages share.
+
+Definitions of services that rosbags does not come with, as in their packages' ``.srv`` files.
+
+Comments, constants and default values are left out: the hash of a type does not depend on them.
+An action is made of services and messages, as in https://design.ros2.org/articles/actions.html.
+Sources: std_srvs and action_msgs of ROS 2 Jazzy, simulation_interfaces 2.1.0.
+
+What ROS calls the frames of a run (REP 103 and REP 105), and how their axes lie.
+"""
 
 from __future__ import annotations
 
 import re
+from typing import Annotated, Literal
 
 import msgspec
+
+from events import CameraAnnouncement
+from events.frames import Axes, axes_of
+from nodes.vehicles import Vehicles
+from runtime import NodeConfig
 
 NO_HASH = "TypeHashNotSupported"
 """What Humble says in the place of a type's hash."""
@@ -88,3 +105,195 @@ def ros_name(source: str) -> str:
     """Return what comes nearest to the name of a source of events that ROS allows."""
     parts = [re.sub(r"[^A-Za-z0-9_]", "_", part) for part in source.split("/") if part]
     return "/".join(f"_{part}" if part[0].isdigit() else part for part in parts) or "_"
+
+
+TopicGroup = Literal[
+    "images",
+    "depth_images",
+    "segmentation_images",
+    "point_clouds",
+    "imu",
+    "odometry",
+    "camera_poses",
+    "transforms",
+    "estimates",
+    "scores",
+    "ranges",
+    "pressures",
+    "magnetic_fields",
+    "fixes",
+    "lidar_scans",
+    "wind",
+    "body_poses",
+    "clock",
+    "paths",
+]
+
+ALL_GROUPS: tuple[TopicGroup, ...] = TopicGroup.__args__  # type: ignore[attr-defined]
+
+Positive = Annotated[int, msgspec.Meta(ge=1)]
+Rate = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class PublishingConfig(NodeConfig):
+    """Settings of what is published.
+
+    Attributes:
+        namespace: Before all topics' names that do not begin with a slash.
+        publish: Which groups of topics are published.
+        topics: Other names for topics, by the name that they would have.
+        time: ``simulated``: stamps count from the run's start, and ``/clock`` gives the time (set
+            ``use_sim_time``). ``wall``: they are shifted to the wall clock, and there is no
+            ``/clock``; with the real clock only.
+        vehicle: Whose truth ``/tf`` shows; if empty, that of all vehicles which are announced.
+            If there are several, their frames begin with the vehicle's name.
+        tf: ``truth``, or the source of the estimates that place ``base_link`` instead.
+        path_rate: Messages a second, at most, of the path of a vehicle or of an estimate.
+        path_step: Metres from one pose of a path to the next.
+        path_length: Poses of a path at most; beyond that, every other is left out and the step
+            doubled, so that a path always reaches back to its start.
+        covariance: Publish estimates as PoseWithCovarianceStamped.
+        raw_images: Publish images as ``Image``.
+        compressed_images: Publish images as ``CompressedImage`` of this format.
+        raw_depth: Publish depth images as ``Image``: in metres (32FC1), or in whole
+            ``millimetres`` up to 65.535 m (16UC1).
+        compressed_depth: Publish depth images as compressed_depth_image_transport does:
+            ``inverse`` depth in 16 bits (32FC1), or whole ``millimetres`` up to 65.535 m (16UC1).
+        depth_max: Metres beyond which ``inverse`` depth is unknown.
+        depth_quantization: Metres near which steps of ``inverse`` depth are a hundredth of the
+            depth; farther away they grow with its square.
+        jpeg_quality: 1 to 100.
+        sensor_qos: ``best_effort`` (as ROS's sensor data) or ``reliable``, for the topics of
+            sensors.
+    """
+
+    namespace: str = "/"
+    publish: tuple[TopicGroup, ...] = ALL_GROUPS
+    topics: dict[str, str] = msgspec.field(default_factory=dict)
+    time: Literal["simulated", "wall"] = "simulated"
+    vehicle: str = ""
+    tf: str = "truth"
+    path_rate: Rate = 2.0
+    path_step: Rate = 0.05
+    path_length: Annotated[int, msgspec.Meta(ge=3, le=1_000_000)] = 1000
+    covariance: bool = False
+    raw_images: bool = True
+    compressed_images: Literal["", "jpeg", "png"] = ""
+    raw_depth: bool | Literal["millimetres"] = True
+    compressed_depth: Literal["", "inverse", "millimetres"] = ""
+    depth_max: Rate = 10.0
+    depth_quantization: Rate = 100.0
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
+    sensor_qos: Literal["best_effort", "reliable"] = "best_effort"
+
+    def __post_init__(self) -> None:
+        if not self.namespace.startswith("/"):
+            raise ValueError(f"namespace: expected a leading slash, found {self.namespace!r}")
+        if self.namespace != "/":
+            check_name("namespace", self.namespace)
+        for given, name in self.topics.items():
+            check_name(f'topics: "{given}"', name)
+
+
+def check_name(where: str, name: str) -> None:
+    """Make sure that ROS allows a name.
+
+    Raises:
+        ValueError: It does not; the message begins with `where`.
+    """
+    try:
+        topic_name("/", name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+SIMULATION = "simulation_interfaces/srv"
+STEPS = "simulation_interfaces/action/SimulateSteps"
+CANCEL_GOAL = "action_msgs/srv/CancelGoal"
+TRIGGER = "std_srvs/srv/Trigger"
+_ID = "unique_identifier_msgs/UUID goal_id\n"
+_STAMP = "builtin_interfaces/Time stamp"
+
+DEFINITIONS = {
+    TRIGGER: "---\nbool success\nstring message",
+    "simulation_interfaces/msg/Result": "uint8 result\nstring error_message",
+    "simulation_interfaces/msg/SimulationState": "uint8 state",
+    "simulation_interfaces/msg/SimulatorFeatures": (
+        "uint16[] features\nstring[] spawn_formats\nstring custom_info"
+    ),
+    f"{SIMULATION}/GetSimulatorFeatures": "---\nSimulatorFeatures features",
+    f"{SIMULATION}/GetSimulationState": "---\nSimulationState state\nResult result",
+    f"{SIMULATION}/SetSimulationState": "SimulationState state\n---\nResult result",
+    f"{SIMULATION}/StepSimulation": "uint64 steps\n---\nResult result",
+    f"{SIMULATION}/ResetSimulation": "uint8 scope\n---\nResult result",
+    f"{STEPS}_Goal": "uint64 steps",
+    f"{STEPS}_Result": "Result result",
+    f"{STEPS}_Feedback": "uint64 completed_steps\nuint64 remaining_steps",
+    f"{STEPS}_FeedbackMessage": f"{_ID}{STEPS}_Feedback feedback",
+    f"{STEPS}_SendGoal": f"{_ID}{STEPS}_Goal goal\n---\nbool accepted\n{_STAMP}",
+    f"{STEPS}_GetResult": f"{_ID}---\nint8 status\n{STEPS}_Result result",
+    CANCEL_GOAL: "GoalInfo goal_info\n---\nint8 return_code\nGoalInfo[] goals_canceling",
+}
+"""By type; request and response of a service are divided by ``---``."""
+
+
+class CameraFrames(msgspec.Struct, frozen=True):
+    """A camera's two frames in ROS (REP 103): ``camera_link`` and ``camera_optical_frame``."""
+
+    link: str
+    optical: str
+
+
+class FrameNames:
+    """Our frames' names and axes, and what ROS calls them.
+
+    Of one vehicle alone, frames have the names of REP 105 (``odom``, ``base_link``). Once there is
+    a second, the vehicle's name stands before those of each: ``drone/odom``, ``drone/base_link``.
+    Whose frame is meant follows from the source: ``drone/camera`` is of ``drone``.
+    """
+
+    def __init__(self) -> None:
+        self._cameras: dict[str, tuple[str, str]] = {}
+        """Optical frame to the camera's source and its own name."""
+        self.own: set[str] = set()
+        """Frames whose names say already whose they are: ROS calls them the same."""
+        self.vehicles = Vehicles()
+        """Whose frames are distinguished."""
+
+    def add(self, camera: CameraAnnouncement) -> CameraFrames:
+        """Add a camera: its frames have its own name, or its vehicle's too if that is taken."""
+        self.vehicles.announced(camera)
+        if camera.frame_id not in self._cameras:
+            name = ros_name(camera.source.rpartition("/")[2])
+            if any(known == name for _, known in self._cameras.values()):
+                name = ros_name(camera.source).replace("/", "_")
+            self._cameras[camera.frame_id] = (camera.source, name)
+        found = self.camera(camera.frame_id)
+        assert found is not None
+        return found
+
+    def camera(self, frame_id: str) -> CameraFrames | None:
+        """Return the frames of the camera with this optical frame, if there is one."""
+        known = self._cameras.get(frame_id)
+        if known is None:
+            return None
+        source, name = known
+        prefix = ""
+        if len(self.vehicles.names) > 1 and (vehicle := self.vehicles.carrier(source)):
+            prefix, name = f"{ros_name(vehicle)}/", ros_name(source.rpartition("/")[2])
+        return CameraFrames(f"{prefix}{name}_link", f"{prefix}{name}_optical_frame")
+
+    def name(self, frame_id: str, source: str = "") -> str:
+        """Return what ROS calls a frame that a source names."""
+        if frame_id == "map" or frame_id in self.own:
+            return frame_id
+        camera = self.camera(frame_id)
+        if camera is not None:
+            return camera.optical
+        vehicle = self.vehicles.of(source)
+        own = frame_id.removeprefix(f"{vehicle}/")  # ``drone/lidar``, which names it already
+        return f"{ros_name(vehicle)}/{own}" if len(self.vehicles.names) > 1 else own
+
+    def axes(self, frame_id: str) -> Axes:
+        """Return how a frame's axes lie."""
+        return "optical" if frame_id in self._cameras else axes_of(frame_id)

@@ -18,12 +18,10 @@ from events import (
     TransformStamped,
     VehicleAnnouncement,
 )
-from events.frames import OPTICAL_TO_FLU, Axes, convert_rotation, convert_vector
-from events.poses import Pose, relative
-from events.rotations import inverse, multiply
-from nodes.ros2.messages.frame_names import FrameNames
+from events.frames import OPTICAL_TO_FLU, Axes, convert_rotation, convert_vector, inverse, multiply
+from events.geometry import Pose, relative
 from nodes.ros2.messages.messages import Transform
-from nodes.ros2.messages.topics import ros_name
+from nodes.ros2.messages.topics import FrameNames, ros_name
 
 _LINK_IN_OPTICAL = inverse(OPTICAL_TO_FLU)
 

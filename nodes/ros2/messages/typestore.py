@@ -2,20 +2,35 @@
 
 Messages are objects of the classes that rosbags makes from the types' definitions; their fields
 have the names in ROS's files.
+
+What a user's own mapping from events to messages is given: it builds messages of any type.
+
+A mapping is called with the event and a `MessageBuilder`::
+
+    def battery(event: Battery, builder: MessageBuilder) -> Any:
+        return builder.make(
+            "sensor_msgs/msg/BatteryState",
+            header=builder.header(event.stamp, "base_link", event.source),
+            percentage=event.percentage,
+        )
+
+Times: nanoseconds of the run's clock to seconds and nanoseconds of a ROS message, and back.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
-from nodes.ros2.messages.topics import NO_HASH, dds_type
+from nodes.ros2.messages.topics import NO_HASH, FrameNames, dds_type
 from runtime.errors import MissingDependencyError, suggest
 from runtime.extras import install_command
+from runtime.time.schedule import SECOND
 
 Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 
@@ -241,7 +256,6 @@ class Bag:
         """Yield topic, type, time of receipt (ns) and message, in the order of receipt.
 
         Args:
-            topics: Which.
             start: Messages received before it (ns) are left out.
             stop: So are those received at it and after.
             newest: Only the last of all; no other is decoded.
@@ -263,3 +277,90 @@ class Bag:
     def close(self) -> None:
         """Close it."""
         self._reader.close()
+
+
+AHEAD = SECOND
+"""How far ahead of the run's clock a stamp from outside may be (ns)."""
+
+Time = tuple[int, int]
+"""The time in a message: seconds and nanoseconds."""
+
+
+class Stamps(msgspec.Struct, frozen=True):
+    """Converts stamps of the run's clock to times in messages, and back.
+
+    Attributes:
+        offset: Nanoseconds to add on the way out.
+    """
+
+    offset: int = 0
+
+    def out(self, stamp: int) -> Time:
+        """Return the seconds and nanoseconds of a stamp."""
+        return divmod(stamp + self.offset, SECOND)
+
+    def stamp(self, seconds: int, nanoseconds: int) -> int:
+        """Return a message's time on the run's clock (ns), whether it is one of the run or not."""
+        return int(seconds) * SECOND + int(nanoseconds) - self.offset
+
+    def back(self, seconds: int, nanoseconds: int, now: int) -> int:
+        """Return a message's time on the run's clock (ns).
+
+        Args:
+            seconds: Of the message; both 0 stand for now.
+            now: On the run's clock (ns).
+
+        Raises:
+            ValueError: It lies before the run, or ahead of its clock.
+        """
+        if seconds == 0 and nanoseconds == 0:
+            return now
+        stamp = self.stamp(seconds, nanoseconds)
+        if not 0 <= stamp <= now + AHEAD:
+            raise ValueError(
+                f"stamp: expected a time of this run, from 0 s to {now / SECOND:.3f} s, "
+                f"found {stamp / SECOND:.3f} s"
+            )
+        return stamp
+
+
+class MessageBuilder:
+    """Builds messages.
+
+    Args:
+        names: What ROS calls our frames.
+        time: Returns the time in messages of a stamp (ns).
+    """
+
+    def __init__(self, store: TypeStore, names: FrameNames, time: Callable[[int], Time]) -> None:
+        self._store = store
+        self._names = names
+        self._time = time
+
+    def make(self, type_: str, **fields: Any) -> Any:
+        """Return a message; fields that are not given are zero, empty or false.
+
+        Raises:
+            ValueError: There is no such type.
+            TypeError: It has no such field.
+        """
+        message = self._store.zero(type_)
+        for name, value in fields.items():
+            if not hasattr(message, name):
+                raise TypeError(f"{type_} has no field {name!r}")
+            setattr(message, name, value)
+        return message
+
+    def stamp(self, stamp: int) -> Any:
+        """Return the ``builtin_interfaces/msg/Time`` of a stamp (ns)."""
+        sec, nanosec = self._time(stamp)
+        return self._store.message("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
+
+    def header(self, stamp: int, frame_id: str, source: str = "") -> Any:
+        """Return a ``std_msgs/msg/Header``.
+
+        Args:
+            stamp: Nanoseconds of the run's clock.
+            source: Whose frame it is: each of several vehicles has its own ``base_link``.
+        """
+        return self._store.header(self._time(stamp), self._names.name(frame_id, source))

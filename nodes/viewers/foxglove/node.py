@@ -16,10 +16,9 @@ from events import (
     PointCloud,
     TrackedFeatures,
 )
-from nodes.viewers.common.selection import ImageSelection
+from nodes.viewers.common import ImageSelection
 from nodes.viewers.foxglove.publishing import LARGE, SMALL, Publishing
-from nodes.viewers.foxglove.server import Server
-from nodes.viewers.foxglove.settings import FoxgloveConfig
+from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 from runtime import Node, Stream, Tick, every, on
 from runtime.errors import MissingDependencyError, VisnavError
 

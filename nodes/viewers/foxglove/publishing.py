@@ -29,20 +29,23 @@ from events import (
     VehicleEvent,
 )
 from events.frames import convert_vector
-from events.poses import Pose
+from events.geometry import Pose
 from nodes.ros2.messages import publishing as ros
-from nodes.ros2.messages.settings import ALL_GROUPS, PublishingConfig
-from nodes.ros2.messages.stamps import Stamps
-from nodes.ros2.messages.topics import ros_name
-from nodes.ros2.messages.typestore import TypeStore
+from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, ros_name
+from nodes.ros2.messages.typestore import Stamps, TypeStore
 from nodes.trajectory import RecentPoses
-from nodes.viewers.common.appearance import PLAN, Colour, estimate_colour, moving_body, truth_colour
-from nodes.viewers.common.paths import Trail, estimate_frame
-from nodes.viewers.common.selection import PlanSelection
-from nodes.viewers.foxglove.messages import Messages
-from nodes.viewers.foxglove.ros_topics import RosTopic, RosTopics
-from nodes.viewers.foxglove.server import Server
-from nodes.viewers.foxglove.settings import FoxgloveConfig
+from nodes.viewers.common import (
+    PLAN,
+    Colour,
+    PlanSelection,
+    Trail,
+    estimate_colour,
+    estimate_frame,
+    moving_body,
+    truth_colour,
+)
+from nodes.viewers.foxglove.messages import Messages, RosTopic, RosTopics
+from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 
 LARGE: tuple[type[Event], ...] = (
     *(kind for kind in ros.LARGE if kind is not SegmentationImage),

@@ -2,18 +2,217 @@
 
 The server has threads of its own. To make and log a small message takes about 4 µs where nobody
 looks, and 30 µs where somebody does (most of it to wake such a thread): done on the loop.
+
+The door of the server: who may come in is decided here, before a viewer meets the library.
+
+The library takes every WebSocket, and a browser opens one for any page that asks. So the library
+listens on an address of this machine that nobody can guess (one of the 16 million of 127.0.0.0/8),
+and this gate on the port that is known: it reads each viewer's first request, and then passes bytes
+in both directions, in threads that hold no lock of Python's while they wait.
+
+The server's settings in a run's file.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ipaddress
+import secrets
+import socket
 import threading
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Collection
+from typing import Annotated, Any
 
-from nodes.viewers.foxglove.gate import Gate, hidden_host
-from nodes.viewers.foxglove.settings import FoxgloveConfig
+import msgspec
+
+from runtime import NodeConfig
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.extras import install_command
+from runtime.tools.monitor.client import LONGEST_HEAD, HttpError, host_of, parse_head, response
+
+MOST = 64
+"""Viewers at a time, those included that have yet to send their request."""
+
+_HEAD_TIMEOUT = 10.0
+"""Real seconds in which a viewer has to send its request."""
+
+_PART = 1 << 16
+
+
+def hidden_host() -> str:
+    """Return an address of this machine that no page can guess."""
+    return str(ipaddress.IPv4Address((127 << 24) + 2 + secrets.randbelow((1 << 24) - 4)))
+
+
+class Gate:
+    """Lets in viewers of the right origin, and passes bytes between them and the server.
+
+    Args:
+        port: The same; 0 for any that is free.
+        origins: Pages that may connect. Programs that are no browsers name none, and may.
+        refused: Called, in a thread, with why somebody was not let in.
+
+    Raises:
+        OSError: It cannot listen there.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        inside: tuple[str, int],
+        origins: Collection[str],
+        refused: Callable[[str], None],
+    ) -> None:
+        self._inside = inside
+        self._origins = origins
+        self._refused = refused
+        self._lock = threading.Lock()
+        self._open: set[socket.socket] = set()
+        self._closed = False
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._listener = socket.create_server((host, port), family=family)
+        self.port = int(self._listener.getsockname()[1])
+        threading.Thread(target=self._listen, name="foxglove gate", daemon=True).start()
+
+    def close(self) -> None:
+        """Let nobody in any more, and end all connections."""
+        with self._lock:
+            self._closed = True
+            open_ = [self._listener, *self._open]
+        for each in open_:
+            _shut(each)
+        self._listener.close()
+
+    def check(self, head: str) -> None:
+        """Look at a viewer's request.
+
+        Raises:
+            HttpError: It may not come in; the text says why.
+        """
+        _, _, headers = parse_head(head)
+        host = host_of(headers)
+        try:
+            ipaddress.ip_address(host)
+        except ValueError:
+            # A page can give this machine's address a name of its own, and then it is its origin.
+            if host not in {"localhost", socket.gethostname()}:
+                raise HttpError(
+                    403, f"expected a request to an address or localhost, found {host!r:.80}"
+                ) from None
+        origin = headers.get("origin")
+        if origin is not None and origin not in self._origins:
+            raise HttpError(
+                403, f"expected a page that origins names in the run's file, found {origin!r:.80}"
+            )
+
+    def _listen(self) -> None:
+        while True:
+            try:
+                viewer, _ = self._listener.accept()
+            except OSError:
+                if self._closed:
+                    return
+                continue
+            if self._holds(viewer):
+                threading.Thread(target=self._serve, args=(viewer,), daemon=True).start()
+            else:
+                viewer.close()
+
+    def _holds(self, connection: socket.socket) -> bool:
+        """Note a connection; tell whether there is room for it."""
+        with self._lock:
+            if self._closed or len(self._open) >= 2 * MOST:
+                return False
+            self._open.add(connection)
+            return True
+
+    def _serve(self, viewer: socket.socket) -> None:
+        server = socket.socket()
+        try:
+            viewer.settimeout(_HEAD_TIMEOUT)
+            try:
+                head, rest = _read_head(viewer)
+                self.check(head.decode("latin-1"))
+            except HttpError as error:
+                self._refused(error.text)
+                viewer.sendall(response(error.status, f"{error.text}\n".encode()))
+                return
+            viewer.settimeout(None)
+            if not self._holds(server):
+                return
+            server.connect(self._inside)
+            for each in (viewer, server):
+                each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
+            server.sendall(head + rest)
+            back = threading.Thread(target=_pass_on, args=(server, viewer), daemon=True)
+            back.start()
+            _pass_on(viewer, server)
+            back.join()
+        except OSError:
+            pass
+        finally:
+            for each in (viewer, server):
+                with self._lock:
+                    self._open.discard(each)
+                each.close()
+
+
+def _read_head(viewer: socket.socket) -> tuple[bytes, bytes]:
+    """Return a request up to its empty line, and what has come after it."""
+    data = b""
+    while b"\r\n\r\n" not in data:
+        if len(data) > LONGEST_HEAD:
+            raise HttpError(413, "expected a shorter request")
+        part = viewer.recv(_PART)
+        if not part:
+            raise OSError("gone")
+        data += part
+    end = data.index(b"\r\n\r\n") + 4
+    return data[:end], data[end:]
+
+
+def _pass_on(source: socket.socket, target: socket.socket) -> None:
+    """Pass on what comes until either is at its end, and then end both."""
+    buffer = memoryview(bytearray(_PART))
+    with contextlib.suppress(OSError):
+        while count := source.recv_into(buffer):
+            target.sendall(buffer[:count])
+    _shut(source)
+    _shut(target)
+
+
+def _shut(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+class FoxgloveConfig(NodeConfig):
+    """Settings of the server.
+
+    Attributes:
+        host: Where it listens. Whoever reaches it can see the run, except pages of other origins;
+            hence this machine only, unless the file says otherwise.
+        port: The same; 0: any that is free (the log has it).
+        origins: Pages that may connect, as browsers name them: Foxglove's own, in a browser and
+            as a program. What is no browser needs none.
+        image_rate: Images a second of each camera, on the run's clock; of a set (colours,
+            depth) all or none. 0: no images.
+        jpeg_quality: 1 to 100; 0: images as they are.
+        depth: Whether to show depth images, in millimetres.
+        clock_rate: How often a second viewers get the run's time.
+        backlog: Messages that wait for a viewer that is slow; the oldest is dropped.
+    """
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 8765
+    origins: tuple[str, ...] = ("https://app.foxglove.dev", "file://")
+    image_rate: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 15.0
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=0, le=100)] = 80
+    depth: bool = True
+    clock_rate: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 50.0
+    backlog: Annotated[int, msgspec.Meta(ge=1)] = 1024
+
 
 Make = Callable[[], Any]
 """Returns a message."""
@@ -26,8 +225,6 @@ class Server:
     """A WebSocket server (``foxglove.sdk.v1``) and its topics.
 
     Args:
-        config: Where to listen.
-        name: As viewers show it.
         refused: Called, in a thread, with why somebody was not let in.
 
     Raises:

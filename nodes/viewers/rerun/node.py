@@ -22,12 +22,12 @@ from events import (
     TrackingEvent,
     VehicleEvent,
 )
-from events.measurements import MEASURED
-from nodes.trajectory.growing import part_name
-from nodes.viewers.common.selection import ImageSelection
+from events.sensors import MEASURED
+from nodes.trajectory.table import part_name
+from nodes.viewers.common import ImageSelection
 from nodes.viewers.rerun.entities import Numbered
 from nodes.viewers.rerun.recorder import Recorder
-from nodes.viewers.rerun.settings import RerunConfig
+from nodes.viewers.rerun.sdk import RerunConfig
 from runtime import Node, Stream, on
 
 _LARGE, _SMALL = 256, 16384

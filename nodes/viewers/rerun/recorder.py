@@ -40,11 +40,9 @@ from events import (
     VehicleEvent,
     Wind,
 )
-from nodes.viewers.rerun.entities import EntityLog, Numbered
-from nodes.viewers.rerun.layout import Contents, Eye, layout
+from nodes.viewers.rerun.entities import Contents, EntityLog, Eye, Numbered, layout
 from nodes.viewers.rerun.plots import GROUPS, PLOTS, Plots
-from nodes.viewers.rerun.sdk import Viewer, load
-from nodes.viewers.rerun.settings import RerunConfig
+from nodes.viewers.rerun.sdk import RerunConfig, Viewer, load
 from nodes.viewers.rerun.world import World
 
 _GATHERED = 500
@@ -68,7 +66,6 @@ class Recorder:
     """One recording.
 
     Args:
-        config: The node's settings.
         name: Of the run, as the viewer lists it.
         file: To write, in mode ``save``.
 

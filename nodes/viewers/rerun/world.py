@@ -26,26 +26,27 @@ from events import (
     Vector3,
     Wind,
 )
-from nodes.ros2.messages.encoding import depth_in_steps, encode_depth, encode_image
+from nodes.ros2.messages.images import depth_in_steps, encode_depth, encode_image
 from nodes.trajectory import RecentPoses
 from nodes.vehicles import Vehicles
-from nodes.viewers.common.appearance import (
+from nodes.viewers.common import (
     INLIER,
     OUTLIER,
     PLAN,
     VEHICLE,
     WIND,
     Colour,
+    PathPieces,
+    PlanSelection,
     estimate_colour,
+    estimate_frame,
     moving_body,
     truth_colour,
 )
-from nodes.viewers.common.paths import PathPieces, estimate_frame
-from nodes.viewers.common.selection import PlanSelection
 from nodes.viewers.rerun import entities
 from nodes.viewers.rerun.entities import EntityLog, Numbered
-from nodes.viewers.rerun.scene_points import ScenePoints
-from nodes.viewers.rerun.settings import RerunConfig
+from nodes.viewers.rerun.plots import ScenePoints
+from nodes.viewers.rerun.sdk import RerunConfig
 
 CENTIMETRES = 100.0
 """Steps of a depth image per metre. Finer ones would show noise, which makes files large."""

@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from runtime.config.plugins import COMMANDS, OURS, Offer, offers
 from runtime.errors import CommandError, ConfigError, suggest
-from runtime.tools.cli.common import warn
+from runtime.tools.cli.tables import warn
 
 
 class Commands(TyperGroup):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from runtime.tools.cli.common import Overrides
+from runtime.tools.cli.tables import Overrides
 
 INSTALLED = Path(__file__).parents[1] / "example_files"
 CHECKOUT = Path(__file__).parents[3]

@@ -24,10 +24,8 @@ class Observers:
     """The observers of one run.
 
     Args:
-        settings: Of the run.
         name: By which to find it: the run's, and more if it is one process of several.
         quiet: Whether there is to be no progress bar.
-        trace: Where to write a trace.
         top: Whether to show the monitor's screen in this terminal.
         web: Port on which to show it as a page.
 
@@ -49,7 +47,7 @@ class Observers:
         from rich.console import Console
 
         from runtime.logs import terminal_handler
-        from runtime.tools.cli.progress import progress
+        from runtime.tools.cli.tables import progress
         from runtime.tools.monitor.observer import LastRecords
 
         records = LastRecords()

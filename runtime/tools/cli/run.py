@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from runtime.tools.cli.common import ConfigFile, Overrides, warn
+from runtime.tools.cli.tables import ConfigFile, Overrides, warn
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -221,7 +221,6 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
     """End the process, even if work of a node never returns; Python would wait for it.
 
     Args:
-        code: The exit code.
         last: Printed at the end, to standard error.
     """
     from runtime.run import event_loop

@@ -1,4 +1,7 @@
-"""``sweep``: from a file and what to vary to tables and plots."""
+"""``sweep``: from a file and what to vary to tables and plots.
+
+``flights``: what is kept of recorded flights.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from runtime.tools.cli.common import ConfigFile, Overrides
+from runtime.tools.cli.tables import ConfigFile, Overrides
 
 if TYPE_CHECKING:
     from runtime.tools.sweep import Children, Plan, Row
+from datetime import datetime
 
 _WIDTH = 240
 """Of the table where there is no terminal, in letters; 80 would break its words."""
@@ -112,10 +116,8 @@ def carry_out(plan: Plan, *, jobs: int | None = None, fresh: bool = False) -> li
     """Run what a plan lacks on this machine, and show how it gets on.
 
     Args:
-        plan: What to run.
         jobs: Runs at the same time; if not given, as many as there are cores if they share their
             flights, else half of that.
-        fresh: Forget what is finished.
 
     Raises:
         typer.Exit: With 130, after Ctrl-C or another signal that ends it.
@@ -177,3 +179,29 @@ def _seconds(duration: str | None) -> float | None:
         return None if duration is None else float(Duration.parse(duration))
     except ValueError as error:
         raise ConfigError(f"--timeout {duration}: {error}") from None
+
+
+def flights(
+    keep: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="GB", help="Remove those not used for longest beyond this."),
+    ] = None,
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all of them.")] = False,
+) -> None:
+    """Show the flights that sweeps have recorded, or remove some.
+
+    A sweep flies once what several of its runs have in common, and keeps it for later ones: up to
+    20 GB, or as many as VISNAV_FLIGHTS_GB says. What a flight depends on is a part of its name, so
+    one that no longer fits is not used, and goes when it was not used for longest.
+    """
+    from runtime.tools.flights.cache import home, kept, remove_beyond
+
+    if clear or keep is not None:
+        removed = remove_beyond(0.0 if clear or keep is None else keep)
+        gigabytes = sum(each.size for each in removed) / 1e9
+        print(f"{len(removed)} flights removed, {gigabytes:.2f} GB")
+    found = kept()
+    for each in found:
+        used = datetime.fromtimestamp(each.used).strftime("%Y-%m-%d %H:%M")
+        print(f"{each.path.stem}  {each.size / 1e9:7.2f} GB  used {used}")
+    print(f"{len(found)} flights, {sum(each.size for each in found) / 1e9:.2f} GB in {home()}")

@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 from runtime.config.model import Config
 from runtime.errors import VisnavError
 from runtime.node import Node
-from runtime.tools.flights.layout import opened
-from runtime.tools.flights.part import content_key, flight_of
-from runtime.tools.flights.player import stand_ins
+from runtime.tools.flights.player import opened, stand_ins
+from runtime.tools.flights.recorder import content_key, flight_of
 from runtime.tools.flights.recorder import record as fly
 
 _LOG = logging.getLogger("visnav.flights")
@@ -41,7 +40,6 @@ def recorded(config: Config, *, record: bool) -> dict[str, type[Node[Any]]]:
     """Return nodes that play the flight of a file in the place of those that fly it.
 
     Args:
-        config: Of the run.
         record: Whether to fly it, if it is not kept; this takes as long as the flight alone.
 
     Returns:

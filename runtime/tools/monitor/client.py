@@ -1,14 +1,26 @@
-"""A client of a run's monitor: snapshots in, commands out."""
+"""A client of a run's monitor: snapshots in, commands out.
+
+Where runs listen: each at a Unix socket, in a folder that only its user can enter.
+
+The part of HTTP that a page on this machine needs: a request, a response, server-sent events.
+
+Protocols: RFC 9112 (HTTP/1.1); "Server-sent events" in the HTML standard.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
+import os
+import re
 import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import parse_qs, urlsplit
 
-from runtime.errors import CommandError
+from runtime.errors import CommandError, suggest
+from runtime.paths import user_folder
 from runtime.tools.monitor.command import (
     LONGEST_LINE,
     UNREADABLE,
@@ -145,3 +157,196 @@ def _run_over(number: int) -> Answer:
 def _not_listening(path: Path, error: Exception) -> CommandError:
     reason = getattr(error, "strerror", None) or "it ended"
     return CommandError(f"expected a run that listens at {path}: {reason}")
+
+
+_LONGEST = 100
+"""Bytes of a Unix socket's path at most (108 on Linux, 104 elsewhere)."""
+
+
+def socket_of(run: str) -> Path:
+    """Return the path of the socket for a run of this process.
+
+    Raises:
+        CommandError: The folder cannot be used, or others could enter it.
+    """
+    place, end = user_folder(), f"-{os.getpid()}.sock"
+    for other in place.glob("*.sock"):  # what killed runs have left is removed
+        _answers(other)
+    name = re.sub(r"[^\w.-]", "_", run)
+    room = _LONGEST - len(os.fsencode(place)) - 1 - len(end)
+    short = os.fsencode(name)[: max(room, 1)].decode(errors="ignore")
+    return place / f"{short}{end}"
+
+
+def runs() -> dict[str, Path]:
+    """Return the runs that listen now, by name; ``name-process`` where two have the same name."""
+    listening = [path for path in sorted(user_folder().glob("*.sock")) if _answers(path)]
+    names = [path.stem.rpartition("-")[0] for path in listening]
+    return {
+        path.stem if names.count(name) > 1 else name: path
+        for name, path in zip(names, listening, strict=True)
+    }
+
+
+def find(run: str | None) -> Path:
+    """Return the path of a run's socket.
+
+    Args:
+        run: Its name, ``name-process`` if there are two, or the path of its socket; `None` if
+            there is only one.
+
+    Raises:
+        CommandError: There is no such run, no run at all, or several without a name given.
+    """
+    if run is not None and run.endswith(".sock"):
+        return Path(run)
+    found = runs()
+    listed = ", ".join(found)
+    if not found:
+        raise CommandError("expected a run to look at, found none that goes on")
+    if run is None and len(found) > 1:
+        raise CommandError(f"expected the name of one of several runs: {listed}")
+    if run is not None and run not in found:
+        raise CommandError(f"expected one of {listed}; found {run!r}{suggest(run, found)}")
+    return found[run] if run is not None else next(iter(found.values()))
+
+
+def _answers(path: Path) -> bool:
+    """Tell whether a run listens at a socket; remove one that a killed run has left."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            if path.is_socket():  # of a file, a connection is refused as well
+                path.unlink(missing_ok=True)
+            return False
+        except OSError:
+            return False
+    return True
+
+
+LONGEST_HEAD = 16 << 10
+LONGEST_BODY = 64 << 10
+"""Bytes of a request at most."""
+
+_REASONS = {
+    200: "OK",
+    400: "Bad Request",
+    403: "Forbidden",
+    404: "Not Found",
+    405: "Method Not Allowed",
+    413: "Content Too Large",
+    503: "Service Unavailable",
+}
+
+
+class HttpError(Exception):
+    """A request that cannot be served."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+        self.text = text
+
+
+class Request(NamedTuple):
+    """A request; names of headers are in lower case."""
+
+    method: str
+    path: str
+    query: dict[str, str]
+    headers: dict[str, str]
+    body: bytes
+
+
+_ONCE = {"host", "origin", "content-length", "x-token"}
+"""Headers that say who asks, and for what: if there are two, nobody knows which one counts."""
+
+
+def parse_head(head: str) -> tuple[str, str, dict[str, str]]:
+    """Return method, target and headers of a request; names of headers are in lower case.
+
+    Raises:
+        HttpError: It is no request, or has two of a header of which there may be one.
+    """
+    first, *lines = head.split("\r\n")
+    parts = first.split(" ")
+    if len(parts) != 3 or not parts[2].startswith("HTTP/1."):
+        raise HttpError(400, "expected a request of HTTP/1.1")
+    headers: dict[str, str] = {}
+    for line in lines:
+        name, colon, value = line.partition(":")
+        name = name.strip().lower()
+        if colon and name in _ONCE and name in headers:
+            raise HttpError(400, f"expected one header {name}, found two")
+        if colon:
+            headers[name] = value.strip()
+    return parts[0], parts[1], headers
+
+
+def host_of(headers: dict[str, str]) -> str:
+    """Return the host that a request is for, without its port; empty if it names none."""
+    host = headers.get("host", "")
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.partition(":")[0]
+
+
+async def read_request(reader: asyncio.StreamReader) -> Request:
+    """Read one request.
+
+    Raises:
+        HttpError: It is none, or too long.
+        EOFError: The other side went.
+    """
+    try:
+        head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+    except asyncio.LimitOverrunError:
+        raise HttpError(413, "expected a shorter request") from None
+    method, target, headers = parse_head(head)
+    try:
+        url = urlsplit(target)
+    except ValueError as error:
+        raise HttpError(400, f"expected an address: {error}") from None
+    query = {key: values[0] for key, values in parse_qs(url.query).items()}
+    length = headers.get("content-length", "0")
+    if not length.isascii() or not length.isdigit():
+        raise HttpError(400, "expected a length")
+    if len(length) > 9 or int(length) > LONGEST_BODY:
+        raise HttpError(413, f"expected at most {LONGEST_BODY} bytes")
+    return Request(method, url.path, query, headers, await reader.readexactly(int(length)))
+
+
+def response(
+    status: int, content: bytes, kind: str = "text/plain; charset=utf-8", **headers: str
+) -> bytes:
+    """Return a response, after which the connection is closed.
+
+    Args:
+        content: Its body.
+        headers: Others, with ``_`` for ``-``.
+    """
+    return _head(status, kind, {"content-length": str(len(content)), **headers}) + content
+
+
+def event_stream() -> bytes:
+    """Return what begins a stream of server-sent events."""
+    return _head(200, "text/event-stream", {})
+
+
+def server_sent(data: bytes) -> bytes:
+    """Return an event of a stream; `data` is one line."""
+    return b"data: " + data + b"\n\n"
+
+
+def _head(status: int, kind: str, headers: dict[str, str]) -> bytes:
+    lines = [f"HTTP/1.1 {status} {_REASONS[status]}", f"content-type: {kind}"]
+    lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
+    lines += [
+        "cache-control: no-store",
+        "x-content-type-options: nosniff",
+        "referrer-policy: no-referrer",
+        "connection: close",
+    ]
+    return ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")

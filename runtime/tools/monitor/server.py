@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from runtime.errors import CommandError, VisnavError
-from runtime.tools.monitor.address import socket_of
+from runtime.tools.monitor.client import socket_of
 from runtime.tools.monitor.command import (
     LONGEST_COMMAND,
     UNREADABLE,
@@ -31,8 +31,7 @@ from runtime.tools.monitor.command import (
     decode_from_client,
     encode,
 )
-from runtime.tools.monitor.images import ImageEncoder
-from runtime.tools.monitor.observer import Observer, describe
+from runtime.tools.monitor.observer import ImageEncoder, Observer, describe
 
 R = TypeVar("R")
 
@@ -57,7 +56,6 @@ class Server:
     Args:
         observer: Makes snapshots of the run, and carries commands out.
         loop: The run's loop, on which the observer is called.
-        path: Of the socket.
     """
 
     def __init__(self, observer: Observer, loop: asyncio.AbstractEventLoop, path: Path) -> None:

@@ -19,17 +19,9 @@ import jinja2
 import msgspec
 
 from runtime.errors import CommandError, VisnavError
-from runtime.tools.monitor.client import Client
-from runtime.tools.monitor.command import (
-    QUICKEST,
-    SLOWEST,
-    UNREADABLE,
-    Answer,
-    decode_command,
-    encode,
-)
-from runtime.tools.monitor.http import (
+from runtime.tools.monitor.client import (
     LONGEST_HEAD,
+    Client,
     HttpError,
     Request,
     event_stream,
@@ -38,7 +30,15 @@ from runtime.tools.monitor.http import (
     response,
     server_sent,
 )
-from runtime.tools.monitor.rows import COLUMNS, LEFT, RIGHT, aim, headline, is_number, rows
+from runtime.tools.monitor.command import (
+    QUICKEST,
+    SLOWEST,
+    UNREADABLE,
+    Answer,
+    decode_command,
+    encode,
+)
+from runtime.tools.monitor.screen import COLUMNS, LEFT, RIGHT, aim, headline, is_number, rows
 from runtime.tools.monitor.snapshot import Snapshot
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
@@ -51,7 +51,6 @@ class Page:
     """Serves one run's page.
 
     Args:
-        client: The connection to the run.
         token: That an address must have; random if not given.
     """
 
@@ -205,10 +204,8 @@ async def serve(client: Client, port: int, token: str | None = None, leave: bool
     """Serve a run's page until Ctrl-C, or until the run is over.
 
     Args:
-        client: The connection to the run.
         port: On 127.0.0.1; 0 for any that is free.
         token: See `Page`.
-        leave: Whether to end with the run.
 
     Raises:
         OSError: The port is taken.

@@ -24,12 +24,10 @@ ran it unless the sweep's folder is shared. The rows come back in any case.
 """
 
 from runtime.tools.sweep.console import Watch, sweep
-from runtime.tools.sweep.page import write_page
 from runtime.tools.sweep.plan import Job, Plan, make_job, make_plan, sharing
-from runtime.tools.sweep.plots import draw_plots
+from runtime.tools.sweep.plots import draw_plots, write_page
 from runtime.tools.sweep.process import Children, run_job
-from runtime.tools.sweep.rows import Row
-from runtime.tools.sweep.tables import summarise, write_tables
+from runtime.tools.sweep.tables import Row, summarise, write_tables
 
 __all__ = [
     "Children",

@@ -18,8 +18,7 @@ from rich.text import Text
 
 from runtime.tools.sweep.plan import Job, Plan
 from runtime.tools.sweep.process import Children, run_job
-from runtime.tools.sweep.rows import Row, Rows, failed
-from runtime.tools.sweep.tables import MAIN_FIGURES, Combination
+from runtime.tools.sweep.tables import MAIN_FIGURES, Combination, Row, Rows, failed
 
 
 class Watch:
@@ -49,8 +48,6 @@ def sweep(
     next call takes up where it ended. A run that fails is a row with an error.
 
     Args:
-        plan: What to run.
-        executor: Where. Stays open.
         run: Runs one job; must be picklable if the executor needs that.
         watch: Is told how it gets on.
         fresh: Forget rows of earlier sweeps in the same folder.

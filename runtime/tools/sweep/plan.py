@@ -1,21 +1,132 @@
-"""Which runs a sweep consists of, all of them checked before the first one starts."""
+"""Which runs a sweep consists of, all of them checked before the first one starts.
+
+What ``--vary`` says: a setting and its values, and how these lie on an axis.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import tomli_w
 
+from runtime.config.messages import given
 from runtime.config.model import Config, to_builtins
 from runtime.config.reading import load_configuration
 from runtime.errors import ConfigError
-from runtime.tools.flights.part import flight_of, settings_key
-from runtime.tools.sweep.values import Parameter, parameter
+from runtime.tools.flights.recorder import flight_of, settings_key
+from runtime.units import Duration
+
+_CLOSING = {"[": "]", "{": "}"}
+
+
+class Parameter(msgspec.Struct, frozen=True):
+    """A setting that a sweep varies.
+
+    Attributes:
+        path: As in ``--set``: ``camera.rate``.
+        texts: Its values as they were written, each as ``--set`` takes it.
+    """
+
+    path: str
+    texts: tuple[str, ...]
+
+
+class Axis(msgspec.Struct, frozen=True):
+    """Where a parameter's values lie in a plot.
+
+    Attributes:
+        places: One for each value, in the order of the values.
+        unit: Of the places; empty if they have none.
+        words: Whether the values have no place of their own, and just follow one another.
+    """
+
+    places: tuple[float, ...]
+    unit: str = ""
+    words: bool = False
+
+
+def parameter(change: str) -> Parameter:
+    """Read ``PATH=V1,V2,…``.
+
+    Raises:
+        ConfigError: It is something else, or has a value twice.
+    """
+    path, equals, text = change.partition("=")
+    where = f"--vary {change}"
+    if not equals or not path.strip():
+        raise ConfigError(f"{where}: expected PATH=V1,V2,…, found no path with values")
+    texts = split(text, where)
+    for index, one in enumerate(texts):
+        if one in texts[:index]:
+            raise ConfigError(f"{where}: expected different values, found {one} a second time")
+    return Parameter(path.strip(), texts)
+
+
+def split(text: str, where: str) -> tuple[str, ...]:
+    """Split values at the commas that stand outside brackets and quotes.
+
+    A quote opens a text where a value begins; in the middle of a bare word it is a letter.
+
+    Raises:
+        ConfigError: A value is empty, or a bracket or quote is not closed; `where` begins the
+            message.
+    """
+    pieces = [""]
+    expected: list[str] = []  # what closes the brackets and the quote that are open
+    letters = iter(text)
+    for letter in letters:
+        inside = expected[-1] if expected else ""
+        if letter == "," and not expected:
+            pieces.append("")
+            continue
+        pieces[-1] += letter
+        if inside in {'"', "'"}:
+            if letter == inside:
+                expected.pop()
+            elif letter == "\\" and inside == '"':
+                pieces[-1] += next(letters, "")
+        elif letter == inside:
+            expected.pop()
+        elif letter in _CLOSING:
+            expected.append(_CLOSING[letter])
+        elif letter in {'"', "'"} and (expected or pieces[-1].strip() == letter):
+            expected.append(letter)
+    if expected:
+        raise ConfigError(f"{where}: expected a closing {expected[-1]}, found the end")
+    found = tuple(piece.strip() for piece in pieces)
+    if not all(found):
+        raise ConfigError(f'{where}: expected a value between commas, found none ("" is a text)')
+    return found
+
+
+def value(text: str) -> Any:
+    """Return what a text means: its value in TOML, or itself, as for ``--set``."""
+    try:
+        return given(text)
+    except ValueError:  # which reading the settings refuses
+        return text.strip()
+
+
+def axis(texts: Sequence[str]) -> Axis:
+    """Place values on an axis: numbers and durations by size, all else one after another."""
+    values = [value(text) for text in texts]
+    if all(type(v) in {int, float} and math.isfinite(v) for v in values):
+        return Axis(tuple(float(v) for v in values))
+    try:
+        seconds = [Duration.parse(v) for v in values]
+    except ValueError:
+        return Axis(tuple(float(index) for index in range(len(values))), words=True)
+    longest = max(seconds, default=0.0)
+    unit, scale = ("s", 1.0) if longest >= 1 else ("ms", 1e3) if longest >= 1e-3 else ("µs", 1e6)
+    return Axis(tuple(s * scale for s in seconds), unit)
+
 
 LEAST_LIMIT, SLOWEST, USUAL = 600.0, 30.0, 120.0
 """Real seconds that each run may take, and those for each second of its duration, and how long it
@@ -85,7 +196,6 @@ def make_plan(
     """Plan a sweep.
 
     Args:
-        config: The TOML file.
         vary: ``PATH=V1,V2,…``, the paths as in `overrides`.
         overrides: ``node.key=value`` or ``run.key=value``, the same for all runs.
         seeds: How many seeds each combination is run with, from the file's on.
@@ -168,7 +278,6 @@ def make_job(
     Args:
         config: Its settings, but for the seed.
         settings: What tells it from the others, as pairs of name and value.
-        seed: Of its random numbers.
         folder: Where modules of its nodes are looked for.
         out: Absolute path of the sweep's folder.
         repeat: The how manieth run with these settings and this seed.

@@ -21,7 +21,7 @@ import msgspec
 from runtime.channels.digest import combined
 from runtime.run.results import clear
 from runtime.tools.sweep.plan import Job
-from runtime.tools.sweep.rows import Row, failed
+from runtime.tools.sweep.tables import Row, failed
 
 _STOPPED = {"Ctrl-C", "SIGTERM", "SIGHUP"}
 """Reasons for a run's end that are no end of its own; see `runtime.run.execute`."""
@@ -190,7 +190,6 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
     """Put together the row of a process that has ended.
 
     Args:
-        job: What it ran.
         code: Its exit code: 0, or 1 if it missed a threshold; all else is a failure, and so is
             a 1 without a verdict, which is what Python ends with after an exception.
         wall_seconds: How long it took.

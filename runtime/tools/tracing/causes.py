@@ -89,7 +89,6 @@ class Causes:
     """Infers the cause of each event, one by one in the order of sending.
 
     Args:
-        kinds: What is known of types of events.
         receivers: The nodes that receive events of a sender, type and source.
     """
 
@@ -121,9 +120,6 @@ class Causes:
             time: Of sending, real time (ns).
             run: Of sending, the run's clock (ns).
             sender: ``node.port``.
-            event: Its type.
-            source: Its source.
-            stamp: Its stamp.
             identity: Its `id`.
             given: The `id` of the event that the step which sent it was handling; 0 if none.
         """

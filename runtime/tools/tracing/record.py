@@ -19,8 +19,7 @@ from runtime.channels.sender import Sender, Tap
 from runtime.errors import ConfigError
 from runtime.run.instruments import Call, Instrument
 from runtime.run.supervisor import Supervisor
-from runtime.time.clock import Clock
-from runtime.time.real_clock import RealClock
+from runtime.time.clock import Clock, RealClock
 from runtime.tools.tracing.spool import CHUNK, ClockRate, Spool
 from runtime.tools.tracing.write import write_trace
 
@@ -43,7 +42,6 @@ class TraceInstrument(Instrument):
     was given, or 0.
 
     Args:
-        clock: The run's clock.
         spool: Takes the notes, a list at a time.
     """
 
@@ -144,7 +142,6 @@ def tracing(supervisor: Supervisor, path: Path, name: str) -> Iterator[None]:
     Args:
         supervisor: Of the run; nothing has been sent yet.
         path: Of the trace; compressed if it ends with ``.gz``.
-        name: Of the run.
 
     Raises:
         ConfigError: There can be no such file.

@@ -6,8 +6,7 @@ All raise `ValueError` if a number is not finite, or a rotation is none.
 from __future__ import annotations
 
 from events import Collision, Imu, Odometry, PoseStamped, Quaternion, Vector3
-from events.frames import OPTICAL_TO_FRD
-from events.rotations import multiply, normalize, rotate, rotate_inverse
+from events.frames import OPTICAL_TO_FRD, multiply, normalize, rotate, rotate_inverse
 from sims.airsim.structures import CollisionInfo, ImuData, MultirotorState, Pose, Vector3r
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import events as ev
-from events.rotations import rotate, yaw_of
+from events.frames import rotate, yaw_of
 from sims.airsim.client.calls import Calls
 from sims.airsim.client.rpc import RpcCallError
 from sims.airsim.structures import YawMode

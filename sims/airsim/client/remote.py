@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 import events as ev
-from events.frames import OPTICAL_TO_FRD
-from events.rotations import inverse, multiply, normalize, rotate_inverse
+from events.frames import OPTICAL_TO_FRD, inverse, multiply, normalize, rotate_inverse
 from runtime.errors import ConfigError
 from sims.airsim import settings
 from sims.airsim.client.conversion import odometry, pose_of, vector

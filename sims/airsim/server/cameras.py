@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events.base import Vector3
-from events.frames import flip_yz, flip_yz_rotation
-from events.rotations import from_rpy, multiply, normalize, rotate
+from events.frames import flip_yz, flip_yz_rotation, from_rpy, multiply, normalize, rotate
 from sims.airsim.server.methods import RpcError, rpc
 from sims.airsim.server.rendering import Eye, Mount
 from sims.airsim.server.vehicles import ServedVehicle

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import astuple
 
 from events import Arm, Disarm, PoseSetpoint, Reset, Teleport, Vector3
-from events.rotations import normalize
+from events.frames import normalize
 from sims.airsim.server.methods import RpcError, rpc
 from sims.airsim.server.vehicles import ServedMultirotor, ServedVehicle
 from sims.airsim.structures import KinematicsState, Pose

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 
 from events import EstimatorAnnouncement, PoseEstimate, Quaternion, Vector3
-from events.rotations import inverse, multiply, normalize, rotate
+from events.frames import inverse, multiply, normalize, rotate
 from sims.airsim.server.methods import RpcError, rpc
 from sims.airsim.structures import Pose
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 
 from events import MotorSetpoint, Vector3
-from events.geodesy import from_geodetic
-from events.rotations import from_yaw, rotate, yaw_of
+from events.frames import from_geodetic, from_yaw, rotate, yaw_of
 from sims.airsim.server import moves
 from sims.airsim.server.carrot import lookahead_of
 from sims.airsim.server.methods import Finite, RpcError, rpc

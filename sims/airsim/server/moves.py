@@ -19,7 +19,7 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
-from events.rotations import from_rpy, yaw_of
+from events.frames import from_rpy, yaw_of
 from sims.airsim.server.carrot import CLOSE, Carrot, braked
 from sims.airsim.server.tasks import RATE, Order, Task
 from sims.vehicle import State, VehicleParameters

@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from events import CameraInfo
 from events.base import Quaternion, Vector3
-from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation
-from events.poses import pose_matrix
-from events.rotations import multiply
+from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation, multiply
+from events.geometry import pose_matrix
 from sims.airsim.server.image_types import OF_DEPTH, OF_NUMBERS, Form, ImageType, Seen, packed
 from sims.cameras.graphics import keep_memory
 from sims.cameras.renderer import model_from_bytes

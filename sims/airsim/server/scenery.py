@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 
 from events import Vector3
-from events.frames import flip_yz
-from events.geodesy import from_geodetic
+from events.frames import flip_yz, from_geodetic
 from sims.airsim.server.methods import rpc
 from sims.airsim.structures import GeoPoint, Vector3r
 from sims.worlds.wind import check_strength

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from events import Announcement, Event, announcements, sensors
-from events.rotations import multiply, rotate
+from events.frames import multiply, rotate
 from sims.airsim import structures, wire
 from sims.airsim.server.methods import Caller, RpcError, rpc
 from sims.airsim.server.vehicles import ServedMultirotor

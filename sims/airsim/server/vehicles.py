@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from events import Vector3
-from events.geodesy import to_geodetic
+from events.frames import to_geodetic
 from sims.airsim.server.methods import RpcError
 from sims.airsim.structures import (
     CollisionInfo,

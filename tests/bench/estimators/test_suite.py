@@ -13,7 +13,7 @@ from bench.estimators.cells import cells
 from bench.estimators.page import write_page
 from bench.estimators.plan import FOLDER, LEVELS, Suite, make_plan, read_suite
 from runtime.errors import CommandError, ConfigError
-from runtime.tools.sweep.rows import Row, failed
+from runtime.tools.sweep.tables import Row, failed
 from tests.runtime.tools.samples_cli import command
 
 SMALL = """

@@ -6,9 +6,8 @@ from typing import Any
 
 from events import CameraAnnouncement, CameraInfo, ImuAnnouncement, Vector3
 from events.camera_info import DistortionModel
-from events.frames import OPTICAL_TO_FRD
-from events.rotations import from_rpy, multiply
-from nodes.data.dataset.rig import Rig
+from events.frames import OPTICAL_TO_FRD, from_rpy, multiply
+from nodes.data.dataset.recording import Rig
 
 IMU = ImuAnnouncement(
     stamp=0,

@@ -16,12 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from events import CameraInfo
-from events.frames import convert_vector
-from events.poses import pose_matrix
-from events.rotations import from_rpy
+from events.frames import convert_vector, from_rpy
+from events.geometry import pose_matrix
 from nodes.calibration.formats import FORMATS, write_files
 from nodes.calibration.readers import READERS, ReadCamera, read
-from nodes.data.dataset.rig import Rig
+from nodes.data.dataset.recording import Rig
 from tests.nodes.calibration.samples import IMU, LENSES, camera, stereo
 
 SAYS = {

@@ -13,13 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from events import CameraAnnouncement, CameraInfo
 from events.camera_info import DistortionModel
-from events.frames import OPTICAL_TO_FRD
-from events.rotations import from_rpy, multiply
+from events.frames import OPTICAL_TO_FRD, from_rpy, multiply
 from nodes.calibration import proofs
 from nodes.calibration.allan import noise, trials, variances
-from nodes.calibration.collector import Motion, _Collector
-from nodes.calibration.room import HIGH, LOW, hits, mjcf, spheres
-from nodes.data.dataset.rig import Rig
+from nodes.calibration.readers import HIGH, LOW, Motion, _Collector, hits, mjcf, spheres
+from nodes.data.dataset.recording import Rig
 from tests.nodes.calibration.flights import ANGLE, flown, true_motion, twist
 from tests.nodes.calibration.samples import IMU, camera
 

@@ -12,8 +12,8 @@ import pytest
 from events import Announcement, CameraAnnouncement, CameraInfo, EstimatorAnnouncement
 from runtime.config.model import Config
 from runtime.config.reading import parse
-from runtime.tools.lint import Finding, lint
-from runtime.tools.lint import rules as all_rules
+from runtime.tools.preflight import Finding, lint
+from runtime.tools.preflight import rules as all_rules
 from tests.nodes.calibration.samples import IMU, camera, stereo
 from tests.nodes.estimators.kiss_icp.test_node import lidar
 from tests.runtime.tools.samples_cli import command

@@ -26,7 +26,7 @@ from events import (
     TrajectoryEstimate,
 )
 from events.camera_info import COEFFICIENTS
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 from nodes.estimators import Estimator, EstimatorConfig
 from nodes.judging.evaluation.alignment import umeyama
 from runtime import Node, on

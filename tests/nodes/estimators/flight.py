@@ -26,7 +26,7 @@ from events import (
     ImuAnnouncement,
     VehicleAnnouncement,
 )
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 from tests.nodes.estimators.monocular_odometry.world import Floats, Grey, Tile, look_with_depth
 
 PERIOD = 50_000_000

@@ -17,7 +17,7 @@ import pytest
 from nodes.estimators.inertial_odometry import RgbdInertialOdometry, StereoInertialOdometry
 from nodes.estimators.monocular_odometry import MonocularOdometry
 from nodes.estimators.orb_slam3 import OrbSlam3
-from nodes.estimators.orb_slam3.vocabulary_file import find_vocabulary
+from nodes.estimators.orb_slam3.vocabulary import find_vocabulary
 from nodes.estimators.stereo_odometry import StereoOdometry
 from nodes.estimators.svo import Svo
 from nodes.estimators.visual_odometry import VisualOdometry

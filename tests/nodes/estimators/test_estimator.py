@@ -31,7 +31,7 @@ from events import (
     TrajectoryEstimate,
     VehicleAnnouncement,
 )
-from events.poses import pose_matrix, pose_tuples
+from events.geometry import pose_matrix, pose_tuples
 from nodes.estimators import Estimator, RgbdFrame, StereoInertialFrame, TrackingResult
 from nodes.judging.evaluation.record import EstimatorRecord
 from runtime import Bundle

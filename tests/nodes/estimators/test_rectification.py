@@ -22,7 +22,7 @@ from events import (
     TrackedFeatures,
 )
 from events.camera_info import DistortionModel
-from events.poses import pose_matrix, pose_tuples
+from events.geometry import pose_matrix, pose_tuples
 from nodes.estimators import Estimator, RgbdFrame, StereoFrame, TrackingResult
 from nodes.estimators.rectification import WIDEST, Rectification, misalignment
 from runtime import Bundle

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from events import EstimatorAnnouncement, Odometry, PoseEstimate
-from events.rotations import from_yaw, yaw_of
+from events.frames import from_yaw, yaw_of
 from nodes.estimators.synthetic_odometry import SyntheticOdometry
 from runtime.testing import NodeResult, run_node
 

@@ -11,7 +11,7 @@ import pytest
 
 from events import Odometry
 from nodes.mapping import Mapping
-from nodes.mapping.ply import read_ply
+from nodes.mapping.cloud import read_ply
 from nodes.pilots import WaypointFollower
 from runtime.testing import run_nodes, spec
 from sims.multirotor import Multirotor

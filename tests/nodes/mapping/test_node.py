@@ -21,7 +21,7 @@ from events import (
     PoseStamped,
 )
 from nodes.mapping import Mapping
-from nodes.mapping.ply import read_ply
+from nodes.mapping.cloud import read_ply
 from runtime.errors import NodeError, RefusedError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 

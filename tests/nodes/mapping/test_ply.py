@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.mapping.ply import read_ply, write_ply
+from nodes.mapping.cloud import read_ply, write_ply
 
 POINTS = np.array([[1.5, -2.25, 0.125], [1e-3, 3e4, -7.0], [0.0, 0.0, 0.0]], np.float32)
 COLOURS = np.array([[255, 0, 128], [1, 2, 3], [9, 8, 7]], np.uint8)

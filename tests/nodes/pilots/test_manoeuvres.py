@@ -10,8 +10,16 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from events import PositionSetpoint
-from nodes.pilots.manoeuvres import Excitation, FigureEight, excited, headed, joined
-from nodes.pilots.waypoint_path import Floats, WaypointPath, plan
+from nodes.pilots.waypoint_path import (
+    Excitation,
+    FigureEight,
+    Floats,
+    WaypointPath,
+    excited,
+    headed,
+    joined,
+    plan,
+)
 from runtime import Duration
 from sims.vehicle.clearance import Clearance, trouble_on_path
 from sims.worlds import TOURS

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import pytest
 
-from nodes.trajectory.growing import GrowingFile, part_name
+from nodes.trajectory.table import GrowingFile, part_name
 from runtime import Node, Tick, every
 from runtime.errors import NodeError
 from runtime.testing import run_node, run_nodes, spec

@@ -20,8 +20,8 @@ from runtime.channels.hold import BEHIND, IN_A_ROW, Hold, HoldConfig
 from runtime.errors import MissingAnswerError
 from runtime.summary import OUTSIDE_COLUMNS, OutsideSummary
 from runtime.testing import run_in_lockstep
+from runtime.time.clock import RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.real_clock import RealClock
 from runtime.units import Duration
 
 MS = 1_000_000

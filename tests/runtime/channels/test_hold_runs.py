@@ -13,8 +13,7 @@ import msgspec
 import pytest
 
 from runtime import Duration, Input, Node, NodeConfig, Output
-from runtime.channels.hold import Hold, HoldConfig
-from runtime.channels.owed import Owed
+from runtime.channels.hold import Hold, HoldConfig, Owed
 from runtime.config.model import Config, OnError, RunConfig
 from runtime.errors import VisnavError
 from runtime.run.execute import execute

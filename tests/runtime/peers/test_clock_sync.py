@@ -12,11 +12,10 @@ from typing import Any, cast
 
 import pytest
 
-from runtime.peers.clock_offsets import KEPT, Exchange, Exchanges
 from runtime.peers.clock_sync import LIMIT, ClockFollower, PhaseLockedLoop
-from runtime.peers.member import Member
+from runtime.peers.member import KEPT, Exchange, Exchanges, Member
+from runtime.time.clock import RealClock
 from runtime.time.lockstep import LockstepLoop
-from runtime.time.real_clock import RealClock
 from runtime.time.schedule import SECOND
 from tests.runtime.peers.test_losses import Rig
 
@@ -65,8 +64,8 @@ def followed(
     def ours() -> int:
         return 5 * SECOND + round(loop.now / (1 + ppm * MICRO))
 
-    monkeypatch.setattr("runtime.time.real_clock.time", types.SimpleNamespace(monotonic_ns=ours))
-    monkeypatch.setattr("runtime.time.real_clock.TimerFd", Alarm)
+    monkeypatch.setattr("runtime.time.clock.time", types.SimpleNamespace(monotonic_ns=ours))
+    monkeypatch.setattr("runtime.time.clock.TimerFd", Alarm)
 
     async def main() -> tuple[list[float], float]:
         clock = RealClock(loop)
@@ -111,9 +110,9 @@ def test_what_is_out_of_reach_is_followed_as_quickly_as_may_be(
 def test_a_clock_that_is_steered_goes_on_from_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     real = [1000]
     monkeypatch.setattr(
-        "runtime.time.real_clock.time", types.SimpleNamespace(monotonic_ns=lambda: real[0])
+        "runtime.time.clock.time", types.SimpleNamespace(monotonic_ns=lambda: real[0])
     )
-    monkeypatch.setattr("runtime.time.real_clock.TimerFd", Alarm)
+    monkeypatch.setattr("runtime.time.clock.TimerFd", Alarm)
     clock = RealClock(cast("asyncio.AbstractEventLoop", None), speed=2.0)  # the alarm is ours
     clock.start_at(1000)
     real[0] += SECOND

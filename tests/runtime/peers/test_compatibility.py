@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from runtime.errors import PeerError
-from runtime.peers.compatibility import check_fits, missing, missing_message, what_all_share
+from runtime.peers.handshake import check_fits, missing, missing_message, what_all_share
 from runtime.peers.messages import Hello
 from tests.runtime.peers.samples import Process, settings
 

@@ -114,7 +114,7 @@ def test_one_that_never_hears_that_the_run_has_begun_ends_all(
 def test_the_end_goes_on_without_one_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if its loop stood still, while Zenoh's threads go on."""
     tell = Peers._broadcast_in_order
-    monkeypatch.setattr("runtime.peers.joint_shutdown.SILENCE", 1.0)
+    monkeypatch.setattr("runtime.peers.joint.SILENCE", 1.0)
 
     def mute(peers: Peers, message: Message) -> None:
         if peers._membership.here != ("one",):

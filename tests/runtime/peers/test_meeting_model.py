@@ -16,7 +16,7 @@ from events import Image
 from runtime.channels.sender import Listener
 from runtime.peers.authentication import derive
 from runtime.peers.handshake import Handshakes
-from runtime.peers.joint_start import JointStart
+from runtime.peers.joint import JointStart
 from runtime.peers.messages import FirstUpdate
 from runtime.peers.peers import Peers
 from runtime.peers.waiting import Waiting

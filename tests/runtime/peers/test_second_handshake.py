@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from runtime.errors import PeerError, WireError
-from runtime.peers.joint_start import JointStart
+from runtime.peers.joint import JointStart
 from runtime.peers.membership import Membership
 from runtime.peers.messages import Message
 from runtime.run.execute import execute

@@ -10,7 +10,7 @@ import pytest
 from runtime.config.model import Config, NetworkConfig, to_builtins
 from runtime.config.reading import parse
 from runtime.errors import PeerError
-from runtime.peers.secret import secret_of
+from runtime.peers.authentication import secret_of
 
 LONG = "correct horse battery"
 

@@ -14,8 +14,8 @@ import pytest
 from events import Image
 from runtime.errors import WireError
 from runtime.peers import shared_memory
+from runtime.peers.member import SMALL, Outbox
 from runtime.peers.messages import EventMessage, MemoryMapped, decode
-from runtime.peers.outbox import SMALL, Outbox
 from runtime.peers.shared_memory import Incoming, Outgoing
 from runtime.wire import Packed, pack, unpack
 from runtime.workers.shared_memory import anonymous_file
@@ -171,7 +171,7 @@ def test_images_pass_through_it_if_the_file_says_so(
         return put(outgoing, packed)
 
     monkeypatch.setattr(Outgoing, "put", noted)
-    monkeypatch.setattr("runtime.peers.outbox.SMALL", 4096)  # less than an image of the sample
+    monkeypatch.setattr("runtime.peers.member.SMALL", 4096)  # less than an image of the sample
     config = settings(*THREE, shared=shared)
     one, other = apart(config, "asker", "one,other")
     assert one.outputs == other.outputs

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nodes.estimators.orb_slam3.vocabulary import Vocabulary
-from nodes.estimators.orb_slam3.vocabulary_file import write_vocabulary
-from nodes.mapping.ply import write_ply
+from nodes.estimators.orb_slam3.vocabulary import Vocabulary, write_vocabulary
+from nodes.mapping.cloud import write_ply
 from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError, ResultsError, VisnavError
 from runtime.node import Node

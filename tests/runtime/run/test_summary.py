@@ -14,8 +14,8 @@ import pytest
 from runtime import Duration, Input, Node
 from runtime.config.model import Config, RunConfig
 from runtime.errors import ResultsError
-from runtime.run.environment import command_line, commit
 from runtime.run.execute import execute
+from runtime.run.summarise import command_line, commit
 from runtime.summary import Summary
 from runtime.testing import run_nodes, spec
 from runtime.tools.cli.tables import run_tables

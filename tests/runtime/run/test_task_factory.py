@@ -16,10 +16,11 @@ from runtime.channels.streams import Stream
 from runtime.channels.tasks import Nesting
 from runtime.config.model import RunConfig
 from runtime.errors import UnsupportedInterpreterError
-from runtime.run import task_factory
+from runtime.run import event_loop as task_factory
 from runtime.run.execute import make_loop
 from runtime.testing import run_in_lockstep, spec
-from runtime.time import lockstep, self_test
+from runtime.time import lockstep
+from runtime.time import lockstep as self_test
 from runtime.time.lockstep import LockstepLoop
 from tests.runtime.samples_loop import Camera, Estimator, Pilot, look
 

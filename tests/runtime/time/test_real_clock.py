@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import uvloop
 
-from runtime.time.real_clock import Alarm, LoopAlarm, RealClock, TimerFd
+from runtime.time.clock import Alarm, LoopAlarm, RealClock, TimerFd
 from runtime.time.schedule import Tick, Ticker
 
 MS = 1_000_000
@@ -22,7 +22,7 @@ def test_ticks_and_sleeps_end_in_order_and_never_early(
     alarm: Callable[..., Alarm],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("runtime.time.real_clock.TimerFd", alarm)
+    monkeypatch.setattr("runtime.time.clock.TimerFd", alarm)
 
     async def main() -> tuple[list[Tick], int]:
         clock = RealClock(asyncio.get_running_loop())

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from runtime.errors import CommandError
 from runtime.testing import run_in_lockstep
+from runtime.time.clock import RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.real_clock import RealClock
 from runtime.time.schedule import Once, Ticker
 from runtime.time.stepping import Stepping
 

@@ -13,7 +13,7 @@ import pytest
 
 from runtime import Node
 from runtime.summary import Summary, TickSummary
-from runtime.tools.cli.graph import layers
+from runtime.tools.cli.inspect import layers
 from tests.runtime.tools.samples_cli import ROOT, command, command_here, config_file, summary
 
 pytestmark = pytest.mark.timeout(180)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.judging.report.contents import Facts
+from nodes.judging.report.tables import Facts
 from runtime import Duration, Node
 from runtime.config.model import Config, RunConfig
 from runtime.run.execute import execute

@@ -218,7 +218,7 @@ async def test_what_a_worker_keeps_stays_intact() -> None:
 PARENT = """
 import asyncio, sys, time
 from runtime import Worker
-from runtime.time.real_clock import RealClock
+from runtime.time.clock import RealClock
 from tests.runtime.samples_workers import Plant
 import numpy as np
 async def main():

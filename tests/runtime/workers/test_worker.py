@@ -17,11 +17,11 @@ import pytest
 
 from runtime import Worker
 from runtime.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
-from runtime.run import task_factory
+from runtime.run import event_loop as task_factory
 from runtime.run.node_runner import with_place, wrap
 from runtime.testing import run_in_lockstep
+from runtime.time.clock import RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.time.real_clock import RealClock
 from tests.runtime.samples_workers import Plant, plain
 
 pytestmark = pytest.mark.timeout(30)

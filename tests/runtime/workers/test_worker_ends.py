@@ -16,7 +16,7 @@ import pytest
 from runtime import Node, Worker
 from runtime.errors import WorkerDiedError, WorkerError
 from runtime.testing import spec
-from runtime.time.real_clock import RealClock
+from runtime.time.clock import RealClock
 from tests.runtime.samples_runs import supervise
 from tests.runtime.samples_workers import Plant
 from tests.runtime.workers.test_worker import worker

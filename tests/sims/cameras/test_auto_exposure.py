@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from events import CameraAnnouncement, Image
-from events.photometry import srgb_light
+from events.camera_info import srgb_light
 from runtime.testing import NodeResult, run_node
 from sims.computer_vision import FreeCamera
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from events.rotations import from_rpy, rotate
+from events.frames import from_rpy, rotate
 from sims.cameras import CameraRenderer, Frame, camera_info, pose_to_qpos
 from sims.worlds import TOURS
 from tests.sims.cameras.scenes import ALL, CAMERAS, Scene, scene

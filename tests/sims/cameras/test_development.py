@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from events.photometry import response_light, srgb_light, vignette_map
+from events.camera_info import response_light, srgb_light, vignette_map
 from sims.cameras import CameraSpec, announcement, camera_info
 from sims.cameras.development import Development
 from sims.cameras.noise import generator

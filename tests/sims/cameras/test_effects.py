@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from events.photometry import srgb_light
-from events.rotations import from_rpy
+from events.camera_info import srgb_light
+from events.frames import from_rpy
 from sims.cameras import (
     CameraRenderer,
     CameraSpec,

@@ -25,7 +25,7 @@ from events import (
     TransformStamped,
     VelocitySetpoint,
 )
-from events.poses import pose_matrix
+from events.geometry import pose_matrix
 from runtime import Node, Output, on
 from runtime.errors import ConfigError
 from runtime.testing import NodeResult, run_node, run_nodes, spec

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from events import CameraInfo
-from events.poses import pose_matrix
-from events.rotations import from_rpy
+from events.frames import from_rpy
+from events.geometry import pose_matrix
 from runtime.units import Latency
 from sims.cameras import (
     CameraRenderer,

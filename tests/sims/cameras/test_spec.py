@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from events.rotations import rotate
+from events.frames import rotate
 from sims.cameras import (
     CameraSpec,
     add_camera,

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from sims.cameras import add_free_camera, model_from_bytes, model_to_bytes, pose_to_qpos
 from sims.cameras.stage import Floats, Stage
 from sims.worlds import TOURS

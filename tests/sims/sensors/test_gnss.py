@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from events.geodesy import from_geodetic
+from events.frames import from_geodetic
 from sims.sensors.gnss import Gnss, GnssSpec
 from tests.sims.sensors.truths import ORIGIN, PLACE, random, truth
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from events.rotations import from_rpy, multiply, rotate
+from events.frames import from_rpy, multiply, rotate
 from sims.sensors import ImuModel, ImuNoise, ImuParameters
 from sims.sensors.imu import NOISES, Motion, Vibration, mean_between, motion_at
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from sims.sensors.magnetometer import Magnetometer, MagnetometerSpec, dipole_field, world_field
 from tests.sims.sensors.truths import ORIGIN, PLACE, random, truth
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from events import Quaternion, Vector3
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from sims.sensors.range_finder import RangeFinder, RangeFinderSpec, cone
 from sims.sensors.rays import Rays
 from sims.vehicle import attach_vehicle

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from events import Imu, ImuAnnouncement, TransformStamped
-from events.rotations import multiply, rotate
+from events.frames import multiply, rotate
 from runtime.testing import run_node
 from sims.multirotor import Multirotor
 from sims.sensors import ImuModel, ImuParameters, mount_imu

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from events import Vector3
-from events.rotations import normalize, rotate, rotate_inverse
+from events.frames import normalize, rotate, rotate_inverse
 from sims.vehicle import Physics, Simulation, attach_vehicle
 from sims.vehicle.air import Air, drag, equivalent_box
 from sims.worlds.wind import STRONGEST, Gust, WindSpec

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from events import AttitudeSetpoint, BodyRateSetpoint, Event, MotorSetpoint, PositionSetpoint
-from events.rotations import from_rpy, yaw_of
+from events.frames import from_rpy, yaw_of
 from sims.vehicle import Controller, Limits, State
 from tests.sims.vehicle.flight import UP, airborne, place, step_response, velocity
 

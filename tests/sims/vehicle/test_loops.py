@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from events import AttitudeSetpoint, Quaternion, Vector3, rotations
+from events import AttitudeSetpoint, Quaternion, Vector3
+from events import frames as rotations
 from sims.vehicle import Autopilot, Controller, Gains, Limits, State
 from sims.vehicle.attitude import AttitudeController
 from sims.vehicle.position import PositionController

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from events import Vector3, rotations
+from events import Vector3
+from events import frames as rotations
 from sims.vehicle import STANDING_HEIGHT, Physics, PhysicsDivergedError, State
 from tests.sims.vehicle.flight import UP, compiled
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from sims.cameras import CameraRenderer, pose_to_qpos
 from sims.worlds import TOURS, load_scene
 from tests.sims.cameras.scenes import CAMERAS, Scene, scene

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from msgspec import convert
 
-from events.rotations import from_rpy
+from events.frames import from_rpy
 from nodes.pilots import FigureEight
 from sims.cameras import CameraRenderer, model_to_bytes, pose_to_qpos
 from sims.worlds import CLEARANCE, TOURS, WORLDS, load_world

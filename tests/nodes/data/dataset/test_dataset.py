@@ -22,11 +22,11 @@ from events import (
     Odometry,
     Shutdown,
 )
-from events.rotations import from_rpy, rotate
+from events.frames import from_rpy, rotate
 from nodes.data.dataset import DatasetWriter
 from nodes.data.dataset.recording import ImageFile
 from nodes.data.replay.node import open_reader
-from nodes.data.replay.settings import ReplayConfig
+from nodes.data.replay.reader import ReplayConfig
 from nodes.trajectory.formats import read_euroc, read_tum
 from runtime.errors import ConfigError, FatalError, NodeError
 from runtime.testing import NodeResult, run_node, run_nodes, spec

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from events import Announcement
-from nodes.data.dataset.recording import ImageFile, Pixels, RowFile, in_colour, in_grey
-from nodes.data.dataset.rig import choose
-from nodes.ros2.messages.encoding import depth_in_steps
+from nodes.data.dataset.recording import ImageFile, Pixels, RowFile, choose, in_colour, in_grey
+from nodes.ros2.messages.images import depth_in_steps
 from tests.nodes.data.dataset.samples import camera, image, imu_announcement, png
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from events import CameraInfo, Event, Image
-from events.photometry import srgb_light, vignette_map
+from events.camera_info import srgb_light, vignette_map
 from nodes.data.dataset import DatasetWriter
 from nodes.trajectory.formats import read_tum
 from runtime.errors import NodeError

@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from nodes.data.export.command import export
+from nodes.data.export import export
 from nodes.trajectory.formats import write_tum
 from runtime.errors import ConfigError
 from tests.nodes.trajectory.samples import walk

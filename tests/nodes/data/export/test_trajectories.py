@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.data.export.trajectories import export, load
+from nodes.data.export import export_trajectories, load
 from nodes.judging.evaluation.alignment import align
 from nodes.judging.evaluation.metrics import absolute_errors, path_errors
 from nodes.trajectory import Trajectory, associate
@@ -49,7 +49,9 @@ def evo(folder: Path, *arguments: str) -> dict[str, float]:
 
 
 def test_every_format_has_its_files(run: Path, tmp_path: Path) -> None:
-    written = {form: export(run, form, tmp_path / form) for form in ("tum", "euroc", "kitti")}
+    written = {
+        form: export_trajectories(run, form, tmp_path / form) for form in ("tum", "euroc", "kitti")
+    }
     assert {form: [p.name for p in paths] for form, paths in written.items()} == {
         "tum": ["truth.tum", "slam.tum", "vo.tum"],
         "euroc": ["truth.csv", "slam.csv", "slam.tum", "vo.csv", "vo.tum"],
@@ -61,7 +63,7 @@ def test_every_format_has_its_files(run: Path, tmp_path: Path) -> None:
         ],
     }
     assert all(path.is_file() for paths in written.values() for path in paths)
-    assert all(p.parent == run / "export" for p in export(run, "tum"))
+    assert all(p.parent == run / "export" for p in export_trajectories(run, "tum"))
 
 
 NWU = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -83,7 +85,7 @@ def test_poses_stay_where_they_were_and_stamps_are_of_the_epoch(
     assert list(estimates) == ["slam", "vo"]
     out = run / "export"
     for form, world in (("tum", np.eye(4)), ("euroc", NWU)):
-        export(run, form, epoch=epoch)
+        export_trajectories(run, form, epoch=epoch)
         for name, expected in ({"truth": truth} | estimates).items():
             files = {f"{name}.csv": read_euroc} if form == "euroc" else {}
             if form == "tum" or name != "truth":
@@ -98,7 +100,7 @@ def test_poses_stay_where_they_were_and_stamps_are_of_the_epoch(
 @pytest.mark.parametrize("epoch", ["yesterday", "1969-12-31", "2263-01-01", -1, 1 << 63, "１２x"])
 def test_an_epoch_that_is_none_is_refused(run: Path, epoch: int | str) -> None:
     with pytest.raises(ValueError, match=r"epoch: expected nanoseconds of Unix time or a date as"):
-        export(run, "tum", epoch=epoch)
+        export_trajectories(run, "tum", epoch=epoch)
     assert not (run / "export").exists()
 
 
@@ -112,7 +114,7 @@ def test_kittis_poses_are_the_left_cameras_from_identity_line_by_line(run: Path)
         ([{"type": "ImuAnnouncement"}, CAMERA, {**CAMERA, "position": [9, 9, 9]}], LEVER @ OPTICAL),
     ):
         (run / "summary.json").write_text(json.dumps({"announcements": announced}))
-        export(run, "kitti")
+        export_trajectories(run, "kitti")
         true = read_kitti(run / "export" / "slam.truth.kitti.txt")
         said = read_kitti(run / "export" / "slam.kitti.txt")
         for found, body in ((true, truth.at(estimates["slam"].stamps)), (said, estimates["slam"])):
@@ -121,7 +123,7 @@ def test_kittis_poses_are_the_left_cameras_from_identity_line_by_line(run: Path)
             assert abs(poses[0] @ found - poses).max() < 1e-9
     (run / "summary.json").write_text("{")
     with pytest.raises(ValueError, match=r"summary\.json: expected the run's summary, found: "):
-        export(run, "kitti")
+        export_trajectories(run, "kitti")
 
 
 OPTICAL = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -144,13 +146,13 @@ def test_poses_without_a_truth_are_left_out_of_kittis_pairs() -> None:
 
 def test_a_run_without_trajectories_is_an_error_that_says_what_leaves_them(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"missing: expected the folder of a run, found none"):
-        export(tmp_path / "missing", "tum")
+        export_trajectories(tmp_path / "missing", "tum")
     with pytest.raises(ValueError, match=r"truth\.tum: expected .* found no trajectories: .*Eval"):
-        export(tmp_path, "tum")
+        export_trajectories(tmp_path, "tum")
     (tmp_path / "trajectories").mkdir()
     write_tum(tmp_path / "trajectories" / "vo.tum", walk(3))
     with pytest.raises(ValueError, match=r"truth\.tum: expected .* found vo\.tum"):
-        export(tmp_path, "tum")
+        export_trajectories(tmp_path, "tum")
 
 
 def test_a_kitti_export_needs_an_estimate_of_the_truths_time(tmp_path: Path) -> None:
@@ -158,26 +160,26 @@ def test_a_kitti_export_needs_an_estimate_of_the_truths_time(tmp_path: Path) -> 
     folder.mkdir()
     write_tum(folder / "truth.tum", walk(3))
     with pytest.raises(ValueError, match=r"expected an estimate .*, found truth\.tum only"):
-        export(tmp_path, "kitti")
+        export_trajectories(tmp_path, "kitti")
     write_tum(folder / "vo.tum", walk(3, start=10**12))
     with pytest.raises(ValueError, match=r"vo\.tum: expected estimates within the truth's time"):
-        export(tmp_path, "kitti")
+        export_trajectories(tmp_path, "kitti")
     assert not (tmp_path / "export").exists()
 
 
 def test_a_broken_trajectory_is_named(run: Path) -> None:
     (run / "trajectories" / "vo.tum").write_text("1 2 3\n")
     with pytest.raises(ValueError, match=r"vo\.tum:1: expected 8 fields"):
-        export(run, "tum")
+        export_trajectories(run, "tum")
     with pytest.raises(ValueError, match="expected one of tum, euroc, kitti, found 'bag'"):
-        export(run, "bag")
+        export_trajectories(run, "bag")
 
 
 @pytest.mark.slow
 def test_evos_commands_take_the_files_as_they_are_and_find_our_figures(run: Path) -> None:
     """`evo_ape` and `evo_rpe` of each format, in processes of their own."""
     for form in ("tum", "euroc", "kitti"):
-        export(run, form)
+        export_trajectories(run, form)
     truths, estimates = load(run)
     truth = truths["truth"]
     # Only those at stamps of the truth: where evo would pair poses of different times.
@@ -207,10 +209,10 @@ def test_of_several_vehicles_each_estimate_goes_with_its_own(run: Path) -> None:
     (run / "evaluation").mkdir()
     verdict = {"passed": None, "estimators": {"vo": {"vehicle": "second"}, "slam": {}}}
     (run / "evaluation" / "verdict.json").write_text(json.dumps(verdict))
-    assert {path.name for path in export(run, "tum")} == {
+    assert {path.name for path in export_trajectories(run, "tum")} == {
         "truth.tum", "truth.second.tum", "slam.tum", "vo.tum"
     }  # fmt: skip
-    export(run, "kitti")
+    export_trajectories(run, "kitti")
     for name, true in (("vo", second), ("slam", truths["truth"])):
         there = true.at(estimates[name].stamps).matrices() @ OPTICAL
         found = read_kitti(run / "export" / f"{name}.truth.kitti.txt")
@@ -219,7 +221,7 @@ def test_of_several_vehicles_each_estimate_goes_with_its_own(run: Path) -> None:
 
 @pytest.mark.slow
 def test_evo_reads_an_estimate_in_a_frame_of_its_own(run: Path) -> None:
-    export(run, "kitti")
+    export_trajectories(run, "kitti")
     truths, estimates = load(run)
     truth = truths["truth"]
     true, said = associate(truth, estimates["slam"])

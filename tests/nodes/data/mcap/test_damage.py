@@ -15,12 +15,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from nodes.data.mcap import layout
-from nodes.data.mcap.disk import RecordingError
+from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import McapWriter, contents, read
 from nodes.data.recorder.recover import recover_file
 from nodes.data.replay.node import open_reader
-from nodes.data.replay.reader import ReplayError
-from nodes.data.replay.settings import ReplayConfig
+from nodes.data.replay.reader import ReplayConfig, ReplayError
 from tests.nodes.data.mcap.test_mcap_file import fill, write
 
 CLOSED = "the end is missing: the file was not closed"

@@ -10,8 +10,8 @@ from typing import IO, Any
 import pytest
 from mcap.reader import make_reader
 
-from nodes.data.mcap import records
-from nodes.data.mcap.disk import RecordingError
+from nodes.data.mcap import native as records
+from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import Compression, McapWriter, contents, read
 from nodes.data.recorder.recover import recover_file
 from runtime.errors import MissingDependencyError

@@ -8,7 +8,7 @@ import pytest
 
 from nodes.data.mcap import layout
 from nodes.data.mcap.mcap_file import read
-from nodes.data.recorder.command import recover
+from nodes.data.recorder.recover import recover
 from runtime.errors import VisnavError
 from tests.nodes.data.mcap.test_mcap_file import write
 

@@ -15,11 +15,10 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from events import Event, Image, Odometry
-from nodes.data.mcap.disk import RecordingError
+from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import McapWriter, contents, read
 from nodes.data.recorder import McapRecorder, McapRecorderConfig, pipe
-from nodes.data.recorder.backlog import Backlog
-from nodes.data.recorder.pipe import WriteRequest
+from nodes.data.recorder.pipe import Backlog, WriteRequest
 from nodes.data.recorder.process import FileWriter
 from nodes.data.recorder.writer_process import WriterProcess
 from nodes.data.replay.recorded import Recorded

@@ -17,10 +17,9 @@ from events import Announcement, Event
 from nodes.data.dataset import DatasetWriter
 from nodes.data.mcap.mcap_file import McapWriter
 from nodes.data.recorder.event_writer import EventWriter
-from nodes.data.recorder.settings import McapRecorderConfig
+from nodes.data.recorder.pipe import McapRecorderConfig
 from nodes.data.replay.node import open_reader
-from nodes.data.replay.reader import Reader
-from nodes.data.replay.settings import ReplayConfig
+from nodes.data.replay.reader import Reader, ReplayConfig
 from runtime.testing import run_node
 from runtime.wire import pack
 from tests.nodes.data.dataset.samples import flight

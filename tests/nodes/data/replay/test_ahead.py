@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from nodes.data.replay.ahead import MOST, Batch, ReadAhead
+from nodes.data.replay.node import MOST, Batch, ReadAhead
 from nodes.data.replay.reader import ReplayError, Timed
 from tests.nodes.data.recorder.samples import image, imu
 

@@ -18,7 +18,7 @@ from events import (
     Score,
     VehicleAnnouncement,
 )
-from nodes.data.replay.choice import Choice
+from nodes.data.replay.reader import Choice
 from tests.nodes.data.recorder.samples import announcements
 
 SAID: list[tuple[type[Event], str]] = [

@@ -23,17 +23,14 @@ from events import (
     PoseStamped,
     VehicleAnnouncement,
 )
-from events.poses import pose_matrix
-from events.rotations import rotate
+from events.frames import rotate
+from events.geometry import pose_matrix
 from nodes.data.dataset.euroc import Euroc
-from nodes.data.dataset.recording import in_grey
-from nodes.data.dataset.rig import choose
-from nodes.data.dataset.tum_rgbd import TumRgbd
-from nodes.data.replay.choice import Choice
+from nodes.data.dataset.recording import choose, in_grey
+from nodes.data.dataset.tum import TumRgbd
 from nodes.data.replay.euroc import read_sensor
 from nodes.data.replay.node import open_reader
-from nodes.data.replay.reader import Reader, ReplayError
-from nodes.data.replay.settings import ReplayConfig
+from nodes.data.replay.reader import Choice, Reader, ReplayConfig, ReplayError
 from nodes.trajectory.table import epoch_of
 from tests.nodes.data.dataset.samples import (
     camera,

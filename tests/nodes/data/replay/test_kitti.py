@@ -10,10 +10,9 @@ import pytest
 
 from events import CameraAnnouncement, Image, Odometry, VehicleAnnouncement
 from events.frames import OPTICAL_TO_FRD
-from events.poses import pose_matrix
-from nodes.data.replay.choice import Choice
+from events.geometry import pose_matrix
 from nodes.data.replay.folders import as_pair
-from nodes.data.replay.reader import Reader, ReplayError
+from nodes.data.replay.reader import Choice, Reader, ReplayError
 from nodes.estimators.rectification import misalignment
 from tests.nodes.data.replay import downloads, sets
 from tests.nodes.estimators.test_rectification import EUROC, seen

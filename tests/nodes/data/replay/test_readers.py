@@ -15,8 +15,7 @@ from events import (
     Image,
     Odometry,
 )
-from nodes.data.replay.choice import Choice
-from nodes.data.replay.reader import ReplayError, Timed
+from nodes.data.replay.reader import Choice, ReplayError, Timed
 from runtime.wire import pack
 from tests.nodes.data.replay.sets import SETS, reader
 

@@ -22,9 +22,7 @@ from events import (
     TrackingRegained,
 )
 from nodes.estimators import TrackingResult
-from nodes.estimators.kiss_icp import KissIcp
-from nodes.estimators.kiss_icp.process import KissIcpProcess
-from nodes.estimators.kiss_icp.settings import KissIcpSettings
+from nodes.estimators.kiss_icp import KissIcp, KissIcpProcess, KissIcpSettings
 from runtime import Node
 from runtime.errors import ConfigError, MissingDependencyError, NodeError
 from runtime.testing import run_node

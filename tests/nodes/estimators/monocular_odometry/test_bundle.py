@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.monocular_odometry.bundle import adjust, linearise
 from tests.nodes.estimators.monocular_odometry.world import MATRIX, Floats, pose
 

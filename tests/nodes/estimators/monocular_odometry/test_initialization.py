@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.monocular_odometry.initialization import Initialization, InitialMap
-from nodes.estimators.monocular_odometry.settings import MonocularSettings
+from nodes.estimators.monocular_odometry.views import MonocularSettings
 from tests.nodes.estimators.monocular_odometry.world import (
     FLAT,
     MATRIX,

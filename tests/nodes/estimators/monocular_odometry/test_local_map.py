@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.monocular_odometry.initialization import InitialMap
 from nodes.estimators.monocular_odometry.local_map import LocalMap
-from nodes.estimators.monocular_odometry.settings import MonocularSettings
+from nodes.estimators.monocular_odometry.views import MonocularSettings
 from tests.nodes.estimators.monocular_odometry.world import MATRIX, Floats, Grey, pose
 
 BLANK: Grey = np.zeros((192, 256), np.uint8)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nodes.estimators.monocular_odometry.keyframes import SPACING, new_corners
 from nodes.estimators.monocular_odometry.local_map import Tracks
+from nodes.estimators.monocular_odometry.views import SPACING, new_corners
 from tests.nodes.estimators.monocular_odometry.world import FLAT, look, pose
 
 HERE = look(pose(), FLAT)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.monocular_odometry.views import (
     centre,
     hypotheses,

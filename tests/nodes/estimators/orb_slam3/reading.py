@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nodes.estimators.orb_slam3.vocabulary import Vocabulary
-from nodes.estimators.orb_slam3.vocabulary_file import check_vocabulary
+from nodes.estimators.orb_slam3.vocabulary import Vocabulary, check_vocabulary
 
 
 def read_vocabulary(path: Path) -> Vocabulary:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from nodes.estimators.orb_slam3.anchor import Anchor, KeyFrame, first_key_frame
+from nodes.estimators.orb_slam3.process import Anchor, KeyFrame, first_key_frame
 
 Floats = npt.NDArray[np.float64]
 

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from nodes.estimators.orb_slam3.process import OrbSlam3Process, OrbSlam3Result, check_arrays
 from nodes.estimators.orb_slam3.settings import Mode, OrbSettings, make_settings
 from nodes.estimators.orb_slam3.training import describe
-from nodes.estimators.orb_slam3.vocabulary import TreeShape, train
-from nodes.estimators.orb_slam3.vocabulary_file import write_vocabulary
+from nodes.estimators.orb_slam3.vocabulary import TreeShape, train, write_vocabulary
 from runtime.errors import MissingDependencyError
 from runtime.testing import run_in_lockstep
 from runtime.time.lockstep import LockstepClock, LockstepLoop

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from events import Event, Image
-from nodes.estimators.orb_slam3.command import vocabulary
-from nodes.estimators.orb_slam3.training import VocabularyTrainer, describe
+from nodes.estimators.orb_slam3.training import VocabularyTrainer, describe, vocabulary
 from runtime.errors import ConfigError, NodeError
 from runtime.testing import run_node
 from tests.nodes.estimators.orb_slam3.reading import read_vocabulary

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.estimators.orb_slam3.vocabulary import TreeShape, train
-from nodes.estimators.orb_slam3.vocabulary_file import (
+from nodes.estimators.orb_slam3.vocabulary import (
+    TreeShape,
     cached_vocabulary,
     check_vocabulary,
     find_vocabulary,
+    train,
     write_vocabulary,
 )
 from tests.nodes.estimators.orb_slam3.reading import read_vocabulary

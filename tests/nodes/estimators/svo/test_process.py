@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from events import CameraInfo
-from nodes.estimators.svo.process import SvoProcess, _matrix, _threads, _wait_for
-from nodes.estimators.svo.settings import SvoSettings
+from nodes.estimators.svo import SvoProcess, SvoSettings, _matrix, _threads, _wait_for
 from runtime.errors import MissingDependencyError
 from tests.nodes.estimators.svo.stub.svo_cpp import SE3d
 

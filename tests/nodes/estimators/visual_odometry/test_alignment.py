@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators import TrackingResult
 from nodes.estimators.odometry.images import Floats
 from nodes.estimators.odometry.pose import moved

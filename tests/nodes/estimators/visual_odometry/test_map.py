@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.estimators.odometry.images import Floats
 from nodes.estimators.odometry.pose import rays
 from nodes.estimators.visual_odometry.features import FeatureTracker

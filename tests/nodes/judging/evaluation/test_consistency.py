@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from events import PoseEstimate
-from nodes.judging.evaluation.consistency import consistency, positive_definite
 from nodes.judging.evaluation.judging import judge
+from nodes.judging.evaluation.metrics import consistency, positive_definite
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.trajectory import Trajectory
 from tests.nodes.trajectory.samples import walk

@@ -15,7 +15,7 @@ from evo.core.units import Unit
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
-from events.rotations import angle_between
+from events.frames import angle_between
 from nodes.judging.evaluation.alignment import align
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.metrics import (

@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given, settings
 
 from nodes.judging.evaluation.coverage import cover
-from nodes.judging.evaluation.judging import judge
+from nodes.judging.evaluation.judging import held_errors, interpolated_errors, judge
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.judging.evaluation.whole_flight import held_errors, interpolated_errors
 from nodes.trajectory import Trajectory
 from tests.nodes.judging.evaluation.flights import (
     MS,

@@ -15,7 +15,7 @@ from evo.core import metrics as evo
 from evo.core.units import Unit
 
 from events import Event, Image
-from nodes.data.export.trajectories import export
+from nodes.data.export import export_trajectories
 from nodes.judging.evaluation import Evaluation
 from nodes.judging.report.folder import read_run
 from nodes.trajectory import Trajectory
@@ -118,7 +118,7 @@ def test_every_exported_format_gives_the_same_figures(
 ) -> None:
     folder, expected = run
     for form in ("tum", "euroc", "kitti"):
-        export(folder, form, tmp_path)
+        export_trajectories(folder, form, tmp_path)
     seconds = [line.split()[0] for line in (tmp_path / "est.tum").read_text().splitlines()]
     (tmp_path / "times").write_text("\n".join(line for line in seconds if line[0] != "#"))
     lab = "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n"

@@ -9,7 +9,7 @@ import typer
 from typer.testing import CliRunner
 
 import runtime.tools.cli
-from nodes.judging.report.command import report
+from nodes.judging.report.page import report
 from runtime.errors import ConfigError
 from tests.nodes.judging.report.folders import summary
 

@@ -9,13 +9,12 @@ import pytest
 
 from nodes.judging.evaluation.coverage import Interval
 from nodes.judging.evaluation.verdict import Thresholds
+from nodes.judging.report.clouds import Shown, View, paint
 from nodes.judging.report.curves import draw_latency
-from nodes.judging.report.folder import read_run
-from nodes.judging.report.poses import broken, gaps, read_poses
-from nodes.judging.report.splat import Shown, View, paint
+from nodes.judging.report.folder import broken, gaps, read_poses, read_run
 from nodes.judging.report.style import drawing, label, number
 from nodes.judging.report.trajectories import draw_trajectories
-from nodes.mapping.ply import read_ply
+from nodes.mapping.cloud import read_ply
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import read_tum, write_tum
 from tests.nodes.judging.report.folders import SECOND, evaluated, ply, recorded, walk

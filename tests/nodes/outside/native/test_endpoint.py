@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from events.poses import inverse, pose_matrix
+from events.geometry import inverse, pose_matrix
 from nodes.outside.native import LinkError
 from nodes.outside.native.client import SAMPLE, Link
 from tests.nodes.outside.native.samples_link import (

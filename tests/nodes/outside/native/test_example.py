@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from events import CameraInfo
-from events.poses import inverse
+from events.geometry import inverse
 from nodes.outside.native import Endpoint, LinkAnswer, describe
 from tests.nodes.outside.native.samples_link import CAMERA, LIMIT, compiled
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, cast
 
 from events import Event
-from nodes.ros2.messages.builder import MessageBuilder
 from nodes.ros2.messages.incoming import MessageContext
+from nodes.ros2.messages.typestore import MessageBuilder
 
 PERCENT = 100
 BATTERY = "sensor_msgs/msg/BatteryState"

@@ -13,8 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from nodes.ros2.bridge.attachment import Message
-from nodes.ros2.bridge.keys import NodeName
+from nodes.ros2.bridge.keys import Message, NodeName
 from nodes.ros2.bridge.session import Session
 from nodes.ros2.messages.topics import Qos, Topic
 from tests.nodes.ros2.messages import samples

@@ -14,8 +14,7 @@ import time
 
 import zenoh
 
-from nodes.ros2.bridge.attachment import Attachment, Message, unpack
-from nodes.ros2.bridge.keys import NodeName, data_key
+from nodes.ros2.bridge.keys import Attachment, Message, NodeName, data_key, unpack
 from nodes.ros2.bridge.session import Session
 from nodes.ros2.messages.topics import Qos, Topic
 

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-from nodes.ros2.bridge.attachment import Message
+from nodes.ros2.bridge.keys import Message
 from nodes.ros2.bridge.session import Take
 from nodes.ros2.messages.topics import Topic
 from tests.nodes.ros2.messages import samples

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from nodes.ros2.bridge.attachment import gid, unpack
+from nodes.ros2.bridge.keys import gid, unpack
 from tests.nodes.ros2.bridge.network import bridged_run, client, zenoh_session
 from tests.nodes.ros2.messages import samples
 

@@ -15,8 +15,18 @@ from typing import Any
 import pytest
 import zenoh
 
-from nodes.ros2.bridge.attachment import Attachment, Message, pack, unpack
-from nodes.ros2.bridge.keys import Kind, NodeName, Token, data_key, endpoint_token, node_token
+from nodes.ros2.bridge.keys import (
+    Attachment,
+    Kind,
+    Message,
+    NodeName,
+    Token,
+    data_key,
+    endpoint_token,
+    node_token,
+    pack,
+    unpack,
+)
 from nodes.ros2.bridge.publisher import Publisher
 from nodes.ros2.bridge.session import CLOSING, Session
 from nodes.ros2.messages.topics import Qos, Topic

@@ -7,9 +7,8 @@ import functools
 import time
 from collections import Counter
 
-from nodes.ros2.bridge.attachment import Message
-from nodes.ros2.bridge.complaints import LOG_INTERVAL, Complaints
-from nodes.ros2.bridge.inbox import Inbox
+from nodes.ros2.bridge.incoming_topic import Inbox
+from nodes.ros2.bridge.keys import LOG_INTERVAL, Complaints, Message
 
 
 class Clock:

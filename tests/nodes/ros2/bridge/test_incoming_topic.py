@@ -11,15 +11,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from events import Event, FluidPressure, MagneticField, NavSatFix, Range
-from nodes.ros2.bridge.complaints import Complaints
 from nodes.ros2.bridge.incoming_topic import IncomingTopic
+from nodes.ros2.bridge.keys import Complaints
 from nodes.ros2.bridge.settings import Ros2BridgeConfig, Subscription
-from nodes.ros2.messages.frame_names import FrameNames
 from nodes.ros2.messages.images import ImageWriter
 from nodes.ros2.messages.incoming import READERS
 from nodes.ros2.messages.messages import Messages
-from nodes.ros2.messages.stamps import Stamps
-from nodes.ros2.messages.typestore import MessageError, TypeStore
+from nodes.ros2.messages.topics import FrameNames
+from nodes.ros2.messages.typestore import MessageError, Stamps, TypeStore
 from tests.nodes.ros2.bridge.mappings import Battery
 from tests.nodes.ros2.messages import samples
 

@@ -10,17 +10,21 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.ros2.bridge.attachment import SIZE, Attachment, gid, pack, unpack
 from nodes.ros2.bridge.keys import (
+    SIZE,
+    Attachment,
     Kind,
     NodeName,
     Token,
     data_key,
     endpoint_token,
     endpoints_key,
+    gid,
     node_token,
+    pack,
     parse_token,
     ros2dds_key,
+    unpack,
 )
 from nodes.ros2.messages.topics import Qos, Topic, dds_type, ros_name, topic_name
 from nodes.ros2.messages.typestore import TypeStore

@@ -25,10 +25,9 @@ from events import (
 )
 from nodes.ros2.bridge.keys import data_key
 from nodes.ros2.bridge.node import Ros2Bridge
-from nodes.ros2.messages.frame_names import FrameNames
 from nodes.ros2.messages.images import ImageWriter, read_image
 from nodes.ros2.messages.messages import Messages
-from nodes.ros2.messages.topics import Topic
+from nodes.ros2.messages.topics import FrameNames, Topic
 from nodes.ros2.messages.typestore import TypeStore
 from runtime.errors import ConfigError, FatalError, MissingDependencyError
 from runtime.testing import run_node

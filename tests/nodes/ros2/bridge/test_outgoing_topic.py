@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from events import Imu
-from nodes.ros2.bridge.complaints import Complaints
-from nodes.ros2.bridge.outgoing_topic import OutgoingTopic
+from nodes.ros2.bridge.incoming_topic import OutgoingTopic
+from nodes.ros2.bridge.keys import Complaints
 from nodes.ros2.bridge.settings import OwnPublication, Ros2BridgeConfig
-from nodes.ros2.messages.builder import MessageBuilder
-from nodes.ros2.messages.frame_names import FrameNames
+from nodes.ros2.messages.topics import FrameNames
+from nodes.ros2.messages.typestore import MessageBuilder
 from tests.nodes.ros2.bridge.mappings import Battery
 from tests.nodes.ros2.messages import samples
 

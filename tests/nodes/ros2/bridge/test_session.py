@@ -10,8 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from nodes.ros2.bridge.attachment import gid, unpack
-from nodes.ros2.bridge.keys import NodeName, data_key, endpoint_token, node_token
+from nodes.ros2.bridge.keys import NodeName, data_key, endpoint_token, gid, node_token, unpack
 from nodes.ros2.bridge.session import Session, SessionError, _configuration
 from nodes.ros2.messages.topics import Qos, Topic
 from tests.nodes.ros2.bridge.network import free_port, zenoh_session

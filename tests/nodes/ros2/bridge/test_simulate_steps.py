@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from nodes.ros2.bridge.attachment import Attachment, pack
-from nodes.ros2.bridge.simulate_steps import KEPT
-from nodes.ros2.messages.services import CANCEL_GOAL, DEFINITIONS, STEPS
+from nodes.ros2.bridge.keys import Attachment, pack
+from nodes.ros2.bridge.simulation_services import KEPT
+from nodes.ros2.messages.topics import CANCEL_GOAL, DEFINITIONS, STEPS
 from nodes.ros2.messages.typestore import TypeStore
 from runtime.config.model import Config, NodeSpec, RunConfig
 from runtime.run.execute import execute

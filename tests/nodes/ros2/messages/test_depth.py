@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nodes.ros2.messages.depth import HEAD, CompressedDepthWriter, decode_compressed
+from nodes.ros2.messages.images import HEAD, CompressedDepthWriter, decode_compressed
 from tests.nodes.ros2.messages import samples
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from nodes.ros2.messages.encoding import depth_in_steps, encode_depth, encode_image
+from nodes.ros2.messages.images import depth_in_steps, encode_depth, encode_image
 from tests.nodes.viewers.common.samples import decoded
 
 

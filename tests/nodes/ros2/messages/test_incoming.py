@@ -25,13 +25,13 @@ from events import (
     Setpoint,
     VelocitySetpoint,
 )
-from events.rotations import normalize
+from events.frames import normalize
 from nodes.ros2.bridge.settings import Subscription
 from nodes.ros2.messages.calibration import camera_announcement, camera_info
-from nodes.ros2.messages.frame_names import FrameNames
 from nodes.ros2.messages.incoming import READERS, MessageContext
 from nodes.ros2.messages.messages import Messages
-from nodes.ros2.messages.stamps import Stamps
+from nodes.ros2.messages.topics import FrameNames
+from nodes.ros2.messages.typestore import Stamps
 from tests.nodes.ros2.messages import samples
 from tests.nodes.ros2.messages.samples import S
 

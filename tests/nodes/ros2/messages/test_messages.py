@@ -22,8 +22,8 @@ from events import (
     Score,
     Wind,
 )
-from nodes.ros2.messages.frame_names import FrameNames
 from nodes.ros2.messages.messages import Messages, Transform
+from nodes.ros2.messages.topics import FrameNames
 from nodes.ros2.messages.typestore import TypeStore
 from tests.nodes.ros2.messages import samples
 from tests.nodes.ros2.messages.samples import S

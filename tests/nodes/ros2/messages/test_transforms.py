@@ -14,9 +14,9 @@ from events import (
     PoseStamped,
     TransformStamped,
 )
-from events.poses import pose_matrix
-from nodes.ros2.messages.frame_names import FrameNames
+from events.geometry import pose_matrix
 from nodes.ros2.messages.messages import Transform
+from nodes.ros2.messages.topics import FrameNames
 from nodes.ros2.messages.transforms import Transforms
 from tests.nodes.ros2.messages import samples
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from nodes.viewers.common.paths import GAP, SPAN, PathPieces
+from nodes.viewers.common import GAP, SPAN, PathPieces
 
 MS = 1_000_000
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from events import PlannedPose, PositionSetpoint
-from nodes.viewers.common.selection import ImageSelection, PlanSelection
+from nodes.viewers.common import ImageSelection, PlanSelection
 
 
 def test_of_thirty_images_a_second_five_are_kept_and_of_one_exposure_all() -> None:

@@ -12,11 +12,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from nodes.viewers.foxglove import gate
-from nodes.viewers.foxglove.gate import Gate, hidden_host
-from nodes.viewers.foxglove.server import Server
-from nodes.viewers.foxglove.settings import FoxgloveConfig
-from runtime.tools.monitor.http import HttpError
+from nodes.viewers.foxglove import server as gate
+from nodes.viewers.foxglove.server import FoxgloveConfig, Gate, Server, hidden_host
+from runtime.tools.monitor.client import HttpError
 from tests.nodes.viewers.foxglove.client import Viewer
 
 PROTOCOL = [Subprotocol("foxglove.sdk.v1")]

@@ -15,8 +15,7 @@ import pytest
 
 from events import Event
 from nodes.viewers.foxglove import FoxgloveServer
-from nodes.viewers.foxglove.server import Server
-from nodes.viewers.foxglove.settings import FoxgloveConfig
+from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 from runtime.errors import ConfigError, FatalError, MissingDependencyError
 from runtime.testing import run_node
 from tests.nodes.ros2.messages.samples import store

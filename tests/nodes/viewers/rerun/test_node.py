@@ -18,7 +18,7 @@ import pytest
 from events import Event
 from nodes.viewers.rerun import RerunView, sdk
 from nodes.viewers.rerun.recorder import Recorder
-from nodes.viewers.rerun.settings import RerunConfig
+from nodes.viewers.rerun.sdk import RerunConfig
 from runtime.errors import ConfigError, MissingDependencyError, VisnavError
 from runtime.testing import run_node
 from tests.nodes.viewers.common.samples import (

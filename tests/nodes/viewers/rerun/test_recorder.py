@@ -21,7 +21,7 @@ from events import (
     Wind,
 )
 from nodes.viewers.rerun.recorder import Recorder
-from nodes.viewers.rerun.settings import RerunConfig
+from nodes.viewers.rerun.sdk import RerunConfig
 from tests.nodes.viewers.common.samples import (
     CAMERA,
     ESTIMATOR,

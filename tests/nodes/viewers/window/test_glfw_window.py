@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from nodes.viewers.window.glfw_window import letterbox
-from nodes.viewers.window.keys import KEYS
+from events.window import KEYS
+from nodes.viewers.window import letterbox
 
 
 def test_key_names_are_all_that_glfw_knows() -> None:
@@ -38,7 +38,7 @@ def test_an_image_fills_the_window_in_one_direction(
 def test_importing_the_nodes_imports_neither_glfw_nor_opengl() -> None:
     """A machine without a display, or without the libraries, can import and list the nodes."""
     code = (
-        "import sys, nodes.viewers.window.node, nodes.pilots.teleop, nodes.viewers.window; "
+        "import sys, nodes.viewers.window, nodes.pilots.teleop, nodes.viewers.window; "
         "print({'glfw', 'OpenGL'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

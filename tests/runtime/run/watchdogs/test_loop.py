@@ -17,7 +17,7 @@ import uvloop
 
 from runtime import Node, Tick, every
 from runtime.config.model import Config, RunConfig
-from runtime.run import task_factory
+from runtime.run import event_loop as task_factory
 from runtime.run.execute import make_clock, make_loop
 from runtime.run.supervisor import Supervisor
 from runtime.run.watchdogs import LoopWatchdog

@@ -20,9 +20,8 @@ from runtime.config.model import Config
 from runtime.config.reading import load
 from runtime.errors import NodeError
 from runtime.tools.flights.cache import home, kept, recorded, remove_beyond
-from runtime.tools.flights.layout import Action, Writer, event_at
-from runtime.tools.flights.part import _imported, content_key, flight_of, settings_key
-from runtime.tools.flights.recorder import record
+from runtime.tools.flights.player import Action, Writer, event_at
+from runtime.tools.flights.recorder import _imported, content_key, flight_of, record, settings_key
 from tests.runtime.tools.flights import samples
 from tests.runtime.tools.flights.samples import Seen, events_of, flown
 from tests.runtime.tools.samples_cli import ROOT

@@ -12,9 +12,8 @@ import pytest
 from events import Image
 from runtime.errors import VisnavError
 from runtime.run.supervisor import Supervisor
-from runtime.tools.monitor import images
-from runtime.tools.monitor.images import MAX_SIDE, ImageEncoder, small_jpeg
-from runtime.tools.monitor.observer import Observer
+from runtime.tools.monitor import observer as images
+from runtime.tools.monitor.observer import MAX_SIDE, ImageEncoder, Observer, small_jpeg
 from tests.runtime.tools.monitor.test_observer import observe
 
 CAMERA = "drone.images: drone/front"
@@ -58,7 +57,7 @@ async def test_images_are_encoded_in_a_thread_and_no_oftener_than_said(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = 100.0
-    monkeypatch.setattr("runtime.tools.monitor.images.time.monotonic", lambda: now)
+    monkeypatch.setattr("runtime.tools.monitor.observer.time.monotonic", lambda: now)
     threads: list[threading.Thread] = []
     encode = small_jpeg
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-from runtime.tools.monitor import meter
-from runtime.tools.monitor.meter import Amount
+from runtime.tools.monitor import snapshot as meter
+from runtime.tools.monitor.snapshot import Amount
 
 
 def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.tools.monitor.meter import KEPT, Amount, RecentSamples, Sample
+from runtime.tools.monitor.snapshot import KEPT, Amount, RecentSamples, Sample
 
 SECOND = 1_000_000_000
 

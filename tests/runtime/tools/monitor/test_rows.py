@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from runtime.tools.monitor.rows import COLUMNS, LEFT, RIGHT, headline, is_number, rows
+from runtime.tools.monitor.screen import COLUMNS, LEFT, RIGHT, headline, is_number, rows
 from tests.runtime.tools.monitor.samples import snapshot
 
 

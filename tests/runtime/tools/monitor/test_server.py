@@ -17,8 +17,7 @@ from runtime.errors import VisnavError
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.monitor import client, server
-from runtime.tools.monitor.address import find, runs
-from runtime.tools.monitor.client import Client, ask
+from runtime.tools.monitor.client import Client, ask, find, runs
 from runtime.tools.monitor.command import Answer, Command, Pause, Resume, Set, Speed, Stop, encode
 from runtime.tools.monitor.observer import LastRecords, Observer
 from runtime.tools.monitor.snapshot import LogLine, Snapshot

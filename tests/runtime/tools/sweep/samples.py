@@ -15,7 +15,7 @@ from typing import Any
 from events import Event
 from runtime import Duration, Node, NodeConfig, Output, Tick, every
 from runtime.tools.sweep import Job, Plan, Row, make_plan
-from runtime.tools.sweep.rows import failed
+from runtime.tools.sweep.tables import failed
 from tests.runtime.tools.samples_cli import ROOT
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from runtime.errors import ConfigError
 from runtime.tools.sweep import Job, Row, Watch, sweep
-from runtime.tools.sweep.rows import Rows, failed
+from runtime.tools.sweep.tables import Rows, failed
 from tests.runtime.tools.sweep.samples import die, plan_in, pretend, refuse
 
 

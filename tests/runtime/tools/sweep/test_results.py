@@ -11,8 +11,7 @@ from msgspec.structs import astuple
 
 from runtime.tools.sweep import Row, draw_plots, summarise, write_page, write_tables
 from runtime.tools.sweep.plots import lines
-from runtime.tools.sweep.rows import failed
-from runtime.tools.sweep.tables import Spread
+from runtime.tools.sweep.tables import Spread, failed
 from tests.runtime.tools.sweep.samples import plan_in, pretend
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.errors import ConfigError
-from runtime.tools.sweep.values import Axis, Parameter, axis, parameter, split, value
+from runtime.tools.sweep.plan import Axis, Parameter, axis, parameter, split, value
 
 texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
 plain = st.booleans() | st.integers(-(2**62), 2**62) | st.floats(allow_nan=False) | texts

@@ -16,11 +16,20 @@ from runtime import on
 from runtime.errors import ConfigError
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
-from runtime.tools.cli.trace import tables
+from runtime.tools.cli.live import tables
 from runtime.tools.tracing import spool, write
-from runtime.tools.tracing.paths import Trace, TraceEvent, node_loads, paths, quantile, read_trace
 from runtime.tools.tracing.record import tracing
-from runtime.tools.tracing.write import LOOP, SENSORS, THREADS
+from runtime.tools.tracing.write import (
+    LOOP,
+    SENSORS,
+    THREADS,
+    Trace,
+    TraceEvent,
+    node_loads,
+    paths,
+    quantile,
+    read_trace,
+)
 from tests.runtime.samples_loop import (
     Camera,
     Estimator,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from events import EstimatorAnnouncement, PoseEstimate
-from events.rotations import angle_between, from_rpy, multiply
+from events.frames import angle_between, from_rpy, multiply
 from runtime.testing import NodeResult
 from tests.sims.airsim.scripts import Caller, RefusedError, Script, drone, with_script
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from events import Disarmed, Event, Hover, Odometry, Setpoint
-from events.rotations import yaw_of
+from events.frames import yaw_of
 from sims.airsim.server.methods import thrown
 from tests.sims.airsim.scripts import Caller, RefusedError, Script, drone, with_script
 

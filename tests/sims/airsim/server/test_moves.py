@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from events import Command, Hover, Setpoint, Vector3, VelocitySetpoint
-from events.rotations import from_yaw
+from events.frames import from_yaw
 from sims.airsim.server import moves
 from sims.airsim.server.carrot import CLOSE, Carrot, braked, lookahead_of
 from sims.airsim.server.moves import Heading

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from events.geodesy import to_geodetic
+from events.frames import to_geodetic
 from sims.airsim.server.accepted import ACCEPTED
 from tests.sims.airsim.scripts import Caller, RefusedError, drone, with_script
 

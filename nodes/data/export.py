@@ -1,0 +1,331 @@
+"""A run's trajectories, as files for evo and for the tools of other data sets.
+
+A run leaves them as ``trajectories/truth.tum`` and ``trajectories/<estimator>.tum``, in ``map``
+(NED) or the estimator's own frame, just as the estimator sent them; nothing here aligns them.
+
+Stamps of an export are Unix time: its files say which epoch is the run's time 0. TUM's files keep
+the run's frames; EuRoC's world is z up (north, west, up), as that data set's own; KITTI's poses are
+those of the left camera, from identity.
+
+A recorded run's small sensors as CSV files: one for each sensor and kind of measurement.
+
+``export``: a run's trajectories, measurements and calibration, as files for other tools.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from enum import Enum
+from pathlib import Path
+from typing import IO, Annotated, Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import typer
+
+from events import Event, Quaternion, Vector3
+from events.frames import OPTICAL_TO_FRD
+from events.geometry import pose_matrix
+from events.sensors import MEASURED, fields_of, numbers
+from nodes.trajectory.formats import read_tum, write_euroc, write_kitti, write_tum
+from nodes.trajectory.table import EPOCH, epoch_of
+from nodes.trajectory.trajectory import Trajectory, associate
+from runtime.paths import source_file
+
+FORMATS = ("tum", "euroc", "kitti")
+
+TRUTH = "truth"
+PLAN = "plan"
+"""Names of those files that hold no estimate."""
+
+_COMMENT = {
+    ("tum", TRUTH): "ground truth: base_link (FRD) in map (NED: x north, y east, z down)",
+    ("tum", ""): "estimate, as it was sent: base_link (FRD) in the estimator's frame",
+    ("euroc", TRUTH): "ground truth: base_link (FRD) in the world (x north, y west, z up)",
+    ("euroc", ""): "estimate: base_link (FRD) in the estimator's frame, turned to z up",
+}
+_VELOCITIES = "\nvelocities: by differences of the positions; biases: not known (zeros)"
+
+
+def export_trajectories(
+    run: Path, form: str, out: Path | None = None, epoch: int | str = EPOCH
+) -> list[Path]:
+    """Write a run's true trajectory and its estimates in another format.
+
+    ``tum`` and ``euroc`` give a file each for the truth and every estimator. As evo compares a
+    EuRoC truth with an estimate in TUM's format, ``euroc`` adds the latter. ``kitti``, whose files
+    go together line by line, gives a pair for every estimator, at the estimator's stamps: poses
+    of the first camera that the run announced, in the frame of its first one. Without a camera on
+    the body it is one at the body's origin that looks ahead.
+
+    Args:
+        form: One of `FORMATS`.
+        out: Folder for the files, made if need be; ``export`` in the run's folder if None.
+        epoch: The run's time 0: a date (ISO 8601), or nanoseconds of Unix time.
+
+    Returns:
+        What was written, the truth first.
+
+    Raises:
+        ValueError: The run left no trajectories, one of them is none, or so is the epoch.
+        OSError: A file cannot be written.
+    """
+    zero = epoch_of(epoch)
+    if form not in FORMATS:
+        raise ValueError(f"format: expected one of {', '.join(FORMATS)}, found {form!r}")
+    truths, estimates = load(run)
+    if form == "kitti" and not estimates:
+        raise ValueError(
+            f"{run / 'trajectories'}: expected an estimate to give KITTI's poses their times, "
+            f"found {TRUTH}.tum only"
+        )
+    # Before anything is written: a run that has no such pair leaves no half of an export.
+    pairs = {
+        name: associate(
+            truths.get(_truth_of(run, name), truths[TRUTH]),
+            estimate,
+            name=f"{run / 'trajectories' / name}.tum",
+        )
+        for name, estimate in (estimates.items() if form == "kitti" else ())
+    }
+    folder = out or run / "export"
+    folder.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    mounted = mounting(run) if pairs else np.eye(4)
+    for name, (true, estimate) in pairs.items():
+        for path, poses in (
+            (folder / f"{name}.{TRUTH}.kitti.txt", true),
+            (folder / f"{name}.kitti.txt", estimate),
+        ):
+            matrices = poses.matrices() @ mounted
+            matrices = np.linalg.inv(matrices[0]) @ matrices
+            write_kitti(path, Trajectory.from_matrices(poses.stamps, matrices))
+            written.append(path)
+    if form == "kitti":
+        return written
+    world = np.diag([1.0, -1.0, -1.0, 1.0]) if form == "euroc" else np.eye(4)
+    for name, trajectory in (truths | estimates).items():
+        comment = _COMMENT[form, TRUTH if name in truths else ""]
+        comment = f"{comment}\nthe run's time 0 is {zero} ns"
+        placed = Trajectory.from_matrices(trajectory.stamps + zero, world @ trajectory.matrices())
+        if form == "euroc":
+            written.append(folder / f"{name}.csv")
+            write_euroc(written[-1], placed, comment + _VELOCITIES)
+        if form == "tum" or name in estimates:
+            written.append(folder / f"{name}.tum")
+            write_tum(written[-1], placed, comment)
+    return written
+
+
+def mounting(run: Path, camera: str = "") -> npt.NDArray[np.float64]:
+    """Return the transform from a camera that a run announced to its body, shape (4, 4).
+
+    If none is named it is the first one on a body, or else one at the body's origin that looks
+    ahead.
+
+    Raises:
+        ValueError: The run's summary is none, or there is no such camera.
+    """
+    path = run / "summary.json"
+    try:
+        content = path.read_bytes() if path.is_file() else b"{}"
+        announced = msgspec.json.decode(content, type=_Summary).announcements
+    except (OSError, msgspec.DecodeError) as error:
+        raise ValueError(f"{path}: expected the run's summary, found: {error}") from None
+    found = [
+        (each.source, pose_matrix(each.position, each.orientation))
+        for each in announced
+        if each.type == "CameraAnnouncement" and each.parent_frame_id != "map"
+    ]
+    chosen = [mounted for source, mounted in found if camera in {"", source}]
+    if camera and not chosen:
+        there = ", ".join(source for source, _ in found) or "none"
+        raise ValueError(f"{path}: expected {camera!r} among the cameras on a body, found {there}")
+    return chosen[0] if chosen else pose_matrix((0.0, 0.0, 0.0), OPTICAL_TO_FRD)
+
+
+class _Announced(msgspec.Struct):
+    """What an export asks of an announcement."""
+
+    type: str
+    source: str = ""
+    parent_frame_id: str = "map"
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Quaternion = OPTICAL_TO_FRD
+
+
+class _Summary(msgspec.Struct):
+    """What an export asks of a run's summary."""
+
+    announcements: list[_Announced] = []
+
+
+def load(run: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:
+    """Read a run's true trajectories and its estimates, both by the names of their files.
+
+    The first vehicle's truth is ``truth``, those of others are ``truth.<vehicle>``.
+
+    Raises:
+        ValueError: The run left no trajectories, or one of them is none.
+    """
+    if not run.is_dir():
+        raise ValueError(f"{run}: expected the folder of a run, found none")
+    folder = run / "trajectories"
+    if not (folder / f"{TRUTH}.tum").is_file():
+        found = ", ".join(sorted(p.name for p in folder.glob("*.tum"))) or "no trajectories"
+        raise ValueError(
+            f"{folder / TRUTH}.tum: expected the run's true trajectory, found {found}: "
+            "a run leaves its trajectories if a node of type Evaluation is in it"
+        )
+    truths, estimates = {TRUTH: read_tum(folder / f"{TRUTH}.tum")}, {}
+    for path in sorted(folder.glob("*.tum")):
+        kind = path.stem.partition(".")[0]
+        if kind == TRUTH:
+            truths[path.stem] = read_tum(path)
+        elif kind != PLAN:
+            estimates[path.stem] = read_tum(path)
+    return truths, estimates
+
+
+def _truth_of(run: Path, estimate: str) -> str:
+    """Return the name of the truth that an estimate was judged by, if the verdict names one."""
+    path = run / "evaluation" / "verdict.json"
+    if not path.is_file():
+        return TRUTH
+    found = msgspec.json.decode(path.read_bytes(), type=_Verdict).estimators
+    vehicles = {source_file(name): each.get("vehicle", "") for name, each in found.items()}
+    return f"{TRUTH}.{source_file(vehicles.get(estimate, ''))}"
+
+
+class _Verdict(msgspec.Struct):
+    """What an export asks of a run's verdict."""
+
+    estimators: dict[str, dict[str, Any]] = {}
+
+
+def export_measurements(run: Path, out: Path | None = None, epoch: int | str = EPOCH) -> list[Path]:
+    """Write what IMUs, barometers, receivers, … measured: ``<source>.<kind>.csv``.
+
+    Rows are in the order in which the measurements came; a column is named by its field and unit.
+
+    Args:
+        run: The run's folder, with recordings (MCAP) in it.
+        out: Folder for the files, made if need be; ``export`` in the run's folder if None.
+        epoch: The run's time 0: a date (ISO 8601), or nanoseconds of Unix time.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ValueError: There is no recording, or no measurement in it; or the epoch is none.
+        OSError: A file cannot be written.
+    """
+    zero = epoch_of(epoch)
+    recordings = sorted(run.glob("*.mcap"))
+    if not recordings:
+        raise ValueError(
+            f"{run}: expected a recording (*.mcap), found none: a run leaves one if a node of type "
+            "McapRecorder is in it"
+        )
+    folder = out or run / "export"
+    folder.mkdir(parents=True, exist_ok=True)
+    files: dict[Path, IO[str]] = {}
+    with ExitStack() as stack:
+        for path in recordings:
+            for event in _measurements(path):
+                kind = next(known for known in MEASURED if isinstance(event, known))
+                name = f"{source_file(event.source)}.{kind.__name__}.csv"
+                file = files.get(folder / name)
+                if file is None:
+                    opened = (folder / name).open("w", encoding="utf-8", newline="\n")
+                    file = files[folder / name] = stack.enter_context(opened)
+                    file.write(_header(event))
+                values = (v for field in fields_of(kind) for v in numbers(event, field))
+                file.write(f"{zero + event.stamp},{','.join(map(repr, values))}\n")
+    if not files:
+        raise ValueError(f"{recordings[0]}: expected measurements of small sensors, found none")
+    return sorted(files)
+
+
+def _measurements(recording: Path) -> Iterator[Event]:
+    from nodes.data.replay.recorded import Recorded  # which needs mcap
+
+    reader = Recorded(recording)
+    wanted = reader.events(0, None, lambda kind, _: bool(fields_of(kind)))
+    yield from (each.event for each in wanted)
+
+
+def _header(event: Event) -> str:
+    columns = ["stamp (ns)"]
+    for field, unit in fields_of(type(event)).items():
+        axes = ("_x", "_y", "_z") if len(numbers(event, field)) == 3 else ("",)
+        columns += [f"{field}{axis} ({unit})" for axis in axes]
+    return ",".join(columns) + "\n"
+
+
+class Format(Enum):
+    """What ``--format`` takes."""
+
+    tum = "tum"
+    euroc = "euroc"
+    kitti = "kitti"
+    csv = "csv"
+    kalibr = "kalibr"
+    openvins = "openvins"
+    vins = "vins"
+    basalt = "basalt"
+    orbslam3 = "orbslam3"
+    vslamlab = "vslamlab"
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="The folder of a run: runs/<name>.")],
+    form: Annotated[Format, typer.Option("--format", "-f", help="Format of the files.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the files; if not given RUN/export, of a calibration "
+            "RUN/export/FORMAT."
+        ),
+    ] = None,
+    epoch: Annotated[
+        str, typer.Option(help="The run's time 0: a date, or nanoseconds of Unix time.")
+    ] = "2020-01-01T00:00:00Z",
+    camera: Annotated[
+        str | None,
+        typer.Option(help="Of a calibration: a camera, or a vehicle; the first if not given."),
+    ] = None,
+) -> None:
+    """Write a run's trajectories, measurements or calibration, as other tools read them.
+
+    tum, euroc and kitti are the true and the estimated trajectories, as evo reads them.
+    tum and euroc give one file each for the truth and every estimator; euroc adds the estimates
+    in TUM's format, which is what evo_ape euroc compares with, and turns all to a world with z
+    up. kitti has no stamps, so it gives a pair of files for every estimator, pose by pose: those
+    of the first camera, from identity.
+
+    csv gives what IMU, barometer, magnetometer, satellite receiver and range finders measured, and
+    the wind: a file each, if the run has a recording.
+
+    The others are calibrations: cameras, IMU and the transforms between them, as that program's
+    files say it: kalibr, openvins, vins (VINS-Fusion), basalt, orbslam3, and vslamlab, which also
+    gets images, IMU data and ground truth if the run has a recording. A lens that a format has no
+    word for is refused.
+    """
+    from nodes.calibration.export import export_calibration
+    from nodes.data import export as exports
+    from runtime.errors import ConfigError
+
+    try:
+        if form.value in exports.FORMATS:
+            written = exports.export_trajectories(run, form.value, out, epoch)
+        elif form is Format.csv:
+            written = export_measurements(run, out, epoch)
+        else:
+            written = export_calibration(run, form.value, out, epoch, camera)
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from None
+    for path in written:
+        print(path)

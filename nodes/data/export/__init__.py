@@ -1,1 +1,0 @@
-"""``export``: the data of a recording as text files."""

@@ -1,0 +1,291 @@
+"""The command ``check``: say what is wrong with a file before anything flies.
+
+``graph``: which node sends what to which, as Mermaid text or as a drawing.
+
+``nodes``: what there is to put into a file.
+
+``settings``: what every file may hold, whatever its nodes.
+
+``schema``: what a file may hold, for editors that complete and check TOML.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from runtime.tools.cli.tables import ConfigFile, Overrides, warn
+
+if TYPE_CHECKING:
+    from rich.tree import Tree
+
+    from runtime.tools.describe import NodeDescription, SettingDescription
+
+
+def check(config: ConfigFile, overrides: Overrides = None) -> None:
+    """Check a file without flying: print a line for each mistake.
+
+    The settings are read, and the nodes are brought up to where the first update would be: worlds,
+    recordings and other files are opened, cameras and vehicles announced, and every node says
+    whether it finds what it needs. Checked are, among others, names of nodes, cameras, inputs and
+    files; that no input is without a sender or a reader; that no two nodes write the same file;
+    and that start and waypoints are in free space. Nothing is rendered, written or sent. Ends
+    with 0, or with 2 if there is a mistake; what may be meant, as what lint finds, is a warning.
+    """
+    from runtime.config.reading import load_configuration
+    from runtime.run.graph import edges
+    from runtime.tools import preflight
+    from runtime.tools.cli.run import leave_behind
+    from runtime.tools.preflight import lint
+
+    settings = load_configuration(config, overrides or [])
+    found = preflight.of_file(settings)
+    if not found.errors:
+        nodes = preflight.of_nodes(settings)
+        odd = [] if nodes.errors else [str(e) for e in lint(settings, nodes.announcements)]
+        found = preflight.Findings(nodes.errors, found.warnings + nodes.warnings + odd)
+    errors = found.errors
+    for warning in found.warnings:
+        warn(warning)
+    for error in errors:
+        print(f"error: {config.name}: {error}", file=sys.stderr)
+    if not errors:
+        connections = edges([(spec.name, spec.node) for spec in settings.nodes])
+        print(f"{config}: {len(settings.nodes)} nodes, {len(connections)} connections: right")
+    leave_behind(2 if errors else 0)
+
+
+def graph(
+    config: ConfigFile,
+    overrides: Overrides = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Draw it into this PNG, SVG or PDF instead of printing Mermaid."),
+    ] = None,
+) -> None:
+    """Show which node sends which events to which."""
+    from runtime.config.reading import load_configuration
+    from runtime.run.graph import edges
+
+    settings = load_configuration(config, overrides or [])
+    names = [spec.name for spec in settings.nodes]
+    found = edges([(spec.name, spec.node) for spec in settings.nodes])
+    if out is None:
+        print(mermaid(names, found))
+        return
+    draw(names, found, out)
+    print(out)
+
+
+def mermaid(names: list[str], edges: list[tuple[str, str, str, str, str]]) -> str:
+    """Return the graph in Mermaid's language (mermaid.js.org)."""
+    lines = ["flowchart LR", *(f"    {name}" for name in names)]
+    for (sender, receiver), events in _by_pair(edges).items():
+        lines.append(f"    {sender} -- {', '.join(events)} --> {receiver}")
+    return "\n".join(lines)
+
+
+def draw(names: list[str], edges: list[tuple[str, str, str, str, str]], out: Path) -> None:
+    """Draw the nodes in layers, senders to the left, with an arrow for each pair that talks."""
+    from matplotlib.figure import Figure
+
+    pairs = _by_pair(edges)
+    columns = layers(names, pairs)
+    height = max(len(column) for column in columns)
+    figure = Figure(figsize=(1 + 3.4 * len(columns), 1 + 1.3 * height), layout="constrained")
+    axes: Any = figure.add_subplot()
+    axes.set_axis_off()
+    axes.set(xlim=(-0.4, len(columns) - 0.6), ylim=(-height / 2 - 0.2, height / 2 + 0.2))
+    boxes = {}
+    for x, column in enumerate(columns):
+        for row, name in enumerate(column):
+            y = (len(column) - 1) / 2 - row + 0.25 * (x % 2)  # so that few arrows cross a box
+            boxes[name] = axes.text(
+                x, y, name, ha="center", va="center", fontsize=11, weight="bold", zorder=3,
+                bbox={"boxstyle": "round,pad=0.6", "fc": "#dcebf7", "ec": "#2f6690"},
+            )  # fmt: skip
+    for (sender, receiver), events in pairs.items():
+        tail, head = boxes[sender], boxes[receiver]
+        (x0, y0), (x1, y1) = tail.get_position(), head.get_position()
+        bend = 0.12 if x0 < x1 else -0.3  # an arrow back goes below those ahead
+        axes.annotate(
+            "", xy=(x1, y1), xytext=(x0, y0), zorder=2,
+            arrowprops={
+                "arrowstyle": "-|>", "color": "#5b7083", "shrinkA": 2, "shrinkB": 2,
+                "connectionstyle": f"arc3,rad={bend}", "mutation_scale": 14,
+                "patchA": tail.get_bbox_patch(), "patchB": head.get_bbox_patch(),
+            },
+        )  # fmt: skip
+        # The middle of the arc: half of its bend from the middle of the chord, in pixels.
+        chord = axes.transData.transform([(x0, y0), (x1, y1)])
+        (u0, v0), (u1, v1) = chord
+        middle = (u0 + u1) / 2 + bend / 2 * (v1 - v0), (v0 + v1) / 2 - bend / 2 * (u1 - u0)
+        x, y = axes.transData.inverted().transform(middle)
+        label = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
+        text = "\n".join(events)
+        axes.text(x, y, text, fontsize=7, ha="center", va="center", bbox=label, zorder=4)
+    figure.savefig(out, dpi=150)
+
+
+def layers(names: list[str], pairs: Iterable[tuple[str, str]]) -> list[list[str]]:
+    """Put nodes into layers, so that most arrows go from one layer to a later one.
+
+    A node stands right of all that it listens to; an arrow that would close a circle, looked for
+    in the order of the nodes, is left out of account.
+    """
+    receivers: dict[str, list[str]] = {name: [] for name in names}
+    for sender, receiver in pairs:
+        receivers[sender].append(receiver)
+    finished: list[str] = []
+    ahead: dict[str, list[str]] = {}
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        if name in ahead:
+            return
+        ahead[name] = []
+        for receiver in receivers[name]:
+            if receiver not in (*path, name):
+                ahead[name].append(receiver)
+                visit(receiver, (*path, name))
+        finished.append(name)
+
+    for name in names:
+        visit(name, ())
+    rank = dict.fromkeys(names, 0)
+    for name in reversed(finished):
+        for receiver in ahead[name]:
+            rank[receiver] = max(rank[receiver], rank[name] + 1)
+    return [[name for name in names if rank[name] == n] for n in range(max(rank.values()) + 1)]
+
+
+def _by_pair(edges: list[tuple[str, str, str, str, str]]) -> dict[tuple[str, str], list[str]]:
+    """Return the types of event that pass between each pair of nodes."""
+    pairs: dict[tuple[str, str], dict[str, None]] = {}
+    for sender, _, event, receiver, _ in edges:
+        pairs.setdefault((sender, receiver), {})[event] = None
+    return {pair: list(events) for pair, events in pairs.items()}
+
+
+def nodes(
+    which: Annotated[
+        str | None, typer.Argument(help='Only this one: a part of its name, or "module:Class".')
+    ] = None,
+) -> None:
+    """Describe nodes: their ports, and their settings with meaning, range and default.
+
+    Without an argument these are all that installed packages offer. Settings that every file may
+    have, whatever its nodes, are listed by "python -m runtime settings".
+    """
+    from rich.console import Console
+
+    from runtime.config.reading import find_modules_in, find_node, find_nodes
+    from runtime.errors import ConfigError, suggest
+    from runtime.tools.cli.tables import warn
+    from runtime.tools.describe import describe
+
+    found = find_nodes(warn)
+    shown = {
+        name: cls
+        for name, cls in found.items()
+        if which is None or which.lower() in f"{name} {cls.__module__}".lower()
+    }
+    if not shown and which is not None and ":" in which:
+        find_modules_in(Path.cwd())
+        shown = {which: find_node(which, "nodes")}
+    if not shown:
+        raise ConfigError(
+            f"expected the name of a node, found {which!r}" + suggest(str(which), found)
+        )
+    console = Console()
+    for name, cls in shown.items():
+        console.print(_tree(describe(cls, name)), highlight=False)
+
+
+def _tree(node: NodeDescription) -> Tree:
+    """Return a node as a tree: what it is, its ports, ticks and settings."""
+    from rich.markup import escape
+    from rich.tree import Tree
+
+    tree = Tree(f"[bold]{node.type}[/bold]\n{escape(node.doc)}")
+    for title, ports in (("listens to", node.inputs), ("sends", node.outputs)):
+        branch = _branch(tree, title, ports)
+        for port in ports:
+            details = ", ".join(filter(None, [port.kind, port.delivery]))
+            events = " or ".join(port.events)
+            line = f"[bold]{port.name}[/bold]  {events} ({details})"
+            branch.add(f"{line}\n{escape(port.doc)}".rstrip())
+    branch = _branch(tree, "is called", node.ticks)
+    for tick in node.ticks:
+        branch.add(f"[bold]{tick.name}[/bold]  at {tick.rate}\n{escape(tick.doc)}")
+    add_settings(_branch(tree, "settings", node.settings), node.settings)
+    return tree
+
+
+def _branch(tree: Tree, title: str, content: Sequence[object]) -> Tree:
+    return tree.add(title) if content else tree
+
+
+def add_settings(tree: Tree, settings: Iterable[SettingDescription]) -> None:
+    """Add settings to a tree, and below each table those in it."""
+    from rich.markup import escape
+
+    for setting in settings:
+        default = f"= {setting.default}" if setting.default else ""
+        if len(default) > 60:
+            default = default[:57] + "…"
+        required = "required" if setting.required else ""
+        changeable = "can change in a run" if setting.changeable else ""
+        details = [setting.type, setting.constraint, required, changeable]
+        line = " ".join(filter(None, [default, f"({', '.join(filter(None, details))})"]))
+        line = f"[bold]{setting.name}[/bold]  {escape(line)}"
+        add_settings(tree.add(f"{line}\n{escape(setting.doc)}".rstrip()), setting.settings)
+
+
+def settings() -> None:
+    """Describe the settings that every file may have: of the run, its network, and any node."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.tree import Tree
+
+    from runtime.channels.links import LinkConfig
+    from runtime.config.model import NetworkConfig, RunConfig
+    from runtime.tools.describe import NODE_SETTINGS, describe_settings, summary
+
+    console = Console()
+    for title, doc, found in (
+        ("[run]", summary(RunConfig), describe_settings(RunConfig)),
+        ("[network]", summary(NetworkConfig), describe_settings(NetworkConfig)),
+        ("[[nodes]]", "What every node may have, beside its own settings.", NODE_SETTINGS),
+        ("[nodes.links.PORT]", summary(LinkConfig), describe_settings(LinkConfig)),
+    ):
+        tree = Tree(f"[bold]{escape(title)}[/bold]\n{escape(doc)}")
+        add_settings(tree, found)
+        console.print(tree, highlight=False)
+
+
+def schema(
+    out: Annotated[
+        Path | None, typer.Option(help="File to write; it is printed if not given.")
+    ] = None,
+) -> None:
+    """Write the JSON schema of configuration files, from the types of all listed nodes.
+
+    A file whose first line is "#:schema PATH" is then completed and checked by editors that know
+    such schemas, for example with Taplo or Even Better TOML.
+    """
+    import json
+
+    from runtime.config.reading import find_nodes
+    from runtime.tools.cli.tables import warn
+    from runtime.tools.schema import schema as schema_of
+
+    text = json.dumps(schema_of(find_nodes(warn)), indent=1, ensure_ascii=False) + "\n"
+    if out is None:
+        print(text, end="")
+        return
+    out.write_text(text, encoding="utf-8")
+    print(out)

@@ -1,0 +1,215 @@
+"""``top``: a monitor of a run, in a terminal.
+
+``web``: a monitor of a run, as a page in a browser.
+
+``set``: change a setting of a node while the run goes on.
+
+``trace``: latencies and loads of a trace, as tables.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.table import Table
+    from rich.text import Text
+
+    from runtime.tools.tracing.write import Trace
+
+
+Run = Annotated[str | None, typer.Argument(help="Name of the run; needed if there are several.")]
+
+
+def top(
+    run: Run = None,
+    leave: Annotated[bool, typer.Option("--leave", help="Quit when the run ends.")] = False,
+) -> None:
+    """Monitor a run in a terminal, and control it.
+
+    It shows nodes, channels, clock, settings and log. Keys pause the run, step it, change its
+    speed or a setting, restart a node and end the run. Quitting does not affect the run.
+    """
+    import asyncio
+
+    from runtime.tools.monitor.client import find
+
+    _check_terminal()
+    asyncio.run(_show(find(run), leave))
+
+
+def _check_terminal() -> None:
+    """Refuse what cannot show a screen.
+
+    Raises:
+        CommandError: It is no terminal, or has not the characters.
+    """
+    import codecs
+    import sys
+
+    from runtime.errors import CommandError
+
+    drawn_on = sys.__stderr__  # by Textual
+    if drawn_on is None or not (sys.stdin.isatty() and drawn_on.isatty()):
+        raise CommandError('expected a terminal, found none; "python -m runtime web" needs none')
+    if codecs.lookup(drawn_on.encoding).name != "utf-8":
+        raise CommandError(
+            f"expected a terminal in UTF-8, found {drawn_on.encoding}: set LC_ALL=C.UTF-8 if it is"
+        )
+
+
+async def _show(path: Path, leave: bool) -> None:
+    from runtime.tools.monitor.client import Client
+    from runtime.tools.monitor.screen import Screen
+
+    await Screen(await Client.connect(path), leave).run_async()
+
+
+DEFAULT_PORT = 8420
+
+
+def web(
+    run: Run = None,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="On this machine; 0 for any.")
+    ] = DEFAULT_PORT,
+    token: Annotated[
+        str | None, typer.Option(help="What the address must hold; made up if not given.")
+    ] = None,
+    leave: Annotated[bool, typer.Option("--leave", help="End with the run.")] = False,
+) -> None:
+    """Monitor a run on a live page, with the same figures and commands as top.
+
+    The page is served on this machine only, and only to those who have the address that is printed.
+    """
+    import asyncio
+
+    from runtime.tools.monitor.client import find
+
+    asyncio.run(_serve(find(run), port, token, leave))
+
+
+async def _serve(path: Path, port: int, token: str | None, leave: bool) -> None:
+    from runtime.errors import CommandError
+    from runtime.tools.monitor.client import Client
+    from runtime.tools.monitor.web import serve
+
+    try:
+        await serve(await Client.connect(path), port, token, leave)
+    except OSError as error:
+        raise CommandError(
+            f"--port {port}: expected a port that is free, found: {error.strerror}"
+        ) from None
+
+
+def set_(
+    change: Annotated[str, typer.Argument(metavar="NODE.KEY=VALUE", help="As for run --set.")],
+    run: Annotated[
+        str | None, typer.Option(help="Name of the run; needed if there are several.")
+    ] = None,
+) -> None:
+    """Change a setting of a node while its run goes on.
+
+    The value is checked as in the file. The change is an event of the run, so that its log, its
+    digest and its recordings have it. "python -m runtime nodes" says which settings can change.
+    """
+    from runtime.tools.monitor.client import ask, find
+    from runtime.tools.monitor.command import Set
+
+    found = find(run)
+    print(f"run {found.stem.rpartition('-')[0]}: {ask(found, Set(text=change))}")
+
+
+def trace(
+    file: Annotated[Path, typer.Argument(help="A trace that run --trace wrote.")],
+) -> None:
+    """Show the latency from sensors to set-points, and how much of the loop each node had.
+
+    A path is the events from an exposure to a set-point: → where one follows from another (it
+    bears its stamp, or was sent on hearing it), ⇢ where a node goes at a rate of its own, and it
+    was the newest that it had heard. Latencies begin at the exposure.
+    """
+    from rich.console import Console
+
+    from runtime.tools.tracing.write import read_trace
+
+    found = read_trace(file)
+    console = Console()
+    for table in tables(found, console.encoding):
+        console.print(table)
+    clock = found.about.get("clock", "?")
+    console.print(
+        f"run {found.about.get('run', '?')!r} on the {clock} clock; ui.perfetto.dev shows the rest",
+        highlight=False,
+    )
+
+
+def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
+    """Return the paths of a trace, and its nodes, as a terminal of this encoding can show them."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from runtime.tools.tracing.write import node_loads, paths, quantile
+
+    routes = paths(found)
+    for number, route in enumerate(routes, 1):
+        yield Text(f"path {number}: {_for(encoding, route.path)}")
+    table = Table(
+        "path", "times", "run p50 ms", "p99", "max", "real p50 ms", "p99", "max",
+        title="from sensor to set-point", title_justify="left",
+    )  # fmt: skip
+    for number, route in enumerate(routes, 1):
+        figures = [
+            f"{figure:.2f}"
+            for each in (route.run_ms, route.real_ms)
+            for figure in (quantile(each, 0.5), quantile(each, 0.99), max(each))
+        ]
+        table.add_row(f"{number}", f"{len(route.run_ms)}", *figures)
+    if not table.row_count:
+        yield Text("no set-point was sent that a sensor led to")
+    else:
+        yield _right(table)
+    table = Table(
+        "node", "steps", "loop ms", "share", "longest ms", "in",
+        title="on the loop", title_justify="left",
+    )  # fmt: skip
+    for share in node_loads(found):
+        table.add_row(
+            _for(encoding, share.node),
+            f"{share.steps}",
+            f"{share.busy_ms:.1f}",
+            f"{share.share:.1%}",
+            f"{share.longest_ms:.3f}",
+            _for(encoding, share.longest),
+        )
+    yield _right(table)
+
+
+def _for(encoding: str, text: str) -> str:
+    """Return a text in characters that an encoding has."""
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        text = text.replace("→", "->").replace("⇢", "~>")
+        return text.encode(encoding, "replace").decode(encoding)
+    return text
+
+
+def _right(table: Table) -> Table:
+    for column in table.columns[1:]:
+        if column.header != "in":
+            column.justify = "right"
+    return table
