@@ -17,7 +17,7 @@ from bench.systems.parts import payloads
 from runtime import Input, Node, NodeConfig, Output, on
 from runtime.channels.digest import Digest
 from runtime.config.model import Config, RunConfig
-from runtime.run import event_loop as task_factory
+from runtime.run import event_loop
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.time.clock import RealClock
@@ -134,7 +134,7 @@ def measure(case: Case, digest: bool = False) -> Samples:
 
     async def main() -> Any:
         loop = asyncio.get_running_loop()
-        task_factory.install(loop)
+        event_loop.install(loop)
         clock = RealClock(loop)
         supervisor = Supervisor(config, clock, [Digest()] if digest else [])
         await supervisor.main()

@@ -17,7 +17,7 @@ from bench.system import Ping
 from events import Event, Image, PoseEstimate, Quaternion, Vector3
 from runtime.channels.sender import Listener, Sender
 from runtime.channels.streams import Stream
-from runtime.run import event_loop as task_factory
+from runtime.run import event_loop
 from runtime.time.clock import RealClock
 from runtime.workers.worker import Worker
 
@@ -74,7 +74,7 @@ def measure(bursts: int = 400) -> list[ThroughputRow]:
 
 
 async def _measure(bursts: int) -> list[ThroughputRow]:
-    task_factory.install(asyncio.get_running_loop())
+    event_loop.install(asyncio.get_running_loop())
     event = Ping(stamp=0, source="one", receiver=2, number=0)
     pixels = np.zeros((512, 512, 3), np.uint8)
     image = Image(stamp=0, source="drone/front", frame_id="f", data=pixels)

@@ -1,12 +1,8 @@
-"""What every event is: frozen data with a time, a source and a category.
+"""The base class of all events, events of a run itself, and the checks that every event passes.
 
-Events about the run itself.
-
-What the events of this package are held to when they are made, so that nothing wrong gets about.
-
-A stamp is an `int`; vectors, angles and the like are finite; an orientation is a unit quaternion.
-What is not raises in the node that makes the event, and names the field; it never reaches those
-who would have received it.
+An event is frozen data with a stamp, a source and a category. A stamp is an `int`; vectors, angles
+and the like are finite; an orientation is a unit quaternion. A wrong value raises in the node that
+makes the event, and the error names the field: no receiver ever sees it.
 """
 
 from __future__ import annotations

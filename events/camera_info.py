@@ -1,10 +1,7 @@
-"""Intrinsics of a camera: from points to pixels and back, with the lens's distortion.
+"""Cameras: intrinsics, distortion, response curve and vignette, from points to pixels and back.
 
-Plain numpy: what is announced is what simulators draw with and estimators compute with.
-
-From grey levels to light and back: response curves and vignettes, as cameras announce them.
-
-Light is a share of what makes a pixel white (255) in the middle of the image.
+Plain numpy: simulators draw with what estimators compute with. Light is a share of what makes a
+pixel white (255) in the middle of the image.
 """
 
 from __future__ import annotations

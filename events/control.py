@@ -1,8 +1,7 @@
-"""What a vehicle can be asked to do. Newest set-point wins, whatever its kind.
+"""Set-points and commands for a vehicle, and what happens to it.
 
-World frame NED, body frame FRD, SI units; see `events.geometry`.
-
-What happened to a vehicle.
+The newest set-point wins, whatever its kind. World frame NED, body frame FRD, SI units; see
+`events.geometry`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,4 @@
-"""Events of estimators: poses, tracking, features.
-
-How well something did.
-
-Maps that nodes build.
-"""
+"""Estimates: poses, tracking, features, maps, and scores of them."""
 
 from __future__ import annotations
 

@@ -1,24 +1,18 @@
-"""Changes of axes, on plain float tuples: NED, NWU and ENU worlds, FRD and FLU bodies, optical.
-
-Ours are NED, FRD and optical (x right, y down, z forward); see `events.geometry`. MuJoCo's worlds
-and data sets are NWU, ROS's world is ENU and its bodies FLU (REP 103); optical axes are the same
-everywhere. Each change is a half turn, so the same function of vectors goes both ways.
-
-Places on the earth: between ``map`` (NED at an origin) and WGS 84's latitude and longitude.
-
-Through earth-centred, earth-fixed coordinates (ECEF), so without approximation: a run's ``map`` is
-the plane that touches the ellipsoid's parallel surface at the origin.
-
-Unit quaternions as plain float tuples: product, inverse, rotation of vectors, angles, slerp.
+"""Rotations, changes of axes, and places on the earth, on plain float tuples.
 
 A quaternion is ``(w, x, y, z)``, Hamilton's, everywhere in this project; it rotates vectors from
 the child frame to the parent frame. Equations: J. Solà, *Quaternion kinematics for the error-state
-Kalman filter*, 2017, sections 1 and 2.
+Kalman filter*, 2017, sections 1 and 2. Nothing here makes a numpy array: one `np.cross` of two
+3-vectors costs as much as a whole attitude controller written in floats. Many rotations at once are
+scipy's (``Rotation.from_quat(…, scalar_first=True)``).
 
-Nothing here makes a numpy array: one `np.cross` of two 3-vectors costs as much as a whole attitude
-controller written in floats. Many rotations at once are scipy's
-(``Rotation.from_quat(…, scalar_first=True)``); poses as matrices are in `events.geometry`, and
-changes of axes (NED, ENU, NWU, FRD, FLU, optical) in `events.frames`.
+Axes: ours are NED, FRD and optical (x right, y down, z forward). MuJoCo's worlds and data sets are
+NWU, ROS's world is ENU and its bodies FLU (REP 103); optical axes are the same everywhere. Each
+change is a half turn, so the same function of vectors goes both ways.
+
+Places: between ``map`` (NED at an origin) and WGS 84's latitude and longitude, through
+earth-centred, earth-fixed coordinates (ECEF), so without approximation. A run's ``map`` is the
+plane that touches the ellipsoid's parallel surface at the origin.
 """
 
 from __future__ import annotations

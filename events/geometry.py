@@ -8,12 +8,9 @@ Frames (right-handed, metres, radians):
 - ``<camera>_optical``: x right, y down, z forward (REP 103's optical frame).
   The rotation from optical to camera body is ``[[0,0,1],[1,0,0],[0,1,0]]``.
 
-A pose of B in A is the transform that takes coordinates in B to coordinates in A.
-ENU/FLU (REP 103) appear only at the edges that need them, such as a ROS bridge.
-
-Poses as transforms: a position and an orientation, or a matrix of shape (4, 4).
-
-A pose of B in A is the transform that takes coordinates in B to coordinates in A.
+A pose of B in A is the transform that takes coordinates in B to coordinates in A: a position and an
+orientation, or a matrix of shape (4, 4). ENU/FLU (REP 103) appear only at the edges that need them,
+such as a ROS bridge.
 """
 
 from __future__ import annotations

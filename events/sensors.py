@@ -1,9 +1,7 @@
-"""What sensors measure.
+"""Measurements of sensors, and the fields of them that can be plotted.
 
 Arrays are checked and made read-only when the event is made: what has been sent does not change,
 and an image passes from node to node by reference.
-
-What the small sensors measure: which fields of their events are numbers, and in which unit.
 """
 
 from __future__ import annotations

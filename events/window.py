@@ -1,7 +1,4 @@
-"""Events from a window and its keyboard.
-
-Names of keys, as `KeyPressed` and `KeyReleased` carry them.
-"""
+"""Events of a window and its keyboard, and the names of keys that they carry."""
 
 from __future__ import annotations
 

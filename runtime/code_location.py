@@ -1,9 +1,6 @@
-"""Where code stands or has failed: the node, and the line of it.
+"""Locations in code: the node and the line at which a thread, a task or an exception stands.
 
-Of a thread (by its frame), of a task that waits, of an exception. Not here: watching over a loop
-(`runtime.run.watchdogs`) or a run (`runtime.run.watchdogs`).
-
-The frame in which a thread of this process is.
+Not here: watching over a loop or a run (`runtime.run.watchdogs`).
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, OnError, RunConfig
 from runtime.config.reading import convert
 from runtime.node import Node
-from runtime.run import event_loop as task_factory
+from runtime.run import event_loop
 from runtime.run.summarise import count_drops, tick_summaries
 from runtime.run.supervisor import Supervisor
 from runtime.summary import StreamSummary, TickSummary
@@ -67,7 +67,7 @@ def run_in_lockstep(main: Coroutine[Any, Any, R]) -> R:
 
     async def prepared() -> R:
         loop = asyncio.get_running_loop()
-        task_factory.install(loop)
+        event_loop.install(loop)
         return await loop.create_task(main)
 
     with asyncio.Runner(loop_factory=LockstepLoop) as runner:

@@ -1,10 +1,9 @@
-"""An input of several events of one stamp: image, depth and pose that belong together.
+"""Declarations of a class of nodes, and inputs of several events of one stamp.
 
-It is declared with `Bundle`; at run time a `Matcher` does the work. A set that is not completed, or
-that the reader skips, leaves its tuples to the next one. (A set that is lost by a link before the
-bundle takes them along.) Stamps rise from set to set: what comes twice, or late, makes no set.
-
-Reading what a class of nodes declares: its ports, handlers, ticks and phases.
+A `Bundle` declares that image, depth and pose belong together; at run time a `Matcher` does the
+work. A set that is not completed, or that the reader skips, leaves its tuples to the next one. (A
+set that is lost by a link before the bundle takes them along.) Stamps rise from set to set: an
+event that comes twice, or late, makes no set.
 """
 
 from __future__ import annotations

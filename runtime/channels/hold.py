@@ -16,8 +16,6 @@ the same estimator has the same digest as a worker and as a process of its own.
 
 In real time nothing is held: answers come when they come, no earlier than their latency, and an
 answer to a later frame says that those before it were skipped.
-
-The answer to one frame for a system outside the process, to be awaited.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Saying what is wrong with a setting: msgspec's messages as place, expected, found.
+"""Errors of settings as place, expected and found; and changes from the command line.
 
-Changing settings from the command line: ``--set drone.cameras.front.rate=10``.
+A change is ``--set drone.cameras.front.rate=10``.
 """
 
 from __future__ import annotations

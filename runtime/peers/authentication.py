@@ -1,4 +1,4 @@
-"""Seals on messages: who wrote them, for whom, and that none is forged, repeated or missing.
+"""The secret of a run, and seals on messages: none is forged, repeated or missing.
 
     u8       version of the messages
     u64 LE   number: 0 for a hello, then one more for each message of a session and direction
@@ -9,11 +9,9 @@
 A hello is sealed with the key of the run. It carries a nonce, and once it answers another hello,
 that one's nonce; so an old hello proves nothing. From both nonces comes the key of a session.
 
-The secret of a run: a process that has it may take part, and no other.
-
-On one machine it is a random key in a file that only its user can read, made when it is first
-needed; so nobody has to think of it. Processes on several machines, or of several users, are given
-one by `network.secret`.
+A process that has the secret may take part, and no other. On one machine it is a random key in a
+file that only its user can read, made when it is first needed. Processes on several machines, or of
+several users, are given one by `network.secret`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The start of a run in several processes: announcements exchanged, and one first update for all.
+"""The start and the end of a run in several processes.
+
+At the start announcements are exchanged, and there is one first update for all.
 
 A process is in one of these states, and says so to each other one when it comes to it:
 
@@ -20,10 +22,8 @@ depends on what was lost with the session before. A new process starts its nodes
 announce what it announced before, since nodes elsewhere have heard of it. A loss after the decision
 is one of the run, also for a process that learns of it before it was told.
 
-The end of a run in several processes: in order, and not for ever.
-
-Nodes end in reverse order of the file, wherever they are, and no process leaves before all
-summaries are exchanged. Processes that are silent for long are not waited for.
+At the end nodes end in reverse order of the file, wherever they are, and no process leaves before
+all summaries are exchanged. Processes that are silent for long are not waited for.
 """
 
 from __future__ import annotations

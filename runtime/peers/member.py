@@ -1,16 +1,13 @@
-"""Another process, and what is known of it.
-
-The way to one other process: a message goes at once if it is sure to, else by a thread.
+"""Another process of the run: the way to it, and the difference of its clocks.
 
 Zenoh waits where the network is slow, and the loop must not. A small message goes out on the spot
 as long as little is under way, by what the other process has confirmed; then Zenoh has room for
 it. So does an image if the other process sees memory of ours, where it is put: its message is
-small. All others are written by a thread, in order.
+small. All others are written by a thread, in order (`Outbox`).
 
-How far the clocks of another process are from ours.
-
-Cristian's algorithm: a reply that took little time, there and back, cannot have been read off far
-from the middle of it. (F. Cristian, Probabilistic clock synchronization, 1989.)
+Clocks are compared by Cristian's algorithm: a reply that took little time, there and back, cannot
+have been read off far from the middle of it. (F. Cristian, Probabilistic clock synchronization,
+1989.)
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
-"""Running a loop to the end of a coroutine, and closing it, whatever its tasks do.
+"""Loops that run to the end of a coroutine whatever their tasks do, and tasks that streams resume.
 
-Unlike `asyncio.Runner`, this survives a `SystemExit` or `KeyboardInterrupt` that some task or
-callback lets out of the loop, and waits a limited time for tasks that swallow their cancellation.
+Unlike `asyncio.Runner`, `run_to_end` survives a `SystemExit` or `KeyboardInterrupt` that some task
+or callback lets out of the loop, and waits a limited time for tasks that swallow their
+cancellation.
 
-Tasks whose coroutines streams can resume at once, if this interpreter's asyncio allows it.
-
-`runtime.channels.tasks` and `runtime.channels.streams` rely on how asyncio's tasks work inside. At
-the first use in a process, a self-test tries it; where the interpreter differs, tasks stay
-asyncio's own, which streams wake through the loop: slower, with the same results.
+`runtime.channels.tasks` relies on how asyncio's tasks work inside. At the first use in a process, a
+self-test tries it; where the interpreter differs, tasks stay asyncio's own, which streams wake
+through the loop: slower, with the same results.
 """
 
 from __future__ import annotations

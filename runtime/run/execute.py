@@ -26,7 +26,6 @@ from runtime.errors import NodeError, VisnavError
 from runtime.logs import file_handler, logging_to
 from runtime.node import Node
 from runtime.run import event_loop, results
-from runtime.run import event_loop as task_factory
 from runtime.run.node_runner import log_error, with_place, wrap
 from runtime.run.results import private_results
 from runtime.run.summarise import summarise
@@ -158,7 +157,7 @@ class _Run:
     async def main(self) -> Summary:
         """Run the nodes to their end, and put together what there is to say of it."""
         loop, run = asyncio.get_running_loop(), self._config.run
-        task_factory.install(loop)
+        event_loop.install(loop)
         clock = self._clock = make_clock(run, loop)
         self.supervisor = supervisor = Supervisor(
             self._config,

@@ -1,13 +1,12 @@
-"""What belongs to one node while it runs, and how its errors are named and logged.
+"""One node while it runs: its tasks and limits, its errors, and the phases up to the first update.
 
 A node may raise whatever it likes, `SystemExit` and the like included, and swallow its
-cancellation: each of its steps is a task, waited for within a limit and then left behind.
+cancellation: each of its steps is a task, waited for within a limit and then left behind. The
+phases, the same in a run and in a check of its file (`start_up`):
 
-The phases of nodes up to the first update, the same in a run and in a check of its file.
-
-construct → on_startup, in file order
-announce → on_announcement, check
-on_ready, in file order
+    construct → on_startup, in file order
+    announce → on_announcement, check
+    on_ready, in file order
 """
 
 from __future__ import annotations

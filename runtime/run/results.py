@@ -1,14 +1,13 @@
-"""A run's folder: whose it is, and files in it that are written as a whole or not at all.
+"""A run's folder: its owner, and files in it that are written as a whole or not at all.
 
 A folder that the runtime has made has a marker in it, and only such a folder is ever moved or
 removed. The marker says which process uses it, when its first update was, and in the end which
 files it has made; that process holds a lock on it. Not here: what nodes write.
 
-Where nodes write while a run has programs that must not see it: the truth, a plan, a recording.
-
-Nobody tells a program of this folder. When all nodes are down, whatever ended the run, what is in
-it takes its place in the run's folder, in an instant. Of a run that was killed it stays, and the
-next such run says where. It is no guard against a program that searches the whole machine.
+While a run has programs, its nodes write into a private folder, which no program is told of: truth,
+plan, recording. When all nodes are down, whatever ended the run, its files take their place in the
+run's folder, in an instant. Of a run that was killed it stays, and the next such run says where. It
+is no guard against a program that searches the whole machine.
 """
 
 from __future__ import annotations

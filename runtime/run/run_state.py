@@ -1,8 +1,7 @@
-"""What is known of a run while it goes on: written by its supervisor, read by observers.
+"""State of a run while it goes on, and changes of its nodes' settings.
 
-Changing a node's settings while it runs, and telling every node that listens.
-
-What may change to what is decided in `runtime.config.parameters`.
+The supervisor writes the state, observers read it. Which settings may change is decided in
+`runtime.config.parameters`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The summary of a run, from its state.
-
-What figures depend on besides the file: machine, versions, command line and commit.
-"""
+"""The summary of a run: from its state, the machine, versions, command line and commit."""
 
 from __future__ import annotations
 

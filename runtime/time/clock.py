@@ -1,9 +1,7 @@
 """The run's clock, which is all that a node knows of time.
 
-Two implementations: `runtime.time.lockstep` (simulated time that jumps) and
-`runtime.time.clock`.
-
-Real time: ticks from a Linux timerfd, because uvloop's own timers have a grain of 1 ms.
+Two implementations: `runtime.time.lockstep` (simulated time that jumps) and `RealClock`, whose
+ticks come from a Linux timerfd, because uvloop's own timers have a grain of 1 ms.
 """
 
 from __future__ import annotations

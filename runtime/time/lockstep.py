@@ -11,9 +11,7 @@ Sockets and threads of other libraries are served too, but when their answers ar
 simulated; only `Clock.beside` (that is, `Node.offload` and workers), `asyncio.to_thread` and
 `loop.run_in_executor` are.
 
-Trying once per process whether this interpreter's asyncio works as this project relies on.
-
-What is tried, and what is done if it does not: `runtime.run.event_loop`, `runtime.time.lockstep`.
+A self-test, once per process, tells whether this interpreter's asyncio works as relied on here.
 """
 
 from __future__ import annotations

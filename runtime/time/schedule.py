@@ -1,13 +1,8 @@
-"""What is due when, in integer nanoseconds of the run's clock.
+"""Ticks and other entries due at integer nanoseconds of the run's clock, and how late they were.
 
-Both clocks keep one `Schedule`; they differ in how they get from one due time to the next. Things
-due at the same time run in the order in which they were added, which for ticks is the order of
-the nodes in the file.
-
-A histogram of durations that costs one addition a sample and never grows.
-
-Buckets are 1/32 of an octave wide, so a quantile is right to within 3 %: the scheme of
-HdrHistogram (hdrhistogram.org) on integers of nanoseconds.
+Both clocks keep one `Schedule`; they differ in how they get from one due time to the next. Entries
+due at the same time run in the order in which they were added, which for ticks is the order of the
+nodes in the file. A `Histogram` of lateness costs one addition a sample and never grows.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ from runtime.config.plugins import offers
 from runtime.errors import NodeError, UncheckableError, VisnavError, suggest
 from runtime.node import Node
 from runtime.paths import written
-from runtime.run import event_loop as task_factory
+from runtime.run import event_loop
 from runtime.run.execute import make_clock, make_loop
 from runtime.run.graph import circles, edges, input_types, unconnected
 from runtime.run.node_host import siblings
@@ -103,7 +103,7 @@ def of_nodes(config: Config) -> Findings:
 
 async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> list[Announcement]:
     loop = asyncio.get_running_loop()
-    task_factory.install(loop)
+    event_loop.install(loop)
     clock = make_clock(config.run, loop)
     host = _DryHost(config, clock)
     created: set[asyncio.Task[Any]] = set()
