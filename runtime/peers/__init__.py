@@ -2,20 +2,17 @@
 
     messages         what processes send each other
     zenoh_session    how it gets there: Zenoh, in this module only
-    secret           which processes may take part: those that know it
-    authentication   seals on messages, so that no other process's are taken
+    authentication   the secret of a run, and seals on messages
     shared_memory    what large events pass through between processes of one machine
-    outbox           a thread that writes to one process, so that the loop never waits for a network
-    compatibility    whether the processes present make up the run: all nodes once, and equal files
-    clock_offsets    how far another machine's clocks are from ours
     clock_sync       real time: keeping our clock with another machine's
     time_token       lockstep: one process at a time goes on, the one with the next thing due
     remote_events    outputs here with listeners there, and the other way round
-    handshake        how two processes that see each other come to a session
-    member           another process, and what is known of it
+    handshake        how two processes that see each other come to a session, and whether they fit
+    member           another process: the way to it, and the difference of its clocks
     waiting          for other processes, and for the return of those that were lost
     membership       who is there, who comes and who goes
-    joint_shutdown   the end: in order, and no process leaves before all summaries are exchanged
+    joint            the start and the end, in order, without anybody left behind
+    others           what a supervisor asks of them, of a run without any
     peers            all of it together, for the supervisor
 
 An event that crosses is received once its sender's process has nothing more to do at that instant.

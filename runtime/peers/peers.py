@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
 import msgspec
@@ -38,8 +38,10 @@ from runtime.peers.messages import (
     TimeToken,
     TokenRequest,
 )
+from runtime.peers.others import Others
 from runtime.peers.remote_events import RemoteEvents, subscriptions
 from runtime.peers.time_token import TimeTokenHolder
+from runtime.summary import Summary
 from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
 
@@ -63,7 +65,7 @@ class Run(Protocol):
         """Freeze anew which listener receives which output."""
 
 
-class Peers:
+class Peers(Others):
     """All processes of a run but this one.
 
     Attributes:
@@ -119,14 +121,18 @@ class Peers:
         """Send the others what the nodes here announce; return what all do, in file order."""
         return await self._start.announce(own)
 
-    async def begin(self) -> None:
+    async def begin(self, connect: Callable[[], None]) -> None:
         """Agree on when the first update is, and wait for it."""
+        connect()
         self._follow(await self._start.begin())
 
     def _follow(self, member: Member | None) -> None:
         if member is not None and isinstance(self._clock, RealClock):
             self._followed = member.number
             self._follower = ClockFollower(self._clock, member)
+
+    def start_clock(self) -> None:
+        """Do nothing: `begin` has started it."""
 
     def nodes_run(self) -> None:
         """Deliver messages from now on: the nodes here have begun."""
@@ -191,7 +197,17 @@ class Peers:
         self._ended_here.append(node)
         self._broadcast_in_order(NodeEnded(node))
 
+    async def wait_to_end(self, node: str) -> None:
+        """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
+        await self.shutdown.wait_to_end(node)
+
     # After the run.
+
+    async def leave(self, summary: Summary) -> Summary:
+        """Exchange summaries; return that of all processes, and send what still waits."""
+        whole = await self.shutdown.exchange_summaries(summary)
+        await self.close()
+        return whole
 
     async def close(self) -> None:
         """Send what still waits, and leave."""

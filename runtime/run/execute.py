@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -35,9 +35,6 @@ from runtime.summary import Stall, Summary
 from runtime.time import lockstep
 from runtime.time.clock import Clock, RealClock
 from runtime.time.lockstep import LockstepClock, LockstepLoop
-
-if TYPE_CHECKING:
-    from runtime.peers.peers import Peers
 
 log = logging.getLogger("visnav.runtime")
 events_log = logging.getLogger("visnav.events")
@@ -191,18 +188,11 @@ class _Run:
                 stalls=watchdog.stalls,
                 longest_stalls=watchdog.longest,
             )
-            if supervisor.peers is not None:
-                summary = await self._whole_summary(supervisor.peers, summary)
+            try:
+                summary = await supervisor.others.leave(summary)
+            except Exception as error:
+                self.failed(wrap("the other processes", error))
         clock.close()
-        return summary
-
-    async def _whole_summary(self, peers: Peers, summary: Summary) -> Summary:
-        """Put the summary together with those of the other processes, if they can be had."""
-        try:
-            summary = await peers.shutdown.exchange_summaries(summary)
-            await peers.close()
-        except Exception as error:
-            self.failed(wrap("the other processes", error))
         return summary
 
     def escaped(self, error: BaseException) -> None:

@@ -71,11 +71,6 @@ def listeners(
     return found
 
 
-def no_listeners(_: str) -> Iterable[Listener]:
-    """Return the listeners of an output in other processes, where there are none."""
-    return ()
-
-
 def connect(
     nodes: Sequence[Node[Any]],
     sources: Sources,
@@ -83,7 +78,7 @@ def connect(
     taps: Iterable[Tap] = (),
     fault: Fault | None = None,
     last: Iterable[Listener] = (),
-    elsewhere: Callable[[str], Iterable[Listener]] = no_listeners,
+    elsewhere: Callable[[str], Iterable[Listener]] = lambda _: (),
     wrap: Wrap = unwrapped,
     voices: Voices | None = None,
 ) -> list[Listener]:

@@ -20,7 +20,7 @@ from collections.abc import Collection, Coroutine, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -31,6 +31,7 @@ from runtime.config.model import Config
 from runtime.errors import FatalError, NodeError, PeerError, VisnavError
 from runtime.host import RunEnd
 from runtime.node import Node
+from runtime.peers.others import Others
 from runtime.run import graph
 from runtime.run.event_loop import RunTask
 from runtime.run.instruments import Instruments
@@ -39,9 +40,6 @@ from runtime.run.node_runner import Announced, NodeRunner, Phase, log_error, sta
 from runtime.run.run_state import ParameterServer, RunState
 from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND, Once
-
-if TYPE_CHECKING:
-    from runtime.peers.peers import Peers
 
 log = logging.getLogger("visnav.runtime")
 
@@ -71,7 +69,7 @@ class Supervisor:
         instruments: What looks at the run.
         parameters: Changes settings of nodes.
         stepping: Pauses and steps simulated time.
-        peers: The other processes of the run, if there are any.
+        others: The other processes of the run.
     """
 
     def __init__(
@@ -107,11 +105,11 @@ class Supervisor:
         self.stepping = self._host.stepping
         self._taps = tuple(taps)
         self._voices = Voices([spec.name for spec in config.nodes], scripted)
-        self.peers: Peers | None = None
+        self.others = Others(clock)
         if several:
             from runtime.peers.peers import Peers
 
-            self.peers = Peers(config, only, clock, self)
+            self.others = Peers(config, only, clock, self)
         self._ended = asyncio.Event()
         self._startup: asyncio.Task[None] | None = None
         self._tasks: dict[asyncio.Task[Any], None] = {}
@@ -161,8 +159,7 @@ class Supervisor:
         if state.stop_requested:
             reason, by = state.stop_requested, "user"
         by = "user" if error is None and self._ends_run(by) == "hand" else by
-        if self.peers is not None:
-            self.peers.stopping(reason, error, by=by, from_peer=from_peer)
+        self.others.stopping(reason, error, by=by, from_peer=from_peer)
         state.reason = reason
         state.error = error
         state.stopped, state.stopped_at = time.monotonic(), state.clock.now()
@@ -252,13 +249,12 @@ class Supervisor:
             taps=taps,
             fault=self._listener_failed,
             last=[Listener("run", self._receive_end, (Shutdown, WindowClosed))],
-            elsewhere=self.peers.listeners if self.peers is not None else graph.no_listeners,
+            elsewhere=self.others.listeners,
             wrap=self.instruments.listener,
             voices=self._voices,
         )
         self.state.truth_readers |= graph.truth_readers(nodes, listeners, self.state.announcements)
-        if self.peers is not None:
-            self.peers.connect(listeners, self._listener_failed)
+        self.others.connect(listeners, self._listener_failed)
         self.parameters.connect(listeners, taps, self._listener_failed)
 
     def _reconnect(self) -> None:
@@ -303,8 +299,7 @@ class Supervisor:
                 log.warning("%s: receives true poses, and does not announce so", node)
         state.running = True
         state.first_update = time.monotonic()
-        if self.peers is None:
-            state.clock.start()
+        self.others.start_clock()
         if state.config.run.duration:
             end = state.clock.now() + round(state.config.run.duration * SECOND)
             state.clock.schedule.add(end, Once(lambda: self.stop("duration", by="")))
@@ -312,8 +307,7 @@ class Supervisor:
             if spec.name in state.runners:
                 state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
                 self._host.run_node(state.runners[spec.name])
-        if self.peers is not None:
-            self.peers.nodes_run()
+        self.others.nodes_run()
 
     async def _start_nodes(self) -> list[Announcement]:
         """Bring the nodes here to where their first update is next; return their announcements."""
@@ -325,7 +319,7 @@ class Supervisor:
 
         async def exchange(announced: Announced) -> list[Announcement]:
             mine.extend(chain(*announced.values()))
-            self.state.announcements += await self.peers.announce(announced) if self.peers else mine
+            self.state.announcements += await self.others.announce(announced)
             return self.state.announcements
 
         async def ready(runner: NodeRunner) -> None:
@@ -333,10 +327,9 @@ class Supervisor:
             self._check_wanted()
 
         runners = self.state.runners.values()
-        if self.peers is not None:
-            before = await self.peers.meet()
-            for runner in runners:
-                runner.starts = before
+        before = await self.others.meet()
+        for runner in runners:
+            runner.starts = before
         await start_up(
             runners,
             start=start,
@@ -345,9 +338,7 @@ class Supervisor:
             failed=_give_up,
             voices=self._voices,
         )
-        if self.peers is not None:
-            self.connect()  # so that each knows what the others receive
-            await self.peers.begin()
+        await self.others.begin(self.connect)
         return mine
 
     def _check_wanted(self) -> None:
@@ -411,15 +402,13 @@ class Supervisor:
         for name, runner in reversed(self.state.runners.items()):
             await self._wait_to_end(name)
             await self._shut_down(runner)
-            if self.peers is not None:
-                self.peers.node_ended(name)
+            self.others.node_ended(name)
         await self._wait_to_end("")
 
     async def _wait_to_end(self, name: str) -> None:
         """Let the nodes after this one end first, in whichever process they are."""
         try:
-            if self.peers is not None:
-                await self.peers.shutdown.wait_to_end(name)
+            await self.others.wait_to_end(name)
         except VisnavError as error:
             log.error("%s", error)
             self.state.note_error(error)

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -71,10 +71,10 @@ def test_an_end_between_readiness_and_the_first_update_ends_both(
     """One of them is told, or decides, that the run has begun, and ends before it does."""
     begin = Peers.begin
 
-    async def begin_and_end(peers: Peers) -> None:
+    async def begin_and_end(peers: Peers, connect: Callable[[], None]) -> None:
         if peers._membership.here == (who,):
             peers._run.stop("enough", ValueError("of this"))
-        await begin(peers)
+        await begin(peers, connect)
 
     monkeypatch.setattr(Peers, "begin", begin_and_end)
     config = settings(("asker", "Asker", {}), ("one", "Answerer", {}), clock=clock, duration=60)

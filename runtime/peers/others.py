@@ -1,0 +1,74 @@
+"""Other processes of a run as its supervisor sees them; here, those of a run without any.
+
+With others, `runtime.peers.peers.Peers` stands in the place of this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from itertools import chain
+
+from events import Announcement
+from runtime.channels.sender import Listener
+from runtime.channels.tasks import Fault
+from runtime.summary import Summary
+from runtime.time.clock import Clock
+
+
+class Others:
+    """No other processes: all nodes of the file run here.
+
+    The methods stand in the order in which a run calls them.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+
+    async def meet(self) -> int:
+        """Wait until all nodes of the file are there.
+
+        Returns:
+            How often the nodes here were in this run before, in a process that was lost.
+
+        Raises:
+            PeerError: They are not within the limit, or one runs another file or our nodes.
+        """
+        return 0
+
+    async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
+        """Exchange announcements; return those of all nodes, in file order."""
+        return list(chain(*own.values()))
+
+    async def begin(self, connect: Callable[[], None]) -> None:
+        """Agree on when the first update is, and wait for it.
+
+        Args:
+            connect: Connects the nodes here, so that each process knows what the others receive.
+        """
+
+    def start_clock(self) -> None:
+        """Start the run's clock, if nobody else does."""
+        self._clock.start()
+
+    def nodes_run(self) -> None:
+        """Deliver messages from now on: the nodes here have begun."""
+
+    def listeners(self, output: str) -> list[Listener]:  # noqa: ARG002
+        """Return an output's listeners in other processes."""
+        return []
+
+    def connect(self, listeners: list[Listener], fault: Fault) -> None:
+        """Connect the listeners here to outputs elsewhere, and notify the others."""
+
+    def stopping(self, reason: str, error: Exception | None, *, by: str, from_peer: bool) -> None:
+        """Notify the others that the run ends, and why; also where the reason is `from_peer`."""
+
+    async def wait_to_end(self, node: str) -> None:
+        """Wait until all nodes after this one have ended, wherever they are; "" is before all."""
+
+    def node_ended(self, node: str) -> None:
+        """Notify the others that a node here has ended."""
+
+    async def leave(self, summary: Summary) -> Summary:
+        """Exchange summaries; return that of all processes, and talk to them no more."""
+        return summary
