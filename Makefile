@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-pythons test-all check fix docs wheel peers bench bench-quick orbslam3 svo suite images clean
+.PHONY: help setup demo test test-slow test-pythons test-all check fix size docs wheel peers bench bench-quick orbslam3 svo suite images clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -57,6 +57,9 @@ check: $(READY)  ## Check style and types.
 fix: $(READY)  ## Mend what style checks can mend.
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+size:  ## Print how many lines and files each room has.
+	@$(PYTHON) tools/size.py
 
 docs: $(READY)  ## Build the documentation into build/site; every broken link is an error.
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

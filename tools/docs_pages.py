@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -157,11 +158,11 @@ PLACES = {
 """Column and row of each room: it may import what lies below it."""
 
 ABOUT = {
-    "bench": "benchmarks and their peers",
-    "sims": "simulators",
-    "nodes": "estimators, evaluation, recorder, viewers, bridge",
-    "runtime.tools": "command line, monitor, sweep, trace",
-    "runtime": "the core: node, channels, clocks, workers, run",
+    "bench": "benchmarks and their peers:",
+    "sims": "simulators:",
+    "nodes": "what else plugs in:",
+    "runtime.tools": "round the core:",
+    "runtime": "the core:",
     "events": "frozen typed data",
 }
 
@@ -187,6 +188,13 @@ def _room(module: str) -> str:
     )
 
 
+def _folders(room: str) -> list[str]:
+    """Return the words for a room: what it is, and its folders, in lines that fit into a box."""
+    folder = ROOT / room.replace(".", "/")
+    inside = sorted(path.parent.name for path in folder.glob("*/__init__.py"))
+    return textwrap.wrap(f"{ABOUT[room]} {', '.join(i for i in inside if i != 'tools')}", 56)
+
+
 def architecture(imports: set[tuple[str, str]]) -> str:
     """Return the rooms and their imports as SVG, without arrows that others imply.
 
@@ -201,7 +209,7 @@ def architecture(imports: set[tuple[str, str]]) -> str:
         for one, other in imports
         if not any((one, way) in imports and (way, other) in imports for way in ABOUT)
     }
-    width, height = 300, 50
+    width, height = 300, 64
     place = {room: (340 + 170 * column, 40 + 95 * row) for room, (column, row) in PLACES.items()}
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 680 450" '
@@ -220,9 +228,12 @@ def architecture(imports: set[tuple[str, str]]) -> str:
         parts.append(
             f'<rect x="{x - width / 2:.0f}" y="{y - height / 2:.0f}" width="{width}" '
             f'height="{height}" rx="6" fill="#eceff1" stroke="#607d8b"/>'
-            f'<text x="{x:.0f}" y="{y - 4:.0f}" font-size="15" font-weight="bold">{room}</text>'
-            f'<text x="{x:.0f}" y="{y + 15:.0f}" font-size="10">{ABOUT[room]}</text>'
+            f'<text x="{x:.0f}" y="{y - 11:.0f}" font-size="15" font-weight="bold">{room}</text>'
         )
+        parts += [
+            f'<text x="{x:.0f}" y="{y + 7 + 14 * index:.0f}" font-size="10">{line}</text>'
+            for index, line in enumerate(_folders(room))
+        ]
     return "\n".join([*parts, "</svg>"]) + "\n"
 
 
