@@ -44,6 +44,11 @@ class Inhabitant:
         """
 
     @classmethod
+    def sees(cls, config: Any) -> bool:
+        """Return whether a node of this class has sensors that surfaces look different to."""
+        return bool(getattr(config, "cameras", ()) or getattr(config, "lidars", ()))
+
+    @classmethod
     def wind_of(cls, config: Any) -> WindSpec | None:  # noqa: ARG003
         """Return the wind that a node of this class brings; `None` for most."""
         return None
@@ -56,7 +61,8 @@ class SharedWorld:
 
     Args:
         inhabitants: The nodes that have something in it, in file order.
-        bare: Whether images are left out, since nobody is to see them.
+        bare: Whether images are left out, since nobody is to see them; nobody does, either, if no
+            inhabitant says so.
         seed: Of the turbulence.
 
     Attributes:
@@ -83,7 +89,7 @@ class SharedWorld:
         self.vehicles = [each.name for each in inhabitants if each.node.vehicle]
         self.starts: dict[str, State] = {}
         self.free_cameras: dict[str, Callable[[int], State]] = {}
-        self._bare = bare
+        self._bare = bare or not any(each.node.sees(each.config) for each in inhabitants)
         self._seed = seed
         self._built = False
         self._building = asyncio.Lock()

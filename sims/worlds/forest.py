@@ -17,7 +17,6 @@ import numpy.typing as npt
 from sims.worlds import materials
 from sims.worlds.builder import Builder
 from sims.worlds.dynamics import Dynamics, Scene
-from sims.worlds.materials import add_sky
 from sims.worlds.model import Material, Vector
 from sims.worlds.patterns import Image, fractal, mix, shade, share, smooth, specks
 from sims.worlds.shapes import Surface, cylinder
@@ -73,7 +72,7 @@ def forest(seed: int = 0, bare: bool = False) -> Scene:
         b.wall(f"thicket_{number}", back, size, place, 15.0 * number, window=b.cut(back, *size))
     b.floor("ground", b.material("ground", _ground, DENSITY), (HALF, HALF), step=2.5)
     _shadows(b, sways[2 * GROUPS :])
-    add_sky(b.spec, b.random)
+    b.sky(materials.sky)
     b.light("sun", (0.0, 0.0, 20.0), (0.66, 0.62, 0.46), towards=SUN, sun=True)
     b.light("sky_light", (0.0, 0.0, 20.0), (0.12, 0.15, 0.17), towards=(-0.5, 0.5, -0.3), sun=True)
     b.spec.stat.center = [0.0, 0.0, 2.0]

@@ -107,7 +107,7 @@ def _shelf(b: Builder, wood: Material, crates: Material) -> None:
     for level, height in enumerate((0.35, 1.05, 1.75)):
         b.box(f"rack/board_{level}", wood, (3.7, 0.5, 0.06), (-1.8, 5.7, height), hidden=())
         for slot, x in enumerate((-3.1, -2.4, -1.3, -0.5)):
-            if b.random.uniform() < 0.75 and not b.bare:
+            if b.random.uniform() < 0.75:
                 edge = float(b.random.uniform(0.3, 0.46))
                 place = (x, 5.7, height + 0.06)
                 b.crate(f"rack/box_{level}_{slot}", crates, edge, place)

@@ -49,8 +49,7 @@ def load_scene(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -
             contains a slash, or is a `Path`).
         seed: Seed of a built-in world's textures; its geometry is the same for every seed, but for
             what lies on shelves. A file has none.
-        bare: Leave out a built-in world's images, and what has a random place in it: the rest
-            is there in a tenth of the time.
+        bare: Leave out a built-in world's images, which nobody is to see.
 
     Raises:
         WorldError: No such name or file, or the file is no MJCF that compiles.

@@ -6,10 +6,7 @@ painted on them (posters, windows, letters) are in `sims.worlds.decals`.
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
-import mujoco
 import numpy as np
 
 from sims.worlds.patterns import (
@@ -23,7 +20,6 @@ from sims.worlds.patterns import (
     shade,
     smooth,
     specks,
-    to_bytes,
 )
 
 RED_BRICK: tuple[Colour, ...] = (
@@ -229,8 +225,8 @@ def asphalt(shape: tuple[int, int], random: np.random.Generator, density: float)
 SIZE = 384
 
 
-def add_sky(spec: Any, random: np.random.Generator, night: bool = False) -> None:
-    """Give the world a sky: haze at the horizon, blue above, clouds that lie in one plane.
+def sky(random: np.random.Generator, night: bool = False) -> Image:
+    """Return a sky for `Model.sky`: haze at the horizon, blue above, clouds that lie in one plane.
 
     By night all of that is hardly seen, before a few stars.
     """
@@ -239,10 +235,7 @@ def add_sky(spec: Any, random: np.random.Generator, night: bool = False) -> None
     if night:
         stars = random.uniform(size=faces.shape[:2]) > 0.9993
         faces = mix(faces * (0.05, 0.06, 0.09), (0.75, 0.78, 0.82), stars.astype(np.float32))
-    texture = spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=SIZE, height=6 * SIZE, nchannel=3
-    )
-    texture.data = to_bytes(faces).tobytes()
+    return faces
 
 
 # Each face in GL's order (+x -x +y -y +z -z, where y is up and z is our west): its middle, its

@@ -7,15 +7,15 @@ The world here is MuJoCo's: x north, y **west**, z up (NWU), metres. What is put
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from events.frames import from_rpy
-from sims.worlds.patterns import Image, to_bytes
 from sims.worlds.shapes import Surface, Window
+from sims.worlds.textures import Draw, own_generator, texture
 
 LOOK_GROUP, SOLID_GROUP = 0, 3
 Vector = tuple[float, float, float]
@@ -42,13 +42,14 @@ class Model:
     """Collects a world.
 
     Args:
-        name: Name of the model.
+        name: Name of the model, which its random numbers depend on.
         seed: Seed of everything random.
-        bare: Leave out the images, which take seconds to draw, and what has a random place.
+        bare: Leave out the images, which take seconds to draw.
+        world: Name of the world whose textures these are; the model's, if empty.
     """
 
-    def __init__(self, name: str, seed: int, bare: bool = False) -> None:
-        self.bare = bare
+    def __init__(self, name: str, seed: int, bare: bool = False, world: str = "") -> None:
+        self._world, self._seed, self._bare = world or name, seed, bare
         self.random = np.random.default_rng([seed, len(name), *name.encode()])
         self.spec = mujoco.MjSpec()
         self.spec.modelname = name
@@ -58,29 +59,31 @@ class Model:
         self.spec.visual.quality.shadowsize = 0
         self.spec.visual.quality.offsamples = 0
 
+    def _texture(self, name: str, draw: Draw, kind: Any) -> tuple[int, int]:
+        """Add a texture, and return its width and height, pixels."""
+        random = own_generator(self._world, self._seed, name, self.random)
+        if self._bare:
+            image = np.zeros((6, 1, 3), np.uint8)  # as a skybox has it, which is six squares
+        else:
+            image = texture(self._world, self._seed, name, draw, random)
+        height, width = image.shape[:2]
+        added = self.spec.add_texture(name=name, type=kind, width=width, height=height, nchannel=3)
+        added.data = image.tobytes()
+        return width, height
+
     def material(
-        self,
-        name: str,
-        draw: Callable[[np.random.Generator], Image],
-        density: float,
-        module: float = 0.0,
-        glow: float = 0.0,
+        self, name: str, draw: Draw, density: float, module: float = 0.0, glow: float = 0.0
     ) -> Material:
         """Add a material drawn at `density` pixels per metre.
 
         Args:
             name: Name of the material and of its texture.
-            draw: Returns its image, shape (h, w, 3), given a source of random numbers.
+            draw: Draws it, if it is not in the cache.
             density: Pixels per metre.
             module: See `Material`.
             glow: Light that it emits, 0..1.
         """
-        image = np.zeros((64, 64, 3), np.float32) if self.bare else draw(self.random)
-        height, width = image.shape[:2]
-        texture = self.spec.add_texture(
-            name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3
-        )
-        texture.data = to_bytes(image).tobytes()
+        width, height = self._texture(name, draw, mujoco.mjtTexture.mjTEXTURE_2D)
         material = self.spec.add_material(
             name=name, specular=0.05, shininess=0.1, reflectance=0.0, emission=glow
         )
@@ -88,6 +91,10 @@ class Model:
         textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
         material.textures = textures
         return Material(name, width / density, height / density, module)
+
+    def sky(self, draw: Draw) -> None:
+        """Add a sky: the six faces of a cube, one below the other, as OpenGL has them."""
+        self._texture("sky", draw, mujoco.mjtTexture.mjTEXTURE_SKYBOX)
 
     def cut(self, material: Material, width: float, height: float) -> Window:
         """Return a piece of a material from a random place, of a size in metres.

@@ -17,7 +17,6 @@ import numpy as np
 
 from sims.worlds import decals, facades, materials, yard_ground
 from sims.worlds.builder import WHOLE, Builder
-from sims.worlds.materials import add_sky
 from sims.worlds.model import Material
 from sims.worlds.patterns import Image, fractal, shade, smooth
 from sims.worlds.yard_ground import CONTAINERS, CRATES, POSTS, TREES
@@ -34,7 +33,7 @@ SIDES = {  # the houses' line, how they are turned, widths and storeys from the 
 
 def yard(seed: int = 0, bare: bool = False, night: bool = False) -> Any:
     """Return the yard as a `mujoco.MjSpec`; every seed has its own houses, ground and trees."""
-    b = Builder("yard", seed, bare)
+    b = Builder("yard", seed, bare, "night" if night else "")
     b.spec.visual.headlight.ambient = [0.07, 0.08, 0.12] if night else [0.56, 0.59, 0.66]
     red = b.material("brick", lambda r: materials.brick((384, 768), r, 80.0), 80.0, 0.12)
     ashlar = b.material("ashlar", _stone, 96.0, 0.22)
@@ -52,7 +51,7 @@ def yard(seed: int = 0, bare: bool = False, night: bool = False) -> Any:
     ground = b.material("ground", lambda r: yard_ground.image(r, sun), yard_ground.DENSITY)
     step = 0.8 if night else 2.2
     b.floor("ground", ground, (yard_ground.HALF, yard_ground.HALF), step=step)
-    add_sky(b.spec, b.random, night)
+    b.sky(functools.partial(materials.sky, night=night))
     (_lamps if night else _daylight)(b)
     b.spec.stat.center = [0.0, 0.0, 2.0]
     b.spec.stat.extent = 20.0
@@ -146,8 +145,6 @@ def _trees(b: Builder) -> None:
         b.cylinder(f"tree_{number}/trunk", bark, 0.17, height, (x, y, 0.0))
         flat = 0.85 * radius
         b.crown(f"tree_{number}/crown", green, (radius, radius, flat), (x, y, height + 0.8 * flat))
-        if b.bare:
-            continue
         off = b.random.uniform(-0.5, 0.5, 2) * radius
         small = 0.66 * radius
         top = height + 1.6 * flat

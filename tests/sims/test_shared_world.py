@@ -153,6 +153,23 @@ def test_a_world_is_at_one_place_of_the_earth(world: str) -> None:
         fly(drone("a", 0.0, world), there, duration=0.01)
 
 
+@pytest.mark.parametrize("sees", [False, True])
+def test_a_world_in_which_nobody_sees_is_not_painted(
+    monkeypatch: pytest.MonkeyPatch, sees: bool
+) -> None:
+    """Lidars see, too: they are told how bright a surface is."""
+    asked = []
+
+    def texture(world: str, seed: int, name: str, *_: Any) -> Any:
+        asked.append(name)
+        return np.zeros((4, 4, 3), np.uint8)
+
+    monkeypatch.setattr("sims.worlds.model.texture", texture)
+    lidars = [{"name": "front", "rate": 1, "channels": 1, "columns": 10}] if sees else []
+    fly(spec(Multirotor, "a", {"world": "office", "lidars": lidars}), duration=0.01)
+    assert bool(asked) == sees
+
+
 def test_a_check_goes_through_all_of_it(world: str) -> None:
     nodes = (drone("a", 0.0, world), drone("b", 4.0, world))
     found = of_nodes(Config(run=RunConfig(duration=Duration(1.0)), nodes=nodes))

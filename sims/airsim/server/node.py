@@ -235,6 +235,11 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         scene.spec.worldbody.add_camera(name=f"{name}/camera")
         return Dynamics()
 
+    @classmethod
+    def sees(cls, config: Any) -> bool:  # noqa: ARG003
+        """Return that its clients may ask for images."""
+        return True
+
     def on_announcement(self, announcement: Announcement) -> None:
         """Take note of the vehicles' sensors."""
         self.sensors.announced(announcement)
