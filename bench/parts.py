@@ -24,7 +24,7 @@ from runtime.channels.digest import Digest
 from runtime.config.reading import parse
 from runtime.run.execute import execute
 from runtime.workers.shared_memory import SharedPipe, anonymous_file
-from sims.cameras.noise import generator, noisy_depth, noisy_image
+from sims.cameras.response import generator, noisy_depth, noisy_image
 
 RATE, SIDE = 30, 512
 NOISE, DEPTH_NOISE = 2.0, 0.0015

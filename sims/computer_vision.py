@@ -15,28 +15,14 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import (
-    Odometry,
-    PoseSetpoint,
-    PositionSetpoint,
-    Quaternion,
-    Vector3,
-    VelocitySetpoint,
-)
+from events import Odometry, PoseSetpoint, PositionSetpoint, Quaternion, Vector3, VelocitySetpoint
 from events.frames import from_rpy, from_yaw, multiply, normalize, rotate, rotate_inverse, yaw_of
 from runtime import Tick, every, on
 from runtime.paths import InputPath
-from sims.addressing import Addressee
-from sims.cameras import (
-    CameraSpec,
-    add_free_camera,
-    check_cameras,
-    pose_to_qpos,
-    qvel_between,
-)
-from sims.shared_world import join_world
-from sims.simulator import Rate, Simulator, SimulatorConfig
+from sims.cameras import CameraSpec, add_free_camera, check_cameras, pose_to_qpos, qvel_between
+from sims.simulator import Addressee, Simulator, SimulatorConfig
 from sims.vehicle import State
+from sims.world import Rate, join_world
 from sims.worlds import Dynamics, Scene
 
 Course = Callable[[int], tuple[Vector3, Quaternion]]

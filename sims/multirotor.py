@@ -32,11 +32,9 @@ from events import (
 )
 from events.frames import rotate_inverse
 from runtime import Output, Tick, every, on
-from sims.addressing import Addressee
 from sims.cameras import CameraSpec, add_camera, check_cameras
 from sims.sensors import SensorsConfig, SensorSuite, mount_imu
-from sims.shared_world import join_world
-from sims.simulator import Rate, Simulator
+from sims.simulator import Addressee, Simulator
 from sims.vehicle import (
     STANDING_HEIGHT,
     Autopilot,
@@ -47,8 +45,9 @@ from sims.vehicle import (
     State,
     attach_vehicle,
 )
-from sims.vehicle.clearance import FALL, Clearance, trouble_at_start, trouble_on_path
+from sims.vehicle.autopilot import FALL, Clearance, trouble_at_start, trouble_on_path
 from sims.vehicle.physics import Contact
+from sims.world import Rate, join_world
 from sims.worlds import Dynamics, Scene
 
 FRAME = "base_link"

@@ -1,9 +1,9 @@
-"""What the nodes of all simulators have in common: a world, and cameras in it."""
+"""What the nodes of all simulators have in common: a world, cameras in it, and what they obey."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 import msgspec
@@ -11,20 +11,25 @@ from typing_extensions import TypeVar
 
 from events import (
     Announcement,
+    Command,
     DepthImage,
     Image,
     Odometry,
+    PathAnnouncement,
+    PilotAnnouncement,
     PoseStamped,
     SegmentationImage,
+    Setpoint,
     TransformStamped,
 )
 from runtime import Duration, Node, NodeConfig, Output
+from runtime.errors import suggest
+from runtime.host import Sibling
 from runtime.paths import NameOrPath
 from sims.cameras import CameraSpec
 from sims.cameras.rig import CameraOutputs, CameraRig
-from sims.shared_world import Inhabitant
+from sims.world import Inhabitant
 
-Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
 Longitude = Annotated[float, msgspec.Meta(ge=-180, le=180)]
 Count = Annotated[int, msgspec.Meta(ge=1, le=16)]
@@ -111,3 +116,68 @@ class Simulator(Inhabitant, Node[C], ABC):
     async def on_shutdown(self) -> None:
         """Log how many images are missing."""
         self.rig.log_missing()
+
+
+Order = Command | Setpoint | PathAnnouncement | PilotAnnouncement
+
+
+class Addressee:
+    """Decides what a vehicle, or a free camera, obeys.
+
+    An order that names a vehicle is for that one. One that names none is for the only vehicle of
+    the run, and for those whose ports are narrowed to its source. A free camera is a vehicle here
+    if there is no other.
+    """
+
+    def __init__(self, name: str, simulators: Sequence[Sibling], ports: Mapping[str, str]) -> None:
+        self._name = name
+        self._ports = ports
+        self._simulators = simulators
+        self._known = [each.name for each in simulators]
+        vehicles = [each.name for each in simulators if each.node.vehicle]
+        self._vehicles = vehicles or self._known
+        self._refused: set[tuple[str, str]] = set()
+
+    def obeys(self, order: Order, port: str) -> bool:
+        """Return whether an order that comes to a port, or a pilot's path, is for this vehicle."""
+        narrowed = self._ports.get(port)
+        if narrowed and not f"{order.source}/".startswith(f"{narrowed}/"):
+            return False
+        if order.vehicle:
+            return order.vehicle == self._name
+        return bool(narrowed) or self._vehicles == [self._name]
+
+    def refusal(self, order: Order) -> str:
+        """Return, the first time, why an order is for nobody; empty if it is for somebody.
+
+        Only the first of several vehicles does so.
+        """
+        key = (order.source, order.vehicle)
+        if self._vehicles[0] != self._name or key in self._refused:
+            return ""
+        reason = "" if not order.vehicle and self._narrowed_to(order.source) else self._fault(order)
+        if reason:
+            self._refused.add(key)
+        return reason
+
+    def complaints(self, pilots: Iterable[PilotAnnouncement]) -> Iterator[str]:
+        """Yield what is wrong with the vehicles that pilots name; the first vehicle does so."""
+        for pilot in pilots:
+            if reason := self.refusal(pilot):
+                yield f"{pilot.source}: vehicle: {reason}"
+
+    def _fault(self, order: Order) -> str:
+        if order.vehicle in self._known or (not order.vehicle and len(self._vehicles) < 2):
+            return ""
+        found = (
+            f'"{order.vehicle}"{suggest(order.vehicle, self._known)}' if order.vehicle else "none"
+        )
+        return f"expected one of {', '.join(self._vehicles)}, found {found}"
+
+    def _narrowed_to(self, source: str) -> bool:
+        return any(
+            f"{source}/".startswith(f"{narrowed}/")
+            for each in self._simulators
+            for port, narrowed in each.sources.items()
+            if port in ("commands", "setpoints")
+        )

@@ -1,25 +1,202 @@
-"""What belongs to a world and to no vehicle in it, as a node: wind, moving bodies, lights, fog."""
+"""The one world of a run: built once, of all nodes that have something in it, which share it.
+
+What belongs to it and to no vehicle (wind, moving bodies, lights, fog) has a node of its own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+import asyncio
+import functools
+from abc import abstractmethod
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, ClassVar
 
-from events import (
-    Announcement,
-    BodyAnnouncement,
-    PoseStamped,
-    Wind,
-    WindAnnouncement,
-)
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from events import Announcement, BodyAnnouncement, PoseStamped, Vector3, Wind, WindAnnouncement
 from runtime import Node, NodeConfig, Output, Tick, every
+from runtime.host import Sibling
 from runtime.paths import NameOrPath
-from sims.shared_world import Inhabitant, join_world
-from sims.simulator import Rate
-from sims.worlds import Dynamics, Scene, WorldError
+from sims.cameras import model_to_bytes
+from sims.vehicle import Simulation, State
+from sims.vehicle.physics import Air
+from sims.vehicle.simulation import Influence
+from sims.worlds import Dynamics, Scene, WorldError, load_scene
 from sims.worlds.bodies import BodyMotion, BodySpec, add_bodies
-from sims.worlds.lights import FogSpec, LightSpec, add_fog, change_lights
+from sims.worlds.dynamics import FogSpec, LightSpec, add_fog, change_lights
 from sims.worlds.wind import WindSpec, check_strength
+
+Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+Floats = npt.NDArray[np.float64]
+
+
+class Inhabitant:
+    """Mixin of the nodes that have something in the world."""
+
+    vehicle: ClassVar[bool] = False
+    """Whether it is moved by physics."""
+    alone: ClassVar[bool] = False
+    """Whether it has a world for itself if all nodes of the run that have something in it do."""
+
+    @classmethod
+    @abstractmethod
+    def populate(cls, scene: Scene, name: str, config: Any) -> Dynamics:
+        """Put what a node of this class has into a world, and return what of it moves by itself."""
+
+    @classmethod
+    def sees(cls, config: Any) -> bool:
+        """Return whether a node of this class has sensors that surfaces look different to."""
+        return bool(getattr(config, "cameras", ()) or getattr(config, "lidars", ()))
+
+    @classmethod
+    def wind_of(cls, config: Any) -> WindSpec | None:  # noqa: ARG003
+        """Return the wind that a node of this class brings; `None` for most."""
+        return None
+
+
+class SharedWorld:
+    """A compiled world, its physics, and what of it is to be handed to renderers.
+
+    It outlives a restart of any node: what a vehicle does is then as it was left.
+
+    Args:
+        inhabitants: The nodes that have something in it, in file order.
+        bare: Whether images are left out, since nobody is to see them; nobody does, either, if no
+            inhabitant says so.
+
+    Attributes:
+        simulation: Its physics, which all vehicles share. `None` if there is no vehicle.
+        air: Its wind; `None` if there is none, or no vehicle.
+        vehicles: Names of the vehicles.
+        starts: State of each vehicle and free camera at its start, once that node has started up.
+        free_cameras: Gives the state of each free camera at a time (ns); no physics knows it.
+    """
+
+    model: Any
+    dynamics: Dynamics
+    simulation: Simulation | None
+    air: Air | None
+
+    def __init__(self, inhabitants: tuple[Sibling, ...], bare: bool, seed: int) -> None:
+        named = [each for each in inhabitants if each.config.world]
+        self.name = named[0].config.world if named else "hall"
+        self.named_by = named[0].name if named else ""
+        self._inhabitants = inhabitants
+        self.vehicles = [each.name for each in inhabitants if each.node.vehicle]
+        self.starts: dict[str, State] = {}
+        self.free_cameras: dict[str, Callable[[int], State]] = {}
+        self._bare = bare or not any(each.node.sees(each.config) for each in inhabitants)
+        self._seed = seed
+        self._built = False
+        self._building = asyncio.Lock()
+
+    async def build(self, node: Node[Any]) -> None:
+        """Build it, if that is not done or its physics have diverged."""
+        async with self._building:
+            if not self._built or (self.simulation and self.simulation.diverged):
+                await node.offload(self._build)
+                self._built = True
+
+    @functools.cached_property
+    def model_bytes(self) -> bytes:
+        """The compiled world, for other processes; made when it is first asked for."""
+        return model_to_bytes(self.model)
+
+    def state_at(self, stamp_ns: int) -> tuple[int, Floats, Floats]:
+        """Step the physics up to a time if it is not there yet, and return the world's state.
+
+        Returns:
+            The state's time: that asked for, or that of the physics if it is further, as may
+            happen in real time. Copies of the generalised positions, shape (nq,), and velocities,
+            shape (nv,).
+        """
+        if self.simulation is None:
+            return stamp_ns, self.model.qpos0.copy(), np.zeros(self.model.nv)
+        self.simulation.advance_to(stamp_ns)
+        stamp_ns = max(stamp_ns, self.simulation.time_ns)
+        return stamp_ns, *self.simulation.state_at(stamp_ns)
+
+    def remember(self, seconds: float) -> None:
+        """Keep the states of the last `seconds` for `past_state`, if any are wanted."""
+        if seconds and self.simulation is not None:
+            # In real time, they may be asked for later.
+            self.simulation.history.keep(seconds + 1.0)
+
+    def past_state(self, stamp_ns: int) -> Floats:
+        """Return the generalised positions at a time that has come, shape (nq,)."""
+        if self.simulation is None:
+            return self.state_at(stamp_ns)[1]
+        self.simulation.advance_to(stamp_ns)
+        return self.simulation.history.at(stamp_ns)[0].copy()
+
+    def set_wind(self, velocity: Vector3) -> None:
+        """Set the mean wind, m/s NED, from the next millisecond on; gusts and turbulence stay.
+
+        Without vehicles it blows on nothing.
+        """
+        if self.simulation is not None and self.air is None:
+            random = np.random.default_rng([self._seed, *b"wind"])
+            self.air = Air(self.model, WindSpec(), self.vehicles, random)
+            self.simulation.add_influence(self.air)
+        if self.air is not None:
+            self.air.velocity = velocity
+
+    def geoms_of(self, body: str) -> tuple[int, ...]:
+        """Return the numbers of a body's geoms, which are those in segmentation images."""
+        return tuple(np.flatnonzero(self.model.geom_bodyid == self.model.body(body).id).tolist())
+
+    def _build(self) -> None:
+        spec, dynamics = load_scene(self.name, bare=self._bare)
+        wind = None
+        for each in self._inhabitants:
+            node: type[Inhabitant] = each.node
+            added = node.populate(Scene(spec, dynamics), each.name, each.config)
+            dynamics = dynamics.joined(added)
+            wind = node.wind_of(each.config) or wind
+        self.model = spec.compile()
+        self.__dict__.pop("model_bytes", None)
+        self.dynamics = dynamics
+        self.simulation = self.air = None
+        if self.vehicles:
+            influences: list[Influence] = list(dynamics.solid.motions)
+            if wind is not None and not wind.still:
+                random = np.random.default_rng([self._seed, *b"wind"])
+                self.air = Air(self.model, wind, self.vehicles, random)
+                influences.append(self.air)
+            self.simulation = Simulation(self.model, influences)
+
+
+async def join_world(node: Any) -> SharedWorld:
+    """Return the world in which a node has something, built by the first one that asks.
+
+    Raises:
+        WorldError: The node names another world than the others do, or some of them are in
+            another process.
+    """
+    inhabitants, key = node.siblings(Inhabitant), "world"
+    if all(each.node.alone for each in inhabitants):
+        inhabitants = tuple(each for each in inhabitants if each.name == node.name)
+        key = f"world of {node.name}"
+    if absent := [each.name for each in inhabitants if not each.here]:
+        raise WorldError(
+            "expected all that is in one world in one process, found "
+            f"{', '.join(absent)} in another one: name them together after --only"
+        )
+    world: SharedWorld = node.share(key, lambda: SharedWorld(inhabitants, node.checking, node.seed))
+    if node.config.world not in ("", world.name):
+        raise WorldError(
+            f'world: expected "{world.name}", in which {world.named_by} is, since all vehicles of '
+            f'a run share one world, found "{node.config.world}"'
+        )
+    origins = {each.config.origin for each in inhabitants if hasattr(each.config, "origin")}
+    if len(origins) > 1:
+        raise WorldError(
+            f"origin: expected one for all vehicles of a world, found {sorted(origins)}"
+        )
+    await world.build(node)
+    return world
 
 
 class WorldConfig(NodeConfig):

@@ -8,7 +8,7 @@ set -u
 
 has_what_it_takes() {
     case "$1" in
-    gl) "$2" -c 'from sims.cameras.graphics import open_context; open_context(8, 8, 1).free()' ;;
+    gl) "$2" -c 'from sims.cameras.stage import open_context; open_context(8, 8, 1).free()' ;;
     orbslam3) "$2" -c "import pyorbslam3" ;;
     display) command -v Xvfb && command -v xdotool ;;
     peers) command -v g++ && dpkg -s libroscpp-dev libnodeletlib-dev python3-rosmaster python3-rospy ;;

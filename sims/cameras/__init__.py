@@ -1,18 +1,19 @@
 """Cameras: settings, mounting, rendering. Pure functions and one renderer."""
 
-from sims.cameras.frame import Frame
-from sims.cameras.free import add_free_camera, pose_to_qpos, qvel_between
-from sims.cameras.graphics import GraphicsError
-from sims.cameras.renderer import CameraRenderer, model_from_bytes, model_to_bytes
+from sims.cameras.renderer import CameraRenderer, Frame, model_from_bytes, model_to_bytes
 from sims.cameras.spec import (
     CameraSpec,
     add_camera,
+    add_free_camera,
     announcement,
     camera_info,
     check_cameras,
     optical_frame,
     optical_in_body,
+    pose_to_qpos,
+    qvel_between,
 )
+from sims.cameras.stage import GraphicsError
 
 __all__ = [
     "CameraRenderer",

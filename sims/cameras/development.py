@@ -3,6 +3,12 @@
 The grey levels that MuJoCo draws are taken to be sRGB's (IEC 61966-2-1), and their white to be the
 light that fills a pixel at the reference exposure. Light beyond it was cut off in drawing, so a
 short exposure darkens the image, but brings no overexposed surface back.
+
+Depth is measured as sensors do, by triangulation, with what they cannot see left out:
+K. Khoshelham, S. O. Elberink, "Accuracy and Resolution of Kinect Depth Data", Sensors 2012 (noise
+of disparity, eq. 9); A. Handa et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction
+and SLAM", ICRA 2014 (noise of disparity before it is rounded); A. Grunnet-Jepsen et al.,
+"Best-Known-Methods for Tuning Intel RealSense D400 Depth Cameras", 2018 (invalid band, range).
 """
 
 from __future__ import annotations
@@ -16,14 +22,132 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from events import CameraInfo
 from events.camera_info import response_light, srgb_light, vignette_map
-from sims.cameras.depth_sensor import DepthMeter
-from sims.cameras.noise import noise_steps, noisy_depth, noisy_image
-from sims.cameras.response import defocused, mean, read_response
-from sims.cameras.spec import CameraSpec, camera_info
+from sims.cameras.response import (
+    defocused,
+    gaussian,
+    grey_of,
+    mean,
+    noise_steps,
+    noisy_depth,
+    noisy_image,
+    read_response,
+)
+from sims.cameras.spec import CameraSpec, DepthSensor, camera_info
+
+Depths = npt.NDArray[np.float32]
+Holes = npt.NDArray[np.bool_]
+
+_WINDOW = (7, 7)
+"""The pixels in which a stereo camera looks for texture."""
+
+_FARTHEST = 1e6
+"""Metres; stands for ``inf`` where its inverse has to be more than zero."""
+
+
+class DepthMeter:
+    """Measures the depth of one camera's exposures.
+
+    Args:
+        light: Factor on the lights of the scene in the images: the projector's is the same.
+    """
+
+    def __init__(self, sensor: DepthSensor, info: CameraInfo, light: float = 1.0) -> None:
+        self._sensor = sensor
+        self._info = info
+        self._reach = sensor.reach(info.fx)
+        self._columns = np.arange(info.width, dtype=np.float32)
+        self._u = ((self._columns - info.cx) / info.fx).astype(np.float32)
+        rows = np.arange(info.height, dtype=np.float32)[:, None]
+        self._v = ((rows - info.cy) / info.fy).astype(np.float32)
+        self._ray = 1.0 + self._u**2 + self._v**2  # length of the ray at depth 1, squared
+        levels = np.arange(256.0)
+        brightness = np.interp(levels / light, levels, srgb_light())
+        self._light = np.square(brightness).astype(np.float32)[None]
+
+    def measure(
+        self, depth: Depths, colour: npt.NDArray[np.uint8] | None, random: np.random.Generator
+    ) -> Depths:
+        """Return what the sensor measures of true depth.
+
+        Args:
+            depth: Metres along the optical axis, shape (height, width); ``inf`` for none.
+            colour: What the camera sees, shape (height, width, 3), if `needs_colours`.
+
+        Returns:
+            Metres, float32; within `min_depth` and `max_depth`, or ``inf``.
+        """
+        sensor = self._sensor
+        inverse = np.clip(depth, 1e-6, _FARTHEST)
+        np.divide(np.float32(1.0), inverse, out=inverse)
+        hole = self._hidden(inverse)
+        hole |= self._unmatched(inverse, colour)
+        disparity = np.multiply(inverse, np.float32(self._reach), out=inverse)
+        if sensor.disparity_noise:
+            disparity += gaussian(depth.shape, sensor.disparity_noise, random)
+        if sensor.disparity_step:
+            disparity *= 1.0 / sensor.disparity_step
+            np.rint(disparity, out=disparity)
+            disparity *= sensor.disparity_step
+        # A disparity that noise has brought to zero or below is that of the horizon.
+        np.maximum(disparity, 1e-9, out=disparity)
+        found = np.divide(np.float32(self._reach), disparity, out=disparity)
+        hole |= (found < sensor.min_depth) | (found > sensor.max_depth)
+        return np.where(hole, np.float32(np.inf), found)
+
+    def _hidden(self, inverse: Depths) -> Holes:
+        """Return which pixels the second eye does not see: something nearer is in its way.
+
+        A pixel's ray meets the second image in the column ``x - disparity``. On one surface that
+        rises with x; where a column further right falls left of it, that one's surface is nearer.
+        """
+        reach = self._info.fx * self._sensor.baseline
+        columns = self._columns - inverse * np.float32(reach)
+        farthest = min(int(float(inverse.max()) * reach) + 2, self._info.width)
+        nearer = np.asarray(cv2.erode(columns, np.ones((1, farthest), np.uint8), anchor=(0, 0)))
+        hidden = np.zeros(columns.shape, np.bool_)
+        # The left edge of a pixel is half a pixel before its middle.
+        np.greater(columns[:, :-1], nearer[:, 1:] - np.float32(0.5), out=hidden[:, :-1])
+        if self._sensor.model == "stereo":
+            hidden |= columns < -0.5
+        return hidden
+
+    def _unmatched(self, inverse: Depths, colour: npt.NDArray[np.uint8] | None) -> Holes:
+        """Return which pixels are aslant, at an edge, dark or without texture.
+
+        Inverse depth of a plane is affine in the pixel: its gradient gives the normal n, and the
+        cosine of the angle to the ray r is ``inverse / (|n| |r|)``.
+        """
+        sensor, info = self._sensor, self._info
+        border = cv2.BORDER_REPLICATE
+        across = np.asarray(cv2.Sobel(inverse, -1, 1, 0, scale=info.fx / 8, borderType=border))
+        down = np.asarray(cv2.Sobel(inverse, -1, 0, 1, scale=info.fy / 8, borderType=border))
+        normal = across * self._u
+        normal += down * self._v
+        normal -= inverse
+        for part in (across, down, normal):
+            np.square(part, out=part)
+        normal += across
+        normal += down
+        normal *= self._ray
+        cosine = np.divide(np.square(inverse, out=across), normal, out=across)  # squared
+        hole: Holes = cosine < math.cos(math.radians(sensor.max_slant)) ** 2
+        if colour is None or not sensor.needs_colours:
+            return hole
+        grey = grey_of(colour)
+        if sensor.model == "stereo":
+            mean = np.asarray(cv2.boxFilter(grey, cv2.CV_32F, _WINDOW))
+            square = np.asarray(cv2.sqrBoxFilter(grey, cv2.CV_32F, _WINDOW))
+            square -= np.square(mean, out=mean)
+            hole |= square < sensor.min_contrast**2
+        else:
+            light = np.asarray(cv2.LUT(grey, self._light))
+            hole |= np.multiply(light, cosine, out=light) < sensor.min_brightness**2
+        return hole
+
 
 Image = npt.NDArray[np.uint8]
-Depths = npt.NDArray[np.float32]
 Codes = npt.NDArray[np.uint16]
 
 _LINEAR = 65535.0
@@ -73,9 +197,6 @@ class Development:
         Args:
             images: What was drawn at equally spaced moments of it, each of shape (height, width, 3)
                 or (height, width).
-            random: For the noise.
-            exposure: Seconds that the shutter was open.
-            gain: Factor of the amplifier.
         """
         reference = self._spec.reference_exposure
         factor = gain * (exposure / reference if reference else 1.0)
@@ -95,8 +216,6 @@ class Development:
 
         Args:
             depth: Metres, shape (height, width); ``inf`` where nothing was hit.
-            images: As for `develop`, if the depth sensor needs them.
-            random: For the noise.
         """
         if self._depth_meter is None:
             return noisy_depth(depth, self._spec.depth_noise, random)

@@ -1,9 +1,8 @@
-"""Rendering: what a camera sees, and the effects of its lens, shutter and sensor.
+"""Rendering: what a camera sees in an exposure, with the effects of its lens, shutter and sensor.
 
 Made for a worker process (a GL context belongs to the thread that made it), but works in-process.
-An exposure is *captured* (drawn, at each of its moments) and then *developed* (made the images of a
-sensor). The drawing is in `sims.cameras.stage`, effects on images are in `sims.cameras.response`
-and `sims.cameras.noise`.
+A *shot* is *captured* (drawn, at each of its moments) and then *developed* (made a frame: the
+images of a sensor). The drawing is in `sims.cameras.stage`.
 """
 
 from __future__ import annotations
@@ -20,15 +19,132 @@ import numpy.typing as npt
 from events.base import Quaternion, Vector3
 from events.geometry import pose_matrix
 from sims.cameras.development import Development
-from sims.cameras.frame import Frame, Shot
-from sims.cameras.graphics import gl_renderer, keep_memory
 from sims.cameras.lens import undistorted
-from sims.cameras.noise import generator, grey_of
-from sims.cameras.response import moments
-from sims.cameras.shutter import FINER_FOR_DEPTH, image_speeds, row_bands, row_time, small_camera
+from sims.cameras.response import generator, grey_of, moments
 from sims.cameras.spec import CameraSpec, camera_info, eyes, is_plain
-from sims.cameras.stage import Changing, Colours, Depths, Floats, Stage
-from sims.cameras.view import Drawn, View, looked_up, stacked
+from sims.cameras.stage import Changing, Colours, Depths, Floats, Stage, gl_renderer, keep_memory
+from sims.cameras.view import (
+    FINER_FOR_DEPTH,
+    Drawn,
+    View,
+    image_speeds,
+    looked_up,
+    row_bands,
+    row_time,
+    small_camera,
+    stacked,
+)
+
+
+class Motion(NamedTuple):
+    """True states of the world while a shutter is open.
+
+    Attributes:
+        seconds: Times of the states after the exposure's stamp, rising, shape (k,).
+        qpos: Generalised positions at these times, shape (k, nq).
+    """
+
+    seconds: Floats
+    qpos: Floats
+
+
+class Shot(NamedTuple):
+    """One exposure of one camera.
+
+    Attributes:
+        stamp: Nanoseconds on the run's clock: the middle row's mid-exposure.
+        qpos: The model's generalised positions then, shape (nq,).
+        qvel: Its generalised velocities then, shape (nv,): constant while the shutter is open,
+            unless `motion` is known. None: at rest.
+        motion: The states from the beginning of the first row's exposure to the end of the last
+            one's; needed by a rolling shutter.
+        exposure: Seconds that the shutter is open.
+    """
+
+    camera: str
+    stamp: int
+    qpos: Floats
+    qvel: Floats | None = None
+    motion: Motion | None = None
+    exposure: float = 0.0
+    gain: float = 1.0
+
+    def moves(self) -> bool:
+        """Return whether the state may change while the shutter is open."""
+        return self.qvel is not None or self.motion is not None
+
+    def state(self, model: Any, seconds: float) -> Floats:
+        """Return the generalised positions some seconds after the stamp, shape (nq,).
+
+        Between two known states the velocity is constant, as `mj_integratePos` understands it.
+        """
+        if seconds == 0.0 or not self.moves():
+            return self.qpos
+        if self.motion is None:
+            assert self.qvel is not None
+            start, velocity, since = self.qpos, self.qvel, seconds
+        else:
+            times, states = self.motion
+            if len(times) == 1:
+                return np.asarray(states[0])
+            after = int(np.clip(np.searchsorted(times, seconds), 1, len(times) - 1))
+            start, velocity = states[after - 1], np.empty(model.nv)
+            step = float(times[after] - times[after - 1])
+            mujoco.mj_differentiatePos(model, velocity, step, start, states[after])
+            since = seconds - float(times[after - 1])
+        moved: Floats = start.copy()
+        mujoco.mj_integratePos(model, moved, velocity, since)
+        return moved
+
+
+class Frame(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """One exposure: all its images and its pose are of the same instant, or are read out alike.
+
+    Images of kinds that the camera's settings do not name are None.
+
+    Attributes:
+        stamp: Nanoseconds on the run's clock: the middle of the middle row's exposure.
+        position: The optical frame's origin, metres in ``map`` (NED).
+        orientation: Rotation from the optical frame to ``map``.
+        ends: Of a rolling shutter, position and orientation at the exposure of the first and of
+            the last row; None of a global one.
+        exposure: Seconds that the shutter was open.
+        light: Mean light of the image, if it is metered (`Development.meter`).
+        depth: float32 metres along the optical z axis, shape (height, width); ``inf`` where
+            nothing was hit.
+        segmentation: int32 object numbers (geom ids), shape (height, width); -1 where nothing
+            was hit.
+        undistorted: The same images without distortion, if they are wanted.
+    """
+
+    stamp: int
+    position: Vector3
+    orientation: Quaternion
+    ends: tuple[tuple[Vector3, Quaternion], tuple[Vector3, Quaternion]] | None = None
+    exposure: float = 0.0
+    gain: float = 1.0
+    light: float | None = None
+    rgb: npt.NDArray[np.uint8] | None = None
+    grey: npt.NDArray[np.uint8] | None = None
+    depth: npt.NDArray[np.float32] | None = None
+    segmentation: npt.NDArray[np.int32] | None = None
+    undistorted: Frame | None = None
+
+
+def delay_of(spec: CameraSpec, seed: int, stamp_ns: int) -> float | None:
+    """Return the seconds from an exposure to its delivery, or None if it is lost."""
+    # No camera's name has a slash: what is drawn here and the noise are independent.
+    random = generator(seed, f"{spec.name}/delivery", stamp_ns)
+    if random.random() < spec.loss:
+        return None
+    return float(spec.latency) + float(spec.jitter) * random.random()
+
+
+def stamp_error(spec: CameraSpec, seed: int, stamp_ns: int) -> int:
+    """Return the nanoseconds by which the stamps of an exposure are late."""
+    random = generator(seed, f"{spec.name}/stamp", stamp_ns)
+    error = float(spec.time_jitter) * random.uniform(-1.0, 1.0) if spec.time_jitter else 0.0
+    return round((float(spec.time_offset) + error) * 1e9)
 
 
 def model_to_bytes(model: Any) -> bytes:
@@ -76,8 +192,6 @@ class CameraRenderer:
     Args:
         model_bytes: From `model_to_bytes`; has a camera `<prefix><name>` for each spec.
         cameras: Settings of the cameras; a stereo rig is two.
-        prefix: Prefix of the cameras' names in the model.
-        seed: Seed of the noise.
         threads: Threads of the software renderer, if this is the process's first GL context.
         dynamics: What moves in the world by itself, as `sims.worlds.Dynamics`.
 
@@ -115,11 +229,7 @@ class CameraRenderer:
         self._stage = Stage(model, int(width), int(height), threads, dynamics)
 
     def render(
-        self,
-        stamp_ns: int,
-        qpos: Floats,
-        names: tuple[str, ...],
-        qvel: Floats | None = None,
+        self, stamp_ns: int, qpos: Floats, names: tuple[str, ...], qvel: Floats | None = None
     ) -> dict[str, Frame]:
         """Expose some cameras at one state: `expose`, with a frame for each name."""
         shots = []
@@ -131,13 +241,7 @@ class CameraRenderer:
         return dict(zip(names, frames, strict=True))
 
     def expose(self, shots: tuple[Shot, ...]) -> tuple[Frame, ...]:
-        """Return the frames of some exposures. The same arguments give the same bits.
-
-        Raises:
-            RuntimeError: After `close`.
-            KeyError: A camera that no spec has.
-            ValueError: A state or velocity has another length than the model's.
-        """
+        """Return the frames of some exposures. The same arguments give the same bits."""
         if self._stage.closed:
             raise RuntimeError("render: expected an open renderer, found a closed one")
         self._stage.enter()

@@ -1,20 +1,27 @@
-"""What lens, shutter and response curve make of the light of an image.
+"""Effects on images: response curve, defocus, motion blur, noise, and automatic exposure.
 
-What the image sensor makes of it is in `sims.cameras.development`.
+Noise depends on seed, camera and stamp, and on nothing else. Normal numbers come from a table of
+the normal distribution's quantiles, at a place that 16 random bits name: no two pixels or images
+share any, and it takes a sixth of the time of drawing them.
 """
 
 from __future__ import annotations
 
+import functools
 import math
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 from events.camera_info import response_light
+from runtime.units import Latency
 
 _GAMMA = 2.2
 
@@ -50,7 +57,6 @@ def noise_at(light: npt.NDArray[np.float64], level: int, noise: float, electrons
 
     Args:
         light: Of each grey level, shape (256,).
-        level: 1 to 254.
         noise: What is the same at all levels, grey levels.
         electrons: Of a white pixel, for the shot noise; 0 if there is none.
     """
@@ -97,3 +103,174 @@ def mean(images: Sequence[Image]) -> Image:
         cv2.accumulate(image, total)
     share: Any = 1.0 / len(images)
     return np.asarray(cv2.multiply(total, share, dtype=cv2.CV_16U), np.uint16)
+
+
+N = TypeVar("N", np.float32, np.int16)
+
+_TABLES_OF_16_BITS = int(cv2.__version__.partition(".")[0]) >= 5
+
+_FARTHEST = np.float32(1e9)
+"""Metres; stands for ``inf`` where its square has to be a number."""
+
+
+def generator(seed: int, camera: str, stamp_ns: int) -> np.random.Generator:
+    """Return the generator of one exposure's noise: the same in whatever process asks for it."""
+    words = (seed, zlib.crc32(camera.encode()), stamp_ns)
+    return np.random.default_rng([word & 0xFFFF_FFFF_FFFF_FFFF for word in words])
+
+
+def noisy_image(
+    image: npt.NDArray[np.uint8], sigma: float, random: np.random.Generator
+) -> npt.NDArray[np.uint8]:
+    """Return the image plus Gaussian noise of `sigma` grey levels, clipped to 0..255."""
+    if sigma <= 0.0:
+        return image
+    noise = noise_steps(image.shape, sigma, 255, random)
+    return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def noise_steps(
+    shape: tuple[int, ...], sigma: float, limit: int, random: np.random.Generator
+) -> npt.NDArray[np.int16]:
+    """Return Gaussian noise in whole numbers, none beyond a limit (at most 32767) either way."""
+    return _look_up(_steps(sigma, limit), _draw(shape, random))
+
+
+def noisy_depth(
+    depth: npt.NDArray[np.float32], coefficient: float, random: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    """Return depth (metres) plus Gaussian noise with sigma = coefficient · depth².
+
+    The error of a triangulating sensor grows so (Khoshelham and Elberink, "Accuracy and
+    Resolution of Kinect Depth Data", Sensors 2012, eq. 9). What was not hit stays ``inf``, and
+    nothing comes closer than zero.
+    """
+    if coefficient <= 0.0:
+        return depth
+    noise = gaussian(depth.shape, coefficient, random)
+    near = np.minimum(depth, _FARTHEST)
+    noise *= near
+    noise *= near
+    noise += depth
+    return np.maximum(noise, np.float32(0.0), out=noise)
+
+
+def gaussian(
+    shape: tuple[int, ...], sigma: float, random: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    """Return Gaussian noise of mean 0."""
+    return _look_up(_quantiles() * np.float32(sigma), _draw(shape, random))
+
+
+def grey_of(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return the luma (BT.601) of a colour image, shape (height, width)."""
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def _draw(shape: tuple[int, ...], random: np.random.Generator) -> npt.NDArray[np.uint16]:
+    """Return whole numbers, each of 16 random bits."""
+    count = int(np.prod(shape))
+    raw = random.bit_generator.random_raw(-(-count // 4))
+    return np.asarray(raw).view(np.uint16)[:count].reshape(shape)
+
+
+def _look_up(table: npt.NDArray[N], places: npt.NDArray[np.uint16]) -> npt.NDArray[N]:
+    """Return the table's entries at some places, shape as theirs."""
+    if _TABLES_OF_16_BITS:  # the same in half the time
+        return np.asarray(cv2.LUT(places, table.reshape(1, -1)))
+    return np.take(table, places)
+
+
+@functools.cache
+def _quantiles() -> npt.NDArray[np.float32]:
+    """Return 65536 numbers as likely as each other, of mean 0 and standard deviation 1."""
+    values = ndtri((np.arange(65536) + 0.5) / 65536)
+    return np.asarray(values / values.std(), dtype=np.float32)
+
+
+@functools.lru_cache(maxsize=16)
+def _steps(sigma: float, limit: int) -> npt.NDArray[np.int16]:
+    """Return the same, times sigma, in whole numbers up to a limit."""
+    levels = np.clip(np.rint(sigma * _quantiles()), -limit, limit)
+    return np.asarray(levels, dtype=np.int16)
+
+
+_MOST = 8.0
+"""Factor that one image may ask for, either way: a black one says nothing of how dark it is."""
+
+
+class AutoExposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the automatic exposure, which first makes use of the time and then of the gain.
+
+    Attributes:
+        target: Mean light of an image that is well exposed, as a share of white's; in linear
+            light, where 0.18 is a middle grey.
+        min_exposure: Shortest exposure time.
+        max_exposure: Longest exposure time.
+        exposure_step: Exposure times are whole multiples of it, as of an image sensor's row time.
+        max_gain: Largest factor of the amplifier.
+        gain_step: Gains are whole multiples of it, decibels.
+        damping: Share of the error (of its logarithm) that stays after each image: 0 is quickest.
+        tolerance: Error, as a share of the target, that is left alone.
+    """
+
+    target: Annotated[float, msgspec.Meta(ge=0.01, le=0.9)] = 0.18
+    min_exposure: Latency = Latency(20e-6)  # immutable
+    max_exposure: Latency = Latency(10e-3)
+    exposure_step: Latency = Latency(10e-6)
+    max_gain: Annotated[float, msgspec.Meta(ge=1.0, le=1000.0)] = 8.0
+    gain_step: Annotated[float, msgspec.Meta(gt=0.0, le=6.0)] = 0.5
+    damping: Annotated[float, msgspec.Meta(ge=0.0, le=0.95)] = 0.5
+    tolerance: Annotated[float, msgspec.Meta(ge=0.0, le=0.5)] = 0.03
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.exposure_step <= self.min_exposure <= self.max_exposure:
+            raise ValueError(
+                "exposure_step, min_exposure, max_exposure: expected 0 < step ≤ min ≤ max, found "
+                f"{self.exposure_step:g} s, {self.min_exposure:g} s, {self.max_exposure:g} s"
+            )
+
+
+class ExposureControl:
+    """Exposure time and gain of one camera, image by image.
+
+    What an image asks for is computed from its own exposure time and gain, so images that come late
+    make the control slow, and do not make it oscillate: it never goes beyond what an image
+    asked for.
+    """
+
+    def __init__(self, settings: AutoExposure, exposure: float) -> None:
+        self._settings = settings
+        self._product = exposure
+        self._seen: list[tuple[int, float, float]] = []  # delivery (ns), product, light
+
+    def delivered(self, stamp: int, exposure: float, gain: float, light: float) -> None:
+        """Note an image delivered at a stamp (ns): exposure (s), gain, mean light (0 to 1)."""
+        self._seen.append((stamp, exposure * gain, light))
+
+    def next(self, stamp: int) -> tuple[float, float]:
+        """Return exposure time (seconds) and gain of an exposure that begins at a time.
+
+        Args:
+            stamp: Nanoseconds; above that of the call before. The last image that was delivered
+                *before* it counts, whenever this is called.
+        """
+        settings = self._settings
+        before = [seen for seen in self._seen if seen[0] < stamp]
+        if before:
+            self._seen = self._seen[len(before) :]
+            _, product, light = before[-1]
+            ratio = settings.target / max(light, settings.target / _MOST)
+            error = math.log(product * max(ratio, 1.0 / _MOST) / self._product)
+            if abs(error) > settings.tolerance:
+                self._product *= math.exp((1.0 - settings.damping) * error)
+        steps = int(settings.max_exposure / settings.exposure_step + 1e-9)
+        least = math.ceil(settings.min_exposure / settings.exposure_step - 1e-9)
+        longest = steps * settings.exposure_step
+        most = longest * settings.max_gain
+        self._product = min(max(self._product, least * settings.exposure_step), most)
+        rows = max(round(min(self._product, longest) / settings.exposure_step), least)
+        decibels = 20.0 * math.log10(max(self._product / longest, 1.0))
+        largest = math.floor(20.0 * math.log10(settings.max_gain) / settings.gain_step + 1e-9)
+        decibels = min(round(decibels / settings.gain_step), largest) * settings.gain_step
+        return rows * settings.exposure_step, 10.0 ** (decibels / 20.0)

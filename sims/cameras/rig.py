@@ -25,10 +25,9 @@ from events import (
 from events.base import Quaternion, Vector3
 from runtime import Node, Worker
 from runtime.channels.sender import Sender
-from sims.cameras.exposure import ExposureControl
-from sims.cameras.frame import Frame, Motion, Shot, delay_of, stamp_error
 from sims.cameras.lens import undistorted
-from sims.cameras.renderer import CameraRenderer
+from sims.cameras.renderer import CameraRenderer, Frame, Motion, Shot, delay_of, stamp_error
+from sims.cameras.response import ExposureControl
 from sims.cameras.spec import CameraSpec, announcement, eyes, optical_frame, optical_in_body
 
 STEP = 1_000_000
@@ -48,11 +47,7 @@ class CameraOutputs(msgspec.Struct, frozen=True):
 
 
 class DrawnWorld(Protocol):
-    """What the renderers are told of the world.
-
-    Attributes:
-        dynamics: What moves in it by itself.
-    """
+    """What the renderers are told of the world."""
 
     dynamics: Any
 
@@ -88,9 +83,7 @@ class CameraRig:
     Args:
         node: The node that carries the cameras; a camera's source is ``<node>/<camera>``.
         specs: The cameras, which the model has under the names ``<node>/<camera>``.
-        outputs: Where the events go.
         processes: Number of processes that render; frames go to them in turn.
-        threads: Threads of the software renderer in each of them.
     """
 
     def __init__(
@@ -212,7 +205,6 @@ class CameraRig:
         """Expose a camera at a state; its events are sent when they are due.
 
         Args:
-            camera: Its name.
             stamp: Time of the state (ns).
             qpos: The state, shape (nq,); not copied.
             qvel: Its velocity, shape (nv,), for motion blur; not copied. None: at rest.
@@ -256,10 +248,7 @@ class CameraRig:
                 )
 
     async def _deliver(
-        self,
-        exposure: _Exposure,
-        before: asyncio.Future[None] | None,
-        done: asyncio.Future[None],
+        self, exposure: _Exposure, before: asyncio.Future[None] | None, done: asyncio.Future[None]
     ) -> None:
         assert self._renderer is not None
         spec, shots, due, states = exposure

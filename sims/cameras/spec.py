@@ -1,6 +1,8 @@
 """What a camera is: how it is written down, what it announces, how it enters a model.
 
-No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.free`, the vehicles).
+No rendering here (`sims.cameras.renderer`), and no bodies (`sims.cameras.spec`, the vehicles).
+
+A camera without a vehicle: its state is a pose, and nothing moves it but the user.
 """
 
 from __future__ import annotations
@@ -13,22 +15,89 @@ from typing import Annotated, Any, Literal
 import msgspec
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 import events
 from events.base import Quaternion, Vector3
 from events.camera_info import response_light
-from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation, from_rpy, multiply, rotate
+from events.frames import (
+    OPTICAL_TO_FRD,
+    flip_yz,
+    flip_yz_rotation,
+    from_rpy,
+    multiply,
+    normalize,
+    rotate,
+)
 from runtime.config.parameters import Changeable
 from runtime.paths import NameOrPath
 from runtime.units import Latency
-from sims.cameras.depth_sensor import DepthSensor
-from sims.cameras.exposure import AutoExposure
-from sims.cameras.intrinsics import Intrinsics, Lens, intrinsics
-from sims.cameras.response import noise_at, read_response
+from sims.cameras.lens import Intrinsics, Lens, intrinsics
+from sims.cameras.response import AutoExposure, noise_at, read_response
 
 ImageKind = Literal["rgb", "grey", "depth", "segmentation"]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=8192)]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+
+
+class DepthSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a depth sensor whose second eye, or projector, is right of the camera.
+
+    A pixel without a measurement is ``inf``: out of range; not seen by the second eye (the shadow
+    left of what is near); on a surface that is seen too much aslant, or at an edge; and, as the
+    model says, too dark or without texture.
+
+    Attributes:
+        model: ``structured_light``: a projector; dark surfaces return too little of its light.
+            ``stereo``: a second camera; surfaces without texture cannot be matched, nor can the
+            band at the left which is out of its view.
+        baseline: Distance to the second eye or projector, metres.
+        focal: Focal length of the sensor's own images, pixels, by which disparities are counted; 0
+            for that of this camera.
+        disparity_step: Disparities are whole multiples of it, pixels; 0: of nothing.
+        disparity_noise: Standard deviation of disparities before that, pixels.
+        min_depth: Metres; what is nearer is not measured.
+        max_depth: Metres; what is farther is not measured.
+        max_slant: Greatest angle between the ray and the surface's normal, degrees; in 3×3 pixels,
+            so that edges of objects are lost, too. 90: any.
+        min_brightness: ``structured_light``: least light of a surface seen head-on, as a share
+            of white's, in linear light; aslant more by the angle's cosine. The camera's ``light``
+            makes no difference to it. 0: any.
+        min_contrast: ``stereo``: least standard deviation of 7×7 pixels, grey levels. 0: any.
+    """
+
+    model: Literal["structured_light", "stereo"] = "structured_light"
+    baseline: Positive = 0.075
+    focal: NonNegative = 0.0
+    disparity_step: NonNegative = 0.125
+    disparity_noise: Annotated[float, msgspec.Meta(ge=0.0, le=100.0)] = 0.07
+    min_depth: NonNegative = 0.4
+    max_depth: Positive = 10.0
+    max_slant: Annotated[float, msgspec.Meta(ge=0.0, le=90.0)] = 80.0
+    min_brightness: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.005
+    min_contrast: NonNegative = 1.0
+
+    def __post_init__(self) -> None:
+        if 0.0 < self.disparity_step < 1e-3:
+            raise ValueError(
+                f"disparity_step: expected 0 or at least 0.001 px, found {self.disparity_step:g}"
+            )
+        if self.min_depth >= self.max_depth:
+            raise ValueError(
+                f"min_depth, max_depth: expected a range, found {self.min_depth:g} m to "
+                f"{self.max_depth:g} m"
+            )
+
+    @property
+    def needs_colours(self) -> bool:
+        """Whether what is measured depends on how bright things are."""
+        limit = self.min_contrast if self.model == "stereo" else self.min_brightness
+        return limit > 0.0
+
+    def reach(self, focal: float) -> float:
+        """Return the depth of disparity 1 of a camera of a focal length (pixels), metres."""
+        return (self.focal or focal) * self.baseline
 
 
 class Stereo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -271,15 +340,7 @@ def optical_frame(spec: CameraSpec, prefix: str) -> str:
 def announcement(
     spec: CameraSpec, *, source: str, prefix: str, parent_frame_id: str, stamp: int = 0
 ) -> events.CameraAnnouncement:
-    """Return the announcement of a camera: its images, and its pose on the body.
-
-    Args:
-        spec: The camera.
-        source: Source of the announcement, and of the images: ``drone/front``.
-        prefix: Goes before the camera's name in the names of its frames: ``drone/``.
-        parent_frame_id: Frame of the body that it is mounted on.
-        stamp: Nanoseconds on the run's clock.
-    """
+    """Return the announcement of a camera: its images, and its pose on the body."""
     position, orientation = optical_in_body(spec)
     response = read_response(spec.response)
     electrons = spec.full_well / spec.gain
@@ -336,11 +397,8 @@ def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: s
     """Mount a camera, or both of a stereo rig, on a body of the world.
 
     Args:
-        world: The world, which is changed.
         body_name: The body that carries it; its axes are forward, left, up (FLU), as are all
             bodies' in MuJoCo, whose half turn about x is our FRD.
-        spec: The camera.
-        prefix: Goes before the camera's name: ``drone/``.
 
     Raises:
         ValueError: The world has no such body, or has a camera of that name already.
@@ -364,3 +422,47 @@ def add_camera(world: mujoco.MjSpec, body_name: str, spec: CameraSpec, prefix: s
             quat=flip_yz_rotation(orientation),
             fovy=vertical_fov(eye),
         )
+
+
+def add_free_camera(world: mujoco.MjSpec, name: str, specs: tuple[CameraSpec, ...]) -> str:
+    """Add a body that carries cameras, meets nothing and falls nowhere.
+
+    Returns:
+        The prefix of the cameras' names, as `CameraRenderer` takes it.
+
+    Raises:
+        ValueError: The world has a body of that name, or two specs share theirs.
+    """
+    if world.body(name) is not None:
+        raise ValueError(f"free camera {name}: expected a name of its own, but the world has one")
+    # A free joint, because the renderer takes qpos; a mass, because a free joint needs one.
+    body = world.worldbody.add_body(
+        name=name, gravcomp=1.0, explicitinertial=True, mass=0.1, inertia=[1e-4, 1e-4, 1e-4]
+    )
+    body.add_freejoint(name=name)
+    prefix = f"{name}/"
+    for spec in specs:
+        add_camera(world, name, spec, prefix)
+    return prefix
+
+
+def pose_to_qpos(position: Vector3, orientation: Quaternion) -> npt.NDArray[np.float64]:
+    """Return a free camera's qpos, shape (7,), from its body's pose.
+
+    Args:
+        orientation: Rotation from the body (FRD) to ``map``; needn't be of unit length.
+
+    Raises:
+        ValueError: The quaternion is zero.
+    """
+    turn = flip_yz_rotation(normalize(orientation))
+    return np.array([*flip_yz(position), *turn])
+
+
+def qvel_between(
+    before: npt.NDArray[np.float64], after: npt.NDArray[np.float64], seconds: float
+) -> npt.NDArray[np.float64]:
+    """Return a free camera's velocity, shape (6,), from its qpos at two times."""
+    turn = np.empty(3)
+    mujoco.mju_subQuat(turn, after[3:], before[3:])
+    return np.concatenate([after[:3] - before[:3], turn]) / seconds

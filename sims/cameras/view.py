@@ -1,17 +1,19 @@
-"""From drawings to what falls on a camera's sensor: whole images, or bands of their rows."""
+"""From drawings to what falls on a camera's sensor: whole images, or bands of a rolling shutter."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from events import CameraInfo
-from sims.cameras.lens import MARGIN, Face, Maps, faces
-from sims.cameras.stage import Colours, Depths, Stage
+from sims.cameras.lens import MARGIN, Face, Maps, faces, pixel_rays
+from sims.cameras.stage import RANGE, Colours, Depths, Stage
 
 Numbers = npt.NDArray[np.int32]
 
@@ -39,7 +41,6 @@ class View:
     """How one camera's images come from drawings.
 
     Args:
-        info: The camera's intrinsics.
         framed: Whether the model's camera has just this frame, so that nothing is aimed.
     """
 
@@ -61,15 +62,7 @@ class View:
         numbers: bool,
         rows: tuple[int, int] | None = None,
     ) -> Drawn:
-        """Draw what the camera sees.
-
-        Args:
-            stage: A stage that looks through the camera.
-            colour: Whether colours are wanted.
-            depth: Whether depth is wanted.
-            numbers: Whether object numbers are wanted.
-            rows: First row, and the one after the last; None for all.
-        """
+        """Draw what the camera sees."""
         first, last = rows or (0, self.info.height)
         size = last - first, self.info.width
         if self._framed and rows is None:
@@ -102,7 +95,6 @@ def looked_up(drawn: Drawn, columns: Maps, rows: Maps) -> Drawn:
     interpolated, since that is linear on any plane; where surfaces meet it is the nearest pixel's.
 
     Args:
-        drawn: The images.
         columns: Column of each pixel, shape (h, w); outside them if there is none.
         rows: Row of each pixel.
     """
@@ -164,3 +156,82 @@ def _aim(stage: Stage, face: Face, left: int, top: int, width: int, height: int)
 def _drawn(stage: Stage, size: tuple[int, int], colour: bool, depth: bool, numbers: bool) -> Drawn:
     colours, planar = stage.colour_and_depth(size, colour, depth)
     return Drawn(colours, planar, stage.segmentation(size) if numbers else None)
+
+
+Floats = npt.NDArray[np.float64]
+
+OFF = 0.25
+"""Pixels by which a row may be off because it is drawn at the time of another one."""
+
+FINER_FOR_DEPTH = 2.5
+"""Times as many bands where depth is wanted: on a slanted floor a pixel is some centimetres."""
+
+MOST_BANDS = 128
+"""Bands of one image, at most; beyond 64 pixels of motion in a readout, rows are farther off."""
+
+SAMPLES = 32
+"""Pixels along the longer side of the small image by which motion is measured."""
+
+
+def row_time(readout: float, row: float, height: int) -> float:
+    """Return the seconds from an image's stamp to the middle of a row's exposure."""
+    return readout * (row / (height - 1) - 0.5) if height > 1 else 0.0
+
+
+def row_bands(height: int, shift: float) -> list[tuple[int, int]]:
+    """Return bands of rows, each to be drawn at the time of its middle.
+
+    Args:
+        shift: Pixels by which the image moves during the readout.
+
+    Returns:
+        First row, and the one after the last, of each band; at least one.
+    """
+    count = min(max(math.ceil(0.5 * shift / OFF), 1), height, MOST_BANDS)
+    edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
+    return list(itertools.pairwise(edges))
+
+
+def small_camera(info: CameraInfo) -> CameraInfo:
+    """Return a camera that sees the same with few pixels."""
+    share = min(SAMPLES / max(info.width, info.height), 1.0)
+    width, height = max(round(info.width * share), 1), max(round(info.height * share), 1)
+    across, down = width / info.width, height / info.height
+    return msgspec.structs.replace(
+        info,
+        width=width,
+        height=height,
+        fx=info.fx * across,
+        fy=info.fy * down,
+        cx=(info.cx + 0.5) * across - 0.5,
+        cy=(info.cy + 0.5) * down - 0.5,
+    )
+
+
+def image_speeds(
+    info: CameraInfo,
+    small: CameraInfo,
+    depth: npt.NDArray[np.float32],
+    poses: list[Floats],
+    seconds: float,
+) -> Floats:
+    """Return how quickly what a camera sees moves through its image, pixels per second.
+
+    Args:
+        depth: Planar depth as the small camera sees it at the middle pose, shape (h, w).
+        poses: The optical frame in ``map`` at an odd number of times at equal intervals, shape
+            (4, 4) each.
+
+    Returns:
+        The greatest speed of each point that stays in sight, shape (n,); zero if there is none.
+    """
+    rays = pixel_rays(small).reshape(-1, 3)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = depth.reshape(-1) / rays[:, 2]
+    points = rays * np.where(np.isfinite(scale), scale, RANGE)[:, None]
+    middle = poses[len(poses) // 2]
+    points = points[np.isfinite(points).all(axis=1)] @ middle[:3, :3].T + middle[:3, 3]
+    places = np.array([info.project((points - pose[:3, 3]) @ pose[:3, :3]) for pose in poses])
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=2)
+    steps = steps[:, np.isfinite(steps).all(axis=0)].max(axis=0, initial=0.0)
+    return np.append(steps * (len(poses) - 1) / seconds, 0.0)

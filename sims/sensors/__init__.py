@@ -6,14 +6,6 @@ when it is due.
 """
 
 from sims.sensors.imu import ImuModel, ImuNoise, ImuParameters
-from sims.sensors.settings import SensorsConfig
-from sims.sensors.suite import SensorSuite, mount_imu
+from sims.sensors.suite import SensorsConfig, SensorSuite, mount_imu
 
-__all__ = [
-    "ImuModel",
-    "ImuNoise",
-    "ImuParameters",
-    "SensorSuite",
-    "SensorsConfig",
-    "mount_imu",
-]
+__all__ = ["ImuModel", "ImuNoise", "ImuParameters", "SensorSuite", "SensorsConfig", "mount_imu"]

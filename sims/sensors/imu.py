@@ -113,9 +113,6 @@ class ImuNoise:
     navigation*, 2006; the same as Kalibr's "IMU noise model").
 
     Args:
-        parameters: Parameters of the noise.
-        rate: Samples per second.
-        generator: Source of the random numbers; equal seeds give equal noise.
         bias: Bias at the start: rad/s, then m/s², shape (6,).
 
     Raises:
@@ -186,8 +183,6 @@ class ImuModel:
     """An IMU with all its errors: told the true motion of its place, it returns what it measures.
 
     Args:
-        parameters: Its settings.
-        rate: Samples per second.
         noise: Source of the random numbers of its noise.
         constants: Source of what is drawn once: bias at the start, scale, misalignment, phases.
     """
@@ -248,13 +243,7 @@ class ImuModel:
         return _limited(rates, *self._limits[0]), _limited(force, *self._limits[1])
 
     def announcement(self, source: str, body: str, stamp: int = 0) -> ImuAnnouncement:
-        """Return what the IMU will provide.
-
-        Args:
-            source: Its source, and its frame if it is not the body's.
-            body: Frame of the body.
-            stamp: Nanoseconds on the run's clock.
-        """
+        """Return what the IMU will provide."""
         p = self.parameters
         fields = ImuAnnouncement.__struct_fields__
         same = {name: getattr(p, name) for name in fields if hasattr(p, name)}
@@ -312,7 +301,6 @@ def motion_at(
     """Return the motion of an IMU's place on a body.
 
     Args:
-        parameters: Settings of the IMU.
         orientation: Rotation from the body to NED.
         velocity: Of the body's origin, metres per second NED.
         rates: Angular velocity of the body, rad/s in its frame.

@@ -1,13 +1,18 @@
-"""Rays in a world: what they hit, at which distance, and under which angle."""
+"""Rays through a world, and range finders, which send some."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from events import Quaternion, Range, RangeAnnouncement
+from events.frames import flip_yz, flip_yz_rotation, multiply, rotate
+from sims.sensors.sensor import Name, NonNegative, Place, Positive, Sensor, SensorSpec, Truth
 from sims.worlds import Dynamics
 
 Floats = npt.NDArray[np.float64]
@@ -35,7 +40,6 @@ class Rays:
 
     Args:
         model: The compiled world; lights and colours of it are changed by its dynamics.
-        dynamics: What moves in it by itself.
         body: Name of the body whose geoms rays pass through.
     """
 
@@ -78,3 +82,87 @@ class Rays:
         )
         distances[(geoms < 0) | (distances > reach)] = np.inf
         return Hits(distances, geoms, normals)
+
+
+class RangeFinderSpec(SensorSpec, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a range finder, which looks along its x axis.
+
+    Attributes:
+        name: Name of the sensor, unique on its body.
+        noise: Standard deviation of the white noise, metres (AirSim: always 0.2).
+        min_range: Metres; below it the range is ``-inf`` (AirSim: ``MinDistance``, only reported).
+        max_range: Metres; beyond it the range is ``inf`` (AirSim: ``MaxDistance``, at which it
+            reports `max_range` itself).
+        field_of_view: Angle of the cone, degrees, in which the nearest surface counts, as of
+            ultrasound: found with 25 rays. 0 is a single ray, as of a laser.
+    """
+
+    name: Name
+    noise: NonNegative = 0.02
+    min_range: NonNegative = 0.2
+    max_range: Positive = 40.0
+    field_of_view: Annotated[float, msgspec.Meta(ge=0.0, le=90.0)] = 0.0
+
+    def __post_init__(self) -> None:
+        if self.max_range <= self.min_range:
+            raise ValueError(
+                f"{self.name}: max_range: expected more than the {self.min_range:g} m of "
+                f"min_range, found {self.max_range:g} m"
+            )
+
+
+def cone(angle: float) -> Floats:
+    """Return unit vectors about the x axis, shape (n, 3): one, or 25 over a cone's angle (rad)."""
+    rows = [(1.0, 0.0, 0.0)]
+    if angle > 0.0:
+        for radius, count in ((angle / 4.0, 8), (angle / 2.0, 16)):
+            for turn in np.arange(count) * 2.0 * math.pi / count:
+                y, z = math.sin(radius) * math.cos(turn), math.sin(radius) * math.sin(turn)
+                rows.append((math.cos(radius), y, z))
+    return np.array(rows)
+
+
+class RangeFinder(Sensor[RangeFinderSpec]):
+    """Distance to the nearest surface in the cone."""
+
+    port = "ranges"
+    announced = RangeAnnouncement
+
+    def __init__(
+        self, spec: RangeFinderSpec, place: Place, random: np.random.Generator, rays: Rays
+    ) -> None:
+        super().__init__(spec, place, random)
+        self._rays = rays
+        self._cone = cone(math.radians(spec.field_of_view))
+
+    def measure(self, truth: Truth) -> Range:
+        """Return the next range."""
+        spec = self.spec
+        turn = multiply(truth.orientation, spec.rotation)
+        place = np.add(truth.position, rotate(truth.orientation, spec.position)).tolist()
+        self._rays.look(truth.qpos, truth.stamp / 1e9)
+        directions = self._cone @ _matrix(flip_yz_rotation(turn)).T
+        hits = self._rays.cast(np.array(flip_yz(tuple(place))), directions, spec.max_range)
+        noise = spec.noise * float(self.random.standard_normal())
+        found = float(hits.distances.min()) + noise
+        if found > spec.max_range:
+            found = math.inf
+        elif found < spec.min_range:
+            found = -math.inf
+        return Range(
+            stamp=truth.stamp,
+            source=self.source,
+            frame_id=self.source,
+            range=found,
+            field_of_view=math.radians(spec.field_of_view),
+            min_range=spec.min_range,
+            max_range=spec.max_range,
+        )
+
+    def also_announced(self) -> dict[str, Any]:
+        """Return the cone in radians."""
+        return {"field_of_view": math.radians(self.spec.field_of_view)}
+
+
+def _matrix(rotation: Quaternion) -> Floats:
+    return np.array([rotate(rotation, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]).T

@@ -119,13 +119,7 @@ class Mounted(Generic[S]):
 
 
 class Sensor(Mounted[S], ABC):
-    """Model of one sensor: told the truth at its rate, it returns what it measures.
-
-    Args:
-        spec: Its settings.
-        place: Where it is.
-        random: Source of its random numbers; equal seeds give equal measurements.
-    """
+    """Model of one sensor: told the truth at its rate, it returns what it measures."""
 
     port: ClassVar[str]
     """Output of the vehicle's node that its measurements are sent on."""
@@ -145,8 +139,6 @@ class GaussMarkov:
     Args:
         sigma: Standard deviation that it tends to; of AirSim's, the factor of its input.
         tau: Time constant, seconds; 0 is a process that stays zero.
-        dt: Interval, seconds.
-        size: Number of independent components.
         airsim: Take AirSim's recursion, whose input is weighted with 1 - e^(-dt/τ) instead of
             √(1 - e^(-2 dt/τ)): its deviation tends to σ √(dt / 2τ) only.
     """

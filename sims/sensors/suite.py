@@ -1,4 +1,4 @@
-"""From the physics' states to the events of a vehicle's sensors, each at its rate and in time."""
+"""A vehicle's sensors: their settings, and their events, each at its rate and in time."""
 
 from __future__ import annotations
 
@@ -12,17 +12,55 @@ from events import Announcement, Event, Imu, ImuAnnouncement, TransformStamped
 from events.frames import flip_yz, flip_yz_rotation
 from runtime import Node, Tick
 from sims.cameras.rig import DrawnWorld
-from sims.sensors.barometer import Barometer
-from sims.sensors.gnss import Gnss
+from sims.sensors.earth import (
+    Barometer,
+    BarometerSpec,
+    Gnss,
+    GnssSpec,
+    Magnetometer,
+    MagnetometerSpec,
+)
 from sims.sensors.imu import ImuModel, ImuParameters, Motion, mean_between, motion_at
-from sims.sensors.lidar import Lidar
-from sims.sensors.lidar_rig import LidarRig
-from sims.sensors.magnetometer import Magnetometer
-from sims.sensors.range_finder import RangeFinder
-from sims.sensors.rays import Rays
+from sims.sensors.lidar import Lidar, LidarRig, LidarSpec
+from sims.sensors.rays import RangeFinder, RangeFinderSpec, Rays
 from sims.sensors.sensor import Mount, Mounted, Place, Sensor, Truth, generator_of
-from sims.sensors.settings import SensorsConfig
+from sims.simulator import SimulatorConfig
 from sims.vehicle import Physics, State
+from sims.world import Rate
+
+
+class SensorsConfig(SimulatorConfig):
+    """Settings of a vehicle's sensors.
+
+    Attributes:
+        imu_rate: Rate of the IMU and of the ground truth (`odometry`), Hz. The ground truth is also
+            sent at each exposure.
+        imu: Noise of the IMU.
+        barometer: The barometer; none if it is not set. ``{}`` is one with all its defaults.
+        gnss: The satellite receiver; none if it is not set.
+        magnetometer: The magnetometer; none if it is not set.
+        range_finders: The range finders.
+        lidars: The lidars.
+    """
+
+    imu_rate: Rate = 200
+    imu: ImuParameters = ImuParameters()
+    barometer: BarometerSpec | None = None
+    gnss: GnssSpec | None = None
+    magnetometer: MagnetometerSpec | None = None
+    range_finders: tuple[RangeFinderSpec, ...] = ()
+    lidars: tuple[LidarSpec, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = {"imu", "barometer", "gnss", "magnetometer"}
+        for field in ("cameras", "range_finders", "lidars"):
+            for spec in getattr(self, field):
+                if spec.name in names:
+                    raise ValueError(
+                        f"{field}: {spec.name}: expected a name of its own, found that of "
+                        "another sensor"
+                    )
+                names.add(spec.name)
 
 
 def mount_imu(world: mujoco.MjSpec, vehicle: str, parameters: ImuParameters) -> None:
@@ -33,14 +71,7 @@ def mount_imu(world: mujoco.MjSpec, vehicle: str, parameters: ImuParameters) -> 
 
 
 class VehicleImu:
-    """The IMU of one vehicle: its model, fed from the physics.
-
-    Args:
-        node: The vehicle's node.
-        config: Settings of its sensors.
-        physics: The vehicle, in a world that `mount_imu` has seen.
-        frame_id: Frame of the body.
-    """
+    """The IMU of one vehicle: its model, fed from the physics."""
 
     def __init__(
         self, node: Node[Any], config: SensorsConfig, physics: Physics, frame_id: str
@@ -98,11 +129,8 @@ class SensorSuite:
     Args:
         node: The node that carries the sensors, with their outputs; a sensor's source is
             ``<node>/<sensor>``.
-        config: Their settings.
-        frame_id: Frame of the body.
         physics: The vehicle, in a world that `mount_imu` has seen.
         advance: Steps the physics up to a tick, and returns the stamp of the state then.
-        world: The world, as other processes are told of it.
     """
 
     def __init__(

@@ -2,17 +2,104 @@
 
 Position P with feed-forward → velocity PID → acceleration → thrust vector and yaw → attitude, in
 NED and all in floats. How the attitude is reached is in `attitude`.
+
+Settings of the controller: gains of the cascade and limits of the flight.
 """
 
 from __future__ import annotations
 
-from math import asin, atan2, cos, pi, sin, sqrt, tan
+from math import asin, atan2, cos, pi, radians, sin, sqrt, tan
+from typing import Annotated
+
+import msgspec
 
 from events import Quaternion, Vector3
 from events.frames import from_rpy, yaw_of
-from sims.vehicle.gains import Gains, Limits
 from sims.vehicle.model import VehicleParameters
 from sims.vehicle.physics import State
+
+Factor = Annotated[float, msgspec.Meta(ge=0)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Tilt = Annotated[float, msgspec.Meta(gt=0, lt=1.5)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+
+
+class Gains(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Gains of the cascade, for a vehicle whose motors lag by about 40 ms.
+
+    None depends on mass, inertia or thrust: those come from the vehicle's parameters.
+
+    Attributes:
+        position_xy: Velocity per position error, 1/s.
+        position_z: The same for the vertical, 1/s.
+        velocity_xy_p: Acceleration per velocity error, 1/s.
+        velocity_xy_i: Acceleration per integrated velocity error, 1/s².
+        velocity_xy_d: Acceleration per measured acceleration, which it opposes; without unit.
+        velocity_z_p: As `velocity_xy_p`, for the vertical, 1/s.
+        velocity_z_i: As `velocity_xy_i`, for the vertical, 1/s².
+        velocity_z_d: As `velocity_xy_d`, for the vertical, without unit.
+        tilt: Body rate per angle of tilt error, 1/s.
+        yaw: Body rate per angle of yaw error, 1/s.
+        rate_xy_p: Angular acceleration per error in roll or pitch rate, 1/s.
+        rate_xy_i: Angular acceleration per integrated error, 1/s².
+        rate_xy_d: Angular acceleration per measured angular acceleration, without unit.
+        rate_z_p: As `rate_xy_p`, for the yaw rate, 1/s.
+        rate_z_i: As `rate_xy_i`, for the yaw rate, 1/s².
+        derivative_cutoff: Cut-off frequency of the low-pass filter on every derivative, Hz.
+    """
+
+    position_xy: Positive = 1.5
+    position_z: Positive = 2.0
+    velocity_xy_p: Positive = 3.4
+    velocity_xy_i: Factor = 1.0
+    velocity_xy_d: Factor = 0.1
+    velocity_z_p: Positive = 6.0
+    velocity_z_i: Factor = 2.0
+    velocity_z_d: Factor = 0.0
+    tilt: Factor = 8.0
+    yaw: Factor = 3.0
+    rate_xy_p: Factor = 20.0
+    rate_xy_i: Factor = 10.0
+    rate_xy_d: Factor = 0.4
+    rate_z_p: Factor = 6.0
+    rate_z_i: Factor = 2.0
+    derivative_cutoff: Positive = 40.0
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Limits that the cascade keeps, whatever the set-point.
+
+    Attributes:
+        tilt: Angle between the thrust and the vertical in position and velocity flight, radians.
+        speed: Horizontal speed, metres per second.
+        climb: Speed upwards, metres per second.
+        descent: Speed downwards, metres per second.
+        approach: Deceleration towards a position, metres per second squared.
+        integral: Acceleration that the velocity integrators may add, metres per second squared.
+        tilt_rate: Angular velocity about x and y, radians per second.
+        yaw_rate: Angular velocity about z, radians per second.
+        min_thrust: Least thrust in position and velocity flight, as a share of the motors' maximum.
+        max_thrust: Greatest upward thrust there, as a share of the same; the rest is for steering.
+    """
+
+    tilt: Tilt = radians(35.0)
+    speed: Positive = 12.0
+    climb: Positive = 4.0
+    descent: Positive = 2.0
+    approach: Positive = 3.0
+    integral: Factor = 3.0
+    tilt_rate: Positive = 8.0
+    yaw_rate: Positive = 2.0
+    min_thrust: Share = 0.08
+    max_thrust: Share = 0.9
+
+    def __post_init__(self) -> None:
+        if not self.min_thrust < self.max_thrust:
+            raise ValueError(
+                f"min_thrust: expected less than max_thrust, {self.max_thrust:g}, found "
+                f"{self.min_thrust:g}"
+            )
+
 
 _STILL = 0.2
 """Metres per second below which a braking vehicle takes hold of its place."""
@@ -31,9 +118,6 @@ class PositionController:
     The thrust vector becomes an attitude as in D. Mellinger, V. Kumar, *Minimum snap trajectory
     generation and control for quadrotors*, ICRA 2011, with the x axis taken so that the heading is
     the yaw of the ZYX angles even when tilted, as in PX4.
-
-    Attributes:
-        yaw: Heading of the target, radians.
     """
 
     __slots__ = (
@@ -92,9 +176,6 @@ class PositionController:
 
         Args:
             velocity: In NED, or with `heading_frame` x along the vehicle's heading, y to its right.
-            yaw: Radians.
-            yaw_rate: Radians per second.
-            heading_frame: See `velocity`.
         """
         self._vx, self._vy, self._vz = velocity
         self._ax = self._ay = self._az = 0.0
@@ -223,11 +304,7 @@ class PositionController:
         c = cos(yaw)
         s = sin(yaw)
         norm = sqrt(ax * ax + ay * ay + lift * lift)
-        target = from_rpy(
-            asin((c * ay - s * ax) / norm),
-            atan2(-(c * ax + s * ay), lift),
-            yaw,
-        )
+        target = from_rpy(asin((c * ay - s * ax) / norm), atan2(-(c * ax + s * ay), lift), yaw)
         # Only the part of it along the body's present z axis is thrust in the right direction.
         qw, qx, qy, qz = state.orientation
         thrust = self._mass * (

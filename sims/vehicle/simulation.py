@@ -1,7 +1,9 @@
-"""The physics of one world, with all vehicles that are in it: stepping, and its present state."""
+"""The physics of one world, with all vehicles in it: stepping, its present state, and its past."""
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -9,10 +11,76 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from sims.vehicle.history import History
 from sims.vehicle.model import TIMESTEP_NS
 
 Floats = npt.NDArray[np.float64]
+
+
+class History:
+    """The states of a simulation's last milliseconds, as long a time as somebody has asked for.
+
+    Args:
+        simulation: The simulation, which calls `add` before each of its steps if `kept` is true.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._states: deque[tuple[Floats, Floats]] = deque(maxlen=0)
+
+    @property
+    def kept(self) -> bool:
+        """Whether anybody has asked for a past."""
+        return bool(self._states.maxlen)
+
+    def keep(self, seconds: float) -> None:
+        """Keep at least the states of the last `seconds` from now on."""
+        steps = math.ceil(seconds * 1e9 / TIMESTEP_NS) + 1
+        if steps > (self._states.maxlen or 0):
+            self._states = deque(self._states, maxlen=steps)
+
+    def add(self) -> None:
+        """Keep the present state, from which the next step is about to begin."""
+        data = self._simulation.data
+        self._states.append((data.qpos.copy(), data.qvel.copy()))
+
+    def clear(self) -> None:
+        """Forget all states."""
+        self._states.clear()
+
+    def at(self, stamp_ns: int) -> tuple[Floats, Floats]:
+        """Return the world's state at a time in the past that is kept, or a step ahead at most.
+
+        On a whole millisecond positions are those of that step, between two as the step carried
+        them (semi-implicit Euler); velocities are as of `Simulation.state_at`. Before time 0 all
+        is as it was then.
+
+        Returns:
+            Generalised positions, shape (nq,), and velocities, shape (nv,); not to be written to.
+
+        Raises:
+            ValueError: The time is not kept any more, or is too far ahead.
+        """
+        now = self._simulation.time_ns
+        stamp_ns = max(stamp_ns, 0)
+        if stamp_ns >= now:
+            return self._simulation.state_at(stamp_ns)
+        steps = now // TIMESTEP_NS
+        step, rest = divmod(stamp_ns, TIMESTEP_NS)
+        oldest = steps - len(self._states)
+        if step < oldest:
+            raise ValueError(
+                f"history: expected a time from {oldest * TIMESTEP_NS} ns on, which is what "
+                f"`keep` asked for, found {stamp_ns} ns"
+            )
+        qpos, qvel = self._states[step - oldest]
+        if step + 1 < steps:
+            _, later = self._states[step + 1 - oldest]
+        else:
+            later = self._simulation.data.qvel
+        if rest:
+            qpos = qpos.copy()
+            mujoco.mj_integratePos(self._simulation.model, qpos, later, rest * 1e-9)
+        return qpos, qvel + (later - qvel) * (0.5 + rest / TIMESTEP_NS)
 
 
 class PhysicsDivergedError(Exception):
@@ -36,17 +104,9 @@ class Simulation:
     (their lag), so a new command changes nothing at the instant at which it is given: of several
     vehicles it does not matter which is controlled first.
 
-    Args:
-        model: A compiled world.
-        influences: What is applied at each millisecond, in this order.
-
     Attributes:
-        model: The compiled world.
-        data: MuJoCo's data. Whoever writes a state into it does so before anything is read at
-            that instant, or calls `changed`.
         history: The states of the past.
         mocap_velocities: Of the bodies that move by themselves, m/s NWU, shape (nmocap, 3).
-        influences: What is applied at each millisecond, in this order.
         diverged: Whether its state was no longer finite once: it is of no use any more.
 
     Raises:

@@ -4,9 +4,9 @@ A built-in world costs physics little (primitives, all in the world body) and is
 textures are drawn from a seed, and nothing repeats for long.
 """
 
+from sims.worlds.builder import CLEARANCE, TOURS
 from sims.worlds.dynamics import Dynamics, Motion, Scene
 from sims.worlds.loading import WORLDS, WorldError, load_scene, load_world
-from sims.worlds.tours import CLEARANCE, TOURS
 
 __all__ = [
     "CLEARANCE",

@@ -19,8 +19,7 @@ import mujoco
 from events import Quaternion, Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_yaw
 from runtime.units import Duration
-from sims.worlds.curves import Path, interpolated, path_through
-from sims.worlds.dynamics import Dynamics, Scene
+from sims.worlds.dynamics import Dynamics, Path, Scene, interpolated, path_through
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -108,9 +107,7 @@ class BodyMotion(NamedTuple):
     Attributes:
         name: Name of the MuJoCo body, which is a mocap body.
         place: Where it stands, metres NED, if it has no path.
-        yaw: Its heading there, radians.
         path: Its way, if it has one.
-        times: Of a door.
         angles: Of a door, radians, at those times.
         loop: Whether a door does the same again and again.
     """
@@ -187,10 +184,7 @@ def add_shape(scene: Scene, body: Any, kind: Kind, size: Vector3, colour: Vector
     """Give a body of a world the shape of a kind: its parts, called after it, and their materials.
 
     Args:
-        scene: The world.
         body: MuJoCo's body, with its origin in the middle of its foot.
-        kind: What it is to be.
-        size: Length, width and height, metres.
         colour: Red, green and blue, 0 to 1.
     """
     shape = _Shape(scene.spec, body, size, colour)

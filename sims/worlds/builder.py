@@ -8,14 +8,235 @@ geoms: `<name>` is the solid (a primitive, group 3, not drawn), `<name>.look` th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
+from events.base import Vector3
+from events.frames import from_rpy
 from sims.worlds.decals import tile
-from sims.worlds.model import Material, Model, Vector
-from sims.worlds.shapes import FACES, STEP, Window, arch, blob, box, cylinder, face_size, quad
+from sims.worlds.shapes import (
+    FACES,
+    STEP,
+    Surface,
+    Window,
+    arch,
+    blob,
+    box,
+    cylinder,
+    face_size,
+    quad,
+)
+from sims.worlds.textures import Draw, own_generator, texture
+
+LOOK_GROUP, SOLID_GROUP = 0, 3
+Vector = tuple[float, float, float]
+
+
+class Material(NamedTuple):
+    """A texture in the model.
+
+    Attributes:
+        module: Pieces that are cut out of it start at a multiple of this, metres down: a course
+            of bricks.
+    """
+
+    name: str
+    width: float
+    height: float
+    module: float = 0.0
+
+
+class Model:
+    """Collects a world.
+
+    Args:
+        name: Name of the model, which its random numbers depend on.
+        bare: Leave out the images, which take seconds to draw.
+        world: Name of the world whose textures these are; the model's, if empty.
+    """
+
+    def __init__(self, name: str, seed: int, bare: bool = False, world: str = "") -> None:
+        self._world, self._seed, self._bare = world or name, seed, bare
+        self.random = np.random.default_rng([seed, len(name), *name.encode()])
+        self.spec = mujoco.MjSpec()
+        self.spec.modelname = name
+        # A light shade everywhere, so that nothing is black.
+        self.spec.visual.headlight.diffuse = [0.0, 0.0, 0.0]
+        self.spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+        self.spec.visual.quality.shadowsize = 0
+        self.spec.visual.quality.offsamples = 0
+
+    def _texture(self, name: str, draw: Draw, kind: Any) -> tuple[int, int]:
+        """Add a texture, and return its width and height, pixels."""
+        random = own_generator(self._world, self._seed, name, self.random)
+        if self._bare:
+            image = np.zeros((6, 1, 3), np.uint8)  # as a skybox has it, which is six squares
+        else:
+            image = texture(self._world, self._seed, name, draw, random)
+        height, width = image.shape[:2]
+        added = self.spec.add_texture(name=name, type=kind, width=width, height=height, nchannel=3)
+        added.data = image.tobytes()
+        return width, height
+
+    def material(
+        self, name: str, draw: Draw, density: float, module: float = 0.0, glow: float = 0.0
+    ) -> Material:
+        """Add a material drawn at `density` pixels per metre.
+
+        Args:
+            module: See `Material`.
+            glow: Light that it emits, 0..1.
+        """
+        width, height = self._texture(name, draw, mujoco.mjtTexture.mjTEXTURE_2D)
+        material = self.spec.add_material(
+            name=name, specular=0.05, shininess=0.1, reflectance=0.0, emission=glow
+        )
+        textures = list(material.textures)
+        textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+        material.textures = textures
+        return Material(name, width / density, height / density, module)
+
+    def sky(self, draw: Draw) -> None:
+        """Add a sky: the six faces of a cube, one below the other, as OpenGL has them."""
+        self._texture("sky", draw, mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+
+    def cut(self, material: Material, width: float, height: float) -> Window:
+        """Return a piece of a material from a random place, of a size in metres.
+
+        A piece larger than the material is all of it, drawn larger.
+        """
+        width, height = min(width, material.width), min(height, material.height)
+        left = self.random.uniform(0.0, material.width - width)
+        top = self.random.uniform(0.0, material.height - height)
+        if material.module > 0.0:
+            top = math.floor(top / material.module) * material.module
+        return (
+            left / material.width,
+            top / material.height,
+            (left + width) / material.width,
+            (top + height) / material.height,
+        )
+
+    def look(
+        self,
+        name: str,
+        surface: Surface,
+        material: Material,
+        place: Vector,
+        turn: float = 0.0,
+        tilt: float = 0.0,
+    ) -> None:
+        """Add a surface that is drawn, without collisions."""
+        self.mesh(name, surface)
+        self.hang(name, name, material, self.spec.worldbody, place, turn, tilt)
+
+    def mesh(self, name: str, surface: Surface) -> None:
+        """Add a surface that can be hung up more than once."""
+        self.spec.add_mesh(
+            name=name,
+            uservert=surface.points.ravel(),
+            usernormal=surface.normals.ravel(),
+            usertexcoord=surface.texture.ravel(),
+            userface=surface.faces.ravel(),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )
+
+    def moving(self, name: str) -> Any:
+        """Add a body that moves by itself, to hang surfaces on; it has no weight that matters."""
+        return self.spec.worldbody.add_body(
+            name=name, mocap=True, mass=1.0, inertia=[1.0, 1.0, 1.0], explicitinertial=True
+        )
+
+    def hang(
+        self,
+        name: str,
+        mesh: str,
+        material: Material,
+        body: Any,
+        place: Vector = (0.0, 0.0, 0.0),
+        turn: float = 0.0,
+        tilt: float = 0.0,
+    ) -> None:
+        """Put a surface that `mesh` added on a body: drawn, without collisions."""
+        body.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=mesh,
+            material=material.name,
+            pos=place,
+            quat=from_rpy(0.0, math.radians(tilt), math.radians(turn)),
+            contype=0,
+            conaffinity=0,
+            group=LOOK_GROUP,
+        )
+
+    def solid(
+        self,
+        name: str,
+        kind: Any,
+        size: Sequence[float],
+        place: Vector,
+        turn: float = 0.0,
+        tilt: float = 0.0,
+        roll: float = 0.0,
+    ) -> None:
+        """Add a primitive for collisions, not drawn; `size` is MuJoCo's (half lengths)."""
+        quat = np.empty(4)
+        mujoco.mju_mulQuat(
+            quat,
+            np.asarray(from_rpy(0.0, math.radians(tilt), math.radians(turn))),
+            np.array([math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0]),
+        )
+        self.spec.worldbody.add_geom(
+            name=name,
+            type=kind,
+            size=[*size, 0.0, 0.0][:3],
+            pos=place,
+            quat=quat,
+            group=SOLID_GROUP,
+            rgba=[0.6, 0.6, 0.6, 1.0],
+        )
+
+    def light(
+        self,
+        name: str,
+        place: Vector,
+        colour: Vector,
+        *,
+        towards: Vector = (0.0, 0.0, -1.0),
+        sun: bool = False,
+        fall_off: float = 0.0,
+        cone: float = 0.0,
+    ) -> None:
+        """Add a light.
+
+        Args:
+            colour: Strength in red, green, blue.
+            fall_off: 1/m² in 1 / (1 + fall_off r²).
+            cone: Degrees to each side of its direction that it reaches; 0: to all sides.
+        """
+        kind = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL if sun else mujoco.mjtLightType.mjLIGHT_POINT
+        if cone:
+            kind = mujoco.mjtLightType.mjLIGHT_SPOT
+        light = self.spec.worldbody.add_light(
+            name=name,
+            type=kind,
+            pos=place,
+            dir=towards,
+            diffuse=colour,
+            specular=[0.0, 0.0, 0.0],
+            ambient=[0.0, 0.0, 0.0],
+            attenuation=[1.0, 0.0, fall_off],
+            castshadow=False,
+        )
+        if cone:
+            light.cutoff, light.exponent = cone, 1.5
+
 
 WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 
@@ -49,8 +270,6 @@ class Builder(Model):
         """Add a box.
 
         Args:
-            name: Name of the box.
-            material: Material of all its faces.
             size: Lengths along its x, y, z, metres.
             place: The middle of its **base**, metres (of the box itself if it is tilted).
             turn: About z, degrees.
@@ -198,11 +417,6 @@ class Builder(Model):
         """Hang up an image (drawn, without collisions).
 
         Args:
-            name: Name of the image.
-            material: Material of which it shows a part.
-            window: That part.
-            size: Width and height, metres.
-            place: Its middle.
             facing: Direction in which it faces: degrees from north to the west.
         """
         width, height = size
@@ -229,7 +443,6 @@ class Builder(Model):
 
         Args:
             name: Its name; the legs are ``<name>/left``, ``/right``, the ring ``<name>/ring``.
-            material: Material of the whole arch.
             opening: Clear width, and height of the legs, metres.
             leg: Width of a leg and of the ring, metres.
             depth: Thickness along x, metres.
@@ -263,3 +476,18 @@ class Builder(Model):
                 turn,
                 roll=angle - math.pi / 2.0,
             )
+
+
+CLEARANCE = 0.8
+"""Least distance (metres) of the straight lines between a tour's points from every solid."""
+
+
+def _tours() -> dict[str, tuple[Vector3, ...]]:
+    found = tomllib.loads(Path(__file__).with_name("tours.toml").read_text(encoding="utf-8"))
+    return {name: tuple((x, y, z) for x, y, z in points) for name, points in found.items()}
+
+
+TOURS = _tours()
+TOURS["night"] = TOURS["yard"]
+"""Each world's tour: waypoints in NED (metres), in order; from the last it goes back to the first.
+Each is about 50 to 60 m long."""

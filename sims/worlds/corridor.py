@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 
 from sims.worlds import materials
-from sims.worlds.builder import WHOLE, Builder, sides
-from sims.worlds.model import Material
-from sims.worlds.patterns import Colour, Image, shade, smooth, specks
+from sims.worlds.builder import WHOLE, Builder, Material, sides
+from sims.worlds.materials import Colour, Image, shade, smooth, specks
 
 MODULE = 2.6
 """Metres from door to door, and the width of the corridor."""

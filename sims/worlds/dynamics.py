@@ -1,4 +1,4 @@
-"""What moves or changes in a world by itself: pure functions of simulated time.
+"""What moves or changes in a world by itself: pure functions of simulated time; lights, and fog.
 
 Physics, renderers and lidars, each in its own process, apply the same `Dynamics` to their copy of
 the model, and so see the same world at the same time.
@@ -6,9 +6,22 @@ the model, and so see the same world at the same time.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+import math
+import zlib
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Annotated, Any, NamedTuple, Protocol
 
+import msgspec
 import mujoco
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from events import Vector3
+from events.frames import flip_yz
+from runtime.errors import suggest
+from runtime.units import Duration
 
 
 class Motion(Protocol):
@@ -30,7 +43,6 @@ class Motion(Protocol):
         Args:
             model: The compiled world; lights and colours may be written to.
             data: MuJoCo's data of it; ``mocap_pos`` and ``mocap_quat`` may be written to.
-            seconds: Simulated time, from 0 on.
         """
 
 
@@ -38,7 +50,6 @@ class Dynamics(NamedTuple):
     """All that moves or changes in a world by itself.
 
     Attributes:
-        motions: In the order in which they are applied.
         fog: Whether the world is drawn with fog, as MuJoCo's settings of it say.
     """
 
@@ -65,3 +76,271 @@ class Scene(NamedTuple):
 
     spec: mujoco.MjSpec
     dynamics: Dynamics = Dynamics()
+
+
+_YAW_STEP = 0.02
+"""Seconds between the headings that are worked out beforehand."""
+
+_TURN = 0.25
+"""Seconds over which changes of heading are smoothed (standard deviation)."""
+
+
+def within(seconds: float, times: Sequence[float], loop: bool) -> float:
+    """Return a time within a curve's: the end holds, or the beginning comes again."""
+    first, last = times[0], times[-1]
+    if loop and last > first and seconds > first:
+        return first + (seconds - first) % (last - first)
+    return min(max(seconds, first), last)
+
+
+def interpolated(
+    times: Sequence[float], values: Sequence[float], seconds: float, *, loop: bool, smooth: bool
+) -> float:
+    """Return a curve's value at a time, between its knots linear or with rest at each of them."""
+    seconds = within(seconds, times, loop)
+    after = min(bisect_right(times, seconds), len(times) - 1)
+    if after == 0:
+        return values[0]
+    before = after - 1
+    share = (seconds - times[before]) / (times[after] - times[before])
+    if smooth:
+        share *= share * (3.0 - 2.0 * share)
+    return values[before] + share * (values[after] - values[before])
+
+
+class Path(NamedTuple):
+    """A smooth way through places, with the heading of its direction.
+
+    Attributes:
+        times: When it is at each place, seconds, rising.
+        cubics: For each stretch the coefficients of (t - its start)³, ², ¹ and ⁰, each (x, y, z).
+        yaws: Headings, radians, at equal steps from the first time to the last.
+        loop: Whether it begins anew when it is over; else its end holds.
+    """
+
+    times: tuple[float, ...]
+    cubics: tuple[Any, ...]
+    yaws: tuple[float, ...]
+    loop: bool
+
+    def at(self, seconds: float) -> tuple[Vector3, float]:
+        """Return the place and the heading (radians) at a time."""
+        seconds = within(seconds, self.times, self.loop)
+        stretch = min(bisect_right(self.times, seconds), len(self.times) - 1) - 1
+        t = seconds - self.times[stretch]
+        a, b, c, d = self.cubics[stretch]
+        x, y, z = (((p * t + q) * t + r) * t + s for p, q, r, s in zip(a, b, c, d, strict=True))
+        step, rest = divmod((seconds - self.times[0]) / _YAW_STEP, 1.0)
+        here = min(int(step), len(self.yaws) - 2)
+        yaw = self.yaws[here] + rest * (self.yaws[here + 1] - self.yaws[here])
+        return (x, y, z), yaw
+
+
+def path_through(
+    places: Sequence[Vector3], times: Sequence[float], *, loop: bool, yaw: float
+) -> Path:
+    """Return a cubic spline through places, at rest at its ends, or periodic.
+
+    Args:
+        places: At least two; of a loop the last one is the first.
+        times: When it is to be at each, seconds, rising.
+        yaw: Heading until it first moves, radians.
+    """
+    spline = CubicSpline(times, places, bc_type="periodic" if loop else "clamped")
+    at = np.arange(times[0], times[-1] + 2 * _YAW_STEP, _YAW_STEP)
+    velocity = spline(np.minimum(at, times[-1]), 1)
+    moving = np.hypot(velocity[:, 0], velocity[:, 1]) > 0.02
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(at)), -1))
+    if loop and moving.any():  # what stands at the beginning has come from the end
+        last = np.where(last < 0, int(np.flatnonzero(moving)[-1]), last)
+    heading = np.arctan2(velocity[:, 1], velocity[:, 0])
+    yaws = np.unwrap(np.where(last >= 0, heading[last], yaw))
+    cubics: Any = spline.c.transpose(1, 0, 2).tolist()
+    return Path(
+        tuple(float(t) for t in times),
+        tuple(tuple(tuple(row) for row in stretch) for stretch in cubics),
+        tuple(_smoothed(yaws, loop).tolist()),
+        loop,
+    )
+
+
+def _smoothed(
+    yaws: np.ndarray[tuple[int], np.dtype[np.float64]], loop: bool
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Average headings over a Gaussian window; a loop goes on as it began, with its turns."""
+    width = _TURN / _YAW_STEP
+    reach = min(math.ceil(3 * width), len(yaws) - 1)
+    window = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    if loop:
+        turns = yaws[-1] - yaws[0]
+        turns = round(turns / math.tau) * math.tau
+        before, after = yaws[-reach - 1 : -1] - turns, yaws[1 : reach + 1] + turns
+        padded = np.unwrap(np.concatenate([before, yaws, after]))
+    else:
+        padded = np.pad(yaws, reach, mode="edge")
+    return np.convolve(padded, window / window.sum(), mode="valid")
+
+
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+
+HEADLIGHT = "headlight"
+"""MuJoCo's name for the light that comes from everywhere, which all worlds have."""
+
+
+class Changing(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How something changes in time.
+
+    Attributes:
+        times: When `factors` hold; in between they change evenly.
+        factors: Strengths at these times, of what it is in the world.
+        loop: Whether it begins anew after the last time; else the last factor holds.
+    """
+
+    times: tuple[Duration, ...] = (Duration(0),)
+    factors: tuple[NonNegative, ...] = (1.0,)
+    loop: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.times or len(self.times) != len(self.factors):
+            raise ValueError(
+                f"times, factors: expected as many of each, and one at least, found "
+                f"{len(self.times)} and {len(self.factors)}"
+            )
+        if any(after <= before for before, after in pairwise(self.times)):
+            raise ValueError(f"times: expected rising ones, found {list(self.times)}")
+
+    def factor(self, seconds: float) -> float:
+        """Return the strength at a time."""
+        return interpolated(self.times, self.factors, seconds, loop=self.loop, smooth=False)
+
+
+class LightSpec(Changing, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a light of the world that changes in time.
+
+    Attributes:
+        name: The light's name in the world; ``headlight`` for the light that comes from everywhere;
+            ``*`` for all of them.
+        flicker: Share of its strength by which it flickers, at random but always alike.
+        flicker_rate: How often a second it does.
+        directions: Directions of its rays at the `times`, north, east, down: a sun that moves.
+            Empty for that in the world.
+    """
+
+    name: str = "*"
+    flicker: Share = 0.0
+    flicker_rate: Annotated[float, msgspec.Meta(gt=0)] = 12.0
+    directions: tuple[Vector3, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.directions and len(self.directions) != len(self.times):
+            raise ValueError(
+                f"directions: expected one for each of {len(self.times)} times, "
+                f"found {len(self.directions)}"
+            )
+
+    def strength(self, seconds: float) -> float:
+        """Return its strength at a time, flicker included."""
+        step, rest = divmod(seconds * self.flicker_rate, 1.0)
+        here, next_ = (zlib.crc32(b"%d" % (step + i)) / 0xFFFFFFFF for i in (0, 1))
+        return self.factor(seconds) * (1.0 - self.flicker * (here + rest * (next_ - here)))
+
+
+class FogSpec(Changing, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the fog.
+
+    Attributes:
+        start: Distance at which it begins, metres.
+        end: Distance beyond which there is nothing but fog, metres. A factor of 2 halves both.
+        colour: Red, green and blue, 0 to 1.
+    """
+
+    start: NonNegative = 0.0
+    end: Annotated[float, msgspec.Meta(gt=0)] = 30.0
+    colour: tuple[Share, Share, Share] = (0.72, 0.75, 0.78)
+
+
+class LightMotion(NamedTuple):
+    """A light's strength and direction at each time."""
+
+    name: str
+    spec: LightSpec
+    colours: tuple[tuple[float, ...], ...]
+
+    @property
+    def solid(self) -> bool:
+        """Whether vehicles can touch it: never."""
+        return False
+
+    def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
+        """Give it the strength and direction of a time."""
+        strength = self.spec.strength(seconds)
+        colours = [[strength * each for each in colour] for colour in self.colours]
+        if self.name == HEADLIGHT:
+            light = model.vis.headlight
+            light.ambient[:], light.diffuse[:], light.specular[:] = colours
+            return
+        light = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_LIGHT, self.name)
+        model.light_ambient[light], model.light_diffuse[light] = colours[:2]
+        model.light_specular[light] = colours[2]
+        if self.spec.directions:
+            x, y, z = (
+                interpolated(self.spec.times, axis, seconds, loop=self.spec.loop, smooth=False)
+                for axis in zip(*self.spec.directions, strict=True)
+            )
+            length = (x * x + y * y + z * z) ** 0.5 or 1.0
+            model.light_dir[light] = flip_yz((x / length, y / length, z / length))
+
+
+class FogMotion(NamedTuple):
+    """How thick the fog is at each time."""
+
+    spec: FogSpec
+
+    @property
+    def solid(self) -> bool:
+        """Whether vehicles can touch it: never."""
+        return False
+
+    def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
+        """Make it as thick as it is at a time."""
+        factor = max(self.spec.factor(seconds), 1e-3)
+        fog = model.vis.map
+        fog.fogstart = self.spec.start / factor / model.stat.extent
+        fog.fogend = self.spec.end / factor / model.stat.extent
+
+
+def change_lights(scene: Scene, specs: tuple[LightSpec, ...]) -> Dynamics:
+    """Return how lights of a world change.
+
+    Raises:
+        ValueError: The world has no such light, or its direction cannot change.
+    """
+    world: Any = scene.spec
+    lights = {light.name: light for light in world.lights if light.name}
+    lights[HEADLIGHT] = world.visual.headlight
+    motions = []
+    for spec in specs:
+        if spec.name != "*" and spec.name not in lights:
+            raise ValueError(
+                f"lights: expected one of {', '.join(lights)} or *, found "
+                f'"{spec.name}"{suggest(spec.name, lights)}'
+            )
+        names = list(lights) if spec.name == "*" else [spec.name]
+        if spec.directions and (spec.name == "*" or spec.name == HEADLIGHT):
+            raise ValueError(f"lights: directions: expected those of one light, found {spec.name}")
+        for name in names:
+            light = lights[name]
+            colours = tuple(
+                tuple(float(each) for each in colour)
+                for colour in (light.ambient, light.diffuse, light.specular)
+            )
+            motions.append(LightMotion(name, spec, colours))
+    return Dynamics(tuple(motions))
+
+
+def add_fog(scene: Scene, spec: FogSpec) -> Dynamics:
+    """Put fog into a world, and return how it changes."""
+    scene.spec.visual.rgba.fog = [*spec.colour, 1.0]
+    return Dynamics((FogMotion(spec),), fog=True)

@@ -15,12 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sims.worlds import materials
-from sims.worlds.builder import Builder
+from sims.worlds.builder import TOURS, Builder, Material, Vector
 from sims.worlds.dynamics import Dynamics, Scene
-from sims.worlds.model import Material, Vector
-from sims.worlds.patterns import Image, fractal, mix, shade, share, smooth, specks
+from sims.worlds.materials import Image, fractal, mix, shade, share, smooth, specks
 from sims.worlds.shapes import Surface, cylinder
-from sims.worlds.tours import TOURS
 
 HALF = 20.0
 DENSITY = 60.0

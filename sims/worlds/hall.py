@@ -1,8 +1,7 @@
 """`hall`: an old brick factory hall, 16 x 12 m and 5 m high, made into a flying arena.
 
 Coordinates in this file are MuJoCo's: x north, y **west**, z up, metres, from the middle of the
-floor. What things are made of is in `materials` and `decals`, the images of floor, walls and
-ceiling in `hall_surfaces`; how they get into the model, in `builder`.
+floor. Shadows are painted on the floor, not drawn: they cost nothing per frame.
 """
 
 from __future__ import annotations
@@ -10,35 +9,197 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+import cv2
 import numpy as np
 
-from sims.worlds import decals, hall_surfaces, materials
-from sims.worlds.builder import Builder, sides
-from sims.worlds.hall_surfaces import (
-    BARRELS,
-    CEILING_DENSITY,
-    CRATES,
-    DENSITY,
-    HEIGHT,
-    NORTH,
-    PILLARS,
-    WEST,
-)
-from sims.worlds.model import Material
-from sims.worlds.patterns import Image
+from sims.worlds import decals, materials
+from sims.worlds.builder import Builder, Material, sides
+from sims.worlds.materials import Image, cells, fractal, mix, shade, share, smooth, specks
+
+NORTH, WEST, HEIGHT = 8.0, 6.0, 5.0
+DENSITY = 96.0
+"""Pixels per metre of floor and walls."""
+
+CEILING_DENSITY = 64.0
+
+PILLARS = ((2.3, 2.1), (-2.6, -2.2), (2.2, -2.2), (-4.6, 1.9))
+CRATES = (  # x, y, base, edge, turn
+    (6.9, 5.0, 0.0, 0.9, 8.0), (7.2, 3.9, 0.0, 0.8, -12.0), (6.95, 4.9, 0.9, 0.8, 31.0),
+    (-7.2, -5.1, 0.0, 1.0, 4.0), (-6.2, -5.4, 0.0, 0.8, -20.0), (-7.1, -5.1, 1.0, 0.7, 25.0),
+    (7.0, -5.1, 0.0, 0.9, -6.0), (0.2, -2.3, 0.0, 0.8, 17.0), (0.3, -2.25, 0.8, 0.6, -24.0),
+    (4.3, 1.9, 0.0, 0.7, 38.0), (-1.9, -2.0, 0.0, 0.6, 12.0), (-7.2, 5.2, 0.0, 1.0, -9.0),
+)  # fmt: skip
+BARRELS = (
+    (-6.3, 5.3, "blue"), (-5.7, 5.5, "red"), (6.0, -5.4, "blue"), (5.4, -5.5, "red"),
+    (3.6, -2.2, "red"), (-7.4, -1.0, "blue"), (7.4, 1.0, "red"),
+)  # fmt: skip
+
+
+def _wall(random: np.random.Generator, width: float) -> Image:
+    """Return brick, painted from 1.1 m up where paint still holds, windows under the ceiling."""
+    shape = (int(HEIGHT * DENSITY), int(width * DENSITY))
+    bare = materials.brick(shape, random, DENSITY)
+    colours = ((0.74, 0.73, 0.66), (0.62, 0.68, 0.66), (0.78, 0.70, 0.56), (0.68, 0.70, 0.74))
+    colour = colours[int(random.integers(len(colours)))]
+    painted = materials.plaster(shape, random, DENSITY, colour, bare)
+    # Bricks show through paint.
+    relief = bare.mean(2) - float(bare.mean())
+    painted = shade(painted, 0.35 * relief)
+    level = np.arange(shape[0], dtype=np.float32)[:, None] / DENSITY
+    ragged = 0.03 * fractal(shape, random, coarse=40)
+    wall = mix(bare, painted, smooth(-0.03, 0.03, (HEIGHT - 1.15) - level + ragged))
+    band = smooth(-0.02, 0.02, 0.07 - np.abs(level - (HEIGHT - 1.2)) + 0.3 * ragged)
+    wall = mix(wall, (0.22, 0.34, 0.38), band * smooth(-1.4, 0.0, fractal(shape, random)) * 0.9)
+    step = 2.0
+    for left in np.arange(0.45, width - 1.4, step):
+        if random.uniform() < 0.72:
+            size = (int(0.95 * DENSITY), int(1.25 * DENSITY))
+            pane = decals.window_pane(size, random, lit=random.uniform() < 0.25)
+            decals.paste(wall, pane, int(left * DENSITY), int(0.5 * DENSITY), border=7)
+        else:
+            number = f"{random.integers(1, 99):02d}"
+            box = (int(left * DENSITY), 50, int((left + 1.25) * DENSITY), 140)
+            decals.letters(wall, number, box, (0.20, 0.24, 0.28),
+                           smooth(-1.2, 0.2, fractal(shape, random, coarse=24)))  # fmt: skip
+    # Dirt gathers in the corners and at the foot.
+    across = np.arange(shape[1], dtype=np.float32)[None, :] / DENSITY
+    corner = np.exp(-np.minimum(across, width - across) / 0.5)
+    foot = np.exp(-(HEIGHT - level) / 0.35)
+    return shade(
+        wall, (-0.35 * corner - 0.45 * foot - 0.2 * np.exp(-level / 0.4)).astype(np.float32)
+    )
+
+
+def _floor(random: np.random.Generator) -> Image:
+    """Return slabs and cast concrete, lines of a flying course, shadows of what stands there."""
+    shape = (int(2 * NORTH * DENSITY), int(2 * WEST * DENSITY))
+    slabs = materials.tiles(
+        shape, random, DENSITY, ((0.58, 0.56, 0.52), (0.50, 0.49, 0.47), (0.64, 0.60, 0.53)),
+        size=(0.8, 0.8),
+    )  # fmt: skip
+    cast = materials.concrete(shape, random, DENSITY, (0.55, 0.54, 0.52))
+    where = fractal(shape, random, coarse=4.0 * DENSITY, fine=8, gain=0.55)
+    floor = mix(slabs, cast, smooth(0.25, 0.32, where))
+    worn = smooth(-1.5, 0.3, fractal(shape, random, coarse=50))
+    line = np.zeros(shape, np.uint8)
+    inset = int(1.0 * DENSITY)
+    cv2.rectangle(line, (inset, inset), (shape[1] - inset, shape[0] - inset), 255, 9)
+    floor = mix(floor, (0.86, 0.70, 0.22), share(line) * worn * 0.85)
+    ring = np.zeros(shape, np.uint8)
+    middle = (shape[1] // 2, shape[0] // 2)
+    cv2.circle(ring, middle, int(0.75 * DENSITY), 255, 8, cv2.LINE_AA)
+    floor = mix(floor, (0.88, 0.88, 0.84), share(ring) * worn * 0.9)
+    decals.letters(floor, "H", (middle[0] - 40, middle[1] - 40, middle[0] + 40, middle[1] + 40),
+                   (0.88, 0.88, 0.84), worn * 0.9)  # fmt: skip
+    for number, (x, y) in enumerate(((5.2, 0.6), (4.9, 4.1), (-4.2, 4.3), (-5.3, -0.6),
+                                     (-4.0, -4.2), (3.6, -4.3))):  # fmt: skip
+        column, row = _pixel(x, y)
+        decals.letters(floor, f"{number + 1}", (column - 45, row - 60, column + 45, row + 60),
+                       (0.80, 0.80, 0.76), worn * 0.85)  # fmt: skip
+    for x, y in PILLARS:
+        column, row = _pixel(x, y)
+        decals.stripes(floor, (column - 45, row - 45, column + 45, row + 45), worn)
+    return decals.contact_shadow(floor, _footprints(shape), 22.0, 0.75)
+
+
+def _pixel(x: float, y: float) -> tuple[int, int]:
+    """Return column and row of a place on the floor."""
+    return int((WEST - y) * DENSITY), int((NORTH - x) * DENSITY)
+
+
+def _footprints(shape: tuple[int, int]) -> Image:
+    mask = np.zeros(shape, np.float32)
+    squares = [(x, y, e, e) for x, y, base, e, _ in CRATES if base == 0.0]
+    squares += [(x, y, 0.5, 0.5) for x, y in PILLARS]
+    squares += [(x, y, 0.55, 0.55) for x, y, _ in BARRELS]
+    squares += [(-1.6, 2.15, 3.6, 0.2), (-1.8, 5.7, 3.7, 0.5), (-6.9, -2.9, 1.4, 1.4)]
+    squares += [(3.0, 4.15 + s * 1.42, 0.6, 0.45) for s in (-1, 1)]
+    squares += [(-0.6, y, 0.3, 0.3) for y in (-2.95, -5.55)]
+    for x, y, along, across in squares:
+        column, row = _pixel(x, y)
+        high, wide = int(along * DENSITY / 2), int(across * DENSITY / 2)
+        mask[max(row - high, 0) : row + high, max(column - wide, 0) : column + wide] = 1.0
+    mask[:6] = mask[-6:] = 1.0
+    mask[:, :6] = mask[:, -6:] = 1.0
+    return mask
+
+
+def _ceiling(random: np.random.Generator) -> Image:
+    """Return painted boards between the beams, with skylights and water stains."""
+    density = CEILING_DENSITY
+    shape = (int(2 * NORTH * density), int(2 * WEST * density))
+    boards = materials.planks(
+        shape, random, density, width=0.30,
+        palette=((0.60, 0.58, 0.53), (0.52, 0.50, 0.46), (0.68, 0.64, 0.57), (0.45, 0.43, 0.41)),
+    )  # fmt: skip
+    boards = shade(boards, 0.30 * specks(shape, random, count=5000, radius=(1.2, 5.0)))
+    stain = fractal(shape, random, coarse=2.5 * density, fine=6)
+    boards = mix(boards, (0.34, 0.27, 0.20), smooth(0.8, 1.9, stain) * 0.6)
+    for x in (-3.6, 0.0, 3.6):
+        for y in (-4.3, 0.6, 4.5):
+            pane = decals.window_pane((int(1.7 * density), int(1.2 * density)), random, lit=False)
+            row, column = int((NORTH + x - 0.85) * density), int((WEST - y - 0.6) * density)
+            decals.paste(boards, pane, column, row, border=5)
+    return boards
+
+
+def _columns(random: np.random.Generator) -> Image:
+    """Return sixteen pillar faces side by side: concrete, a number, stripes at the foot."""
+    width = int(0.45 * DENSITY)
+    faces = []
+    for number in range(16):
+        shape = (int(HEIGHT * DENSITY), width)
+        face = materials.concrete(shape, random, DENSITY, (0.63, 0.62, 0.58))
+        layout = cells(shape, random, high=1.25 * DENSITY, wide=10.0 * DENSITY)
+        face = mix(face, (0.25, 0.24, 0.22), 1.0 - smooth(0.5, 2.0, layout.edge))
+        worn = smooth(-1.6, 0.2, fractal(shape, random, coarse=20))
+        foot = shape[0]
+        decals.stripes(face, (0, foot - 105, width, foot - 8), worn)
+        decals.letters(
+            face,
+            f"{'NESW'[number % 4]}{number // 4 + 1}",
+            (4, foot - 210, width - 4, foot - 150),
+            (0.16, 0.22, 0.30),
+            worn,
+        )
+        faces.append(face)
+    return np.concatenate(faces, 1)
+
+
+def _crate_faces(random: np.random.Generator) -> Image:
+    """Return nine crates' faces, three by three."""
+    return decals.sheets([decals.crate_face(256, random, n) for n in range(9)], 3)
+
+
+def _posters(random: np.random.Generator) -> Image:
+    """Return twelve posters, four by three."""
+    return decals.sheets([decals.poster((288, 216), random, n) for n in range(12)], 4)
+
+
+def _steel(random: np.random.Generator) -> Image:
+    """Return blue barrels' sides above, red ones' in the middle, bare sheet below."""
+    parts = []
+    for rows, colour in ((154, (0.20, 0.36, 0.52)), (154, (0.62, 0.24, 0.18)),
+                         (76, (0.58, 0.59, 0.60))):  # fmt: skip
+        shape = (rows, 512)
+        sheet = materials.metal(shape, random, 128.0, colour, pitch=0.32)
+        rims = cells(shape, random, high=rows / 3.0, wide=5000.0)
+        sheet = shade(sheet, 0.35 * smooth(1.0, 3.0, rims.edge) - 0.35)
+        parts.append(sheet)
+    return np.concatenate(parts, 0)
 
 
 def hall(seed: int = 0, bare: bool = False) -> Any:
     """Return the hall as a `mujoco.MjSpec`; every seed has its own bricks, posters and crates."""
     b = Builder("hall", seed, bare)
     b.spec.visual.headlight.ambient = [0.62, 0.62, 0.64]
-    crates = b.material("crates", hall_surfaces.crates, 256.0)
-    posters = b.material("posters", hall_surfaces.posters, 128.0, glow=0.15)
+    crates = b.material("crates", _crate_faces, 256.0)
+    posters = b.material("posters", _posters, 128.0, glow=0.15)
     red = b.material("brick", lambda r: materials.brick((512, 1024), r, DENSITY), DENSITY, 0.12)
     wood = b.material("wood", lambda r: materials.planks((512, 768), r, 128.0), 128.0)
     timber = b.material("timber", _upright, 128.0)
-    column = b.material("column", hall_surfaces.columns, 96.0)
-    steel = b.material("steel", hall_surfaces.steel, 128.0)
+    column = b.material("column", _columns, 96.0)
+    steel = b.material("steel", _steel, 128.0)
     _things(b, crates, steel)
     _structure(b, red, wood, timber, column)
     _partition(b, wood, posters)
@@ -131,9 +292,9 @@ def _shell(b: Builder, posters: Material) -> None:
                 facing,
             )
             count += 1
-        brick = b.material(name, functools.partial(hall_surfaces.wall, width=width), DENSITY)
+        brick = b.material(name, functools.partial(_wall, width=width), DENSITY)
         b.wall(name, brick, (width, HEIGHT), (*place, 0.0), facing)
-    floor = b.material("floor", hall_surfaces.floor, DENSITY)
+    floor = b.material("floor", _floor, DENSITY)
     b.floor("floor", floor, (NORTH, WEST))
 
 
@@ -152,7 +313,7 @@ def _roof(b: Builder, wood: Material, steel: Material) -> None:
                 windows=dict.fromkeys(("left", "right", "top", "bottom"), bare),
                 hidden=("front", "back"),
             )
-    ceiling = b.material("ceiling", hall_surfaces.ceiling, CEILING_DENSITY)
+    ceiling = b.material("ceiling", _ceiling, CEILING_DENSITY)
     b.ceiling("ceiling", ceiling, (NORTH, WEST), HEIGHT)
 
 

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from sims.worlds import materials
-from sims.worlds.builder import Builder, sides
-from sims.worlds.model import Material
-from sims.worlds.patterns import Colour, Image
+from sims.worlds.builder import Builder, Material, sides
+from sims.worlds.materials import Colour, Image
 
 NORTH, WEST, HEIGHT = 8.0, 6.0, 2.9
 DESKS = (  # x, y, turn

@@ -186,8 +186,6 @@ def arch(
     Args:
         inner: Radius of the opening, metres.
         outer: Radius of the outer edge, metres.
-        depth: Thickness along x, metres.
-        angles: Number of pieces into which the ring is cut.
         per_metre: Texture coordinates of a metre, across and down.
     """
     turn = np.linspace(np.pi, 0.0, angles + 1)

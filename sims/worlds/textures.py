@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sims.worlds.patterns import Image, to_bytes
+from sims.worlds.materials import Image, to_bytes
 
 Draw = Callable[[np.random.Generator], Image]
 """Returns an image, shape (h, w, 3), given a source of random numbers."""
@@ -99,12 +99,7 @@ def _digest(content: bytes | memoryview) -> bytes:
 
 
 def _read(path: Path) -> npt.NDArray[np.uint8]:
-    """Read a texture.
-
-    Raises:
-        OSError: There is none.
-        ValueError: It is not whole.
-    """
+    """Read a texture."""
     content = path.read_bytes()
     if content[:_DIGEST] != _digest(memoryview(content)[_DIGEST:]):
         raise ValueError(f"{path}: expected a whole texture")

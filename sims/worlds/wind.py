@@ -116,10 +116,9 @@ class WindSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 def scales(height: float, w20: float) -> tuple[Vector3, Vector3]:
-    """Return the turbulence's intensities (m/s) and lengths (m) along, across, vertical.
+    """Return intensities (m/s) and lengths (m) along, across, vertical at a height (metres).
 
     Args:
-        height: Above the ground, metres.
         w20: Wind at a height of 20 feet, m/s.
     """
     height = min(max(height, LOWEST), HIGHEST)
@@ -154,14 +153,12 @@ class Turbulence:
     def step(
         self, seconds: float, speed: float, height: float, w20: float, noise: list[float]
     ) -> Vector3:
-        """Go on in time, and return the velocity along, across and vertical, m/s.
+        """Go on by some seconds at a speed through the air (m/s) and a height above the ground (m).
+
+        Returns the velocity along, across and vertical, m/s; `noise` is five normal numbers.
 
         Args:
-            seconds: Since the last step.
-            speed: Through the air, m/s.
-            height: Above the ground, metres.
             w20: Wind at a height of 20 feet, m/s.
-            noise: Five numbers, normally distributed.
         """
         sigma, length = scales(height, w20)
         way = max(speed, SLOWEST) * seconds

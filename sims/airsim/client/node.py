@@ -15,7 +15,6 @@ import events as ev
 from runtime import Node, Output, Worker, on
 from runtime.errors import UncheckableError
 from runtime.time.schedule import SECOND
-from sims.addressing import Addressee
 from sims.airsim.client import conversion
 from sims.airsim.client.calls import Calls
 from sims.airsim.client.images import ImageSet, ImageSource
@@ -24,6 +23,7 @@ from sims.airsim.client.remote import FRAME, ask
 from sims.airsim.client.rpc import RpcCallError
 from sims.airsim.client.settings import AirsimClientConfig
 from sims.airsim.structures import CollisionInfo, ImuData, MultirotorState
+from sims.simulator import Addressee
 
 T = TypeVar("T")
 E = TypeVar("E", bound=ev.Event)

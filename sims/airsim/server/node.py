@@ -41,8 +41,8 @@ from sims.airsim.server.time import Time
 from sims.airsim.server.vehicles import ServedFreeCamera, ServedMultirotor, ServedVehicle, Vehicles
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
-from sims.shared_world import Inhabitant, join_world
 from sims.simulator import Count
+from sims.world import Inhabitant, join_world
 from sims.worlds import Dynamics, Scene
 
 PORTS = "ports of AirSim servers"

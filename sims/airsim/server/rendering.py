@@ -14,10 +14,9 @@ from events.base import Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD, flip_yz, flip_yz_rotation, multiply
 from events.geometry import pose_matrix
 from sims.airsim.server.image_types import OF_DEPTH, OF_NUMBERS, Form, ImageType, Seen, packed
-from sims.cameras.graphics import keep_memory
 from sims.cameras.renderer import model_from_bytes
 from sims.cameras.spec import CameraSpec, camera_info, is_plain, vertical_fov
-from sims.cameras.stage import Changing, Floats, Stage
+from sims.cameras.stage import Changing, Floats, Stage, keep_memory
 from sims.cameras.view import View
 
 Mount = tuple[Vector3, Quaternion]

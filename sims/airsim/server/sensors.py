@@ -14,7 +14,7 @@ from sims.airsim import structures, wire
 from sims.airsim.server.methods import Caller, RpcError, rpc
 from sims.airsim.server.vehicles import ServedMultirotor
 from sims.airsim.structures import GeoPoint, Pose, Quaternionr, Vector3r
-from sims.sensors.barometer import altitude_at
+from sims.sensors.earth import altitude_at
 from sims.vehicle import TIMESTEP_NS
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ class Sensors:
         places, turns = _poses(served.physics, sensor, scan)
         places -= served.origin
         steps = scan.times.astype(np.float64) / (TIMESTEP_NS * 1e-9)
-        # As `sims.sensors.scanner` takes them: the place of the nearest millisecond.
+        # As `sims.sensors.lidar` takes them: the place of the nearest millisecond.
         points = scan.points.astype(np.float64)
         if len(points):
             between = Slerp(np.arange(len(places)), turns)(np.minimum(steps, len(places) - 1))

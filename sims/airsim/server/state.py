@@ -17,7 +17,7 @@ from sims.airsim.structures import (
     RotorStates,
     Vector3r,
 )
-from sims.sensors.barometer import pressure_at, temperature_at
+from sims.sensors.earth import pressure_at, temperature_at
 
 if TYPE_CHECKING:
     from sims.airsim.server.node import AirsimServer

@@ -25,8 +25,8 @@ from sims.airsim.structures import (
     Vector3r,
 )
 from sims.cameras import pose_to_qpos
-from sims.shared_world import SharedWorld
 from sims.vehicle import Physics, State
+from sims.world import SharedWorld
 
 Floats = npt.NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from nodes.pilots.waypoint_path import (
     plan,
 )
 from runtime import Duration
-from sims.vehicle.clearance import Clearance, trouble_on_path
+from sims.vehicle.autopilot import Clearance, trouble_on_path
 from sims.worlds import TOURS
 from tests.sims.vehicle.flight import UP, airborne, compiled
 

@@ -24,8 +24,7 @@ from sims.cameras import (
     model_to_bytes,
     pose_to_qpos,
 )
-from sims.cameras.intrinsics import Lens
-from sims.cameras.lens import LARGEST, faces, pixel_rays, undistorted
+from sims.cameras.lens import LARGEST, Lens, faces, pixel_rays, undistorted
 
 Array = npt.NDArray[np.float64]
 AHEAD = (1.0, 0.0, 0.0, 0.0)

@@ -19,10 +19,10 @@ from sims.cameras import (
     Frame,
     GraphicsError,
     add_free_camera,
-    graphics,
     model_to_bytes,
     pose_to_qpos,
 )
+from sims.cameras import stage as graphics
 from tests.sims.cameras.scenes import CAMERAS, scene
 
 QPOS = pose_to_qpos((1.0, 0.4, -1.5), (0.9, 0.05, -0.1, 0.4))
@@ -154,7 +154,7 @@ def test_missing_libraries_are_named_with_their_packages(monkeypatch: pytest.Mon
     def broken(name: str) -> None:
         raise ImportError("libEGL.so.1: cannot open shared object file")
 
-    monkeypatch.setattr("sims.cameras.graphics.importlib.import_module", broken)
+    monkeypatch.setattr("sims.cameras.stage.importlib.import_module", broken)
     with pytest.raises(GraphicsError, match="apt-get install libegl1 libgl1"):
         graphics.open_context(8, 8, 1)
 

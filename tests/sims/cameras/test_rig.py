@@ -31,7 +31,7 @@ from runtime.errors import ConfigError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from runtime.units import Latency
 from sims.cameras import CameraSpec, optical_in_body
-from sims.cameras.frame import delay_of
+from sims.cameras.renderer import delay_of
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
 
@@ -62,10 +62,7 @@ class Listener(Node):
     def came(self, event: Event) -> None:
         self.arrivals.send(
             Arrival(
-                stamp=self.clock.now(),
-                source=self.name,
-                what=type(event).__name__,
-                of=event.stamp,
+                stamp=self.clock.now(), source=self.name, what=type(event).__name__, of=event.stamp
             )
         )
 

@@ -26,9 +26,9 @@ from sims.cameras import (
     model_to_bytes,
     pose_to_qpos,
 )
-from sims.cameras.frame import Motion, Shot
-from sims.cameras.intrinsics import Lens
-from sims.cameras.shutter import MOST_BANDS, OFF, row_bands, row_time
+from sims.cameras.lens import Lens
+from sims.cameras.renderer import Motion, Shot
+from sims.cameras.view import MOST_BANDS, OFF, row_bands, row_time
 
 Array = npt.NDArray[np.float64]
 READOUT, EXPOSURE = 0.03, 0.006

@@ -17,7 +17,7 @@ from runtime.errors import ConfigError
 from sims.world import World, WorldConfig
 from sims.worlds import Dynamics, Scene, load_world
 from sims.worlds.bodies import BodyMotion, BodySpec, motion_of
-from sims.worlds.curves import Path
+from sims.worlds.dynamics import Path
 
 WALK = ((0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (3.0, 2.0, -0.5), (0.0, 2.0, 0.0))
 
@@ -36,11 +36,7 @@ def body(**fields: Any) -> BodyMotion:
     return motion_of(found, "world/b")
 
 
-@given(
-    speed=st.floats(0.2, 8.0),
-    turns=st.integers(0, 3),
-    loop=st.booleans(),
-)
+@given(speed=st.floats(0.2, 8.0), turns=st.integers(0, 3), loop=st.booleans())
 def test_a_path_passes_its_places_at_its_times(speed: float, turns: int, loop: bool) -> None:
     motion = body(waypoints=WALK, speed=speed, loop=loop)
     assert motion.path is not None

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sims.worlds import WORLDS, load_world, textures
-from sims.worlds.model import Model
-from sims.worlds.patterns import Image
+from sims.worlds.builder import Model
+from sims.worlds.materials import Image
 
 SAVED: dict[str, dict[str, str]] = json.loads(
     Path(__file__).with_name("textures.json").read_text(encoding="utf-8")

@@ -1,9 +1,17 @@
-"""What the built-in worlds promise: names, clearance, collisions, sizes, texture everywhere."""
+"""What the built-in worlds promise: names, clearance, collisions, sizes, texture everywhere.
+
+Each hard world is hard in its own way, moves as it says, and costs little more to draw.
+
+Worlds are found by name or path; what is wrong is said.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
+import pickle
+import statistics
+import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +26,8 @@ from msgspec import convert
 from events.frames import from_rpy
 from nodes.pilots import FigureEight
 from sims.cameras import CameraRenderer, model_to_bytes, pose_to_qpos
-from sims.worlds import CLEARANCE, TOURS, WORLDS, load_world
-from tests.sims.cameras.scenes import CAMERAS, fresh, scene
+from sims.worlds import CLEARANCE, TOURS, WORLDS, WorldError, load_scene, load_world
+from tests.sims.cameras.scenes import CAMERAS, Scene, fresh, scene
 
 ROOT = Path(__file__).parents[3]
 REACH = {"hall": (7.0, 5.0), "yard": (12.0, 12.0)}
@@ -30,7 +38,7 @@ class Probe:
     """Measures how far a place is from the nearest solid."""
 
     def __init__(self, name: str) -> None:
-        world = fresh(name)
+        world = load_world(name, bare=True)
         body = world.worldbody.add_body(name="probe", mocap=True)
         body.add_geom(name="probe", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0])
         self.model: Any = world.compile()
@@ -80,7 +88,7 @@ def test_the_examples_fly_clear(probe: tuple[str, Probe]) -> None:
     name, measure = probe
     for file in sorted((ROOT / "examples").glob("*.toml")):
         nodes = tomllib.loads(file.read_text(encoding="utf-8"))["nodes"]
-        world = next((n.get("world", "hall") for n in nodes if n["type"].startswith("sims.")), "")
+        world = next((node["world"] for node in nodes if "world" in node), "hall")
         paths = [np.array(n["waypoints"]) for n in nodes if "waypoints" in n and world == name]
         eights = [n["figure_eight"] for n in nodes if "figure_eight" in n and world == name]
         paths += [convert(eight, FigureEight).places() for eight in eights]
@@ -136,7 +144,7 @@ def test_everything_has_a_name_and_only_solids_collide(probe: tuple[str, Probe])
 def test_a_ball_comes_to_rest_on_the_floor_and_steps_are_cheap(probe: tuple[str, Probe]) -> None:
     """Solids hold a vehicle; they are few, and none touches another, so that steps cost little."""
     name, _ = probe
-    world = fresh(name)
+    world = load_world(name, bare=True)
     ball = world.worldbody.add_body(name="ball", pos=[0, 0, 1.0])
     ball.add_freejoint()
     ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], mass=1.0)
@@ -222,3 +230,149 @@ def test_what_mujoco_warns_of_goes_to_the_log_and_to_no_file(
     mujoco.mj_step(model, data)
     assert "CTRL at ACTUATOR 0" in caplog.text
     assert not list(here.iterdir())
+
+
+HARD = ("corridor", "office", "night", "forest")
+
+
+def places(name: str, count: int) -> list[tuple[Any, float]]:
+    """Places on a world's tour, and the direction of flight there."""
+    points = np.array(TOURS[name])
+    found = []
+    for share in np.arange(count) / count * len(points):
+        start, end = points[int(share)], points[(int(share) + 1) % len(points)]
+        way = end - start
+        place = start + (share % 1.0) * way
+        found.append((place, math.atan2(way[1], way[0])))
+    return found
+
+
+def qpos(built: Scene, place: Any, heading: float) -> Any:
+    pose = pose_to_qpos(tuple(place.tolist()), from_rpy(0.0, 0.0, heading))
+    assert len(pose) == built.model.nq
+    return pose
+
+
+def greys(name: str, views: list[tuple[Any, float]]) -> list[Any]:
+    built = scene(name)
+    renderer = CameraRenderer(built.packed, CAMERAS, built.prefix, seed=0)
+    images = []
+    for place, heading in views:
+        frame = renderer.render(0, qpos(built, place, heading), ("wide",))["wide"]
+        assert frame.rgb is not None
+        images.append(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY))
+    renderer.close()
+    return images
+
+
+def corners(image: Any) -> int:
+    return len(cv2.FastFeatureDetector.create(20).detect(image))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_opposite_places_of_the_corridor_look_alike() -> None:
+    """From the other side of the block the image is the same to 2 grey levels, but for bins."""
+    views = [(place, heading) for place, heading in places("corridor", 12)]
+    other = [(np.array([-p[0], -7.8 - p[1], p[2]]), heading + math.pi) for p, heading in views]
+    for image, twin in zip(greys("corridor", views), greys("corridor", other), strict=True):
+        assert np.abs(image.astype(int) - twin).mean() < 4.0
+        assert image.std() > 20.0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_office_shows_few_corners_and_the_night_is_dark() -> None:
+    """Against hall and yard: a sixth of the corners, a fifth of the light."""
+    images = {n: greys(n, places(n, 12)) for n in ("hall", "office", "yard", "night")}
+    count = {n: statistics.median(corners(image) for image in images[n]) for n in images}
+    assert count["office"] < count["hall"] / 6
+    light = {n: statistics.median(float(image.mean()) for image in images[n]) for n in images}
+    assert light["night"] < light["yard"] / 5
+    assert max(int(image.max()) for image in images["night"]) > 200
+
+
+def test_leaves_and_shadows_move_as_a_pure_function_of_time() -> None:
+    """The same second gives the same place, whatever was before; nothing strays or is touched."""
+    built = load_scene("forest", bare=True)
+    model: Any = built.spec.compile()
+    data, again = mujoco.MjData(model), mujoco.MjData(model)
+    motion = built.dynamics.motions[0]
+    assert not motion.solid
+    built.dynamics.apply(model, data, 7.0)
+    built.dynamics.apply(model, again, 3.0)
+    moved = np.abs(again.mocap_pos - data.mocap_pos).max(axis=1)
+    assert (moved > 0.0005).all()
+    pickle.loads(pickle.dumps(motion)).apply(model, again, 7.0)
+    np.testing.assert_array_equal(again.mocap_pos, data.mocap_pos)
+    for seconds in np.linspace(0.0, 60.0, 100):
+        built.dynamics.apply(model, data, float(seconds))
+        assert np.abs(data.mocap_pos).max() < 0.4
+        assert not data.mocap_pos[-7:, 2].any(), "shadows stay on the ground"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_they_cost_at_most_half_as_much_again_as_the_others() -> None:
+    """Processor time of colour and depth at 512 x 512, outdoors against the yard, else the hall."""
+    built = {name: scene(name) for name in ("hall", "yard", *HARD)}
+    renderers = {
+        name: CameraRenderer(each.packed, CAMERAS, each.prefix, seed=0)
+        for name, each in built.items()
+    }
+    times: dict[str, list[float]] = {name: [] for name in built}
+    for number in range(16):
+        for name, renderer in renderers.items():
+            place, heading = places(name, 16)[number]
+            state = qpos(built[name], place, heading)
+            tries = []
+            for _ in range(3):
+                start = time.process_time()
+                renderer.render(number, state, ("wide",))
+                tries.append(time.process_time() - start)
+            times[name].append(min(tries))
+    medians = {name: statistics.median(each) for name, each in times.items()}
+    print({name: f"{1e3 * seconds:.1f} ms" for name, seconds in medians.items()})
+    for name in HARD:
+        usual = "yard" if name in ("night", "forest") else "hall"
+        assert medians[name] < 1.5 * medians[usual], name
+    for renderer in renderers.values():
+        renderer.close()
+
+
+def test_every_world_has_a_tour() -> None:
+    """The tours' names are the worlds' names."""
+    assert set(TOURS) == set(WORLDS)
+
+
+def test_a_file_is_a_world(tmp_path: Path) -> None:
+    """A user's MJCF loads by path, as text or as a Path."""
+    file = tmp_path / "mine.xml"
+    file.write_text("<mujoco><worldbody><geom name='g' size='1'/></worldbody></mujoco>")
+    for place in (file, str(file)):
+        spec = load_world(place)
+        assert isinstance(spec, mujoco.MjSpec)
+        assert spec.geom("g") is not None
+
+
+def test_an_unknown_name_gets_near_ones_suggested() -> None:
+    """The message has what was found, what there is and what may have been meant."""
+    with pytest.raises(WorldError, match=r'of corridor, forest.*found "hal"; did you mean hall\?'):
+        load_world("hal")
+    with pytest.raises(WorldError, match=r'found "moon"$'):
+        load_world("moon")
+
+
+def test_missing_and_broken_files_are_told_apart(tmp_path: Path) -> None:
+    """Nothing there, a directory, no XML, and XML that doesn't compile."""
+    with pytest.raises(WorldError, match=r"none\.xml: expected an MJCF file, found nothing"):
+        load_world(tmp_path / "none.xml")
+    with pytest.raises(WorldError, match="found a directory"):
+        load_world(tmp_path)
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<mujoco><worldbody>")
+    with pytest.raises(WorldError, match=r"broken\.xml: expected an MJCF file that compiles.*XML"):
+        load_world(broken)
+    broken.write_text("<mujoco><worldbody><geom type='mesh' mesh='x'/></worldbody></mujoco>")
+    with pytest.raises(WorldError, match=r"broken\.xml: .*mesh"):
+        load_world(str(broken))

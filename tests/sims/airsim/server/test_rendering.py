@@ -15,7 +15,7 @@ from sims.airsim.server.cameras import camera_of_file
 from sims.airsim.server.image_types import Form, ImageType
 from sims.airsim.server.rendering import Renderer, Wanted
 from sims.cameras import CameraRenderer, CameraSpec, add_camera, model_to_bytes
-from sims.cameras.intrinsics import Lens
+from sims.cameras.lens import Lens
 from sims.vehicle import attach_vehicle
 
 WORLD = """

@@ -11,8 +11,7 @@ import pytest
 
 from events import Quaternion, Vector3
 from events.frames import from_rpy
-from sims.sensors.range_finder import RangeFinder, RangeFinderSpec, cone
-from sims.sensors.rays import Rays
+from sims.sensors.rays import RangeFinder, RangeFinderSpec, Rays, cone
 from sims.vehicle import attach_vehicle
 from sims.worlds import Dynamics
 from tests.sims.sensors.truths import PLACE, random, truth
