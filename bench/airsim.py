@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 import subprocess
 import sys
 import threading
@@ -23,7 +22,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from bench.lateness import BEATS, PROBE, LateRow, figures, lateness
+from bench.lateness import BEATS, PROBE, LateRow, figures, lateness, ratios
+from bench.system import free_port
 from runtime.config.reading import parse
 from runtime.run.execute import execute
 from sims.airsim.client.rpc import RpcClient
@@ -77,9 +77,7 @@ def measure(
     """
     progress(f"airsim: {2 * rounds * len(CASES)} windows of {WINDOW:g} s")
     BEATS.clear()
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
+    port = free_port()
     windows: list[Window] = []
     command = [sys.executable, "-m", "bench.airsim", str(port), str(rounds)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as client:
@@ -103,8 +101,6 @@ def measure(
 
 def _row(case: str, windows: list[Window], quiet: list[Any]) -> AirsimRow:
     late = [lateness(window.begin, window.end) for window in windows]
-    pairs = zip(late, quiet, strict=True)
-    ratios = [np.percentile(busy, 99) / np.percentile(before, 99) for busy, before in pairs]
     trips = np.concatenate([window.round_trips for window in windows]) / 1e3
     seconds = sum(window.end - window.begin for window in windows) / 1e9
     return AirsimRow(
@@ -112,7 +108,8 @@ def _row(case: str, windows: list[Window], quiet: list[Any]) -> AirsimRow:
         per_second=len(trips) / seconds,
         median_us=float(np.median(trips)),
         p99_us=float(np.percentile(trips, 99)),
-        **figures(late) | {"ratio_p99": float(np.median(ratios))},
+        ratio_p99=ratios(late, quiet)[1],
+        **figures(late),
     )
 
 

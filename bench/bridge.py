@@ -4,12 +4,15 @@ Two nodes of one run in two processes, on the real clock, against two bare Zenoh
 same two processes. What is asked is a small event, or an image; the answer is always small. Blocks
 of both are measured in turns, in an order that is drawn, so that whatever else the machine does
 falls on both alike; a ratio is that of the two medians.
+
+And what an image costs on its way to ROS 2, encoded as the bridge does it, and by rosbags alone.
+Both make the same bytes, CDR of a ``sensor_msgs/msg/Image``; rosbags gets its message ready-made
+and has only to be told the time.
 """
 
 from __future__ import annotations
 
 import asyncio
-import random
 import subprocess
 import sys
 import threading
@@ -21,9 +24,12 @@ from typing import Any
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from rosbags.typesys import Stores, get_typestore
 
-from bench.systems.zenoh_system import config, free_locator, publisher, subscribe
+from bench.system import free_port, in_turns, pair, zenoh_config, zenoh_publisher, zenoh_subscriber
 from events import Event, Image
+from nodes.ros2.messages.images import ImageWriter
+from nodes.ros2.messages.typestore import TypeStore
 from runtime import Input, Node, Output
 from runtime.config.model import Config
 from runtime.config.reading import parse
@@ -33,6 +39,11 @@ BLOCK = 50
 """Round trips of one side before it may be the other's turn."""
 
 WARM_UP = 50
+ENCODED_FIRST = 20
+"""Images that both encode before any is measured."""
+
+IMAGE = "sensor_msgs/msg/Image"
+FRAME = "camera_optical_frame"
 IMAGES = {"512×512 rgb8": (512, 512, 3), "1080×1080 rgb8": (1080, 1080, 3)}
 
 
@@ -62,6 +73,30 @@ class BridgeRow(msgspec.Struct, frozen=True, kw_only=True):
     zenoh_p99_us: float
     ours_per_second: float
     zenoh_per_second: float
+
+
+class RosImageRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One kind of image.
+
+    Attributes:
+        case: Size and encoding.
+        bytes: Of a message.
+        samples: Of each side.
+        ours_us: Median microseconds that the bridge takes to encode one.
+        rosbags_us: The same of rosbags' ``serialize_cdr``.
+        ratio: Ours to theirs.
+        ours_p99_us: 99th percentile of ours.
+        rosbags_p99_us: Of theirs.
+    """
+
+    case: str
+    bytes: int
+    samples: int
+    ours_us: float
+    rosbags_us: float
+    ratio: float
+    ours_p99_us: float
+    rosbags_p99_us: float
 
 
 class Asked(Event):
@@ -124,33 +159,22 @@ class Asker(Node):
         self.progress(case)
         data = None if shape is None else np.random.default_rng(0).integers(0, 255, shape, np.uint8)
         samples = self.samples if data is None else max(self.samples // 4, BLOCK)
-        ours: list[int] = []
-        raw: list[int] = []
-        sides = [True, False] * (-(-(samples + WARM_UP) // BLOCK))
-        random.Random(0).shuffle(sides)
-        for mine in sides:
-            if mine:
-                ours += [await self._round_trip(data) for _ in range(BLOCK)]
+        taken: dict[str, list[int]] = {"ours": [], "zenoh": []}
+        for _, side in in_turns(taken, -(-(samples + WARM_UP) // BLOCK)):
+            if side == "ours":
+                taken[side] += [await self._round_trip(data) for _ in range(BLOCK)]
             else:
-                raw += await asyncio.to_thread(self.raw.round_trips, data, BLOCK)
+                taken[side] += await asyncio.to_thread(self.raw.round_trips, data, BLOCK)
         burst = 200 if data is None else 20
         ours_burst = [await self._burst(data, burst) for _ in range(5)]
         raw_burst = [await asyncio.to_thread(self.raw.burst, data, burst) for _ in range(5)]
-        middle, high = (
-            [float(np.percentile(side[WARM_UP:], q)) / 1e3 for side in (ours, raw)]
-            for q in (50, 99)
-        )
         return BridgeRow(
             case=case,
             bytes=64 if data is None else data.nbytes,
             samples=samples,
-            ours_us=middle[0],
-            zenoh_us=middle[1],
-            ratio=middle[0] / middle[1],
-            ours_p99_us=high[0],
-            zenoh_p99_us=high[1],
             ours_per_second=float(np.median(ours_burst)),
             zenoh_per_second=float(np.median(raw_burst)),
+            **pair({side: times[WARM_UP:] for side, times in taken.items()}),
         )
 
     async def _round_trip(self, data: npt.NDArray[np.uint8] | None) -> int:
@@ -182,10 +206,10 @@ class Raw:
     def __init__(self, locator: str) -> None:
         import zenoh
 
-        self._session = zenoh.open(config(zenoh, listen=locator))
-        self._put = publisher(zenoh, self._session, "asked").put
+        self._session = zenoh.open(zenoh_config(listen=locator))
+        self._put = zenoh_publisher(self._session, "asked").put
         self._answered = threading.Semaphore(0)
-        self._kept = subscribe(zenoh, self._session, "answered", lambda _: self._answered.release())
+        self._kept = zenoh_subscriber(self._session, "answered", lambda _: self._answered.release())
 
     def round_trips(self, data: npt.NDArray[np.uint8] | None, count: int) -> list[int]:
         """Return the nanoseconds of each."""
@@ -224,7 +248,7 @@ def measure(
         samples: Round trips with small events on each side; a quarter with images.
         progress: Called with what is measured.
     """
-    meet, locator = free_locator(), free_locator()
+    meet, locator = f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
     Asker.samples, Asker.progress, Asker.rows = samples, staticmethod(progress), []
     with _other_process(meet, locator):
         Asker.raw = Raw(locator)
@@ -239,14 +263,14 @@ def mirror(meet: str, locator: str) -> None:
     """Be the other process: a node that answers, and a bare session that does."""
     import zenoh
 
-    with zenoh.open(config(zenoh, connect=locator)) as session:
-        answer = publisher(zenoh, session, "answered").put
+    with zenoh.open(zenoh_config(connect=locator)) as session:
+        answer = zenoh_publisher(session, "answered").put
 
         def asked(sample: Any) -> None:
             np.frombuffer(sample.payload.to_bytes(), np.uint8)
             answer(b"x" * 64)
 
-        _kept = subscribe(zenoh, session, "asked", asked)
+        _kept = zenoh_subscriber(session, "asked", asked)
         execute(_config(meet), only=["mirror"])
 
 
@@ -266,3 +290,55 @@ def _other_process(meet: str, locator: str) -> Iterator[None]:
     finally:
         process.kill()
         process.wait()
+
+
+def measure_ros_images(repeats: int = 300) -> list[RosImageRow]:
+    """Measure a colour image and a depth image of 512×512."""
+    drawn = np.random.default_rng(0)
+    return [
+        _measure_encoding("rgb8", drawn.integers(0, 256, (512, 512, 3), np.uint8), repeats),
+        _measure_encoding(
+            "32FC1", drawn.uniform(0.3, 20.0, (512, 512)).astype(np.float32), repeats
+        ),
+    ]
+
+
+def _measure_encoding(encoding: str, data: npt.NDArray[Any], repeats: int) -> RosImageRow:
+    ours, theirs = _by_the_bridge(encoding, data), _by_rosbags(encoding, data)
+    for number in range(ENCODED_FIRST):
+        if bytes(ours(number)) != bytes(theirs(number)):
+            raise AssertionError(f"{encoding}: expected the same bytes of both")
+    encoders = {"ours": ours, "rosbags": theirs}
+    taken: dict[str, list[int]] = {side: [] for side in encoders}
+    for number, side in in_turns(encoders, repeats):
+        begin = time.perf_counter_ns()
+        encoders[side](number)
+        taken[side].append(time.perf_counter_ns() - begin)
+    height, width = data.shape[:2]
+    return RosImageRow(
+        case=f"{width}×{height} {encoding}", bytes=len(ours(0)), samples=repeats, **pair(taken)
+    )
+
+
+def _by_the_bridge(encoding: str, data: npt.NDArray[Any]) -> Callable[[int], Any]:
+    writer = ImageWriter(TypeStore(), FRAME, encoding)
+    return lambda number: writer.write((number, 7), data)
+
+
+def _by_rosbags(encoding: str, data: npt.NDArray[Any]) -> Callable[[int], Any]:
+    store, plain = TypeStore(), get_typestore(Stores.ROS2_JAZZY)
+    message: Any = plain.types[IMAGE](
+        header=store.header((0, 7), FRAME),
+        height=data.shape[0],
+        width=data.shape[1],
+        encoding=encoding,
+        is_bigendian=0,
+        step=data.nbytes // data.shape[0],
+        data=data.view(np.uint8).ravel(),
+    )
+
+    def encode(number: int) -> Any:
+        message.header.stamp.sec = number
+        return plain.serialize_cdr(message, IMAGE)
+
+    return encode

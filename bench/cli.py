@@ -99,7 +99,7 @@ def idle(
     seconds: Annotated[float, typer.Option(min=0.5, help="Length of the run.")] = 10.0,
 ) -> None:
     """Measure the processor time of one 100 Hz timer node."""
-    from bench.idle import measure
+    from bench.throughput import measure_idle as measure
 
     with _status() as say:
         say("idle")
@@ -114,13 +114,12 @@ def lockstep(
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 5,
 ) -> None:
     """Measure simulated seconds a second beside a bare loop, and where a frame's time goes."""
-    from bench import parts
-    from bench.lockstep import measure
+    from bench.lockstep import measure, measure_parts
 
     with _status() as say:
         rows = measure(seconds=seconds, repeats=repeats, progress=say)
         say("parts of a frame")
-        shares = parts.measure(seconds=seconds / 3, repeats=repeats)
+        shares = measure_parts(seconds=seconds / 3, repeats=repeats)
     _finish(json, lockstep=rows, parts=shares)
 
 
@@ -133,13 +132,12 @@ def bridge(
     repeats: Annotated[int, typer.Option(min=30, help="Images encoded for ROS.")] = 300,
 ) -> None:
     """Measure what crosses between two processes beside raw Zenoh, and ROS images' encoding."""
-    from bench.bridge import measure
-    from bench.ros_images import measure as measure_ros
+    from bench.bridge import measure, measure_ros_images
 
     with _status() as say:
         rows = measure(samples, say)
         say("images for ROS")
-        ros = measure_ros(repeats)
+        ros = measure_ros_images(repeats)
     _finish(json, bridge=rows, ros_images=ros)
 
 
@@ -149,7 +147,7 @@ def link(
     samples: Annotated[int, typer.Option(min=30, help="Frames each way, in turns.")] = 1000,
 ) -> None:
     """Measure a frame to a program outside and back, beside a call of a worker."""
-    from bench.link import measure
+    from bench.outside import measure_link as measure
 
     with _status() as say:
         say("native interface")
@@ -164,7 +162,7 @@ def held(
     repeats: Annotated[int, typer.Option(min=1, help="Flights of each side, in turns.")] = 5,
 ) -> None:
     """Measure a flight with an odometry outside that is held for, beside the same in a worker."""
-    from bench.held import measure
+    from bench.outside import measure_held as measure
 
     with _status() as say:
         rows = measure(seconds=seconds, repeats=repeats, progress=say)
@@ -179,7 +177,7 @@ def recording(
     rate: Annotated[float, typer.Option(min=1.0, help="Hertz of the camera.")] = 30.0,
 ) -> None:
     """Measure how late a 400 Hz tick is while a run is recorded, and while it is not."""
-    from bench.recording import measure
+    from bench.lateness import measure_recording as measure
 
     with _status() as say:
         rows = measure(seconds=seconds, repeats=repeats, rate=rate, progress=say)
@@ -224,8 +222,7 @@ def everything(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer nodes, rounds, samples.")] = False,
 ) -> None:
     """Run every benchmark, and write the page of results."""
-    from bench.page import write
-    from bench.suite import measure
+    from bench.page import measure, write
 
     path = page or out / "RESULTS.md"
     with _status() as say:
@@ -241,7 +238,7 @@ def compare(
     """Say what got faster or slower between two result files, beyond the noise of both."""
     from rich.console import Console
 
-    from bench.compare import compare as changes_between
+    from bench.results import compare as changes_between
     from bench.tables import TABLES
 
     changes = changes_between(before, after)
@@ -264,7 +261,6 @@ def _latency(
     from rich.console import Console
 
     from bench.driver import measure_all
-    from bench.plots import draw
     from bench.results import write_json
     from bench.tables import latency
 
@@ -280,6 +276,8 @@ def _latency(
             progress=say,
         )
     if plots is not None:
+        from bench.page import draw
+
         draw(outcome.rows, plots, counts)
     table, rows = latency(outcome.rows)
     Console().print(table.terminal(rows))

@@ -3,13 +3,15 @@
 Every (system, mode, N) is measured once a round; each round has an order of its own, so that a
 busy minute of the machine falls on all systems alike. Samples of all rounds are pooled; the
 medians of the rounds are kept, because their spread is the noise that a comparison must exceed.
+
+``python -m bench.driver MODULE NAME CASE.json OUT.npy`` is one measurement.
 """
 
 from __future__ import annotations
 
+import gc
 import importlib
 import pkgutil
-import random
 import subprocess
 import sys
 import tempfile
@@ -19,8 +21,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-import bench.systems
-from bench.system import Case, CaseName, Mode, Samples, System
+from bench.system import Case, CaseName, Mode, Samples, System, in_turns
 
 _LIMIT = 120.0
 """Seconds that one measurement may take."""
@@ -74,16 +75,16 @@ class Outcome(msgspec.Struct, frozen=True):
     versions: dict[str, str]
 
 
-def systems() -> dict[str, list[System]]:
-    """Return all systems by module, ours first."""
+RIVALS = Path(__file__).with_name("systems")
+"""What the runtime is measured beside; a wheel has none of it."""
+
+
+def systems() -> dict[str, tuple[System, ...]]:
+    """Return all systems by module, ours first; without a checkout, there are no others."""
     modules = ["bench.ours"]
-    modules += [f"bench.systems.{m.name}" for m in pkgutil.iter_modules(bench.systems.__path__)]
-    found = {}
-    for module in modules:
-        entries = getattr(importlib.import_module(module), "SYSTEMS", ())
-        if entries:
-            found[module] = list(entries)
-    return found
+    modules += [f"bench.systems.{module.name}" for module in pkgutil.iter_modules([str(RIVALS)])]
+    found = {name: getattr(importlib.import_module(name), "SYSTEMS", ()) for name in modules}
+    return {name: entries for name, entries in found.items() if entries}
 
 
 def measure_all(
@@ -108,9 +109,12 @@ def measure_all(
     """
     wanted = tuple(part.lower() for part in only)
     missing: dict[str, str] = {}
+    if not RIVALS.is_dir():
+        missing["all other systems"] = "only a checkout of the project has what measures them"
     versions: dict[str, str] = {}
     jobs: list[tuple[str, System, Mode, int]] = []
-    for module, entries in systems().items():
+    known = systems()
+    for module, entries in known.items():
         for system in entries:
             if wanted and not any(part in system.name.lower() for part in wanted):
                 continue
@@ -127,21 +131,18 @@ def measure_all(
                 if n <= system.max_nodes
             ]
     taken: dict[tuple[str, Mode, int], list[Samples]] = {}
-    shuffle = random.Random(1).shuffle
-    for round_ in range(repeats):
-        shuffle(jobs)
-        for index, (module, system, mode, n) in enumerate(jobs):
-            progress(f"{system.name}, {mode}, {n} nodes", (round_ + index / len(jobs)) / repeats)
-            count = _affordable(samples, system, case, n, budget)
-            asked = Case(
-                case=case, mode=mode, nodes=n, samples=count, warm_up=min(warm_up, count // 5 + 1)
-            )
-            try:
-                samples_of_it = _measure(module, system.name, asked)
-                taken.setdefault((system.name, mode, n), []).append(samples_of_it)
-            except (subprocess.SubprocessError, OSError) as error:
-                missing[f"{system.name}, {mode}, {n} nodes"] = _reason(error)
-    places = {s.name: s.place for entries in systems().values() for s in entries}
+    for number, (_, (module, system, mode, n)) in enumerate(in_turns(jobs, repeats)):
+        progress(f"{system.name}, {mode}, {n} nodes", number / (len(jobs) * repeats))
+        count = _affordable(samples, system, case, n, budget)
+        asked = Case(
+            case=case, mode=mode, nodes=n, samples=count, warm_up=min(warm_up, count // 5 + 1)
+        )
+        try:
+            samples_of_it = _measure(module, system.name, asked)
+            taken.setdefault((system.name, mode, n), []).append(samples_of_it)
+        except (subprocess.SubprocessError, OSError) as error:
+            missing[f"{system.name}, {mode}, {n} nodes"] = _reason(error)
+    places = {s.name: s.place for entries in known.values() for s in entries}
     rows = [_row(case, *key, places[key[0]], runs) for key, runs in taken.items()]
     rows.sort(key=lambda r: (r.mode, r.nodes, r.median_us))
     return Outcome(rows, missing, versions)
@@ -160,7 +161,7 @@ def _measure(module: str, name: str, case: Case) -> Samples:
         out = Path(folder) / "samples.npy"
         encoded = msgspec.json.encode(case).decode()
         subprocess.run(
-            [sys.executable, "-m", "bench.measure", module, name, encoded, str(out)],
+            [sys.executable, "-m", "bench.driver", module, name, encoded, str(out)],
             check=True,
             capture_output=True,
             timeout=_LIMIT,
@@ -194,3 +195,29 @@ def _row(case: str, system: str, mode: str, nodes: int, place: str, runs: Sequen
         max_us=float(pooled.max()),
         rounds_us=tuple(float(np.median(run)) / 1e3 for run in runs),
     )
+
+
+def find(module: str, name: str) -> System:
+    """Return a system by the module that has it and its name.
+
+    Raises:
+        LookupError: The module has no such system.
+    """
+    systems: tuple[System, ...] = importlib.import_module(module).SYSTEMS
+    for system in systems:
+        if system.name == name:
+            return system
+    raise LookupError(f"{module}: expected one of {[s.name for s in systems]}, found {name!r}")
+
+
+def main(module: str, name: str, case: str, out: str) -> None:
+    """Measure, and write the samples."""
+    system = find(module, name)
+    gc.collect()
+    gc.freeze()
+    samples = system.measure(msgspec.json.decode(case, type=Case))
+    np.save(Path(out), samples)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

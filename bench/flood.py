@@ -4,13 +4,17 @@ A multirotor hovers on the real clock, controlled at 400 Hz, with the bridge bes
 subscribed to velocities. Another process sends 10,000 of them a second in every other window of
 a second. Each flooded window is compared with the quiet one just before it, and the median of all
 such pairs is told: whatever else the machine does falls on both alike, and on few pairs much.
+
+``python -m bench.flood PORT KEY RATE SECONDS WINDOWS`` is the flood. It connects, says ``ready``,
+waits for a line on its standard input, and then prints a line for each window: when it began and
+ended (monotonic clock, ns) and how many messages it sent. Nothing is dropped on this side. Another
+line of input then ends it; a number in it is the size of a last message, that of no twist.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import socket
 import subprocess
 import sys
 import threading
@@ -18,15 +22,19 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
+import zenoh
 
-from bench.flooder import TWIST
-from bench.lateness import BEATS, PROBE, LateRow, figures, lateness
+from bench.lateness import BEATS, PROBE, LateRow, figures, lateness, ratios
+from bench.system import free_port, zenoh_config
 from nodes.ros2.bridge.keys import data_key
 from nodes.ros2.messages.topics import Topic
 from nodes.ros2.messages.typestore import TypeStore
 from runtime.config.reading import parse
 from runtime.run.execute import execute
+
+TWIST = "geometry_msgs/msg/Twist"
+BURST = 0.001
+"""Seconds from one handful of messages to the next."""
 
 RATE = 10_000.0
 WINDOW = 1.0
@@ -62,9 +70,7 @@ def measure(
     """
     progress(f"{windows} windows of {WINDOW:g} s, every other with {rate:g} messages a second")
     BEATS.clear()
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
+    port = free_port()
     found: list[tuple[int, int, int]] = []
     with _flooder(port, rate, windows, found):
         execute(parse(_settings(port, windows * WINDOW + 8.0), "bench flood"))
@@ -80,7 +86,7 @@ def _flooder(
     type_hash = TypeStore().hash(TWIST)
     key = data_key(0, Topic(name="/cmd_vel", type=TWIST, hash=type_hash))
     words = [str(port), key, str(rate), str(WINDOW), str(windows)]
-    command = [sys.executable, "-m", "bench.flooder", *words]
+    command = [sys.executable, "-m", "bench.flood", *words]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -126,13 +132,8 @@ def _settings(port: int, seconds: float) -> dict[str, Any]:
 def _row(
     case: str, windows: list[tuple[int, int, int]], quiet: list[tuple[int, int, int]]
 ) -> FloodRow:
-    lates = [lateness(window[0], window[1]) for window in windows]
-    befores = [lateness(window[0], window[1]) for window in quiet]
-    ratios = [
-        np.percentile(late, [50, 99]) / np.percentile(before, [50, 99])
-        for late, before in zip(lates, befores, strict=False)
-    ]
-    ratio_p50, ratio_p99 = np.median(ratios, axis=0).tolist()
+    lates, befores = ([lateness(*window[:2]) for window in side] for side in (windows, quiet))
+    ratio_p50, ratio_p99 = ratios(lates, befores)
     seconds = sum(end - begin for begin, end, _ in windows) / 1e9
     return FloodRow(
         case=case,
@@ -141,3 +142,32 @@ def _row(
         ratio_p99=ratio_p99,
         **figures(lates),
     )
+
+
+def main(port: int, key: str, rate: float, seconds: float, windows: int) -> None:
+    """Send in every second of so many windows, the first of which is quiet."""
+    store = TypeStore()
+    twist = bytes(store.serialize(store.zero(TWIST)))
+    with zenoh.open(zenoh_config(connect=f"tcp/127.0.0.1:{port}")) as session:
+        publisher: Any = session.declare_publisher(
+            key, congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        while not publisher.matching_status.matching:
+            time.sleep(0.01)  # until the other side has subscribed
+        print("ready", flush=True)
+        sys.stdin.readline()
+        for window in range(windows):
+            begin, sent = time.monotonic_ns(), 0
+            while (passed := (time.monotonic_ns() - begin) / 1e9) < seconds:
+                if window % 2:
+                    for _ in range(round(passed * rate) - sent):
+                        publisher.put(twist)
+                        sent += 1
+                time.sleep(BURST)
+            print(json.dumps([begin, time.monotonic_ns(), sent]), flush=True)
+        if size := sys.stdin.readline().strip():
+            publisher.put(bytes(int(size)))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), sys.argv[2], float(sys.argv[3]), float(sys.argv[4]), int(sys.argv[5]))

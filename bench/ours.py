@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 
-from bench.system import Case, Ping, Pong, Samples, System
-from bench.systems.parts import payloads
+from bench.system import Case, Ping, Pong, Samples, System, payloads
 from runtime import Input, Node, NodeConfig, Output, on
 from runtime.channels.digest import Digest
 from runtime.config.model import Config, RunConfig

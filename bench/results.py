@@ -1,12 +1,14 @@
-"""What every benchmark's JSON file has: where and with what it was measured."""
+"""Result files: where and with what it was measured, and what changed between two of them."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from runtime.errors import ConfigError
 from runtime.run.summarise import commit
 from runtime.run.summarise import environment as versions
 
@@ -28,3 +30,68 @@ def _cpu() -> str:
     except OSError:
         return "unknown"
     return next((x.partition(":")[2].strip() for x in lines if x.startswith("model name")), "?")
+
+
+class Change(msgspec.Struct, frozen=True):
+    """One figure of two files.
+
+    Attributes:
+        what: Case, system, mode, nodes.
+        before_us: Median in the first file.
+        after_us: Median in the second.
+        ratio: After to before.
+        noise: Ratio that noise explains: the product of both files' spreads between rounds.
+    """
+
+    what: str
+    before_us: float
+    after_us: float
+    ratio: float
+    noise: float
+
+    @property
+    def real(self) -> bool:
+        """Whether the change exceeds the noise."""
+        return abs(math.log(self.ratio)) > math.log(self.noise)
+
+
+def read_rows(path: Path) -> dict[str, dict[str, Any]]:
+    """Return a result file's latency rows by what they measure.
+
+    Raises:
+        ConfigError: The file is missing or no result file.
+    """
+    try:
+        content = msgspec.json.decode(path.read_bytes())
+        rows = content["rows"]
+        return {
+            f"{r['case']}, {r['system']}, {r['mode']}, {r['nodes']} nodes": r
+            for r in rows
+            if "median_us" in r
+        }
+    except OSError as error:
+        raise ConfigError(f"{path}: expected a result file, found: {error.strerror}") from None
+    except (msgspec.DecodeError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: expected a result file of bench, found: {error!r}") from None
+
+
+def compare(before: Path, after: Path) -> list[Change]:
+    """Return the changes of all figures that both files have, largest first."""
+    old, new = read_rows(before), read_rows(after)
+    changes = [
+        Change(
+            what,
+            old[what]["median_us"],
+            new[what]["median_us"],
+            new[what]["median_us"] / old[what]["median_us"],
+            _spread(old[what]) * _spread(new[what]),
+        )
+        for what in old.keys() & new.keys()
+    ]
+    return sorted(changes, key=lambda c: -abs(math.log(c.ratio)))
+
+
+def _spread(row: dict[str, Any]) -> float:
+    """Return the largest to the smallest median of the rounds; a guess if there is but one."""
+    rounds = row.get("rounds_us") or [1.0]
+    return max(max(rounds) / min(rounds), 1.02) if len(rounds) > 1 else 1.1

@@ -10,26 +10,31 @@ is fetched in one of these ways:
     fetch inline  from a server on a socket that takes 80 ms, waiting for it on the loop: the thesis
     fetch         from the same server, awaited
 
-Short runs of all ways are interleaved and pooled, so that whatever else the machine does falls on
-all alike.
+Short runs of all ways are interleaved and pooled.
+
+``python -m bench.stall DELAY BYTES`` is the server, a stand-in for the image fetch that the thesis
+measured: it prints its port, answers each request so late, and ends with its standard input.
 """
 
 from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
 import itertools
-import random
 import socket
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from bench.lateness import BEATS, PROBE, Beat, LateRow, figures
-from bench.slow_server import slow_server
+from bench.system import in_turns
 from events import Odometry
 from runtime import Input, Node, NodeConfig, Tick, Worker, every
 from runtime.config.reading import parse
@@ -38,6 +43,9 @@ from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_b
 from sims.worlds import load_world
 
 Mode = Literal["none", "inline", "thread", "worker", "fetch inline", "fetch"]
+DELAY = 0.08
+"""Seconds that the server takes for an answer."""
+
 WARM_UP = 1_000_000_000
 """Nanoseconds of each run that are left out."""
 MODES: tuple[Mode, ...] = ("none", "inline", "thread", "worker", "fetch inline", "fetch")
@@ -211,16 +219,12 @@ def measure(
         progress: Called with what is being measured.
     """
     _collected.clear()
-    shuffle = random.Random(0).shuffle
     with slow_server(pair_size(size, size)) as port:
-        for round_ in range(repeats):
-            order = list(modes)
-            shuffle(order)
-            for mode in order:
-                progress(f"round {round_ + 1} of {repeats}: {mode}")
-                BEATS.clear()
-                execute(parse(_settings(mode, seconds, rate, size, port), "bench stall"))
-                _collected.setdefault(mode, _Samples()).add(BEATS)
+        for number, mode in in_turns(modes, repeats):
+            progress(f"round {number + 1} of {repeats}: {mode}")
+            BEATS.clear()
+            execute(parse(_settings(mode, seconds, rate, size, port), "bench stall"))
+            _collected.setdefault(mode, _Samples()).add(BEATS)
     rows = [_row(mode, _collected[mode]) for mode in modes]
     return [
         msgspec.structs.replace(row, ratio_p99=row.late_p99_us / rows[0].late_p99_us)
@@ -259,3 +263,45 @@ def _row(mode: str, samples: _Samples) -> StallRow:
         fetch_ms_median=float(np.median(samples.fetch) / 1e6) if samples.fetch else 0.0,
         **figures([samples.late]),
     )
+
+
+def main(delay: float, size: int) -> None:
+    """Serve one connection after another until standard input ends."""
+    answer = bytes(size)
+    server = socket.create_server(("127.0.0.1", 0))
+    print(server.getsockname()[1], flush=True)
+    threading.Thread(target=_serve, args=(server, delay, answer), daemon=True).start()
+    sys.stdin.read()
+
+
+def _serve(server: socket.socket, delay: float, answer: bytes) -> None:
+    while True:
+        connection, _ = server.accept()
+        with connection, contextlib.suppress(OSError):
+            while connection.recv(1):
+                time.sleep(delay)  # the fetch that is simulated
+                connection.sendall(answer)
+
+
+@contextlib.contextmanager
+def slow_server(size: int, delay: float = DELAY) -> Iterator[int]:
+    """Run the server while the block runs, and give its port.
+
+    Args:
+        size: Bytes of an answer.
+        delay: Seconds that it takes.
+    """
+    command = [sys.executable, "-m", "bench.stall", str(delay), str(size)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            yield int(process.stdout.readline())
+        finally:
+            process.stdin.close()
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]), int(sys.argv[2]))

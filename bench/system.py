@@ -1,4 +1,4 @@
-"""What is measured, and the interface that every measured system implements.
+"""What is measured, the interface of every measured system, and what benchmarks share.
 
 The exchange is the thesis's: node 1 sends a ping (sender, receiver, number, time) that all N-1
 other nodes hear; the last of them is its receiver and replies; the sample is the time at node 1
@@ -7,8 +7,13 @@ from just before the send to the arrival of the reply. Pings never overlap.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Literal
+import importlib.metadata
+import importlib.util
+import json
+import random
+import socket
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -16,6 +21,7 @@ import numpy.typing as npt
 
 from events import Event
 
+T = TypeVar("T")
 CaseName = Literal["small", "large", "large-shared"]
 Mode = Literal["handler", "stream", "routed"]
 Place = Literal["one process", "processes"]
@@ -106,3 +112,108 @@ class Pong(Event):
     """
 
     number: int
+
+
+def needs(**packages: str) -> Callable[[], str | None]:
+    """Return a `System.missing` that asks for some packages.
+
+    Args:
+        packages: Name of each module that must be there, and of the package that has it.
+    """
+
+    def missing() -> str | None:
+        absent = [package for name, package in packages.items() if not _is_here(name)]
+        if not absent:
+            return None
+        return f"not installed; `make peers`, or `pip install {' '.join(absent)}`"
+
+    return missing
+
+
+def versions(*packages: str) -> Callable[[], str]:
+    """Return a `System.version` that names some packages."""
+
+    def version() -> str:
+        return ", ".join(f"{package} {importlib.metadata.version(package)}" for package in packages)
+
+    return version
+
+
+def payloads(case: Case) -> Callable[[], Any]:
+    """Return what makes the payload of each ping: nothing, a fresh copy, or the same array."""
+    if case.case == "small":
+        return lambda: None
+    array = large_array()
+    return array.copy if case.case == "large" else lambda: array
+
+
+def _is_here(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def free_port() -> int:
+    """Return a TCP port of the loopback that nobody had a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def zenoh_config(**endpoints: str) -> Any:
+    """Return the configuration of a Zenoh peer that finds nobody but by an endpoint.
+
+    Args:
+        endpoints: ``listen`` or ``connect``, as locators.
+    """
+    made = importlib.import_module("zenoh").Config()
+    made.insert_json5("mode", '"peer"')
+    made.insert_json5("scouting/multicast/enabled", "false")
+    made.insert_json5("scouting/gossip/enabled", "false")
+    for way in ("listen", "connect"):
+        made.insert_json5(f"{way}/endpoints", json.dumps([*filter(None, [endpoints.get(way)])]))
+    return made
+
+
+def zenoh_publisher(session: Any, key: str) -> Any:
+    """Return a publisher that sends at once and never drops."""
+    block = importlib.import_module("zenoh").CongestionControl.BLOCK
+    return session.declare_publisher(key, express=True, congestion_control=block)
+
+
+def zenoh_subscriber(session: Any, key: str, callback: Callable[[Any], None]) -> Any:
+    """Return a subscriber whose callback runs where Zenoh delivers, with no thread between."""
+    direct = importlib.import_module("zenoh").handlers.Callback(callback, indirect=False)
+    return session.declare_subscriber(key, direct)
+
+
+def in_turns(sides: Iterable[T], rounds: int) -> Iterator[tuple[int, T]]:
+    """Yield the number of a round and a side, for each side of each round.
+
+    Each round has an order of its own, which is drawn, so that whatever else the machine does
+    falls on all sides alike.
+    """
+    order, shuffle = [*sides], random.Random(0).shuffle
+    for number in range(rounds):
+        shuffle(order)
+        for side in order:
+            yield number, side
+
+
+def pair(taken: Mapping[str, Sequence[int]]) -> dict[str, float]:
+    """Return the fields of a row that holds one side against another.
+
+    Args:
+        taken: Times (ns) of both sides, by the name with which their fields begin.
+
+    Returns:
+        Medians and 99th percentiles in microseconds, and the ratio of the two medians.
+    """
+    found: dict[str, float] = {}
+    for side, times in taken.items():
+        middle, high = np.percentile(times, (50, 99)) / 1e3
+        found |= {f"{side}_us": float(middle), f"{side}_p99_us": float(high)}
+    ours, theirs = (found[f"{side}_us"] for side in taken)
+    return {**found, "ratio": ours / theirs}

@@ -216,7 +216,7 @@ TABLES = {
         ),
     ),
 }
-"""By what is measured, as `bench.suite.Results` names it."""
+"""By what is measured, as `bench.page.Results` names it."""
 
 
 def latency(rows: Sequence[Row]) -> tuple[Table, list[dict[str, Any]]]:

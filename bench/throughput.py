@@ -1,6 +1,8 @@
 """How much gets through: events through handlers and streams, images through streams and workers.
 
 Times are of whole bursts, divided by their size; each figure is the median of many bursts.
+
+And what a run takes through which nothing goes: processor time of one 100 Hz timer node.
 """
 
 from __future__ import annotations
@@ -13,11 +15,14 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 
-from bench.system import Ping
+from bench.system import Ping, in_turns
 from events import Event, Image, PoseEstimate, Quaternion, Vector3
+from runtime import Node, Tick, every
 from runtime.channels.sender import Listener, Sender
 from runtime.channels.streams import Stream
+from runtime.config.reading import parse
 from runtime.run import event_loop
+from runtime.run.execute import execute
 from runtime.time.clock import RealClock
 from runtime.workers.worker import Worker
 
@@ -43,6 +48,22 @@ class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
     def megabytes_per_second(self) -> float:
         """Return the same in megabytes."""
         return self.bytes_per_second / 1e6
+
+
+class IdleRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One run.
+
+    Attributes:
+        hz: Rate of the timer.
+        seconds: Length of the run.
+        ticks: How many came.
+        cpu_percent: Of one core, all threads of the process together.
+    """
+
+    hz: float
+    seconds: float
+    ticks: int
+    cpu_percent: float
 
 
 BATCH = 256
@@ -98,13 +119,15 @@ async def _measure(bursts: int) -> list[ThroughputRow]:
 def _making_rows(bursts: int) -> list[ThroughputRow]:
     """Measure what making a pose costs, and what of it are its checks; in turns."""
     place, turn = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
-    taken: dict[type[Event], list[float]] = {Unchecked: [], PoseEstimate: []}
-    for _ in range(bursts):
-        for event in (Unchecked, PoseEstimate):
-            begin = time.perf_counter_ns()
-            for stamp in range(BATCH):
-                event(stamp=stamp, source="one", position=place, orientation=turn)
-            taken[event].append((time.perf_counter_ns() - begin) / BATCH)
+    taken: dict[type[Unchecked] | type[PoseEstimate], list[float]] = {
+        Unchecked: [],
+        PoseEstimate: [],
+    }
+    for _, event in in_turns(taken, bursts):
+        begin = time.perf_counter_ns()
+        for stamp in range(BATCH):
+            event(stamp=stamp, source="one", position=place, orientation=turn)
+        taken[event].append((time.perf_counter_ns() - begin) / BATCH)
     plain, checked = (float(np.median(each)) for each in taken.values())
     return [
         _row("poses made, without checks", BATCH, plain, 0),
@@ -183,4 +206,30 @@ def _row(case: str, batch: int, nanoseconds: float, size: int) -> ThroughputRow:
         per_event_us=nanoseconds / 1e3,
         events_per_second=1e9 / nanoseconds,
         bytes_per_second=size * 1e9 / nanoseconds,
+    )
+
+
+_marks: list[tuple[float, float]] = []
+
+
+class Timer(Node):
+    """Does nothing, a hundred times a second."""
+
+    @every(hz=100)
+    def tick(self, _: Tick) -> None:
+        """Note the time, real and of the processor."""
+        _marks.append((time.monotonic(), time.process_time()))
+
+
+def measure_idle(seconds: float = 10.0) -> IdleRow:
+    """Run the timer for so many seconds; what it takes is what a nearly idle run costs."""
+    _marks.clear()
+    node = {"name": "timer", "type": f"{__name__}:Timer"}
+    execute(parse({"run": {"clock": "real", "duration": seconds}, "nodes": [node]}, "bench idle"))
+    (begin, cpu_begin), (end, cpu_end) = _marks[0], _marks[-1]
+    return IdleRow(
+        hz=100,
+        seconds=end - begin,
+        ticks=len(_marks),
+        cpu_percent=100 * (cpu_end - cpu_begin) / (end - begin),
     )

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import venv
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,8 @@ def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
         assert finished.returncode == 0, f"{words}: {finished.stderr}{finished.stdout}"
         return finished.stdout
 
+    with zipfile.ZipFile(wheel) as content:
+        assert [name for name in content.namelist() if name.startswith("bench/systems")] == []
     done(bin_ / "pip", "install", "--quiet", wheel)
     visnav = bin_ / "visnav"
     assert "example" in done(visnav, "--help")
@@ -121,6 +124,9 @@ def test_the_wheel_works_in_a_clean_environment(tmp_path: Path) -> None:
     assert "monocular" in done(visnav, "example")
     done(visnav, "example", "brightness")
     done(visnav, "check", "brightness.toml")
+    measured = done(visnav, "bench", "small", "--nodes", "2", "--samples", "30", "--repeats", "1")
+    assert "visnav, fingerprinted" in measured
+    assert measured.splitlines()[-1].startswith("not measured: all other systems: only a checkout")
     shorter = [
         *("--set", "run.duration=3s", "--set", "run.shutdown_limit=60s"),
         *("--set", "camera.width=128", "--set", "camera.height=128"),

@@ -17,16 +17,23 @@ from typing import Any
 import numpy as np
 import uvloop
 
-from bench.system import Case, Samples, System
-from bench.systems.children import ALL, TIMEOUT, Job, PeerError, children, number_of, reply_to
-from bench.systems.parts import needs, versions
-from bench.systems.zenoh_system import config, free_locator, header, pinger, publisher
+from bench.system import (
+    Case,
+    Samples,
+    System,
+    free_port,
+    needs,
+    versions,
+    zenoh_config,
+    zenoh_publisher,
+)
+from bench.systems.children import ALL, Crew, Job, children, number_of, reply_to
+from bench.systems.zenoh_system import header, pinger
 
 
 async def _listen(node: int, session: Any, *, large: bool) -> None:
     afor: Any = importlib.import_module("asyncio_for_robotics.zenoh")
-    zenoh: Any = importlib.import_module("zenoh")
-    pongs = publisher(zenoh, session, "pong")
+    pongs = zenoh_publisher(session, "pong")
     pings = afor.Sub("ping", session)
     async for sample in pings.listen_reliable(queue_size=0):
         pong = reply_to(node, header(sample, large=large))
@@ -39,10 +46,9 @@ class _Sender:
 
     def __init__(self, session: Any, case: Case, check: Callable[[int, str], None]) -> None:
         afor: Any = importlib.import_module("asyncio_for_robotics.zenoh")
-        zenoh: Any = importlib.import_module("zenoh")
         self._case = case
         self._check = check
-        self._put = pinger(publisher(zenoh, session, "ping"), case)
+        self._put = pinger(zenoh_publisher(session, "ping"), case)
         self._pongs = afor.Sub("pong", session).listen_reliable(queue_size=0)
         self._since = time.perf_counter_ns()
 
@@ -95,31 +101,26 @@ async def _run(
     return samples
 
 
-def _give_up(since: int, awaited: str) -> None:
-    if time.perf_counter_ns() - since > TIMEOUT * 1e9:
-        raise PeerError(f"{awaited}: nothing came for {TIMEOUT:g} s")
-
-
 def serve(job: Job) -> None:
     """Be a node."""
     zenoh: Any = importlib.import_module("zenoh")
-    with zenoh.open(config(zenoh, connect=job.address)) as session:
+    with zenoh.open(zenoh_config(connect=job.address)) as session:
         uvloop.run(_listen(job.node, session, large=job.case != "small"))
 
 
 def measure(case: Case) -> Samples:
     """Measure round trips through one session."""
     zenoh: Any = importlib.import_module("zenoh")
-    with zenoh.open(config(zenoh)) as session:
-        return uvloop.run(_run(session, case, _give_up, range(2, case.nodes + 1)))
+    with zenoh.open(zenoh_config()) as session:
+        return uvloop.run(_run(session, case, Crew({}).check, range(2, case.nodes + 1)))
 
 
 def measure_processes(case: Case) -> Samples:
     """Measure round trips between processes."""
     zenoh: Any = importlib.import_module("zenoh")
-    locator = free_locator()
+    locator = f"tcp/127.0.0.1:{free_port()}"
     with (
-        zenoh.open(config(zenoh, listen=locator)) as session,
+        zenoh.open(zenoh_config(listen=locator)) as session,
         children(__name__, case, locator) as crew,
     ):
         return uvloop.run(_run(session, case, crew.check, range(0)))

@@ -151,6 +151,13 @@ def children(module: str, case: Case, address: str, variant: str = "") -> Iterat
         yield Crew(nodes)
 
 
+def answer(node: int, receiver: int, number: int) -> int | None:
+    """Return the number with which a node answers a ping to a receiver, if it is to."""
+    if receiver == node:
+        return number
+    return -node if receiver == ALL else None
+
+
 def reply_to(node: int, ping: Any) -> bytes | None:
     """Return the pong with which a node answers a ping, if it is to.
 
@@ -158,9 +165,8 @@ def reply_to(node: int, ping: Any) -> bytes | None:
         ping: Bytes that begin with a `PING`.
     """
     stamp, _, receiver, number = PING.unpack_from(ping)
-    if receiver == node:
-        return PONG.pack(stamp, number)
-    return PONG.pack(stamp, -node) if receiver == ALL else None
+    answered = answer(node, receiver, number)
+    return None if answered is None else PONG.pack(stamp, answered)
 
 
 def number_of(pong: Any) -> int:

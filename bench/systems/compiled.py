@@ -1,7 +1,12 @@
-"""Helper programs: compiling them into a cache, running them, and reading their samples.
+"""Programs in C++, of which one is the thesis's client: compiled into a cache, run, and read.
 
 Sources are in ``bench/systems/cpp``. A program is compiled again when a source, the compiler or
 what it is linked with has changed. Programs write their samples as raw int64.
+
+The thesis's client is written anew from its description: ``cpp/thesis_client.hpp``. Delivery is
+synchronous and nested: the sample covers the ping through all nodes in order, the pong back through
+all nodes until node 1 handles it, and one reading of the clock, which is most of it at N = 2. A
+large ping copies its array into the event; freed memory is kept, so the copy meets no fresh pages.
 """
 
 from __future__ import annotations
@@ -15,11 +20,11 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
-from bench.system import Case, Samples
+from bench.system import Case, Samples, System
 
+CLIENT = "thesis_client.cpp"
 SOURCES = Path(__file__).parent / "cpp"
 
 KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": "33554432", "MALLOC_TRIM_THRESHOLD_": "1073741824"}
@@ -32,20 +37,6 @@ than copying it: a property of the allocator's defaults and not of what is measu
 
 class CompiledError(RuntimeError):
     """A program cannot be compiled, failed, or did not end in time."""
-
-
-class Program(msgspec.Struct, frozen=True, kw_only=True):
-    """A program in one source file.
-
-    Attributes:
-        source: Name of the file in `SOURCES`.
-        libraries: To link with.
-        built_for: Version of what it is linked with.
-    """
-
-    source: str
-    libraries: tuple[str, ...] = ()
-    built_for: str = ""
 
 
 def missing_compiler() -> str | None:
@@ -62,25 +53,30 @@ def compiler_version() -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")[0]
 
 
-def build(program: Program) -> Path:
-    """Return the compiled program, from the cache if it is there.
+def build(source: str, libraries: Sequence[str] = (), built_for: str = "") -> Path:
+    """Return a compiled program, from the cache if it is there.
+
+    Args:
+        source: Name of its one file in `SOURCES`.
+        libraries: To link with.
+        built_for: Version of what it is linked with.
 
     Raises:
         CompiledError: It does not compile.
     """
     command = [*_compiler(), "-std=c++17", "-O2", "-DNDEBUG", "-Wall", "-Wextra"]
-    libraries = [f"-l{library}" for library in program.libraries]
-    key = hashlib.sha256(repr((command, libraries, program, compiler_version())).encode())
-    for source in (SOURCES / program.source, *sorted(SOURCES.glob("*.hpp"))):
-        key.update(source.read_bytes())
+    links = [f"-l{library}" for library in libraries]
+    key = hashlib.sha256(repr((command, links, built_for, compiler_version())).encode())
+    for file in (SOURCES / source, *sorted(SOURCES.glob("*.hpp"))):
+        key.update(file.read_bytes())
     cache = _cache()
-    built = cache / f"{Path(program.source).stem}-{key.hexdigest()[:16]}"
+    built = cache / f"{Path(source).stem}-{key.hexdigest()[:16]}"
     if built.exists():
         return built
     cache.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache) as directory:
         fresh = Path(directory) / "program"
-        command += [str(SOURCES / program.source), "-o", str(fresh), *libraries]
+        command += [str(SOURCES / source), "-o", str(fresh), *links]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         if done.returncode:
             raise CompiledError(f"{shlex.join(command)}: {done.stderr[:2000]}")
@@ -152,3 +148,32 @@ def _compiler() -> list[str]:
 def _cache() -> Path:
     home = os.environ.get("XDG_CACHE_HOME")
     return (Path(home) if home else Path.home() / ".cache") / "visnav-runtime"
+
+
+def measure_client(case: Case) -> Samples:
+    """Measure round trips.
+
+    Raises:
+        CompiledError: The client cannot be compiled, or failed.
+    """
+    with tempfile.TemporaryDirectory() as directory:
+        out = Path(directory) / "samples"
+        run([build(CLIENT), *arguments(case, out)], deadline_for(case))
+        return read(out, case)
+
+
+def order_heard() -> str:
+    """Return in which order nodes hear an event that nobody handles, and one that node 2 does."""
+    return run([build(CLIENT), "check"], 30)
+
+
+SYSTEMS = (
+    System(
+        name="thesis client (C++)",
+        modes=("handler",),
+        slowness=0.05,
+        missing=missing_compiler,
+        version=lambda: f"replica, {compiler_version()}",
+        measure=measure_client,
+    ),
+)

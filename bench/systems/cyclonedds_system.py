@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
-from bench.systems.children import ALL, Job, children
-from bench.systems.parts import needs, versions
+from bench.system import LARGE_SHAPE, Case, Samples, System, large_array, needs, versions
+from bench.systems.children import Job, answer, children
 
 _BYTES = int(np.prod(LARGE_SHAPE)) * 4
 
@@ -116,8 +115,8 @@ def serve(job: Job) -> None:
             continue
         if large:
             np.frombuffer(ping.payload, np.float32).reshape(LARGE_SHAPE)
-        if ping.receiver in (job.node, ALL):
-            number = -job.node if ping.receiver == ALL else ping.number
+        number = answer(job.node, ping.receiver, ping.number)
+        if number is not None:
             pongs.write(domain.pong(ping.stamp, number))
 
 
@@ -128,9 +127,8 @@ def measure(case: Case) -> Samples:
     domain = _Domain(number, large=case.case != "small")
     pings = domain.writer(domain.ping)
     pongs = domain.reader(domain.pong)
-    make = functools.partial(domain.ping)
-    if case.case != "small":
-        make = functools.partial(domain.ping, payload=large_array().data.cast("B"))
+    payload = {} if case.case == "small" else {"payload": large_array().data.cast("B")}
+    make = functools.partial(domain.ping, **payload)
 
     def send(stamp: int, receiver: int, number: int) -> None:
         pings.write(make(stamp=stamp, sender=1, receiver=receiver, number=number))

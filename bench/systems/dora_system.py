@@ -22,7 +22,7 @@ from typing import Any
 
 import msgspec
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+from bench.system import LARGE_SHAPE, Case, Samples, System, free_port, large_array, needs, versions
 from bench.systems.children import (
     PING,
     TIMEOUT,
@@ -33,7 +33,6 @@ from bench.systems.children import (
     number_of,
     reply_to,
 )
-from bench.systems.parts import needs, versions
 
 _DORA = (sys.executable, "-c", "import sys, dora_cli; sys.exit(dora_cli.py_main())")
 _POOL = 1 << 26
@@ -47,13 +46,6 @@ class _Address(msgspec.Struct, frozen=True):
     directory: str
     coordinator: int
     daemon: int
-
-
-def _free_ports() -> tuple[int, int]:
-    with socket.socket() as first, socket.socket() as second:
-        first.bind(("127.0.0.1", 0))
-        second.bind(("127.0.0.1", 0))
-        return first.getsockname()[1], second.getsockname()[1]
 
 
 def _dataflow(case: Case) -> bytes:
@@ -169,7 +161,7 @@ def measure(case: Case) -> Samples:
     """Measure round trips."""
     with tempfile.TemporaryDirectory() as directory:
         Path(directory, "flow.yml").write_bytes(_dataflow(case))
-        address = _Address(directory, *_free_ports())
+        address = _Address(directory, free_port(), free_port())
         daemon = msgspec.structs.replace(case, nodes=2)
         with children(__name__, daemon, msgspec.json.encode(address).decode()) as crew:
             begin = time.perf_counter_ns()
@@ -186,12 +178,12 @@ def _exchange(case: Case, crew: Crew, port: int) -> Samples:
     node = dora.Node("node1", daemon_port=port)
     array = large_array().ravel()
 
-    def send_small(stamp: int, receiver: int, number: int) -> None:
-        node.send_output("ping", PING.pack(stamp, 1, receiver, number))
-
-    def send_large(stamp: int, receiver: int, number: int) -> None:
-        metadata = {"stamp": stamp, "receiver": receiver, "number": number}
-        node.send_output("ping", pyarrow.array(array), metadata)
+    def send(stamp: int, receiver: int, number: int) -> None:
+        if case.case == "small":
+            node.send_output("ping", PING.pack(stamp, 1, receiver, number))
+        else:
+            metadata = {"stamp": stamp, "receiver": receiver, "number": number}
+            node.send_output("ping", pyarrow.array(array), metadata)
 
     def receive() -> int | None:
         event = node.next(timeout=1.0)
@@ -199,7 +191,7 @@ def _exchange(case: Case, crew: Crew, port: int) -> Samples:
             return None
         return number_of(event["value"].to_numpy(zero_copy_only=True))
 
-    return crew.exchange(case, send_small if case.case == "small" else send_large, receive)
+    return crew.exchange(case, send, receive)
 
 
 SYSTEMS = (

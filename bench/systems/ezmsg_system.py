@@ -19,9 +19,8 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from bench.system import Case, Ping, Pong, Samples, System
-from bench.systems.children import ALL, TIMEOUT, PeerError
-from bench.systems.parts import needs, payloads, versions
+from bench.system import Case, Ping, Pong, Samples, System, needs, payloads, versions
+from bench.systems.children import ALL, TIMEOUT, PeerError, answer
 
 _BUFFER = 1 << 23
 _Method = TypeVar("_Method", bound=Callable[..., Any])
@@ -118,8 +117,8 @@ def _units(ez: Any) -> tuple[Any, Any]:
         @subscriber(PING)
         @publisher(PONG)
         async def on_ping(self, ping: Ping) -> AsyncGenerator[tuple[Any, Pong]]:
-            if ping.receiver in (self.number, ALL):
-                number = -self.number if ping.receiver == ALL else ping.number
+            number = answer(self.number, ping.receiver, ping.number)
+            if number is not None:
                 yield self.PONG, Pong(stamp=ping.stamp, source="n", number=number)
 
         @task

@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
-from bench.systems.children import ALL, Job, children
-from bench.systems.parts import needs, versions
+from bench.system import LARGE_SHAPE, Case, Samples, System, large_array, needs, versions
+from bench.systems.children import Job, answer, children
 
 _BYTES = int(np.prod(LARGE_SHAPE)) * 4
 _POLLS = 100_000
@@ -120,8 +119,8 @@ def serve(job: Job) -> None:
         ping = sample.payload().contents
         if kind is Large:
             np.frombuffer(ping.array, np.float32).reshape(LARGE_SHAPE)
-        if ping.receiver in (job.node, ALL):
-            number = -job.node if ping.receiver == ALL else ping.number
+        number = answer(job.node, ping.receiver, ping.number)
+        if number is not None:
             pongs.send_copy(Small(ping.stamp, job.node, 1, number))
             notify()
         del ping, sample
@@ -136,19 +135,17 @@ def measure(case: Case, variant: str) -> Samples:
     pings, notify = _Topic(node, f"{address}/ping", kind, events=events).sender()
     next_pong = _Topic(node, f"{address}/pong", Small, events=events).receiver()
     array = large_array()
-    copied = case.case == "large"
 
-    def send_small(stamp: int, receiver: int, number: int) -> None:
-        pings.send_copy(Small(stamp, 1, receiver, number))
-        notify()
-
-    def send_large(stamp: int, receiver: int, number: int) -> None:
-        sample = pings.loan_uninit()
-        ping = sample.payload().contents
-        ping.stamp, ping.sender, ping.receiver, ping.number = stamp, 1, receiver, number
-        if copied:
-            ctypes.memmove(ping.array, array.ctypes.data, _BYTES)
-        sample.assume_init().send()
+    def send(stamp: int, receiver: int, number: int) -> None:
+        if kind is Small:
+            pings.send_copy(Small(stamp, 1, receiver, number))
+        else:
+            sample = pings.loan_uninit()
+            ping = sample.payload().contents
+            ping.stamp, ping.sender, ping.receiver, ping.number = stamp, 1, receiver, number
+            if case.case == "large":
+                ctypes.memmove(ping.array, array.ctypes.data, _BYTES)
+            sample.assume_init().send()
         notify()
 
     def receive() -> int | None:
@@ -157,7 +154,7 @@ def measure(case: Case, variant: str) -> Samples:
 
     try:
         with children(__name__, case, address, variant) as crew:
-            return crew.exchange(case, send_small if kind is Small else send_large, receive)
+            return crew.exchange(case, send, receive)
     finally:
         # The other nodes did not leave of their own accord; what they had in memory goes now.
         node.try_cleanup_dead_nodes()

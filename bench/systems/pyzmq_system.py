@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+from bench.system import LARGE_SHAPE, Case, Samples, System, large_array, needs, versions
 from bench.systems.children import PING, Job, children, number_of, reply_to
-from bench.systems.parts import needs, versions
 
 
 def _socket(context: Any, kind: int, zmq: Any) -> Any:
@@ -59,12 +58,13 @@ def measure(case: Case) -> Samples:
         pongs.set(zmq.RCVTIMEO, 1000)
         array = large_array()
 
-        def send_small(stamp: int, receiver: int, number: int) -> None:
-            pings.send(PING.pack(stamp, 1, receiver, number))
-
-        def send_large(stamp: int, receiver: int, number: int) -> None:
-            pings.send(PING.pack(stamp, 1, receiver, number), zmq.SNDMORE)
-            pings.send(array, copy=False)
+        def send(stamp: int, receiver: int, number: int) -> None:
+            header = PING.pack(stamp, 1, receiver, number)
+            if case.case == "small":
+                pings.send(header)
+            else:
+                pings.send(header, zmq.SNDMORE)
+                pings.send(array, copy=False)
 
         def receive() -> int | None:
             try:
@@ -73,7 +73,6 @@ def measure(case: Case) -> Samples:
                 return None
 
         with children(__name__, case, directory) as crew:
-            send = send_small if case.case == "small" else send_large
             return crew.exchange(case, send, receive)
 
 

@@ -14,9 +14,7 @@ payloads then travel through shared memory where Zenoh sees fit, as is its defau
 from __future__ import annotations
 
 import importlib
-import json
 import queue
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -24,44 +22,20 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array
+from bench.system import (
+    LARGE_SHAPE,
+    Case,
+    Samples,
+    System,
+    free_port,
+    large_array,
+    needs,
+    versions,
+    zenoh_config,
+    zenoh_publisher,
+    zenoh_subscriber,
+)
 from bench.systems.children import PING, PONG, Job, PeerError, children, number_of, reply_to
-from bench.systems.parts import needs, versions
-
-
-def config(zenoh: Any, **endpoints: str) -> Any:
-    """Return the configuration of a peer that finds nobody but by an endpoint.
-
-    Args:
-        endpoints: ``listen`` or ``connect``, as locators.
-    """
-    made = zenoh.Config()
-    made.insert_json5("mode", '"peer"')
-    made.insert_json5("scouting/multicast/enabled", "false")
-    made.insert_json5("scouting/gossip/enabled", "false")
-    for way in ("listen", "connect"):
-        locators = [endpoints[way]] if way in endpoints else []
-        made.insert_json5(f"{way}/endpoints", json.dumps(locators))
-    return made
-
-
-def free_locator() -> str:
-    """Return a TCP locator on the loopback whose port nobody had a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-def publisher(zenoh: Any, session: Any, key: str) -> Any:
-    """Return a publisher that sends at once and never drops."""
-    block = zenoh.CongestionControl.BLOCK
-    return session.declare_publisher(key, express=True, congestion_control=block)
-
-
-def subscribe(zenoh: Any, session: Any, key: str, callback: Any) -> Any:
-    """Return a subscriber whose callback runs where Zenoh delivers, with no thread between."""
-    direct = zenoh.handlers.Callback(callback, indirect=False)
-    return session.declare_subscriber(key, direct)
 
 
 def pinger(pings: Any, case: Case) -> Callable[[int, int, int], None]:
@@ -88,8 +62,8 @@ def header(sample: Any, *, large: bool) -> bytes:
 def measure_callbacks(case: Case) -> Samples:
     """Measure round trips through one session."""
     zenoh: Any = importlib.import_module("zenoh")
-    with zenoh.open(config(zenoh)) as session:
-        pings, pongs = (publisher(zenoh, session, key) for key in ("ping", "pong"))
+    with zenoh.open(zenoh_config()) as session:
+        pings, pongs = (zenoh_publisher(session, key) for key in ("ping", "pong"))
         large = case.case != "small"
         latest, landed = -1, 0
         now = time.perf_counter_ns
@@ -100,7 +74,7 @@ def measure_callbacks(case: Case) -> Samples:
                 if receiver == node:
                     pongs.put(PONG.pack(0, number))
 
-            return subscribe(zenoh, session, "ping", ping)
+            return zenoh_subscriber(session, "ping", ping)
 
         def pong(sample: Any) -> None:
             nonlocal latest, landed
@@ -108,7 +82,7 @@ def measure_callbacks(case: Case) -> Samples:
             landed = now()
 
         _kept = [listen(node) for node in range(2, case.nodes + 1)]
-        _kept.append(subscribe(zenoh, session, "pong", pong))
+        _kept.append(zenoh_subscriber(session, "pong", pong))
         put = pinger(pings, case)
         taken = np.empty(case.warm_up + case.samples, np.int64)
         for number in range(len(taken)):
@@ -124,8 +98,8 @@ def serve(job: Job) -> None:
     """Be a node."""
     zenoh: Any = importlib.import_module("zenoh")
     large = job.case != "small"
-    with zenoh.open(config(zenoh, connect=job.address)) as session:
-        pongs = publisher(zenoh, session, "pong")
+    with zenoh.open(zenoh_config(connect=job.address)) as session:
+        pongs = zenoh_publisher(session, "pong")
 
         def ping(sample: Any) -> None:
             pong = reply_to(job.node, header(sample, large=large))
@@ -139,9 +113,9 @@ def serve(job: Job) -> None:
 def measure_processes(case: Case) -> Samples:
     """Measure round trips between processes."""
     zenoh: Any = importlib.import_module("zenoh")
-    locator = free_locator()
-    with zenoh.open(config(zenoh, listen=locator)) as session:
-        pings = publisher(zenoh, session, "ping")
+    locator = f"tcp/127.0.0.1:{free_port()}"
+    with zenoh.open(zenoh_config(listen=locator)) as session:
+        pings = zenoh_publisher(session, "ping")
         heard: queue.SimpleQueue[int] = queue.SimpleQueue()
 
         def pong(sample: Any) -> None:

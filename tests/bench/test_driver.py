@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import subprocess
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from bench import driver
-from bench.driver import measure_all
+from bench.driver import find, measure_all
 from bench.ours import measure
 from bench.system import Case, Mode, Samples, System
 
@@ -55,6 +56,17 @@ def test_what_cannot_be_measured_is_named_with_the_reason(monkeypatch: pytest.Mo
     assert "No module named 'no'" in outcome.missing["broken, handler, 2 nodes"]
 
 
+def test_without_a_checkout_nothing_else_is_measured(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A wheel has no systems but ours, and one line says so."""
+    monkeypatch.setattr(driver, "RIVALS", tmp_path / "systems")
+    monkeypatch.setattr(driver, "_measure", lambda *_: np.arange(1, 31, dtype=np.int64))
+    outcome = measure_all("small", nodes=(2,), samples=30, warm_up=0, repeats=1)
+    assert {row.system for row in outcome.rows} == {"visnav", "visnav, fingerprinted"}
+    assert [*outcome.missing] == ["all other systems"]
+
+
 def test_a_system_is_not_measured_beyond_its_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """`max_nodes` and the cases that a system has limit what is asked of it."""
     asked: list[tuple[str, int]] = []
@@ -84,10 +96,8 @@ def test_slow_systems_make_fewer_round_trips() -> None:
 
 def test_an_unknown_system_is_said_to_be_unknown() -> None:
     """The process that measures ends with the names that it knows."""
-    from bench.measure import find
-
     with pytest.raises(LookupError, match=r"expected one of .*plain calls.*, found .plane calls."):
-        find("bench.systems.plain", "plane calls")
+        find("bench.systems.in_process", "plane calls")
 
 
 def test_the_last_line_of_a_failure_is_its_reason() -> None:

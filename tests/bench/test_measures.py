@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import idle, link, lockstep, parts, stall, throughput
+from bench import lockstep, outside, stall, throughput
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_lockstep_is_compared_with_a_bare_loop() -> None:
 @pytest.mark.slow
 def test_idling_is_measured_over_the_ticks() -> None:
     """A second of 100 Hz is a hundred ticks, and takes some of a core but not all of it."""
-    row = idle.measure(1.0)
+    row = throughput.measure_idle(1.0)
     assert 95 <= row.ticks <= 102
     assert 0 < row.cpu_percent < 100
 
@@ -79,7 +79,7 @@ def test_throughput_covers_handlers_streams_and_workers() -> None:
 @pytest.mark.slow
 def test_the_parts_of_a_frame_add_up() -> None:
     """To the whole; each that is measured by itself takes some time, and none takes it all."""
-    rows = {row.part: row for row in parts.measure(seconds=2, repeats=1)}
+    rows = {row.part: row for row in lockstep.measure_parts(seconds=2, repeats=1)}
     assert list(rows)[-2:] == ["rest", "all"]
     assert sum(row.ms for row in rows.values()) == pytest.approx(2 * rows["all"].ms)
     assert all(0 < rows[part].share < 1 for part in ("noise", "copies", "odometry", "hashing"))
@@ -88,7 +88,15 @@ def test_the_parts_of_a_frame_add_up() -> None:
 @pytest.mark.slow
 def test_a_frame_to_a_program_is_compared_with_a_call() -> None:
     """Both carry the whole frame, so neither takes less than copying it would."""
-    (row,) = link.measure(30)
+    (row,) = outside.measure_link(30)
     assert row.bytes == 512 * 512 * 7
     assert row.ratio == pytest.approx(row.link_us / row.worker_us)
     assert min(row.link_us, row.worker_us) > 20
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_an_odometry_outside_and_one_in_a_worker_fly_the_same() -> None:
+    (row,) = outside.measure_held(seconds=2.0, repeats=1)
+    assert row.equal
+    assert row.ratio == pytest.approx(row.outside_speed / row.worker_speed)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from bench import flood, lateness, ros_images
+from bench import bridge, flood, lateness
 from bench.lateness import Beat
 
 
 def test_both_encoders_are_measured_and_compared() -> None:
     """A row for each kind of image; that both make the same bytes is checked while warming up."""
-    rows = ros_images.measure(repeats=5)
+    rows = bridge.measure_ros_images(repeats=5)
     assert [row.case for row in rows] == ["512×512 rgb8", "512×512 32FC1"]
     for row, size in zip(rows, (3, 4), strict=True):
         assert row.samples == 5

@@ -93,7 +93,7 @@ def _measure(module: str, system: System, case: Case, directory: Path) -> None:
     out = directory / "samples.npy"
     encoded = msgspec.json.encode(case).decode()
     subprocess.run(
-        [sys.executable, "-m", "bench.measure", module, system.name, encoded, str(out)],
+        [sys.executable, "-m", "bench.driver", module, system.name, encoded, str(out)],
         cwd=ROOT,
         check=True,
         timeout=120,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.flooder import TWIST
+from bench.flood import TWIST
 from nodes.ros2.bridge.keys import data_key
 from nodes.ros2.messages.topics import Topic
 from tests.nodes.ros2.bridge.network import bridged_run
@@ -35,7 +35,7 @@ def test_what_was_sent_is_what_was_heard_and_what_was_dropped(rate: float, tmp_p
     """At a rate that refuses most, and at one that lets all wait."""
     key = data_key(0, Topic(name="/cmd_vel", type=TWIST, hash=samples.store().hash(TWIST)))
     with bridged_run(tmp_path, enough=9, more=MORE.format(rate=rate)) as (run, port):
-        command = [sys.executable, "-m", "bench.flooder", str(port), key, "10000", "1", "4"]
+        command = [sys.executable, "-m", "bench.flood", str(port), key, "10000", "1", "4"]
         flooder = subprocess.run(
             command, input="go\n2000\n", capture_output=True, text=True, timeout=60, check=True
         )

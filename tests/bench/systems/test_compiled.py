@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from bench.system import Case, CaseName, System
-from bench.systems import compiled, ros1, thesis_client
-from bench.systems.ros1_graph import GraphError, graph
+from bench.systems import compiled, ros1
+from bench.systems.ros1 import GraphError, graph
 
-SYSTEMS = (*thesis_client.SYSTEMS, *ros1.SYSTEMS)
+SYSTEMS = (*compiled.SYSTEMS, *ros1.SYSTEMS)
 
 
 def or_skip(system: System) -> System:
@@ -26,7 +26,7 @@ def or_skip(system: System) -> System:
 
 @pytest.fixture
 def client() -> System:
-    return or_skip(thesis_client.SYSTEMS[0])
+    return or_skip(compiled.SYSTEMS[0])
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def measures(system: System, case: CaseName, nodes: int) -> None:
 @pytest.mark.parametrize("case", ["small", "large", "large-shared"])
 @pytest.mark.parametrize("nodes", [2, 4])
 def test_client_measures(nodes: int, case: CaseName) -> None:
-    measures(thesis_client.SYSTEMS[0], case, nodes)
+    measures(compiled.SYSTEMS[0], case, nodes)
 
 
 @pytest.mark.slow  # Compiling roscpp's programs, once, takes several seconds.
@@ -57,7 +57,7 @@ def test_ros_measures(system: System, nodes: int, case: CaseName) -> None:
 
 
 def test_client_hands_events_to_nodes_in_order_until_one_handles_them(client: System) -> None:
-    assert thesis_client.check().splitlines() == [
+    assert compiled.order_heard().splitlines() == [
         "heard by 1 2 3 unhandled",
         "heard by 1 2 handled",
     ]
@@ -68,10 +68,10 @@ def test_program_is_compiled_once(
     client: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    built = compiled.build(thesis_client.PROGRAM)
+    built = compiled.build(compiled.CLIENT)
     made = built.stat().st_mtime_ns
     assert built.is_relative_to(tmp_path)
-    assert compiled.build(thesis_client.PROGRAM) == built
+    assert compiled.build(compiled.CLIENT) == built
     assert built.stat().st_mtime_ns == made
 
 
@@ -82,7 +82,7 @@ def test_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_program_that_fails_says_why(client: System) -> None:
     with pytest.raises(compiled.CompiledError, match="expected CASE NODES"):
-        compiled.run([compiled.build(thesis_client.PROGRAM), "nonsense"], 10)
+        compiled.run([compiled.build(compiled.CLIENT), "nonsense"], 10)
 
 
 def test_program_that_hangs_is_ended() -> None:
@@ -101,7 +101,7 @@ def test_graph_ends_its_nodes_when_one_fails(roscpp: System) -> None:
 
 def test_nothing_outlives_the_measuring_process(roscpp: System) -> None:
     code = (
-        "from bench.systems.ros1_graph import graph\n"
+        "from bench.systems.ros1 import graph\n"
         "with graph() as ros:\n"
         "    print(ros.start(['sleep', '60']).pid, flush=True)\n"
         "    input()\n"

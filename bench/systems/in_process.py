@@ -1,10 +1,13 @@
-"""One queue a node and one task around each: what asyncio, anyio and trio themselves offer.
+"""Systems whose nodes share a process, and need nothing but Python or a package of it.
 
-asyncio has `asyncio.Queue`, measured on its own loop and on uvloop; anyio has memory object streams
-(on uvloop), and trio memory channels, on its own loop. All are unbounded and filled at once:
-``put_nowait`` and ``send_nowait`` pass no checkpoint, as ``await send()`` would, which is the
-quickest way of each. So node 1 wakes all receivers before any runs; trio runs what is ready in an
-order of chance, and node 1, woken by the reply, after all of them.
+Functions called within the send: a dict of handlers, the floor, since nothing in Python delivers
+events for less; and pyee's `EventEmitter`.
+
+One queue a node and one task around each: `asyncio.Queue` on asyncio's own loop and on uvloop,
+anyio's memory object streams (on uvloop) and trio's memory channels. All are unbounded and filled
+at once: ``put_nowait`` and ``send_nowait`` pass no checkpoint, as ``await send()`` would, which is
+the quickest way of each. So node 1 wakes all receivers before any runs; trio runs what is ready in
+an order of chance, and node 1, woken by the reply, after all of them.
 """
 
 from __future__ import annotations
@@ -20,10 +23,63 @@ from typing import Any
 import numpy as np
 import uvloop
 
-from bench.system import Case, Ping, Pong, Samples, System
-from bench.systems.parts import needs, payloads, versions
+from bench.system import Case, Ping, Pong, Samples, System, needs, payloads, versions
 
 Put = Callable[[Any], None]
+
+
+def _call(case: Case, send: Callable[[Any], Any], hear: Callable[[type, Any], Any]) -> Samples:
+    """Return the samples; `hear` makes a function one that `send` calls for events of a type."""
+    arrived = 0
+    now = time.perf_counter_ns
+
+    class Listener:
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def ping(self, event: Ping) -> bool | None:
+            if event.receiver == self.number:
+                send(Pong(stamp=event.stamp, source="n", number=event.number))
+                return True
+            return None
+
+    def pong(_: Pong) -> None:
+        nonlocal arrived
+        arrived = now()
+
+    for number in range(2, case.nodes + 1):
+        hear(Ping, Listener(number).ping)
+    hear(Pong, pong)
+    payload = payloads(case)
+    taken = np.empty(case.warm_up + case.samples, np.int64)
+    for number in range(len(taken)):
+        begin = now()
+        send(Ping(stamp=begin, source="1", receiver=case.nodes, number=number, payload=payload()))
+        taken[number] = arrived - begin
+    return taken[case.warm_up :]
+
+
+def measure_calls(case: Case) -> Samples:
+    """Measure round trips through a dict from type to a list of functions."""
+    handlers: dict[type, list[Callable[[Any], bool | None]]] = {Ping: [], Pong: []}
+
+    def send(event: Any) -> None:
+        for handler in handlers[type(event)]:
+            if handler(event):
+                break
+
+    return _call(case, send, lambda kind, handler: handlers[kind].append(handler))
+
+
+def measure_pyee(case: Case) -> Samples:
+    """Measure round trips through one emitter, whose events are named by their types."""
+    emitter: Any = importlib.import_module("pyee.base").EventEmitter()
+    emit = emitter.emit
+    return _call(
+        case,
+        lambda event: emit(type(event).__name__, event),
+        lambda kind, handler: emitter.on(kind.__name__, handler),
+    )
 
 
 async def _exchange(case: Case, puts: Sequence[Put], receive: Callable[[], Awaitable[Any]]) -> Any:
@@ -114,6 +170,15 @@ def measure_trio(case: Case) -> Samples:
 
 
 SYSTEMS = (
+    System(name="plain calls", modes=("handler",), slowness=0.5, measure=measure_calls),
+    System(
+        name="pyee",
+        modes=("handler",),
+        slowness=2,
+        missing=needs(pyee="pyee"),
+        version=versions("pyee"),
+        measure=measure_pyee,
+    ),
     System(
         name="asyncio.Queue (asyncio)",
         modes=("stream",),

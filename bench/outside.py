@@ -1,0 +1,235 @@
+"""What an estimator outside the process costs, beside the same in a worker.
+
+The way there: both sides get the same 512×512 RGB-D frame in shared memory and answer without
+looking at it; a time is from the call to the answer on the loop.
+
+A whole flight: both fly in lockstep with a 512×512 RGB-D camera at 30 Hz and the same odometry; a
+speed is simulated seconds per second. Both say the same: their digests are compared.
+
+Sides take turns, and a ratio is that of the two medians. ``python -m bench.outside`` is the program
+outside: with ``answer`` it answers every frame, with ``track`` it is the odometry.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import uvloop
+
+from bench.system import in_turns
+from events import CameraInfo
+from nodes.estimators import WORKER_ENVIRONMENT
+from nodes.estimators.visual_odometry.node import VisualOdometryConfig, make_tracker
+from nodes.outside.native import Endpoint, LinkAnswer
+from nodes.outside.native.client import Link
+from runtime.config.reading import parse
+from runtime.run.execute import execute
+from runtime.summary import Summary
+from runtime.time.clock import RealClock
+from runtime.workers.worker import Worker
+
+WARM_UP = 30
+ESTIMATES = "odometry.estimates"
+
+
+class LinkRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One kind of frame.
+
+    Attributes:
+        case: Its images.
+        bytes: Of them.
+        samples: Of each side.
+        link_us: Median microseconds through the native interface and back.
+        worker_us: The same of a worker's call.
+        ratio: The first to the second.
+    """
+
+    case: str
+    bytes: int
+    samples: int
+    link_us: float
+    worker_us: float
+    ratio: float
+
+
+class Taker:
+    """Lives in a worker; takes a frame and gives nothing back."""
+
+    def take(self, colours: npt.NDArray[np.uint8], depth: npt.NDArray[np.float32]) -> None:
+        """Take a frame."""
+
+
+def measure_link(samples: int = 1000) -> list[LinkRow]:
+    """Measure an RGB-D frame of 512×512."""
+    drawn = np.random.default_rng(0)
+    colours = drawn.integers(0, 256, (512, 512, 3), np.uint8)
+    depth = drawn.uniform(0.3, 20.0, (512, 512)).astype(np.float32)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner,
+    ):
+        path = Path(folder) / "link.socket"
+        answers: asyncio.Queue[LinkAnswer] = asyncio.Queue()
+        wake = runner.get_loop().call_soon_threadsafe
+
+        def take(answer: LinkAnswer) -> None:
+            wake(answers.put_nowait, answer)
+
+        endpoint = Endpoint(
+            path,
+            {"cameras": [{"body_from_camera": np.eye(4).tolist()}]},
+            slots=2,
+            slot_bytes=colours.nbytes + depth.nbytes,
+            answered=take,
+            gone=lambda _: None,
+            logged=lambda _: None,
+        )
+
+        async def by_link() -> None:
+            endpoint.send_frame(0, [(0, "rgb8", colours), (0, "depth32f", depth)])
+            await answers.get()
+
+        endpoint.listen()
+        environment = {**os.environ, "VISNAV_SOCKET": str(path)}
+        with subprocess.Popen([sys.executable, "-m", "bench.outside", "answer"], env=environment):
+            try:
+                endpoint.wait(60.0)
+                times = runner.run(_measure(by_link, (colours, depth), samples))
+            finally:
+                endpoint.close()
+    link, worker = np.median(times, axis=1) / 1e3
+    size = colours.nbytes + depth.nbytes
+    case = "512×512 rgb8, depth32f"
+    microseconds = {"link_us": link, "worker_us": worker, "ratio": link / worker}
+    return [LinkRow(case=case, bytes=size, samples=samples, **microseconds)]
+
+
+async def _measure(
+    by_link: Callable[[], Awaitable[None]], frame: tuple[Any, Any], samples: int
+) -> list[list[int]]:
+    """Return the times (ns) through the link and by a worker."""
+    clock = RealClock(asyncio.get_running_loop())
+    worker = Worker("taker", clock, Taker, niceness=0)
+    try:
+        await worker.ready()
+        sides: list[Callable[[], Awaitable[None]]] = [
+            by_link,
+            lambda: worker.call(Taker.take, *frame),
+        ]
+        taken: list[list[int]] = [[] for _ in sides]
+        for number, side in in_turns(range(len(sides)), WARM_UP + samples):
+            begin = time.perf_counter_ns()
+            await sides[side]()
+            if number >= WARM_UP:
+                taken[side].append(time.perf_counter_ns() - begin)
+        return taken
+    finally:
+        await asyncio.to_thread(worker.close)
+        clock.close()
+
+
+class HeldRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One way to a program outside.
+
+    Attributes:
+        case: Which.
+        rounds: Flights of each side.
+        outside_speed: Simulated seconds per second with the program, median.
+        worker_speed: The same with a worker.
+        ratio: The first to the second.
+        equal: Whether all flights had the same estimates at the same times.
+    """
+
+    case: str
+    rounds: int
+    outside_speed: float
+    worker_speed: float
+    ratio: float
+    equal: bool
+
+
+def measure_held(
+    *, seconds: float = 8.0, repeats: int = 5, progress: Callable[[str], None] = lambda _: None
+) -> list[HeldRow]:
+    """Measure, interleaved.
+
+    Args:
+        progress: Called with what is being measured.
+    """
+    found: dict[str, list[Summary]] = {side: [] for side in _ESTIMATORS}
+    for number, side in in_turns(_ESTIMATORS, repeats):
+        progress(f"held: round {number + 1} of {repeats}")
+        found[side].append(_fly(seconds, _ESTIMATORS[side]))
+    outside, worker = (seconds / median(s.wall_seconds for s in side) for side in found.values())
+    said = {summary.digests[ESTIMATES] for side in found.values() for summary in side}
+    return [
+        HeldRow(
+            case="native interface",
+            rounds=repeats,
+            outside_speed=outside,
+            worker_speed=worker,
+            ratio=outside / worker,
+            equal=len(said) == 1,
+        )
+    ]
+
+
+_ESTIMATORS: dict[str, dict[str, Any]] = {
+    "outside": {
+        "type": "Process",
+        "command": [sys.executable, "-m", "bench.outside", "track"],
+        "environment": WORKER_ENVIRONMENT,
+        "timeout": 120,
+    },
+    "worker": {"type": "VisualOdometry"},
+}
+
+
+def _fly(seconds: float, estimator: dict[str, Any]) -> Summary:
+    run = {"duration": seconds, "log": "error", "stall": 1}
+    camera = {"name": "camera", "rate": 30, "noise": 2.0, "depth_noise": 0.0015}
+    nodes = [
+        {"name": "pilot", "type": "bench.lockstep:Pilot"},
+        {"name": "drone", "type": "Multirotor", "cameras": [camera]},
+        {"name": "odometry", "latency": "15ms", **estimator},
+    ]
+    return execute(parse({"run": run, "nodes": nodes}, "bench held"))
+
+
+def track() -> None:
+    """Track every frame until the run ends."""
+    with Link("odometry") as link:
+        info = msgspec.convert(link.description["cameras"][0]["info"], CameraInfo)
+        tracker = make_tracker(VisualOdometryConfig(), info)
+        link.ready()
+        for frame in link:
+            images = frame.image("rgb8"), frame.image("depth32f")
+            found = tracker.track(frame.stamp, *images)
+            if found.lost:
+                link.lost(frame, found.points)
+            else:
+                link.pose(frame, found.pose, points=found.points, inliers=found.inliers)
+
+
+def answer() -> None:
+    """Answer every frame until the run ends."""
+    with Link("bench") as link:
+        link.ready()
+        for frame in link:
+            link.done(frame)
+
+
+if __name__ == "__main__":
+    {"answer": answer, "track": track}[sys.argv[1]]()
