@@ -127,7 +127,7 @@ def set_(
     digest and its recordings have it. "python -m runtime nodes" says which settings can change.
     """
     from runtime.tools.monitor.client import ask, find
-    from runtime.tools.monitor.command import Set
+    from runtime.tools.monitor.protocol import Set
 
     found = find(run)
     print(f"run {found.stem.rpartition('-')[0]}: {ask(found, Set(text=change))}")

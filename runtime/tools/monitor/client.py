@@ -1,8 +1,7 @@
-"""A client of a run's monitor: snapshots in, commands out.
+"""A client of a run's monitor, snapshots in and commands out, and how clients find each other.
 
-Where runs listen: each at a Unix socket, in a folder that only its user can enter.
-
-The part of HTTP that a page on this machine needs: a request, a response, server-sent events.
+Runs listen each at a Unix socket, in a folder that only its user can enter. The page listens on
+this machine, and needs only a part of HTTP: a request, a response, server-sent events.
 
 Protocols: RFC 9112 (HTTP/1.1); "Server-sent events" in the HTML standard.
 """
@@ -21,7 +20,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from runtime.errors import CommandError, suggest
 from runtime.paths import user_folder
-from runtime.tools.monitor.command import (
+from runtime.tools.monitor.protocol import (
     LONGEST_LINE,
     UNREADABLE,
     Answer,
@@ -29,11 +28,11 @@ from runtime.tools.monitor.command import (
     CommandRequest,
     EncodedImage,
     ImageRequest,
+    Snapshot,
     WatchRequest,
     decode_from_run,
     encode,
 )
-from runtime.tools.monitor.snapshot import Snapshot
 
 ANSWER_TIMEOUT = 10.0
 """Real seconds within which a run must answer a command."""

@@ -1,52 +1,209 @@
 """Makes snapshots of a run, its log's last records included, and carries commands out.
 
-All of it happens on the run's loop.
-
-The newest image of a camera as a small JPEG, made in a thread and only when a page asks.
+All of it happens on the run's loop. While somebody watches, an instrument measures how much of the
+loop nodes take, and how old events are; figures are those of the last second or so, which are
+steadier than those of one interval.
 """
 
 from __future__ import annotations
 
-import asyncio
 import collections
 import itertools
 import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 
-from events import Image
+from events import Event, Image
+from runtime.channels.sender import Sender
 from runtime.config.model import Config
 from runtime.config.parameters import settings
 from runtime.errors import CommandError, suggest
 from runtime.node import NodeConfig, senders, streams
+from runtime.run.instruments import Call, Instrument
 from runtime.run.node_runner import NodeRunner
 from runtime.run.summarise import count_drops
 from runtime.run.supervisor import Supervisor
+from runtime.time.clock import Clock
 from runtime.time.schedule import SECOND
-from runtime.tools.monitor.command import Command, Pause, Restart, Resume, Set, Speed, Step, Stop
-from runtime.tools.monitor.snapshot import (
+from runtime.tools.monitor.protocol import (
     ClockState,
-    InputState,
-    LinkState,
+    Command,
     LogLine,
-    Meter,
-    NodeCondition,
-    NodeState,
-    OutputState,
-    RecentSamples,
-    Sample,
+    Pause,
+    Restart,
+    Resume,
+    Rows,
+    Set,
     Snapshot,
-    TickState,
+    Speed,
+    Step,
+    Stop,
 )
 
-KEPT = 100
+KEPT = 5
+"""How many intervals between snapshots figures cover."""
+
+
+class Amount(NamedTuple):
+    """Durations of one node or output, added up.
+
+    Attributes:
+        times: How many they are.
+        total: Their sum, nanoseconds.
+        longest: The longest, nanoseconds.
+    """
+
+    times: int = 0
+    total: int = 0
+    longest: int = 0
+
+
+class Sample(NamedTuple):
+    """Counters at one snapshot.
+
+    Attributes:
+        real: Seconds of `time.perf_counter`.
+        run: Nanoseconds of the run's clock.
+        sent: Events sent since the run began, by output.
+        nodes: Time that each node took of the loop since the sample before.
+        outputs: Times from stamp to delivery since then.
+    """
+
+    real: float
+    run: int
+    sent: Mapping[str, int]
+    nodes: Mapping[str, Amount]
+    outputs: Mapping[str, Amount]
+
+
+class RecentSamples:
+    """The last samples.
+
+    Args:
+        first: Only its times and its count of sent events are used.
+    """
+
+    def __init__(self, first: Sample) -> None:
+        self._samples = collections.deque([first], maxlen=KEPT + 1)
+
+    def add(self, sample: Sample) -> None:
+        """Add a sample and forget the oldest."""
+        self._samples.append(sample)
+
+    @property
+    def real(self) -> float:
+        """Real seconds that the samples span."""
+        return max(self._samples[-1].real - self._samples[0].real, 1e-9)
+
+    @property
+    def run(self) -> float:
+        """Seconds of the run's clock that the samples span."""
+        return (self._samples[-1].run - self._samples[0].run) / SECOND
+
+    def rate(self, output: str) -> float:
+        """Return how many events an output sent per second of the run's clock."""
+        sent = self._samples[-1].sent.get(output, 0) - self._samples[0].sent.get(output, 0)
+        return sent / self.run if self.run > 0 else 0.0
+
+    def node(self, name: str) -> Amount:
+        """Return how much of the loop's time a node took."""
+        return _added(sample.nodes.get(name) for sample in [*self._samples][1:])
+
+    def output(self, name: str) -> Amount:
+        """Return the times from the stamps of an output's events to their delivery."""
+        return _added(sample.outputs.get(name) for sample in [*self._samples][1:])
+
+
+def _added(amounts: Iterable[Amount | None]) -> Amount:
+    known = [amount for amount in amounts if amount is not None]
+    return Amount(
+        sum(amount.times for amount in known),
+        sum(amount.total for amount in known),
+        max((amount.longest for amount in known), default=0),
+    )
+
+
+class DurationSum:
+    """Durations since the last snapshot, nanoseconds."""
+
+    __slots__ = ("count", "last", "longest", "total")
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.total = 0
+        self.longest = 0
+        self.last = 0
+        """When the last one ended, on the run's clock (ns); of outputs only."""
+
+    def take(self) -> Amount:
+        """Return the sum, and start again from zero."""
+        amount = Amount(self.count, self.total, self.longest)
+        self.count = self.total = self.longest = 0
+        return amount
+
+
+class Meter(Instrument):
+    """An instrument that adds up durations, and keeps the newest images.
+
+    Attributes:
+        nodes: Time each node took of the loop, by name, without the calls of other nodes in it.
+        outputs: Times from stamp to delivery of each output's events, by ``node.port``.
+        images: The newest image of each camera, by ``node.port: source``.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self.nodes: dict[str, DurationSum] = {}
+        self.outputs: dict[str, DurationSum] = {}
+        self.images: dict[str, Image] = {}
+        self._clock = clock
+        self._inner = [0]
+        """Nanoseconds that the steps within the one that runs have taken."""
+        self.event_sent = self._tap
+
+    def wrap_call(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
+        """Return a function that calls `call` and adds up how long it takes."""
+        inner, time_ns = self._inner, time.perf_counter_ns
+        steps = self.nodes.setdefault(node, DurationSum())
+
+        def metering(argument: Any) -> Any:
+            outer = inner[0]
+            inner[0] = 0
+            begin = time_ns()
+            try:
+                return call(argument)
+            finally:
+                took = time_ns() - begin
+                own = took - inner[0]
+                inner[0] = outer + took
+                steps.total += own
+                steps.count += 1
+                if own > steps.longest:
+                    steps.longest = own
+
+        return metering
+
+    def _tap(self, sender: Sender[Any] | None, event: Event) -> None:
+        name = "run.announced" if sender is None else sender.name
+        flow = self.outputs.get(name)
+        if flow is None:
+            flow = self.outputs[name] = DurationSum()
+        now = self._clock.now()
+        latency = now - event.stamp
+        flow.count += 1
+        flow.total += latency
+        flow.last = now
+        if latency > flow.longest:
+            flow.longest = latency
+        if isinstance(event, Image):
+            self.images[f"{name}: {event.source}"] = event
+
+
+RECORDS = 100
 
 
 class LastRecords(logging.Handler):
@@ -54,7 +211,7 @@ class LastRecords(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self._lines: collections.deque[LogLine] = collections.deque(maxlen=KEPT)
+        self._lines: collections.deque[LogLine] = collections.deque(maxlen=RECORDS)
         self._numbers = itertools.count()
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -125,33 +282,7 @@ class Observer:
                 paused=self._supervisor.stepping.state != "running",
                 fixed=self._supervisor.stepping.fixed(),
             ),
-            nodes=[self._node(runner) for runner in state.runners.values()],
-            outputs=self._outputs(sample),
-            inputs=[
-                InputState(
-                    name=stream.name,
-                    buffered=stream.statistics().buffered,
-                    peak=found.peak,
-                    bound=found.bound,
-                    dropped=found.dropped,
-                )
-                for stream, found in self._inputs()
-            ],
-            links=[
-                LinkState(name=link.name, lost=link.lost, thinned=link.thinned)
-                for link in state.links.values()
-            ],
-            ticks=[
-                TickState(
-                    name=name,
-                    hz=ticker.hz,
-                    calls=ticker.calls,
-                    missed=ticker.missed,
-                    late_p99_us=ticker.late.quantile(0.99) / 1e3,
-                    late_max_us=ticker.late.maximum / 1e3,
-                )
-                for name, ticker in state.tickers.items()
-            ],
+            tables=self._tables(sample),
             cameras=sorted(self._meter.images) if self._meter is not None else [],
             log=self._records.lines(),
         )
@@ -184,18 +315,43 @@ class Observer:
             {} if meter is None else {name: sum_.take() for name, sum_ in meter.outputs.items()},
         )
 
-    def _node(self, runner: NodeRunner) -> NodeState:
+    def _tables(self, sample: Sample) -> dict[str, Rows]:
+        state, runners = self._state, self._state.runners
+        return {
+            "nodes": [self._node(runner) for runner in runners.values()],
+            "outputs": self._outputs(sample),
+            "inputs": self._inputs(),
+            "links": [
+                (link.name, f"{link.lost}", f"{link.thinned}") for link in state.links.values()
+            ],
+            "ticks": [
+                (
+                    name,
+                    f"{ticker.hz:g}",
+                    f"{ticker.calls}",
+                    f"{ticker.missed}",
+                    f"{ticker.late.quantile(0.99) / 1e3:.0f}",
+                    f"{ticker.late.maximum / 1e3:.0f}",
+                )
+                for name, ticker in state.tickers.items()
+            ],
+            "settings": [
+                (f"{name}.{key}", value)
+                for name, runner in runners.items()
+                for key, value in self._shown(runner).items()
+            ],
+        }
+
+    def _node(self, runner: NodeRunner) -> tuple[str, ...]:
         steps, real = self._recent.node(runner.spec.name), self._recent.real
-        return NodeState(
-            name=runner.spec.name,
-            type=runner.spec.type_name,
-            condition=self._condition(runner),
-            failures=runner.failures,
-            share=steps.total / 1e9 / real,
-            steps=steps.times / real,
-            longest_ms=steps.longest / 1e6,
-            calls=sum(worker.outstanding() for worker in runner.workers),
-            settings=self._shown(runner),
+        calls = sum(worker.outstanding() for worker in runner.workers)
+        return (
+            runner.spec.name,
+            self._condition(runner) + (f" ({runner.failures})" if runner.failures else ""),
+            f"{steps.total / 1e9 / real:.1%}",
+            f"{steps.times / real:.0f}",
+            f"{steps.longest / 1e6:.2f}",
+            f"{calls}" if calls else "",
         )
 
     def _shown(self, runner: NodeRunner) -> dict[str, str]:
@@ -205,7 +361,7 @@ class Observer:
             known = self._settings[runner.spec.name] = config, settings(config)
         return known[1]
 
-    def _condition(self, runner: NodeRunner) -> NodeCondition:
+    def _condition(self, runner: NodeRunner) -> str:
         if runner.restarting:
             return "left out" if runner.spec.on_error == "drop" else "restarting"
         if self._state.reason and not runner.started:
@@ -216,37 +372,38 @@ class Observer:
             return "starting"
         return "running" if self._state.running else "ready"
 
-    def _outputs(self, sample: Sample) -> list[OutputState]:
+    def _outputs(self, sample: Sample) -> Rows:
         events = {
             sender.name: sender.event.__name__
             for node in self._state.all_nodes
             for sender in senders(node).values()
         }
         last = self._meter.outputs if self._meter is not None else {}
-        found = []
+        found: Rows = []
         for name, event in events.items():
             flow = self._recent.output(name)
             found.append(
-                OutputState(
-                    name=name,
-                    event=event,
-                    count=sample.sent[name],
-                    rate=self._recent.rate(name),
-                    age=(sample.run - last[name].last) / SECOND if name in last else None,
-                    latency_ms=flow.total / flow.times / 1e6 if flow.times else None,
-                    latency_max_ms=flow.longest / 1e6 if flow.times else None,
+                (
+                    name,
+                    event,
+                    f"{sample.sent[name]}",
+                    f"{self._recent.rate(name):.1f}",
+                    f"{(sample.run - last[name].last) / SECOND:.2f}" if name in last else "",
+                    f"{flow.total / flow.times / 1e6:.2f}" if flow.times else "",
+                    f"{flow.longest / 1e6:.2f}" if flow.times else "",
                 )
             )
         return found
 
-    def _inputs(self) -> list[tuple[Any, Any]]:
+    def _inputs(self) -> Rows:
         drops = count_drops(self._state)
-        return [
-            (stream, drops[stream.name])
-            for runner in self._state.runners.values()
-            if runner.node is not None
-            for stream in streams(runner.node).values()
-        ]
+        found: Rows = []
+        for runner in self._state.runners.values():
+            for stream in streams(runner.node).values() if runner.node is not None else ():
+                of = drops[stream.name]
+                held = stream.statistics().buffered
+                found.append((stream.name, *map(str, (held, of.peak, of.bound, of.dropped))))
+        return found
 
     # Commands.
 
@@ -296,55 +453,3 @@ def describe(command: Command) -> str:
     """Return a command as text, for the log."""
     words = [str(v) for v in msgspec.structs.astuple(command) if v is not None]
     return " ".join([type(command).__name__.lower(), *words])
-
-
-MAX_SIDE = 480
-"""Pixels of an encoded image's longer side at most."""
-
-PERIOD = 0.25
-"""Real seconds between two encoded images of a camera at least, however many pages ask."""
-
-QUALITY = 75
-"""Quality of the JPEG, of 100."""
-
-
-class ImageEncoder:
-    """Encodes images beside the run's loop, at most one per camera and `PERIOD`."""
-
-    def __init__(self) -> None:
-        self._encoded: dict[str, tuple[float, bytes]] = {}
-        self._lock = asyncio.Lock()
-
-    async def encode(self, camera: str, newest: Callable[[], Awaitable[Image]]) -> bytes:
-        """Return the JPEG of a camera's newest image.
-
-        Args:
-            newest: Gets its newest image; not called if the last JPEG is younger than `PERIOD`.
-        """
-        async with self._lock:
-            now = time.monotonic()
-            made, jpeg = self._encoded.get(camera, (-np.inf, b""))
-            if now - made >= PERIOD:
-                image = await newest()
-                jpeg = await asyncio.to_thread(small_jpeg, image.data)
-                self._encoded[camera] = now, jpeg
-            return jpeg
-
-
-def small_jpeg(data: npt.NDArray[np.uint8]) -> bytes:
-    """Return an image as JPEG, made smaller where a side is longer than `MAX_SIDE` pixels.
-
-    Args:
-        data: Pixels, shape (height, width, 3) in RGB, or (height, width) in grey.
-    """
-    import cv2  # not before somebody asks for an image
-
-    pixels: Any = data
-    height, width = data.shape[:2]
-    scale = MAX_SIDE / max(height, width)
-    if scale < 1.0:
-        size = max(round(width * scale), 1), max(round(height * scale), 1)
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    if data.ndim == 3:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()

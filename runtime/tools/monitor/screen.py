@@ -1,14 +1,12 @@
 """The monitor in a terminal, with Textual.
 
-The only module that imports it; what is shown comes from `runtime.tools.monitor.screen`.
-
-A snapshot as rows of text, the same in a terminal and on a page.
+The only module that imports it.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from typing import Any, ClassVar, Protocol
 
 import msgspec
@@ -16,153 +14,25 @@ from rich.text import Text
 
 from runtime.errors import MissingDependencyError, VisnavError
 from runtime.extras import install_command
-from runtime.tools.monitor.command import (
+from runtime.tools.monitor.protocol import (
+    COLUMNS,
+    LEFT,
     QUICKEST,
+    RIGHT,
     SLOWEST,
     Answer,
     Command,
+    LogLine,
     Pause,
     Restart,
     Resume,
     Set,
+    Snapshot,
     Speed,
     Step,
     Stop,
+    is_number,
 )
-from runtime.tools.monitor.snapshot import ClockState, LogLine, Snapshot
-
-Rows = list[tuple[str, ...]]
-
-COLUMNS: dict[str, tuple[str, ...]] = {
-    "nodes": ("node", "condition", "loop", "steps/s", "longest ms", "calls"),
-    "outputs": ("output", "event", "sent", "per s", "age s", "latency ms", "max"),
-    "inputs": ("input", "holds", "fullest", "of", "dropped"),
-    "links": ("link", "lost", "thinned"),
-    "ticks": ("tick", "Hz", "calls", "missed", "late p99 µs", "max µs"),
-    "settings": ("setting that can change", "value"),
-}
-"""Titles of columns, by table."""
-
-LEFT, RIGHT = ("nodes", "ticks", "inputs", "links"), ("outputs", "settings")
-"""Tables in the left and in the right column."""
-
-_WORDS = {"condition", "event", "value"}
-"""Columns of text; all others but the first hold numbers."""
-
-
-def is_number(table: str, column: int) -> bool:
-    """Tell whether a column holds numbers, which are aligned right."""
-    return column > 0 and COLUMNS[table][column] not in _WORDS
-
-
-def rows(table: str, snapshot: Snapshot) -> Rows:
-    """Return the rows of a table; the first column of each is unique."""
-    return _TABLES[table](snapshot)
-
-
-def headline(snapshot: Snapshot) -> str:
-    """Return time, speed and condition of the run, as a line."""
-    clock = snapshot.clock
-    limit = f" of {clock.duration:g}" if clock.duration else ""
-    return f"{snapshot.run}   {clock.now:.3f}{limit} s   {pace(clock)}   {condition(snapshot)}"
-
-
-def condition(snapshot: Snapshot) -> str:
-    """Return whether the run goes on, is paused or ends."""
-    if snapshot.ended:
-        return f"ends: {snapshot.ended}"
-    return "paused" if snapshot.clock.paused else "runs"
-
-
-def pace(clock: ClockState) -> str:
-    """Return the speed of time, and the speed that was asked for."""
-    speed = f"{clock.speed:.2f} × real time"
-    if clock.kind == "real":
-        return f"{speed} (real)"
-    target = clock.target_speed
-    return f"{speed} ({'as fast as it can' if target is None else f'asked: {target:g}'})"
-
-
-def aim(clock: ClockState) -> float:
-    """Return the speed that faster and slower start from: the one asked for, or the present one."""
-    return clock.target_speed if clock.target_speed is not None else max(round(clock.speed, 1), 1.0)
-
-
-def _nodes(snapshot: Snapshot) -> Rows:
-    return [
-        (
-            node.name,
-            node.condition + (f" ({node.failures})" if node.failures else ""),
-            f"{node.share:.1%}",
-            f"{node.steps:.0f}",
-            f"{node.longest_ms:.2f}",
-            f"{node.calls}" if node.calls else "",
-        )
-        for node in snapshot.nodes
-    ]
-
-
-def _outputs(snapshot: Snapshot) -> Rows:
-    return [
-        (
-            out.name,
-            out.event,
-            f"{out.count}",
-            f"{out.rate:.1f}",
-            _number(out.age, ".2f"),
-            _number(out.latency_ms, ".2f"),
-            _number(out.latency_max_ms, ".2f"),
-        )
-        for out in snapshot.outputs
-    ]
-
-
-def _inputs(snapshot: Snapshot) -> Rows:
-    return [
-        (each.name, f"{each.buffered}", f"{each.peak}", f"{each.bound}", f"{each.dropped}")
-        for each in snapshot.inputs
-    ]
-
-
-def _links(snapshot: Snapshot) -> Rows:
-    return [(link.name, f"{link.lost}", f"{link.thinned}") for link in snapshot.links]
-
-
-def _ticks(snapshot: Snapshot) -> Rows:
-    return [
-        (
-            tick.name,
-            f"{tick.hz:g}",
-            f"{tick.calls}",
-            f"{tick.missed}",
-            f"{tick.late_p99_us:.0f}",
-            f"{tick.late_max_us:.0f}",
-        )
-        for tick in snapshot.ticks
-    ]
-
-
-def _settings(snapshot: Snapshot) -> Rows:
-    return [
-        (f"{node.name}.{key}", value)
-        for node in snapshot.nodes
-        for key, value in node.settings.items()
-    ]
-
-
-def _number(value: float | None, form: str) -> str:
-    return "" if value is None else format(value, form)
-
-
-_TABLES: dict[str, Callable[[Snapshot], Rows]] = {
-    "nodes": _nodes,
-    "outputs": _outputs,
-    "inputs": _inputs,
-    "links": _links,
-    "ticks": _ticks,
-    "settings": _settings,
-}
-
 
 try:
     from textual.app import App, ComposeResult
@@ -275,7 +145,7 @@ class Screen(App[str]):
     def show(self, snapshot: Snapshot) -> None:
         """Show a snapshot."""
         self.snapshot = snapshot
-        self.query_one("#head", Static).update(Text(headline(snapshot)))
+        self.query_one("#head", Static).update(Text(snapshot.headline))
         for name in COLUMNS:
             self._fill(name, snapshot)
         log = self.query_one("#log", RichLog)
@@ -287,7 +157,7 @@ class Screen(App[str]):
     def _fill(self, name: str, snapshot: Snapshot) -> None:
         """Update a table's rows in place, so that the cursor stays."""
         table: DataTable[Text] = self.query_one(f"#{name}", DataTable)
-        found = rows(name, snapshot)
+        found = snapshot.tables[name]
         table.set_class(not found, "none")
         if [row[0] for row in found] != [key.value for key in table.rows]:
             table.clear()
@@ -330,7 +200,7 @@ class Screen(App[str]):
     def action_speed(self, factor: float) -> None:
         """Multiply the speed of time."""
         if self.snapshot is not None:
-            asked = min(max(aim(self.snapshot.clock) * factor, SLOWEST), QUICKEST)
+            asked = min(max(self.snapshot.clock.aim * factor, SLOWEST), QUICKEST)
             self._ask(Speed(factor=asked))
             self._expect(target_speed=asked)
 
@@ -363,7 +233,7 @@ class Screen(App[str]):
         """Ask for a setting of the node under the cursor."""
         if self.snapshot is None:
             return
-        known = ["=".join(row) for row in rows("settings", self.snapshot)]
+        known = ["=".join(row) for row in self.snapshot.tables["settings"]]
         prompt = self.query_one("#prompt", Input)
         prompt.suggester = SuggestFromList(known)
         mine = [text for text in known if text.startswith(f"{self._selected_node()}.")]

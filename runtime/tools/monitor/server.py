@@ -2,7 +2,7 @@
 
 The run's loop does nothing but make a snapshot or carry a command out, when the thread asks it to;
 the thread encodes and sends, and keeps the rhythm, because time on the run's loop may be simulated.
-Images are encoded in another thread.
+Images are made small JPEGs in another thread, and only when a page asks.
 """
 
 from __future__ import annotations
@@ -13,13 +13,19 @@ import contextlib
 import logging
 import socket
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
+import numpy.typing as npt
+
+from events import Image
 from runtime.errors import CommandError, VisnavError
 from runtime.tools.monitor.client import socket_of
-from runtime.tools.monitor.command import (
+from runtime.tools.monitor.observer import Observer, describe
+from runtime.tools.monitor.protocol import (
     LONGEST_COMMAND,
     UNREADABLE,
     Answer,
@@ -31,7 +37,6 @@ from runtime.tools.monitor.command import (
     decode_from_client,
     encode,
 )
-from runtime.tools.monitor.observer import ImageEncoder, Observer, describe
 
 R = TypeVar("R")
 
@@ -48,6 +53,58 @@ _LISTEN_TIMEOUT = 5.0
 
 MAX_BACKLOG = 1 << 20
 """Bytes that may wait for one client; a slower one misses snapshots."""
+
+
+MAX_SIDE = 480
+"""Pixels of an encoded image's longer side at most."""
+
+IMAGE_PERIOD = 0.25
+"""Real seconds between two encoded images of a camera at least, however many pages ask."""
+
+QUALITY = 75
+"""Quality of the JPEG, of 100."""
+
+
+class ImageEncoder:
+    """Encodes images beside the run's loop, at most one per camera and `IMAGE_PERIOD`."""
+
+    def __init__(self) -> None:
+        self._encoded: dict[str, tuple[float, bytes]] = {}
+        self._lock = asyncio.Lock()
+
+    async def encode(self, camera: str, newest: Callable[[], Awaitable[Image]]) -> bytes:
+        """Return the JPEG of a camera's newest image.
+
+        Args:
+            newest: Gets its newest image; not called if the last JPEG is young enough.
+        """
+        async with self._lock:
+            now = time.monotonic()
+            made, jpeg = self._encoded.get(camera, (-np.inf, b""))
+            if now - made >= IMAGE_PERIOD:
+                image = await newest()
+                jpeg = await asyncio.to_thread(small_jpeg, image.data)
+                self._encoded[camera] = now, jpeg
+            return jpeg
+
+
+def small_jpeg(data: npt.NDArray[np.uint8]) -> bytes:
+    """Return an image as JPEG, made smaller where a side is longer than `MAX_SIDE` pixels.
+
+    Args:
+        data: Pixels, shape (height, width, 3) in RGB, or (height, width) in grey.
+    """
+    import cv2  # not before somebody asks for an image
+
+    pixels: Any = data
+    height, width = data.shape[:2]
+    scale = MAX_SIDE / max(height, width)
+    if scale < 1.0:
+        size = max(round(width * scale), 1), max(round(height * scale), 1)
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    if data.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
 
 class Server:

@@ -30,16 +30,19 @@ from runtime.tools.monitor.client import (
     response,
     server_sent,
 )
-from runtime.tools.monitor.command import (
+from runtime.tools.monitor.protocol import (
+    COLUMNS,
+    LEFT,
     QUICKEST,
+    RIGHT,
     SLOWEST,
     UNREADABLE,
     Answer,
+    Snapshot,
     decode_command,
     encode,
+    is_number,
 )
-from runtime.tools.monitor.screen import COLUMNS, LEFT, RIGHT, aim, headline, is_number, rows
-from runtime.tools.monitor.snapshot import Snapshot
 
 TOKEN_HEADER = "x-token"  # noqa: S105  # the header's name, not a secret
 _HOSTS = {"127.0.0.1", "localhost"}
@@ -190,12 +193,12 @@ class Page:
 def page_data(snapshot: Snapshot) -> dict[str, Any]:
     """Return what the page shows of a snapshot."""
     return {
-        "headline": headline(snapshot),
+        "headline": snapshot.headline,
         "paused": snapshot.clock.paused,
-        "speed": aim(snapshot.clock),
+        "speed": snapshot.clock.aim,
         "fixed": snapshot.clock.fixed,
         "cameras": snapshot.cameras,
-        "tables": {name: rows(name, snapshot) for name in COLUMNS},
+        "tables": snapshot.tables,
         "log": [msgspec.to_builtins(line) for line in snapshot.log],
     }
 

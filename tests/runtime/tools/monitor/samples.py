@@ -9,17 +9,7 @@ from typing import Any
 import msgspec
 
 from runtime.errors import CommandError
-from runtime.tools.monitor.command import Answer, Command
-from runtime.tools.monitor.snapshot import (
-    ClockState,
-    InputState,
-    LinkState,
-    LogLine,
-    NodeState,
-    OutputState,
-    Snapshot,
-    TickState,
-)
+from runtime.tools.monitor.protocol import Answer, ClockState, Command, LogLine, Snapshot
 
 
 def snapshot(**changes: Any) -> Snapshot:
@@ -34,44 +24,23 @@ def snapshot(**changes: Any) -> Snapshot:
         fixed="",
     )
     of_clock = {k.removeprefix("clock_"): v for k, v in changes.items() if k.startswith("clock_")}
-    common: dict[str, Any] = {"failures": 0, "share": 0.25, "steps": 400.0, "longest_ms": 1.25}
     found = Snapshot(
         run="sample",
         pid=1,
         number=1,
         ended="",
         clock=msgspec.structs.replace(clock, **of_clock),
-        nodes=[
-            NodeState(
-                name="drone", type="m:D", condition="running", calls=2, settings={}, **common
-            ),
-            NodeState(
-                name="pilot",
-                type="m:P",
-                condition="running",
-                calls=0,
-                settings={"gain": "1.0", "patience": "0.5"},
-                **common,
-            ),
-        ],
-        outputs=[
-            OutputState(
-                name="drone.images",
-                event="Image",
-                count=45,
-                rate=30.0,
-                age=0.02,
-                latency_ms=40.0,
-                latency_max_ms=41.5,
-            )
-        ],
-        inputs=[InputState(name="vo.images", buffered=1, peak=1, bound=1, dropped=7)],
-        links=[LinkState(name="pilot.fly", lost=3, thinned=0)],
-        ticks=[
-            TickState(
-                name="drone.control", hz=400, calls=600, missed=0, late_p99_us=12, late_max_us=90
-            )
-        ],
+        tables={
+            "nodes": [
+                ("drone", "running", "25.0%", "400", "1.25", "2"),
+                ("pilot", "running", "25.0%", "400", "1.25", ""),
+            ],
+            "outputs": [("drone.images", "Image", "45", "30.0", "0.02", "40.00", "41.50")],
+            "inputs": [("vo.images", "1", "1", "1", "7")],
+            "links": [("pilot.fly", "3", "0")],
+            "ticks": [("drone.control", "400", "600", "0", "12", "90")],
+            "settings": [("pilot.gain", "1.0"), ("pilot.patience", "0.5")],
+        },
         cameras=["drone.images: drone/front"],
         log=[
             LogLine(number=0, seconds=0.5, level="WARNING", logger_name="pilot", text="[b]wind[/b]")

@@ -12,8 +12,9 @@ import pytest
 from events import Image
 from runtime.errors import VisnavError
 from runtime.run.supervisor import Supervisor
-from runtime.tools.monitor import observer as images
-from runtime.tools.monitor.observer import MAX_SIDE, ImageEncoder, Observer, small_jpeg
+from runtime.tools.monitor import server as images
+from runtime.tools.monitor.observer import Observer
+from runtime.tools.monitor.server import MAX_SIDE, ImageEncoder, small_jpeg
 from tests.runtime.tools.monitor.test_observer import observe
 
 CAMERA = "drone.images: drone/front"
@@ -57,7 +58,7 @@ async def test_images_are_encoded_in_a_thread_and_no_oftener_than_said(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = 100.0
-    monkeypatch.setattr("runtime.tools.monitor.observer.time.monotonic", lambda: now)
+    monkeypatch.setattr("runtime.tools.monitor.server.time.monotonic", lambda: now)
     threads: list[threading.Thread] = []
     encode = small_jpeg
 
@@ -78,7 +79,7 @@ async def test_images_are_encoded_in_a_thread_and_no_oftener_than_said(
     assert asked == [0]
     await encoder.encode("b", newest)
     assert asked == [0, 50]
-    now += images.PERIOD
+    now += images.IMAGE_PERIOD
     assert decoded(await encoder.encode("a", newest)).mean() == pytest.approx(100, abs=3)
     assert len(threads) == 3
     assert threading.main_thread() not in threads

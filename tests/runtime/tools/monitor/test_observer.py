@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import types
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -12,9 +13,28 @@ from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
-from runtime.tools.monitor.command import Pause, Restart, Set, Speed, Step, Stop
-from runtime.tools.monitor.observer import LastRecords, Observer, describe
-from runtime.tools.monitor.snapshot import Snapshot
+from runtime.time.lockstep import LockstepClock, LockstepLoop
+from runtime.tools.monitor import observer
+from runtime.tools.monitor.observer import (
+    KEPT,
+    Amount,
+    LastRecords,
+    Meter,
+    Observer,
+    RecentSamples,
+    Sample,
+    describe,
+)
+from runtime.tools.monitor.protocol import (
+    COLUMNS,
+    Pause,
+    Restart,
+    Set,
+    Snapshot,
+    Speed,
+    Step,
+    Stop,
+)
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
 
 NODES = [
@@ -34,12 +54,11 @@ def observe(script: Script, **options: Any) -> Looked:
     return look(NODES, body, **options)
 
 
-def node(snapshot: Snapshot, name: str) -> Any:
-    return next(n for n in snapshot.nodes if n.name == name)
-
-
-def output(snapshot: Snapshot, name: str) -> Any:
-    return next(o for o in snapshot.outputs if o.name == name)
+def row(snapshot: Snapshot, table: str, name: str) -> dict[str, str]:
+    """Return the cells of a row by the titles of its table's columns."""
+    assert {len(each) for each in snapshot.tables[table]} == {len(COLUMNS[table])}
+    cells = {each[0]: each for each in snapshot.tables[table]}[name]
+    return dict(zip(COLUMNS[table], cells, strict=True))
 
 
 def test_a_snapshot_tells_what_there_was_lately() -> None:
@@ -55,20 +74,18 @@ def test_a_snapshot_tells_what_there_was_lately() -> None:
     first, second = taken
     assert (first.number, second.number) == (1, 2)
     assert (first.run, first.clock.kind, first.clock.now) == ("sample", "lockstep", 0.35)
-    images = output(second, "drone.images")
-    assert (images.event, images.count) == ("Image", 7)
-    assert images.rate == pytest.approx(10.0)
-    assert images.age == pytest.approx(0.08)
-    assert (images.latency_ms, images.latency_max_ms) == (20.0, 20.0)
-    assert output(second, "vo.estimates").latency_ms == 30.0
-    drone = node(second, "drone")
-    assert drone.condition == "running"
-    assert 0 < drone.share < 1
-    assert 0 < drone.longest_ms < 1000
-    assert node(second, "pilot").settings == {"gain": "1.0"}
-    assert [(i.name, i.bound) for i in second.inputs] == [("vo.images", 1)]
-    assert [(each.name, each.lost) for each in second.links] == [("pilot.fly", 7)]
-    assert [(t.name, t.hz) for t in second.ticks] == [("drone.expose", 10.0)]
+    assert second.tables.keys() == COLUMNS.keys()
+    images = ("drone.images", "Image", "7", "10.0", "0.08", "20.00", "20.00")
+    assert tuple(row(second, "outputs", "drone.images").values()) == images
+    assert row(second, "outputs", "vo.estimates")["latency ms"] == "30.00"
+    drone = row(second, "nodes", "drone")
+    assert drone["condition"] == "running"
+    assert 0 <= float(drone["loop"].rstrip("%")) < 100
+    assert 0 < float(drone["longest ms"]) < 1000
+    assert second.tables["settings"] == [("pilot.gain", "1.0")]
+    assert row(second, "inputs", "vo.images")["of"] == "1"
+    assert second.tables["links"] == [("pilot.fly", "7", "0")]
+    assert row(second, "ticks", "drone.expose")["Hz"] == "10"
 
 
 def test_nobody_is_measured_before_the_beginning_and_after_the_end() -> None:
@@ -82,9 +99,9 @@ def test_nobody_is_measured_before_the_beginning_and_after_the_end() -> None:
         await supervisor.state.clock.sleep(0.2)
         after = observer.take()
         for snapshot in (before, after):
-            assert node(snapshot, "drone").steps == 0
-            assert output(snapshot, "drone.images").latency_ms is None
-        assert output(after, "drone.images").count == 6
+            assert row(snapshot, "nodes", "drone")["steps/s"] == "0"
+            assert row(snapshot, "outputs", "drone.images")["latency ms"] == ""
+        assert row(after, "outputs", "drone.images")["sent"] == "6"
 
     observe(script)
 
@@ -106,14 +123,13 @@ def test_a_node_is_restarted_once_at_a_time() -> None:
         await supervisor.state.clock.sleep(0.1)
         assert observer.execute(Restart(node="vo")) == "vo restarts"
         await supervisor.state.clock.sleep(0.1)
-        assert node(observer.take(), "vo").condition == "restarting"
+        assert row(observer.take(), "nodes", "vo")["condition"].startswith("restarting")
         with pytest.raises(VisnavError, match="expected a node that runs, and vo is restarting"):
             observer.execute(Restart(node="vo"))
         with pytest.raises(VisnavError, match="found 'v0'"):
             observer.execute(Restart(node="v0"))
         await supervisor.state.clock.sleep(0.5)
-        found = node(observer.take(), "vo")
-        assert (found.condition, found.failures) == ("running", 1)
+        assert row(observer.take(), "nodes", "vo")["condition"] == "running (1)"
 
     observe(script)
 
@@ -162,3 +178,69 @@ def test_real_time_takes_no_orders(command: Any) -> None:
         assert "sensors do not wait" in observer.take().clock.fixed
 
     observe(script, clock="real", duration=0.02)
+
+
+def sample(n: int) -> Sample:
+    """Return what is known at the n-th fifth of a second: time goes twice as fast as real time."""
+    return Sample(
+        n / 5,
+        n * 10**9 * 2 // 5,
+        {"a.out": n * n},
+        {"a": Amount(1, 10 * n, 10 * n)},
+        {"a.out": Amount(2, n, n)},
+    )
+
+
+def test_it_spans_the_last_samples_and_adds_up_what_lies_between() -> None:
+    recent = RecentSamples(sample(0))
+    for n in range(1, 11):
+        recent.add(sample(n))
+    assert KEPT == 5
+    assert recent.real == pytest.approx(1.0)
+    assert recent.run == 2.0
+    assert recent.rate("a.out") == (100 - 25) / 2
+    assert recent.node("a") == Amount(5, 10 * (6 + 7 + 8 + 9 + 10), 100)
+    assert recent.output("a.out") == Amount(10, 40, 10)
+
+
+def test_there_is_nothing_before_the_second_sample_and_of_strangers() -> None:
+    recent = RecentSamples(sample(3))
+    assert (recent.run, recent.rate("a.out"), recent.node("a")) == (0.0, 0.0, Amount())
+    recent.add(sample(4))
+    assert (recent.node("b"), recent.rate("b.out")) == (Amount(), 0.0)
+
+
+def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0]
+
+    def work(ns: int) -> None:
+        now[0] += ns
+
+    monkeypatch.setattr(observer, "time", types.SimpleNamespace(perf_counter_ns=lambda: now[0]))
+    loop = LockstepLoop()
+    try:
+        found = Meter(LockstepClock(loop))
+
+        def fail(_: Any) -> None:
+            work(5)
+            raise RuntimeError
+
+        inner = found.wrap_call("b", "hear", work)
+        failing = found.wrap_call("c", "hear", fail)
+
+        def outer(_: Any) -> None:
+            work(10)
+            inner(100)
+            inner(200)
+            with pytest.raises(RuntimeError):
+                failing(None)
+            work(20)
+
+        found.wrap_call("a", "tick", outer)(None)
+        found.wrap_call("a", "tick", work)(7)
+    finally:
+        loop.close()
+    assert found.nodes["a"].take() == Amount(2, 37, 30)
+    assert found.nodes["b"].take() == Amount(2, 300, 200)
+    assert found.nodes["c"].take() == Amount(1, 5, 5)
+    assert found.nodes["a"].take() == Amount()

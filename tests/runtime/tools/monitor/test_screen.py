@@ -12,7 +12,7 @@ from textual.pilot import Pilot
 from textual.widgets import DataTable, Input, Static
 
 from runtime.errors import CommandError
-from runtime.tools.monitor.command import (
+from runtime.tools.monitor.protocol import (
     SLOWEST,
     Answer,
     Command,
@@ -20,12 +20,12 @@ from runtime.tools.monitor.command import (
     Restart,
     Resume,
     Set,
+    Snapshot,
     Speed,
     Step,
     Stop,
 )
 from runtime.tools.monitor.screen import Screen
-from runtime.tools.monitor.snapshot import Snapshot
 from tests.runtime.tools.monitor.samples import FakeClient, snapshot
 
 
@@ -55,7 +55,7 @@ async def test_it_shows_what_there_is_and_keeps_the_cursor() -> None:
         image = screen.export_screenshot()
         for words in ("drone.images", "vo.images", "drone.control", "[b]wind[/b]", "quit"):
             assert words in image.replace("&#160;", " ")
-        stand.coming.put_nowait(snapshot(links=[]))
+        stand.coming.put_nowait(snapshot(tables=snapshot().tables | {"links": []}))
         await pilot.pause()
         assert not screen.query_one("#links").display
         assert screen.query_one("#ticks").display

@@ -18,9 +18,19 @@ from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from runtime.tools.monitor import client, server
 from runtime.tools.monitor.client import Client, ask, find, runs
-from runtime.tools.monitor.command import Answer, Command, Pause, Resume, Set, Speed, Stop, encode
 from runtime.tools.monitor.observer import LastRecords, Observer
-from runtime.tools.monitor.snapshot import LogLine, Snapshot
+from runtime.tools.monitor.protocol import (
+    Answer,
+    Command,
+    LogLine,
+    Pause,
+    Resume,
+    Set,
+    Snapshot,
+    Speed,
+    Stop,
+    encode,
+)
 from tests.runtime.samples_loop import Camera, Estimator, Looked, Pilot, look
 from tests.runtime.tools.monitor.samples import snapshot
 
@@ -73,7 +83,7 @@ def test_snapshots_come_and_commands_are_answered(clock: str) -> None:
         seen, answers = asyncio.run(attached(Set(text="pilot.gain=3"), Speed(factor=5.0)))
         numbers = [each.number for each in seen]
         assert numbers == list(range(1, len(seen) + 1))
-        assert [node.name for node in seen[0].nodes] == ["drone", "vo", "pilot"]
+        assert [node[0] for node in seen[0].tables["nodes"]] == ["drone", "vo", "pilot"]
         changed, paced = answers
         assert (changed.done, changed.text) == (True, "gain = 3.0")
         assert paced.done == (clock == "lockstep")

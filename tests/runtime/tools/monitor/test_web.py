@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from runtime.tools.monitor.command import Pause, Set
+from runtime.tools.monitor.protocol import Pause, Set
 from runtime.tools.monitor.web import Page, page_data
 from tests.runtime.tools.monitor.samples import FakeClient, snapshot
 
