@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from runtime.tools.cli.tables import Overrides
+from runtime.tools.cli.tables import Overrides, Quiet
 
 INSTALLED = Path(__file__).parents[1] / "example_files"
 CHECKOUT = Path(__file__).parents[3]
@@ -18,9 +18,7 @@ def demo(
         Path | None, typer.Option(help="Folder for results; runs/tour if not given.")
     ] = None,
     overrides: Overrides = None,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
-    ] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Fly the standard tour, and judge visual odometry on it (config.toml)."""
     from runtime.tools.cli.run import run

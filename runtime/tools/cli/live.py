@@ -1,36 +1,20 @@
-"""``top``: a monitor of a run, in a terminal.
-
-``web``: a monitor of a run, as a page in a browser.
-
-``set``: change a setting of a node while the run goes on.
-
-``trace``: latencies and loads of a trace, as tables.
-"""
+"""Commands that look at a run while it goes, or at its trace: top, web, set and trace."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
-    from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from pathlib import Path
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from rich.table import Table
     from rich.text import Text
 
     from runtime.tools.tracing.write import Trace
 
-
+DEFAULT_PORT = 8420
 Run = Annotated[str | None, typer.Argument(help="Name of the run; needed if there are several.")]
 
 
@@ -76,9 +60,6 @@ async def _show(path: Path, leave: bool) -> None:
     from runtime.tools.monitor.screen import Screen
 
     await Screen(await Client.connect(path), leave).run_async()
-
-
-DEFAULT_PORT = 8420
 
 
 def web(
@@ -167,35 +148,34 @@ def tables(found: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
     routes = paths(found)
     for number, route in enumerate(routes, 1):
         yield Text(f"path {number}: {_for(encoding, route.path)}")
-    table = Table(
-        "path", "times", "run p50 ms", "p99", "max", "real p50 ms", "p99", "max",
-        title="from sensor to set-point", title_justify="left",
-    )  # fmt: skip
+    latencies = Table(
+        *("path", "times", "run p50 ms", "p99", "max", "real p50 ms", "p99", "max"),
+        title="from sensor to set-point",
+    )
     for number, route in enumerate(routes, 1):
         figures = [
             f"{figure:.2f}"
             for each in (route.run_ms, route.real_ms)
             for figure in (quantile(each, 0.5), quantile(each, 0.99), max(each))
         ]
-        table.add_row(f"{number}", f"{len(route.run_ms)}", *figures)
-    if not table.row_count:
-        yield Text("no set-point was sent that a sensor led to")
-    else:
-        yield _right(table)
-    table = Table(
-        "node", "steps", "loop ms", "share", "longest ms", "in",
-        title="on the loop", title_justify="left",
-    )  # fmt: skip
-    for share in node_loads(found):
-        table.add_row(
-            _for(encoding, share.node),
-            f"{share.steps}",
-            f"{share.busy_ms:.1f}",
-            f"{share.share:.1%}",
-            f"{share.longest_ms:.3f}",
-            _for(encoding, share.longest),
+        latencies.add_row(f"{number}", f"{len(route.run_ms)}", *figures)
+    loads = Table("node", "steps", "loop ms", "share", "longest ms", "in", title="on the loop")
+    for load in node_loads(found):
+        loads.add_row(
+            _for(encoding, load.node),
+            f"{load.steps}",
+            f"{load.busy_ms:.1f}",
+            f"{load.share:.1%}",
+            f"{load.longest_ms:.3f}",
+            _for(encoding, load.longest),
         )
-    yield _right(table)
+    for table in (latencies, loads):
+        table.title_justify = "left"
+        for column in table.columns[1:]:
+            if column.header != "in":
+                column.justify = "right"
+    yield latencies if routes else Text("no set-point was sent that a sensor led to")
+    yield loads
 
 
 def _for(encoding: str, text: str) -> str:
@@ -206,10 +186,3 @@ def _for(encoding: str, text: str) -> str:
         text = text.replace("→", "->").replace("⇢", "~>")
         return text.encode(encoding, "replace").decode(encoding)
     return text
-
-
-def _right(table: Table) -> Table:
-    for column in table.columns[1:]:
-        if column.header != "in":
-            column.justify = "right"
-    return table

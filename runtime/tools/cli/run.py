@@ -1,27 +1,33 @@
-"""``run``: from a file to a folder of results."""
+"""``run``: from a file to a folder of results, with what observes the run meanwhile."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from runtime.tools.cli.tables import ConfigFile, Overrides, warn
+from runtime.tools.cli.tables import ConfigFile, Overrides, Quiet, warn
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from runtime.config.model import Config
+    from runtime.run.supervisor import Supervisor
     from runtime.summary import Summary, Verdict
+    from runtime.tools.monitor.observer import LastRecords
 
+Watch = Callable[["Supervisor"], contextlib.AbstractContextManager[None]]
+"""What `execute` takes as `watch`."""
 
 _STATES = {
     True: "[green]passed[/green]",
@@ -61,9 +67,7 @@ def run(
             help="Run just these nodes here; other processes, also elsewhere, run the others.",
         ),
     ] = None,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
-    ] = False,
+    quiet: Quiet = False,
     trace: Annotated[
         Path | None,
         typer.Option(help="Write a trace for ui.perfetto.dev; compressed if it ends with .gz."),
@@ -100,7 +104,6 @@ def run(
     """
     from runtime.config.reading import load_configuration
     from runtime.run.execute import execute
-    from runtime.tools.cli.observers import Observers
     from runtime.tools.twice import run_twice
 
     if "VISNAV_LIFELINE" in os.environ:
@@ -120,13 +123,13 @@ def run(
         from runtime.tools.flights.cache import recorded
 
         stand_ins = recorded(settings, record=flight == "record")
-    observers = Observers(settings, name, quiet=quiet, trace=trace, top=top, web=web)
+    handlers, watch = observed(settings, name, quiet=quiet, trace=trace, top=top, web=web)
     summary = (run_twice if twice else execute)(
         settings,
         folder,
-        handlers=observers.handlers,
+        handlers=handlers,
         log_events=log is Log.events,
-        watch=observers.watch,
+        watch=watch,
         only=nodes_here,
         stand_ins=stand_ins,
     )
@@ -241,3 +244,92 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
             sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def observed(
+    settings: Config, name: str, *, quiet: bool, trace: Path | None, top: bool, web: int | None
+) -> tuple[list[logging.Handler], Watch]:
+    """Return where the log records of a run go, and its observers: `handlers` and `watch`.
+
+    Args:
+        name: By which to find it: the run's, and more if it is one process of several.
+        quiet: Whether there is to be no progress bar.
+        top: Whether to show the monitor's screen in this terminal.
+        web: Port on which to show it as a page.
+    """
+    from rich.console import Console
+
+    from runtime.logs import terminal_handler
+    from runtime.tools.cli.tables import progress
+    from runtime.tools.monitor.observer import LastRecords
+    from runtime.tools.tracing.record import tracing
+
+    records = LastRecords()
+    handlers: list[logging.Handler] = [records]
+    watches: list[Watch] = []
+    if not top:
+        console = Console(stderr=True)  # one for both: the bar makes room for log lines
+        handlers.append(terminal_handler(console))
+        if not quiet:
+            watches.append(progress(settings.run, console))
+    watches.append(lambda supervisor: _monitored(supervisor, settings, name, records, top, web))
+    if trace is not None:
+        watches.append(lambda supervisor: tracing(supervisor, trace, name))
+
+    @contextlib.contextmanager
+    def watching(supervisor: Supervisor) -> Iterator[None]:
+        with contextlib.ExitStack() as stack:
+            for watch in watches:
+                stack.enter_context(watch(supervisor))
+            yield
+
+    return handlers, watching
+
+
+@contextlib.contextmanager
+def _monitored(
+    supervisor: Supervisor,
+    settings: Config,
+    name: str,
+    records: LastRecords,
+    top: bool,
+    web: int | None,
+) -> Iterator[None]:
+    from runtime.tools.monitor.observer import Observer
+    from runtime.tools.monitor.server import serving
+
+    with contextlib.ExitStack() as stack:
+        observer = Observer(supervisor, settings, records)
+        # The screens end after the server, by which they know that the run is over.
+        screens = stack.enter_context(contextlib.ExitStack())
+        path = stack.enter_context(serving(observer, name))
+        if path is not None and top:
+            screens.enter_context(_beside("top", str(path), "--leave"))
+        if path is not None and web is not None:
+            screens.enter_context(_beside("web", str(path), "--leave", "--port", str(web)))
+        yield
+
+
+@contextlib.contextmanager
+def _beside(*arguments: str) -> Iterator[None]:
+    """Run a command of ours in a process of its own, so that drawing does not hold up the run."""
+    command = [sys.executable, "-m", "runtime", *arguments]
+    # The screen has the terminal and gets its Ctrl-C; the page outlives one, to show the end.
+    group = None if arguments[0] == "top" else 0
+    with subprocess.Popen(command, process_group=group) as process:  # noqa: S603  # our own module
+        over = threading.Event()
+        threading.Thread(target=_tell_when_gone, args=(process, over), daemon=True).start()
+        try:
+            yield
+        finally:
+            over.set()
+            try:
+                process.wait(5.0)
+            except subprocess.TimeoutExpired:
+                process.terminate()
+
+
+def _tell_when_gone(process: subprocess.Popen[bytes], over: threading.Event) -> None:
+    process.wait()
+    if not over.is_set():
+        print("the monitor was closed; the run goes on, Ctrl-C ends it", file=sys.stderr)

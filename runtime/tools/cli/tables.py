@@ -1,8 +1,6 @@
-"""Tables for the terminal.
+"""What commands share: arguments, tables for the terminal, and the progress bar.
 
-The progress bar: simulated time, speed, frames. Drawn by a thread; the loop knows nothing.
-
-Arguments that several commands share.
+The bar shows simulated time, speed and frames; a thread draws it, and the loop knows nothing.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,68 +28,84 @@ from runtime.time.schedule import SECOND
 def run_tables(summary: Summary) -> Iterator[Table]:
     """Return what was sent and dropped, how late ticks were, what workers cost, and more."""
     seconds = max(summary.sim_seconds, 1e-9)
-    sent = Table("output", "events", "per second", title="sent")
-    for output, count in sorted(summary.outputs.items()):
-        sent.add_row(output, f"{count}", f"{count / seconds:.1f}")
-    yield _numbers(sent)
-    streams = Table("input", "dropped", "fullest", "holds", "unmatched", title="inputs")
-    for port, stream in sorted(summary.streams.items()):
-        unmatched = f"{sum(stream.missed.values())}" if stream.missed else ""
-        dropped = f"{stream.dropped}"
-        streams.add_row(port, dropped, f"{stream.peak}", f"{stream.bound}", unmatched)
-    if streams.row_count:
-        yield _numbers(streams)
-    ticks = Table("tick", "Hz", "calls", "late p50 µs", "p99 µs", "max µs", "missed", title="ticks")
-    for name, tick in sorted(summary.ticks.items()):
-        ticks.add_row(
-            name,
-            f"{tick.hz:g}",
-            f"{tick.calls}",
-            f"{tick.late_p50_us:.0f}",
-            f"{tick.late_p99_us:.0f}",
-            f"{tick.late_max_us:.0f}",
-            f"{tick.missed}",
-        )
-    if ticks.row_count:
-        yield _numbers(ticks)
-    # The six of its columns for which a terminal has room.
-    titles, columns = ("declared", "real", "p95", "CPU", "p95", "MB"), (0, 2, 3, 5, 6, 8)
-    title = "calls of workers: milliseconds (median, 95 % below), peak memory"
-    workers = Table("worker", *titles, title=title)
-    for name, worker in sorted(summary.workers.items()):
-        row = worker.row()
-        workers.add_row(name, *(row[k] for k in columns))
-    if workers.row_count:
-        yield _numbers(workers)
-    # The columns for which a terminal has room: first what together makes all that was sent.
-    title = "systems outside the process: frames"
+    yield _table(
+        "sent",
+        ("output", "events", "per second"),
+        [(name, f"{n}", f"{n / seconds:.1f}") for name, n in sorted(summary.outputs.items())],
+    )
+    inputs = _table(
+        "inputs",
+        ("input", "dropped", "fullest", "holds", "unmatched"),
+        [
+            (port, *map(str, (stream.dropped, stream.peak, stream.bound)), _sum(stream.missed))
+            for port, stream in sorted(summary.streams.items())
+        ],
+    )
+    ticks = _table(
+        "ticks",
+        ("tick", "Hz", "calls", "late p50 µs", "p99 µs", "max µs", "missed"),
+        [
+            (
+                name,
+                f"{tick.hz:g}",
+                f"{tick.calls}",
+                *(f"{us:.0f}" for us in (tick.late_p50_us, tick.late_p99_us, tick.late_max_us)),
+                f"{tick.missed}",
+            )
+            for name, tick in sorted(summary.ticks.items())
+        ],
+    )
+    # Of the next two, the columns for which a terminal has room.
+    workers = _table(
+        "calls of workers: milliseconds (median, 95 % below), peak memory",
+        ("worker", "declared", "real", "p95", "CPU", "p95", "MB"),
+        [
+            (name, *(worker.row()[k] for k in (0, 2, 3, 5, 6, 8)))
+            for name, worker in sorted(summary.workers.items())
+        ],
+    )
     names = ("sent", "answered", "empty", "init", "skipped", "no answer", "open", "real ms")
-    shown = (0, 2, 3, 4, 5, 6, 7, 15, 16, 17)
-    outside = Table("system", *names, "inputs repeat", "answers repeat", title=title)
-    for name, system in sorted(summary.outside.items()):
-        row = system.row()
-        outside.add_row(name, *(row[k] for k in shown))
-    if outside.row_count:
-        yield _numbers(outside)
-    stalls = Table("node", "times", "longest ms", "where", title="the loop stood still")
-    for node, count in sorted(summary.stalls.items()):
-        worst = summary.longest_stalls[node]
-        stalls.add_row(node, f"{count}", f"{worst.seconds * 1e3:.0f}", worst.line)
-    if stalls.row_count:
-        yield _numbers(stalls)
+    outside = _table(
+        "systems outside the process: frames",  # first what together makes all that was sent
+        ("system", *names, "inputs repeat", "answers repeat"),
+        [
+            (name, *(system.row()[k] for k in (0, 2, 3, 4, 5, 6, 7, 15, 16, 17)))
+            for name, system in sorted(summary.outside.items())
+        ],
+    )
+    longest = summary.longest_stalls
+    stalls = _table(
+        "the loop stood still",
+        ("node", "times", "longest ms", "where"),
+        [
+            (node, f"{count}", f"{longest[node].seconds * 1e3:.0f}", longest[node].line)
+            for node, count in sorted(summary.stalls.items())
+        ],
+    )
+    yield from (table for table in (inputs, ticks, workers, outside, stalls) if table.row_count)
     if summary.verdict is not None:
         yield verdict_table(summary.verdict)
 
 
 def verdict_table(verdict: Verdict) -> Table:
     """Return the figures of those that were judged: one column each."""
-    table = Table("figure", *verdict.estimators, title="verdict")
     figures = dict.fromkeys(key for each in verdict.estimators.values() for key in each)
-    for figure in figures:
-        row = [each.get(figure, "") for each in verdict.estimators.values()]
-        if not any(isinstance(value, list | tuple | dict) for value in row):
-            table.add_row(figure, *(_show(value) for value in row))
-    return _numbers(table)
+    rows = {
+        figure: [each.get(figure, "") for each in verdict.estimators.values()] for figure in figures
+    }
+    return _table(
+        "verdict",
+        ("figure", *verdict.estimators),
+        [
+            (figure, *map(_show, row))
+            for figure, row in rows.items()
+            if not any(isinstance(value, list | tuple | dict) for value in row)
+        ],
+    )
+
+
+def _sum(missed: Mapping[str, int]) -> str:
+    return f"{sum(missed.values())}" if missed else ""
 
 
 def _show(value: Any) -> str:
@@ -102,9 +116,11 @@ def _show(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _numbers(table: Table) -> Table:
-    """Align all but the first column to the right, unless it is text."""
-    table.title_justify = "left"
+def _table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a table whose columns but the first are aligned right, unless they are text."""
+    table = Table(*headings, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*row)
     names = table.columns[0]
     names.min_width = min(max((len(str(cell)) for cell in names.cells), default=0), 24)
     names.overflow = "fold"
@@ -181,6 +197,9 @@ Overrides = Annotated[
         metavar="NODE.KEY=VALUE",
         help="Change a setting of a node, or of the run (run.seed=3). May be repeated.",
     ),
+]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
 ]
 
 
