@@ -248,6 +248,6 @@ def test_log_events_prints_each_event_with_arrays_by_shape(tmp_path: Path) -> No
 
 
 def test_without_arguments_it_explains_itself() -> None:
-    done = command(folder=ROOT)
+    done = command_here(folder=ROOT)
     assert "Fly a simulated vehicle" in done.stdout + done.stderr
     assert os.fspath(ROOT) not in done.stderr

@@ -19,7 +19,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.runtime.tools.samples_cli import ROOT, command, config_file, start, summary
+from tests.runtime.tools.samples_cli import (
+    ROOT,
+    command,
+    command_here,
+    config_file,
+    start,
+    summary,
+)
 
 pytestmark = pytest.mark.timeout(240)
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -52,16 +59,16 @@ def running(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
 def test_a_parameter_is_set_from_another_terminal(tmp_path: Path, sockets: Path) -> None:
     with running(tmp_path) as process:
         _wait_for(sockets, process)
-        done = command("set", "pilot.gain=2", folder=tmp_path)
+        done = command_here("set", "pilot.gain=2", folder=tmp_path)
         assert (done.returncode, done.stdout) == (0, "run sample: gain = 2.0\n")
-        refused = command("set", "pilot.height=3", "--run", "sample", folder=tmp_path)
+        refused = command_here("set", "pilot.height=3", "--run", "sample", folder=tmp_path)
         assert refused.returncode == 2
         assert "error: pilot.height: cannot change while the run goes on" in refused.stderr
     log = (tmp_path / "runs" / "sample" / "log.txt").read_text()
     assert "pilot.gain is now 2.0" in log
     assert summary(tmp_path / "runs" / "sample")["reason"] == "Ctrl-C"
     assert list(sockets.iterdir()) == []
-    gone = command("set", "pilot.gain=2", folder=tmp_path)
+    gone = command_here("set", "pilot.gain=2", folder=tmp_path)
     assert gone.returncode == 2
     assert "error: expected a run to look at, found none" in gone.stderr
 
@@ -141,10 +148,10 @@ def test_a_trace_is_written_and_read(tmp_path: Path, sockets: Path) -> None:
     path = config_file(tmp_path, run="duration = 1", settings=LOOP)
     done = command("run", path, "-q", "--trace", "t.json.gz", folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    told = command("trace", "t.json.gz", folder=tmp_path)
+    told = command_here("trace", "t.json.gz", folder=tmp_path)
     assert "path 1: drone/front Image → vo PoseEstimate → pilot VelocitySetpoint" in told.stdout
     assert re.search(r"│ 1 +│ +10 │ +30.00 │ +30.00 │ +30.00 │", told.stdout)
-    refused = command("trace", path, folder=tmp_path)
+    refused = command_here("trace", path, folder=tmp_path)
     assert refused.returncode == 2
     assert "sample.toml: expected a trace, found:" in refused.stderr
 
@@ -162,7 +169,7 @@ def _wait_for(sockets: Path, process: subprocess.Popen[str]) -> None:
 def test_a_screen_needs_a_terminal_that_can_show_it(tmp_path: Path, sockets: Path) -> None:
     with running(tmp_path) as process:
         _wait_for(sockets, process)
-        done = command("top", folder=tmp_path)
+        done = command_here("top", folder=tmp_path)
         assert done.returncode == 2
         assert "error: expected a terminal, found none" in done.stderr
         terminal, inside = pty.openpty()
