@@ -1,6 +1,5 @@
 """Traces: what each node did when, in real time and on the run's clock, for ui.perfetto.dev.
 
 `record` notes steps and events on the loop, `spool` keeps the notes in a file, `causes` finds which
-event led to which, `write` makes the trace when the run is over, and `paths` reads a trace and says
-how long it took from sensors to set-points.
+event led to which, and `write` makes the trace when the run is over, and reads one.
 """

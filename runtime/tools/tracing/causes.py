@@ -18,7 +18,7 @@ from typing import Literal
 
 import msgspec
 
-from runtime.tools.tracing.spool import EventKind
+from runtime.tools.tracing.spool import EventKind, EventNote
 
 REMEMBERED = 512
 """How many stamps of received events are kept per node."""
@@ -103,35 +103,17 @@ class Causes:
         self._by_identity: OrderedDict[int, tuple[SentEvent, tuple[str, ...]]] = OrderedDict()
         """Events, and the nodes that received them."""
 
-    def add(
-        self,
-        time: int,
-        run: int,
-        sender: str,
-        event: str,
-        source: str,
-        stamp: int,
-        identity: int,
-        given: int,
-    ) -> SentEvent:
-        """Add the next event and return it with its cause.
-
-        Args:
-            time: Of sending, real time (ns).
-            run: Of sending, the run's clock (ns).
-            sender: ``node.port``.
-            identity: Its `id`.
-            given: The `id` of the event that the step which sent it was handling; 0 if none.
-        """
-        node, kind = sender.partition(".")[0], self._kinds[event]
-        sent = SentEvent(time, run, node, event, source, stamp)
+    def add(self, note: EventNote) -> SentEvent:
+        """Add the next event and return it with its cause."""
+        node, kind = note.sender.partition(".")[0], self._kinds[note.event]
+        sent = SentEvent(note.time, note.run, node, note.event, note.source, note.stamp)
         # Another event may lie where one lay that has come from elsewhere.
-        found, heard = self._by_identity.get(given, (None, ()))
+        found, heard = self._by_identity.get(note.given, (None, ()))
         self._trace_back(sent, kind, found if node in heard else None)
         sent.seen = kind.image if sent.cause is None else sent.cause.seen
-        receivers = self._receivers.get((sender, event, source), ())
-        self._by_identity[identity] = sent, receivers
-        self._by_identity.move_to_end(identity)
+        receivers = self._receivers.get((note.sender, note.event, note.source), ())
+        self._by_identity[note.identity] = sent, receivers
+        self._by_identity.move_to_end(note.identity)
         if len(self._by_identity) > IDENTITIES:
             self._by_identity.popitem(last=False)
         if not kind.setpoint and (kind.measured or sent.cause is not None):

@@ -41,6 +41,30 @@ class EventKind(msgspec.Struct, frozen=True):
     setpoint: bool
 
 
+class EventNote(NamedTuple):
+    """The note of an event, as it is read.
+
+    Attributes:
+        time: Of sending, real time (ns).
+        run: Of sending, the run's clock (ns).
+        sender: ``node.port``.
+        event: Its type.
+        source: Its source.
+        stamp: Its stamp.
+        identity: Its `id`.
+        given: The `id` of the event that the step which sent it was handling; 0 if none.
+    """
+
+    time: int
+    run: int
+    sender: str
+    event: str
+    source: str
+    stamp: int
+    identity: int
+    given: int
+
+
 class ClockRate(NamedTuple):
     """How the run's clock follows real time; `run` of a note is then real time, too.
 
@@ -141,7 +165,7 @@ class Spool:
             heard = (each.node for each in listeners or () if each.receives(event, source))
             self.receivers[key] = tuple(dict.fromkeys(heard))
             self.kinds[event.__name__] = _kind(event)
-        return ("event", time, run, *key, stamp, identity, cause)
+        return ("event", *EventNote(time, run, *key, stamp, identity, cause))
 
 
 def _kind(event: type[Event]) -> EventKind:

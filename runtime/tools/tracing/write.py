@@ -1,11 +1,8 @@
-"""Makes a trace of notes: JSON trace events, which ui.perfetto.dev and chrome://tracing open.
+"""Makes a trace of notes, and reads it: how long paths take, and which nodes load the loop.
 
-Format: "Trace Event Format", the Chromium project's document of 2016.
-Its time stamps are microseconds of real time; the run's clock stands in the arguments.
-
-Reads a trace: how long paths from sensor to set-point take, and which nodes load the loop.
-
-Works on any trace that `runtime.tools.tracing.write` wrote, without the run.
+A trace is JSON trace events, which ui.perfetto.dev and chrome://tracing open. Format: "Trace Event
+Format", the Chromium project's document of 2016. Its time stamps are microseconds of real time; the
+run's clock stands in the arguments. Reading needs no run.
 """
 
 from __future__ import annotations
@@ -22,7 +19,7 @@ import msgspec
 from runtime.errors import ConfigError
 from runtime.run.results import replacing
 from runtime.tools.tracing.causes import Causes, SentEvent
-from runtime.tools.tracing.spool import ClockRate, Spool
+from runtime.tools.tracing.spool import ClockRate, EventNote, Spool
 
 MADE_BY = "python -m runtime run --trace"
 """Marks a trace as one of ours."""
@@ -90,7 +87,7 @@ class _Writer:
             if kind == "step":
                 yield from self._step(*note)
             elif kind == "event":
-                yield from self._event(*note)
+                yield from self._event(EventNote(*note))
             elif kind == "thread":
                 yield from self._thread(*note)
             else:
@@ -122,27 +119,17 @@ class _Writer:
         run = self._moments.add(begin, run)
         yield from self._slice(LOOP, node, what, begin, end, run_s=run / 1e9)
 
-    def _event(
-        self,
-        time: int,
-        run: int,
-        sender: str,
-        event: str,
-        source: str,
-        stamp: int,
-        identity: int,
-        given: int,
-    ) -> Iterator[dict[str, Any]]:
-        run = self._moments.add(time, run)
-        sent = self._causes.add(time, run, sender, event, source, stamp, identity, given)
+    def _event(self, note: EventNote) -> Iterator[dict[str, Any]]:
+        time, run = note.time, self._moments.add(note.time, note.run)
+        sent = self._causes.add(note._replace(run=run))
         args: dict[str, Any] = {
-            "port": sender,
-            "source": source,
+            "port": note.sender,
+            "source": note.source,
             "run_s": run / 1e9,
-            "stamp_s": stamp / 1e9,
+            "stamp_s": note.stamp / 1e9,
         }
         path: list[SentEvent] = []
-        if self._spool.kinds[event].setpoint and sent.cause is not None:
+        if self._spool.kinds[note.event].setpoint and sent.cause is not None:
             path = sent.path()
             begin = self._exposure(path[0])
             args |= {
@@ -150,7 +137,7 @@ class _Writer:
                 "run_ms": (run - path[0].stamp) / 1e6,
                 "real_ms": round((time - begin) / 1e6, 6),
             }
-        yield from self._slice(LOOP, sent.node, f"send {event}", time, None, **args)
+        yield from self._slice(LOOP, sent.node, f"send {note.event}", time, None, **args)
         if path:
             yield from self._flow(path)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from runtime.tools.tracing.causes import Causes, SentEvent
-from runtime.tools.tracing.spool import EventKind
+from runtime.tools.tracing.spool import EventKind, EventNote
 
 KINDS = {
     "Image": EventKind(measured=True, image=True, setpoint=False),
@@ -31,8 +31,9 @@ class Story:
     def __call__(self, sender: str, event: str, stamp: int, given: int = 0) -> SentEvent:
         self.number += 1
         source = sender.partition(".")[0]
+        number = self.number
         return self.causes.add(
-            self.number, self.number, sender, event, source, stamp, self.number, given
+            EventNote(number, number, sender, event, source, stamp, number, given)
         )
 
 
