@@ -152,19 +152,13 @@ def _version() -> str:
 
 
 SYSTEMS = (
+    System("visnav", ("handler", "stream", "routed"), measure, 0.6, version=_version),
     System(
-        name="visnav",
-        modes=("handler", "stream", "routed"),
-        slowness=0.6,
-        version=_version,
-        measure=measure,
-    ),
-    System(
-        name="visnav, fingerprinted",
-        modes=("handler", "stream"),
-        cases=("small",),
+        "visnav, fingerprinted",
+        ("handler", "stream"),
+        functools.partial(measure, digest=True),
         slowness=3.0,
+        cases=("small",),
         version=_version,
-        measure=functools.partial(measure, digest=True),
     ),
 )

@@ -58,31 +58,48 @@ Samples = npt.NDArray[np.int64]
 """Round trips in nanoseconds, shape (samples,), in the order in which they were measured."""
 
 
-class System(msgspec.Struct, frozen=True, kw_only=True):
+class System(msgspec.Struct, frozen=True):
     """Something that can be measured.
 
     Attributes:
         name: As it stands in tables: ``asyncio.Queue (uvloop)``.
         modes: Which modes it has.
+        measure: Measures a case; called in a fresh process of its own.
+        slowness: About how many microseconds a round trip takes at N = 2; the driver shortens
+            runs of slow systems by it.
         cases: Which cases it has.
         place: Whether its nodes share a process.
         max_nodes: Beyond this it is not measured: too slow, or too many processes for a laptop.
-        slowness: About how many microseconds a round trip takes at N = 2; the driver shortens
-            runs of slow systems by it.
         missing: Returns why it cannot be measured here (with what installs it), or `None`.
         version: Returns what is measured, as ``library 1.2``.
-        measure: Measures a case; called in a fresh process of its own.
     """
 
     name: str
     modes: tuple[Mode, ...]
+    measure: Callable[[Case], Samples]
+    slowness: float = 1.0
     cases: tuple[CaseName, ...] = ("small", "large", "large-shared")
     place: Place = "one process"
     max_nodes: int = 128
-    slowness: float = 1.0
     missing: Callable[[], str | None] = lambda: None
     version: Callable[[], str] = lambda: ""
-    measure: Callable[[Case], Samples]
+
+
+def in_processes(
+    name: str,
+    modes: tuple[Mode, ...],
+    measure: Callable[[Case], Samples],
+    slowness: float,
+    max_nodes: int = 16,
+    **options: Any,
+) -> System:
+    """Return a system whose nodes have processes of their own.
+
+    Args:
+        options: Of `System`; payloads are copied, unless its cases say more.
+    """
+    options = {"cases": ("small", "large"), **options}
+    return System(name, modes, measure, slowness, place="processes", max_nodes=max_nodes, **options)
 
 
 def large_array() -> npt.NDArray[np.float32]:
@@ -112,6 +129,11 @@ class Pong(Event):
     """
 
     number: int
+
+
+def packaged(**packages: str) -> dict[str, Any]:
+    """Return `missing` and `version` of a `System` that is some packages, as for `needs`."""
+    return {"missing": needs(**packages), "version": versions(*packages.values())}
 
 
 def needs(**packages: str) -> Callable[[], str | None]:

@@ -22,8 +22,8 @@ from bench.system import (
     Samples,
     System,
     free_port,
-    needs,
-    versions,
+    in_processes,
+    packaged,
     zenoh_config,
     zenoh_publisher,
 )
@@ -126,28 +126,18 @@ def measure_processes(case: Case) -> Samples:
         return uvloop.run(_run(session, case, crew.check, range(0)))
 
 
-_MISSING = needs(asyncio_for_robotics="asyncio-for-robotics", zenoh="eclipse-zenoh")
-_VERSION = versions("asyncio-for-robotics", "eclipse-zenoh", "uvloop")
+_PACKAGES = packaged(
+    asyncio_for_robotics="asyncio-for-robotics", zenoh="eclipse-zenoh", uvloop="uvloop"
+)
 
 SYSTEMS = (
     System(
-        name="asyncio-for-robotics (one session)",
-        modes=("stream",),
-        cases=("small", "large"),
+        "asyncio-for-robotics (one session)",
+        ("stream",),
+        measure,
         slowness=30,
-        missing=_MISSING,
-        version=_VERSION,
-        measure=measure,
-    ),
-    System(
-        name="asyncio-for-robotics (tcp)",
-        modes=("stream",),
         cases=("small", "large"),
-        place="processes",
-        max_nodes=16,
-        slowness=250,
-        missing=_MISSING,
-        version=_VERSION,
-        measure=measure_processes,
+        **_PACKAGES,
     ),
+    in_processes("asyncio-for-robotics (tcp)", ("stream",), measure_processes, 250, **_PACKAGES),
 )

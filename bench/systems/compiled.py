@@ -169,11 +169,11 @@ def order_heard() -> str:
 
 SYSTEMS = (
     System(
-        name="thesis client (C++)",
-        modes=("handler",),
+        "thesis client (C++)",
+        ("handler",),
+        measure_client,
         slowness=0.05,
         missing=missing_compiler,
         version=lambda: f"replica, {compiler_version()}",
-        measure=measure_client,
     ),
 )

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array, needs, versions
+from bench.system import LARGE_SHAPE, Case, Samples, in_processes, large_array, packaged
 from bench.systems.children import Job, answer, children
 
 _BYTES = int(np.prod(LARGE_SHAPE)) * 4
@@ -142,15 +142,5 @@ def measure(case: Case) -> Samples:
 
 
 SYSTEMS = (
-    System(
-        name="cyclonedds",
-        modes=("stream",),
-        cases=("small", "large"),
-        place="processes",
-        max_nodes=16,
-        slowness=200,
-        missing=needs(cyclonedds="cyclonedds"),
-        version=versions("cyclonedds"),
-        measure=measure,
-    ),
+    in_processes("cyclonedds", ("stream",), measure, 200, **packaged(cyclonedds="cyclonedds")),
 )

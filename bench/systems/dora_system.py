@@ -22,7 +22,16 @@ from typing import Any
 
 import msgspec
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, free_port, large_array, needs, versions
+from bench.system import (
+    LARGE_SHAPE,
+    Case,
+    Samples,
+    free_port,
+    in_processes,
+    large_array,
+    needs,
+    versions,
+)
 from bench.systems.children import (
     PING,
     TIMEOUT,
@@ -195,18 +204,16 @@ def _exchange(case: Case, crew: Crew, port: int) -> Samples:
 
 
 SYSTEMS = (
-    System(
-        name="dora",
-        modes=("stream",),
-        cases=("small", "large"),
-        place="processes",
-        max_nodes=16,
+    in_processes(
+        "dora",
+        ("stream",),
+        measure,
         slowness=400,
         missing=needs(dora="dora-rs", dora_cli="dora-rs-cli", pyarrow="pyarrow"),
         version=versions("dora-rs"),
-        measure=measure,
     ),
 )
+
 
 if __name__ == "__main__":
     run(int(sys.argv[1]), sys.argv[2])

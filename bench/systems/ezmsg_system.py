@@ -19,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from bench.system import Case, Ping, Pong, Samples, System, needs, payloads, versions
+from bench.system import Case, Ping, Pong, Samples, System, in_processes, packaged, payloads
 from bench.systems.children import ALL, TIMEOUT, PeerError, answer
 
 _BUFFER = 1 << 23
@@ -171,22 +171,17 @@ def measure(case: Case, *, processes: bool) -> Samples:
 
 SYSTEMS = (
     System(
-        name="ezmsg (one process)",
-        modes=("handler",),
+        "ezmsg (one process)",
+        ("handler",),
+        functools.partial(measure, processes=False),
         slowness=30,
-        missing=needs(ezmsg="ezmsg"),
-        version=versions("ezmsg"),
-        measure=functools.partial(measure, processes=False),
+        **packaged(ezmsg="ezmsg"),
     ),
-    System(
-        name="ezmsg (processes)",
-        modes=("handler",),
-        cases=("small", "large"),
-        place="processes",
-        max_nodes=16,
+    in_processes(
+        "ezmsg (processes)",
+        ("handler",),
+        functools.partial(measure, processes=True),
         slowness=250,
-        missing=needs(ezmsg="ezmsg"),
-        version=versions("ezmsg"),
-        measure=functools.partial(measure, processes=True),
+        **packaged(ezmsg="ezmsg"),
     ),
 )

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array, needs, versions
+from bench.system import LARGE_SHAPE, Case, Samples, in_processes, large_array, packaged
 from bench.systems.children import Job, answer, children
 
 _BYTES = int(np.prod(LARGE_SHAPE)) * 4
@@ -160,20 +160,18 @@ def measure(case: Case, variant: str) -> Samples:
         node.try_cleanup_dead_nodes()
 
 
-def _system(name: str, variant: str, max_nodes: int, slowness: float) -> System:
-    return System(
-        name=name,
-        modes=("stream",),
-        place="processes",
-        max_nodes=max_nodes,
-        slowness=slowness,
-        missing=needs(iceoryx2="iceoryx2"),
-        version=versions("iceoryx2"),
-        measure=functools.partial(measure, variant=variant),
+SYSTEMS = tuple(
+    in_processes(
+        f"iceoryx2 ({variant})",
+        ("stream",),
+        functools.partial(measure, variant=variant),
+        slowness,
+        max_nodes,
+        cases=("small", "large", "large-shared"),
+        **packaged(iceoryx2="iceoryx2"),
     )
-
-
-SYSTEMS = (
-    _system("iceoryx2 (polled)", "polled", max(2, min(16, os.cpu_count() or 2)), 8),
-    _system("iceoryx2 (events)", "events", 16, 70),
+    for variant, slowness, max_nodes in (
+        ("polled", 8, max(2, min(16, os.cpu_count() or 2))),
+        ("events", 70, 16),
+    )
 )

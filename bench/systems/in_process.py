@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import uvloop
 
-from bench.system import Case, Ping, Pong, Samples, System, needs, payloads, versions
+from bench.system import Case, Ping, Pong, Samples, System, packaged, payloads, versions
 
 Put = Callable[[Any], None]
 
@@ -170,43 +170,28 @@ def measure_trio(case: Case) -> Samples:
 
 
 SYSTEMS = (
-    System(name="plain calls", modes=("handler",), slowness=0.5, measure=measure_calls),
+    System("plain calls", ("handler",), measure_calls, 0.5),
+    System("pyee", ("handler",), measure_pyee, 2, **packaged(pyee="pyee")),
     System(
-        name="pyee",
-        modes=("handler",),
-        slowness=2,
-        missing=needs(pyee="pyee"),
-        version=versions("pyee"),
-        measure=measure_pyee,
-    ),
-    System(
-        name="asyncio.Queue (asyncio)",
-        modes=("stream",),
+        "asyncio.Queue (asyncio)",
+        ("stream",),
+        _measure_on(asyncio.new_event_loop),
         slowness=10,
         version=lambda: f"Python {platform.python_version()}",
-        measure=_measure_on(asyncio.new_event_loop),
     ),
     System(
-        name="asyncio.Queue (uvloop)",
-        modes=("stream",),
+        "asyncio.Queue (uvloop)",
+        ("stream",),
+        _measure_on(uvloop.new_event_loop),
         slowness=5,
         version=versions("uvloop"),
-        measure=_measure_on(uvloop.new_event_loop),
     ),
     System(
-        name="anyio streams (uvloop)",
-        modes=("stream",),
+        "anyio streams (uvloop)",
+        ("stream",),
+        measure_anyio,
         slowness=6,
-        missing=needs(anyio="anyio", uvloop="uvloop"),
-        version=versions("anyio", "uvloop"),
-        measure=measure_anyio,
+        **packaged(anyio="anyio", uvloop="uvloop"),
     ),
-    System(
-        name="trio channels",
-        modes=("stream",),
-        slowness=12,
-        missing=needs(trio="trio"),
-        version=versions("trio"),
-        measure=measure_trio,
-    ),
+    System("trio channels", ("stream",), measure_trio, 12, **packaged(trio="trio")),
 )

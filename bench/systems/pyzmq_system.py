@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.system import LARGE_SHAPE, Case, Samples, System, large_array, needs, versions
+from bench.system import LARGE_SHAPE, Case, Samples, in_processes, large_array, packaged
 from bench.systems.children import PING, Job, children, number_of, reply_to
 
 
@@ -76,16 +76,4 @@ def measure(case: Case) -> Samples:
             return crew.exchange(case, send, receive)
 
 
-SYSTEMS = (
-    System(
-        name="pyzmq (ipc)",
-        modes=("stream",),
-        cases=("small", "large"),
-        place="processes",
-        max_nodes=16,
-        slowness=100,
-        missing=needs(zmq="pyzmq"),
-        version=versions("pyzmq"),
-        measure=measure,
-    ),
-)
+SYSTEMS = (in_processes("pyzmq (ipc)", ("stream",), measure, 100, **packaged(zmq="pyzmq")),)

@@ -22,11 +22,11 @@ import subprocess
 import tempfile
 import time
 import xmlrpc.client
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
-from bench.system import Case, Samples, System, free_port
+from bench.system import Case, Samples, System, free_port, in_processes
 from bench.systems.compiled import (
     KEEP_MEMORY,
     arguments,
@@ -210,59 +210,51 @@ def _version(package: str) -> str:
     return subprocess.run(query, capture_output=True, text=True, check=False).stdout or "?"
 
 
-def _needs(*, compiler: bool, **packages: Path) -> Callable[[], str | None]:
-    """Return a `System.missing` that looks for a file of each Debian package."""
+def _packaged(
+    name: str, package: str, files: dict[str, Path], *, compiled: bool = True
+) -> dict[str, Any]:
+    """Return `missing` and `version` of a `System` that is some Debian packages.
+
+    Args:
+        name: Before the version of `package`.
+        files: One of each package that must be there.
+    """
 
     def missing() -> str | None:
-        wanted = {"python3-rosmaster": MASTER}
-        wanted |= {name.replace("_", "-"): path for name, path in packages.items()}
-        absent = [name for name, path in wanted.items() if not path.exists()]
+        wanted = {"python3-rosmaster": MASTER, **files}
+        absent = [each for each, path in wanted.items() if not path.exists()]
         if absent:
             return f"not installed; `make peers`, or `apt-get install {' '.join(absent)}`"
-        return missing_compiler() if compiler else None
+        return missing_compiler() if compiled else None
 
-    return missing
+    return {"missing": missing, "version": lambda: f"{name} {_version(package)}"}
 
 
-_ROSCPP = {"libroscpp_dev": INCLUDE / "ros/ros.h"}
-_NODELET = {"libnodeletlib_dev": INCLUDE / "nodelet/nodelet.h"}
-_ROSPY = {"python3_rospy": PACKAGES / "rospy", "python3_numpy": PACKAGES / "numpy"}
+_ROSCPP = {"libroscpp-dev": INCLUDE / "ros/ros.h"}
+_NODELET = {**_ROSCPP, "libnodeletlib-dev": INCLUDE / "nodelet/nodelet.h"}
+_ROSPY = {"python3-rospy": PACKAGES / "rospy", "python3-numpy": PACKAGES / "numpy"}
+_CPP = _packaged("roscpp", "libroscpp-dev", _ROSCPP)
+_PYTHON = {
+    "cases": ("small", "large", "large-shared"),
+    **_packaged("rospy", "python3-rospy", _ROSPY, compiled=False),
+}
 
 SYSTEMS = (
+    System("roscpp, one process", ("handler",), measure_roscpp, 1.5, **_CPP),
     System(
-        name="roscpp, one process",
-        modes=("handler",),
-        slowness=1.5,
-        missing=_needs(compiler=True, **_ROSCPP),
-        version=lambda: f"roscpp {_version('libroscpp-dev')}",
-        measure=measure_roscpp,
-    ),
-    System(
-        name="ROS 1 nodelets",
-        modes=("handler",),
+        "ROS 1 nodelets",
+        ("handler",),
+        measure_nodelets,
         slowness=50,
-        missing=_needs(compiler=True, **_ROSCPP, **_NODELET),
-        version=lambda: f"nodelet {_version('libnodeletlib-dev')}",
-        measure=measure_nodelets,
+        **_packaged("nodelet", "libnodeletlib-dev", _NODELET),
     ),
-    System(
-        name="roscpp, processes",
-        modes=("handler",),
-        place="processes",
-        max_nodes=16,
+    in_processes(
+        "roscpp, processes",
+        ("handler",),
+        measure_roscpp_processes,
         slowness=100,
-        missing=_needs(compiler=True, **_ROSCPP),
-        version=lambda: f"roscpp {_version('libroscpp-dev')}",
-        measure=measure_roscpp_processes,
+        cases=("small", "large", "large-shared"),
+        **_CPP,
     ),
-    System(
-        name="rospy, processes",
-        modes=("handler",),
-        place="processes",
-        max_nodes=16,
-        slowness=70,
-        missing=_needs(compiler=False, **_ROSPY),
-        version=lambda: f"rospy {_version('python3-rospy')}",
-        measure=measure_rospy_processes,
-    ),
+    in_processes("rospy, processes", ("handler",), measure_rospy_processes, 70, **_PYTHON),
 )

@@ -28,9 +28,9 @@ from bench.system import (
     Samples,
     System,
     free_port,
+    in_processes,
     large_array,
-    needs,
-    versions,
+    packaged,
     zenoh_config,
     zenoh_publisher,
     zenoh_subscriber,
@@ -133,25 +133,16 @@ def measure_processes(case: Case) -> Samples:
             return crew.exchange(case, pinger(pings, case), receive)
 
 
+_PACKAGE = packaged(zenoh="eclipse-zenoh")
+
 SYSTEMS = (
     System(
-        name="zenoh (one session)",
-        modes=("handler",),
-        cases=("small", "large"),
+        "zenoh (one session)",
+        ("handler",),
+        measure_callbacks,
         slowness=4,
-        missing=needs(zenoh="eclipse-zenoh"),
-        version=versions("eclipse-zenoh"),
-        measure=measure_callbacks,
-    ),
-    System(
-        name="zenoh (tcp)",
-        modes=("handler",),
         cases=("small", "large"),
-        place="processes",
-        max_nodes=16,
-        slowness=200,
-        missing=needs(zenoh="eclipse-zenoh"),
-        version=versions("eclipse-zenoh"),
-        measure=measure_processes,
+        **_PACKAGE,
     ),
+    in_processes("zenoh (tcp)", ("handler",), measure_processes, 200, **_PACKAGE),
 )
