@@ -17,7 +17,7 @@ from nodes.calibration.selftest import TITLES, Result
 from nodes.judging.report import style
 from nodes.judging.report.page import embedded
 from runtime.paths import source_file
-from runtime.tools.cli.tables import ConfigFile, Overrides
+from runtime.tools.cli.commands import ConfigFile, Overrides
 
 
 def selftest(

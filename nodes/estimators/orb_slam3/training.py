@@ -24,7 +24,7 @@ from nodes.estimators.orb_slam3.vocabulary import (
     write_vocabulary,
 )
 from runtime import Input, Node, NodeConfig
-from runtime.tools.cli.tables import ConfigFile, Overrides
+from runtime.tools.cli.commands import ConfigFile, Overrides
 
 
 class VocabularyTrainerConfig(NodeConfig):

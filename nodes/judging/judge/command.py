@@ -63,8 +63,9 @@ def judge(
     from runtime.config.messages import given
     from runtime.config.reading import convert
     from runtime.errors import ConfigError
+    from runtime.tools.cli.commands import warn
     from runtime.tools.cli.run import print_verdict
-    from runtime.tools.cli.tables import verdict_table, warn
+    from runtime.tools.cli.tables import verdict_table
 
     try:
         said = {

@@ -1,4 +1,4 @@
-"""The commands that installed packages offer, each imported when it is used.
+"""The commands that installed packages offer, each imported when it is used, and shared arguments.
 
 Help needs no imports: it takes the first sentence of a command's docstring from its source, so
 that it comes at once however much the packages import.
@@ -12,14 +12,31 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from runtime.config.plugins import COMMANDS, OURS, Offer, offers
 from runtime.errors import CommandError, ConfigError, suggest
-from runtime.tools.cli.tables import warn
+
+ConfigFile = Annotated[Path, typer.Argument(help="The file that says what to run.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NODE.KEY=VALUE",
+        help="Change a setting of a node, or of the run (run.seed=3). May be repeated.",
+    ),
+]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
+]
+
+
+def warn(warning: str) -> None:
+    """Print a warning, as a line of its own."""
+    print(f"warning: {warning}", file=sys.stderr)
 
 
 class Commands(TyperGroup):

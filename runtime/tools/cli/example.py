@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from runtime.tools.cli.tables import Overrides, Quiet
+from runtime.tools.cli.commands import Overrides, Quiet
 
 INSTALLED = Path(__file__).parents[1] / "example_files"
 CHECKOUT = Path(__file__).parents[3]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from runtime.tools.cli.tables import ConfigFile, Overrides, warn
+from runtime.tools.cli.commands import ConfigFile, Overrides, warn
 
 if TYPE_CHECKING:
     from rich.tree import Tree
@@ -184,7 +184,6 @@ def nodes(
 
     from runtime.config.reading import find_modules_in, find_node, find_nodes
     from runtime.errors import ConfigError, suggest
-    from runtime.tools.cli.tables import warn
     from runtime.tools.describe import describe
 
     found = find_nodes(warn)
@@ -280,7 +279,6 @@ def schema(
     import json
 
     from runtime.config.reading import find_nodes
-    from runtime.tools.cli.tables import warn
     from runtime.tools.schema import schema as schema_of
 
     text = json.dumps(schema_of(find_nodes(warn)), indent=1, ensure_ascii=False) + "\n"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from runtime.tools.cli.tables import ConfigFile, Overrides, Quiet, warn
+from runtime.tools.cli.commands import ConfigFile, Overrides, Quiet, warn
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from runtime.tools.cli.tables import ConfigFile, Overrides
+from runtime.tools.cli.commands import ConfigFile, Overrides
 
 if TYPE_CHECKING:
     from runtime.tools.sweep import Children, Plan, Row

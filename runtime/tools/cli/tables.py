@@ -1,4 +1,4 @@
-"""What commands share: arguments, tables for the terminal, and the progress bar.
+"""What commands show in the terminal: tables, and the progress bar.
 
 The bar shows simulated time, speed and frames; a thread draws it, and the loop knows nothing.
 """
@@ -6,14 +6,11 @@ The bar shows simulated time, speed and frames; a thread draws it, and the loop 
 from __future__ import annotations
 
 import contextlib
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
@@ -187,22 +184,3 @@ def _state(run: RunConfig, supervisor: Supervisor) -> tuple[float, str]:
     except RuntimeError:  # a table of counts grew while this thread read it
         frames = 0
     return seconds, f"{seconds:5.1f}{limit} s  {speed:.1f} × real time  {frames} frames"
-
-
-ConfigFile = Annotated[Path, typer.Argument(help="The file that says what to run.")]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NODE.KEY=VALUE",
-        help="Change a setting of a node, or of the run (run.seed=3). May be repeated.",
-    ),
-]
-Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="No progress bar and no table at the end.")
-]
-
-
-def warn(warning: str) -> None:
-    """Print a warning, as a line of its own."""
-    print(f"warning: {warning}", file=sys.stderr)
