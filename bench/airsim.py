@@ -49,8 +49,7 @@ class AirsimRow(LateRow, frozen=True, kw_only=True):
     Attributes:
         case: ``quiet``, or what is asked for.
         per_second: Answers.
-        median_us: Round trip as the client sees it, microseconds.
-        p99_us: Its 99th percentile.
+        median_us: Round trip as the client sees it; so `p99_us`.
     """
 
     case: str

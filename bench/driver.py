@@ -28,21 +28,10 @@ _LIMIT = 120.0
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One system at one number of nodes; times in microseconds.
+    """One system at one number of nodes: statistics of the samples of all rounds, pooled.
 
     Attributes:
-        case: As in `Case`; so `mode` and `nodes`.
-        system: Its name.
-        mode: ``handler``, ``stream`` or ``routed``.
-        nodes: N.
-        place: Whether its nodes share a process.
         samples: How many round trips, in all rounds.
-        median_us: Of all samples.
-        mean_us: Of all samples.
-        q1_us: First quartile.
-        q3_us: Third quartile.
-        p99_us: 99th percentile.
-        max_us: The longest.
         rounds_us: The median of each round.
     """
 

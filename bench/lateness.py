@@ -1,10 +1,7 @@
 """How late a 400 Hz tick comes while a multirotor hovers: what several benchmarks measure.
 
-What a recorder costs a 400 Hz controller, and what a replay needs: paired, in real time.
-
-A multirotor hovers on the real clock, controlled at 400 Hz, with a 512×512 RGB-D camera at 30 Hz.
-Runs with the recorder and without alternate, and those of a pair stand side by side, so that
-whatever else the machine does falls on both alike; the ratio is the median of the pairs' ratios.
+Here, what a recorder costs such a controller, with a 512×512 RGB-D camera at 30 Hz, on the real
+clock. Runs with a recorder and without take turns, and the ratio is the median of the pairs'.
 """
 
 from __future__ import annotations
@@ -118,12 +115,11 @@ def ratios(runs: Sequence[Any], beside: Sequence[Any]) -> tuple[float, float]:
 
 
 class RecordingRow(LateRow, frozen=True, kw_only=True):
-    """Runs of one kind; `ratio_p99` is the median of the pairs' ratios.
+    """Runs of one kind, all together; `ratio_p99` is the median of the pairs' ratios.
 
     Attributes:
-        case: Which.
-        frames: Pairs of images that came, in all runs.
-        megabytes: Written, in all runs.
+        frames: Pairs of images that came.
+        megabytes: Written.
         dropped: Events that are not in the recordings.
     """
 

@@ -45,15 +45,11 @@ ESTIMATES = "odometry.estimates"
 
 
 class LinkRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One kind of frame.
+    """One kind of frame: medians of the native interface and back, and of a worker's call.
 
     Attributes:
-        case: Its images.
-        bytes: Of them.
+        bytes: Of its images.
         samples: Of each side.
-        link_us: Median microseconds through the native interface and back.
-        worker_us: The same of a worker's call.
-        ratio: The first to the second.
     """
 
     case: str
@@ -141,14 +137,10 @@ async def _measure(
 
 
 class HeldRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One way to a program outside.
+    """One way to a program outside: simulated seconds per second with it, and with a worker.
 
     Attributes:
-        case: Which.
-        rounds: Flights of each side.
-        outside_speed: Simulated seconds per second with the program, median.
-        worker_speed: The same with a worker.
-        ratio: The first to the second.
+        rounds: Flights of each side; speeds are medians.
         equal: Whether all flights had the same estimates at the same times.
     """
 

@@ -55,13 +55,10 @@ class StallRow(LateRow, frozen=True, kw_only=True):
     """One way of fetching images.
 
     Attributes:
-        mode: Which.
         missed: Ticks left out because an earlier one came too late.
-        update_mean_ms: Mean time from one tick to the next, milliseconds.
-        update_median_ms: Its median.
-        update_sd_ms: Its standard deviation.
+        update_mean_ms: Mean time from one tick to the next.
         frames: How many pairs of images came.
-        fetch_ms_median: Median milliseconds from asking for a pair to having it; 0 without any.
+        fetch_ms_median: From asking for a pair to having it; 0 without any.
     """
 
     mode: str

@@ -31,10 +31,7 @@ class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
     """One way through.
 
     Attributes:
-        case: What passed, and how.
         batch: How many at a time.
-        per_event_us: Microseconds each.
-        events_per_second: The same the other way round.
         bytes_per_second: Of payload.
     """
 
@@ -51,12 +48,9 @@ class ThroughputRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class IdleRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One run.
+    """One run of a timer.
 
     Attributes:
-        hz: Rate of the timer.
-        seconds: Length of the run.
-        ticks: How many came.
         cpu_percent: Of one core, all threads of the process together.
     """
 
