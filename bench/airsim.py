@@ -22,10 +22,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from bench.lateness import BEATS, PROBE, LateRow, figures, lateness, ratios
+from bench.lateness import LateRow, figures, hover, lateness, ratios
 from bench.system import free_port
-from runtime.config.reading import parse
-from runtime.run.execute import execute
 from sims.airsim.client.rpc import RpcClient
 from sims.airsim.structures import ImageRequest
 
@@ -75,7 +73,6 @@ def measure(
         progress: Called with what is being measured.
     """
     progress(f"airsim: {2 * rounds * len(CASES)} windows of {WINDOW:g} s")
-    BEATS.clear()
     port = free_port()
     windows: list[Window] = []
     command = [sys.executable, "-m", "bench.airsim", str(port), str(rounds)]
@@ -86,7 +83,8 @@ def measure(
             target=lambda: windows.extend(Window(*json.loads(line)) for line in lines)
         )
         reading.start()
-        execute(parse(_settings(port, 2 * rounds * len(CASES) * WINDOW + START), "bench airsim"))
+        seconds = 2 * rounds * len(CASES) * WINDOW + START
+        hover("airsim", seconds, {"name": "airsim", "type": "AirsimServer", "port": port})
         reading.join()
     quiet, busy = windows[0::2], windows[1::2]
     if len(busy) < rounds * len(CASES):
@@ -110,17 +108,6 @@ def _row(case: str, windows: list[Window], quiet: list[Any]) -> AirsimRow:
         ratio_p99=ratios(late, quiet)[1],
         **figures(late),
     )
-
-
-def _settings(port: int, seconds: float) -> dict[str, Any]:
-    return {
-        "run": {"clock": "real", "duration": seconds, "log": "error"},
-        "nodes": [
-            PROBE,
-            {"name": "drone", "type": "Multirotor"},
-            {"name": "airsim", "type": "AirsimServer", "port": port},
-        ],
-    }
 
 
 async def ask(port: int, rounds: int) -> None:

@@ -24,13 +24,11 @@ from typing import Any
 
 import zenoh
 
-from bench.lateness import BEATS, PROBE, LateRow, figures, lateness, ratios
+from bench.lateness import LateRow, figures, hover, lateness, ratios
 from bench.system import free_port, zenoh_config
 from nodes.ros2.bridge.keys import data_key
 from nodes.ros2.messages.topics import Topic
 from nodes.ros2.messages.typestore import TypeStore
-from runtime.config.reading import parse
-from runtime.run.execute import execute
 
 TWIST = "geometry_msgs/msg/Twist"
 BURST = 0.001
@@ -69,11 +67,17 @@ def measure(
         progress: Called with what is being measured.
     """
     progress(f"{windows} windows of {WINDOW:g} s, every other with {rate:g} messages a second")
-    BEATS.clear()
     port = free_port()
     found: list[tuple[int, int, int]] = []
     with _flooder(port, rate, windows, found):
-        execute(parse(_settings(port, windows * WINDOW + 8.0), "bench flood"))
+        bridge = {
+            "name": "ros2",
+            "type": "Ros2Bridge",
+            "connect": [],
+            "listen": [f"tcp/127.0.0.1:{port}"],
+            "subscriptions": [{"topic": "/cmd_vel", "type": TWIST, "as": "velocity"}],
+        }
+        hover("flood", windows * WINDOW + 8.0, bridge)
     quiet, flood = found[0::2], found[1::2]
     return [_row("quiet", quiet, quiet), _row("flood", flood, quiet)]
 
@@ -109,24 +113,6 @@ def _read(process: subprocess.Popen[str], found: list[tuple[int, int, int]]) -> 
             process.stdin.flush()
         else:
             found.append(tuple(json.loads(line)))
-
-
-def _settings(port: int, seconds: float) -> dict[str, Any]:
-    subscription = {"topic": "/cmd_vel", "type": TWIST, "as": "velocity"}
-    return {
-        "run": {"clock": "real", "duration": seconds, "log": "error"},
-        "nodes": [
-            PROBE,
-            {"name": "drone", "type": "Multirotor"},
-            {
-                "name": "ros2",
-                "type": "Ros2Bridge",
-                "connect": [],
-                "listen": [f"tcp/127.0.0.1:{port}"],
-                "subscriptions": [subscription],
-            },
-        ],
-    }
 
 
 def _row(

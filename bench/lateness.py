@@ -82,6 +82,14 @@ class Probe(TakeoffNode[NodeConfig]):
 PROBE: dict[str, Any] = {"name": "probe", "type": f"{__name__}:Probe"}
 
 
+def hover(benchmark: str, seconds: float, *nodes: dict[str, Any]) -> None:
+    """Have a multirotor hover on the real clock, with the probe and other nodes beside it."""
+    BEATS.clear()
+    run = {"clock": "real", "duration": seconds, "log": "error"}
+    here = [PROBE, {"name": "drone", "type": "Multirotor"}, *nodes]
+    execute(parse({"run": run, "nodes": here}, f"bench {benchmark}"))
+
+
 def figures(runs: Sequence[Any]) -> dict[str, Any]:
     """Return the fields of a row; each run is a list of lateness, nanoseconds."""
     late = np.concatenate(runs) / 1e3

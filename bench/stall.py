@@ -33,12 +33,10 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from bench.lateness import BEATS, PROBE, Beat, LateRow, figures
+from bench.lateness import BEATS, Beat, LateRow, figures, hover
 from bench.system import in_turns
 from events import Odometry
 from runtime import Input, Node, NodeConfig, Tick, Worker, every
-from runtime.config.reading import parse
-from runtime.run.execute import execute
 from sims.cameras import CameraRenderer, CameraSpec, add_free_camera, model_to_bytes, pose_to_qpos
 from sims.worlds import load_world
 
@@ -219,33 +217,15 @@ def measure(
     with slow_server(pair_size(size, size)) as port:
         for number, mode in in_turns(modes, repeats):
             progress(f"round {number + 1} of {repeats}: {mode}")
-            BEATS.clear()
-            execute(parse(_settings(mode, seconds, rate, size, port), "bench stall"))
+            settings = {"mode": mode, "rate": rate, "width": size, "height": size, "port": port}
+            camera = {"name": "camera", "type": f"{__name__}:Camera", **settings}
+            hover("stall", seconds + 1.0, camera)
             _collected.setdefault(mode, _Samples()).add(BEATS)
     rows = [_row(mode, _collected[mode]) for mode in modes]
     return [
         msgspec.structs.replace(row, ratio_p99=row.late_p99_us / rows[0].late_p99_us)
         for row in rows
     ]
-
-
-def _settings(mode: Mode, seconds: float, rate: float, size: int, port: int) -> dict[str, Any]:
-    return {
-        "run": {"clock": "real", "duration": seconds + 1.0, "log": "error"},
-        "nodes": [
-            PROBE,
-            {"name": "drone", "type": "Multirotor"},
-            {
-                "name": "camera",
-                "type": f"{__name__}:Camera",
-                "mode": mode,
-                "rate": rate,
-                "width": size,
-                "height": size,
-                "port": port,
-            },
-        ],
-    }
 
 
 def _row(mode: str, samples: _Samples) -> StallRow:
