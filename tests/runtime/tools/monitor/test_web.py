@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import subprocess
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -169,3 +172,9 @@ async def test_a_page_that_is_slow_still_sees_how_it_ended() -> None:
 def test_faster_starts_from_a_speed_even_when_time_stands() -> None:
     assert page_data(snapshot(clock_paused=True, clock_speed=0.0))["speed"] == 1.0
     assert page_data(snapshot(clock_target_speed=0.5))["speed"] == 0.5
+
+
+def test_the_page_needs_no_textual() -> None:
+    """In a fresh process, as other tests have imported it."""
+    code = "import sys; sys.modules['textual'] = None; import runtime.tools.monitor.web"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[4])
