@@ -52,12 +52,13 @@ def command(
 
 
 def command_here(*arguments: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Do what `command` does in this process: for commands that run no nodes."""
+    """Do what `command` does in this process: where that a process ends, or how, is no matter."""
     words = ["runtime", *map(str, arguments)]
     out, err, code = io.StringIO(), io.StringIO(), 0
     with (
         mock.patch.object(sys, "argv", words),
         mock.patch.object(sys, "path", [*sys.path]),
+        mock.patch.object(os, "_exit", sys.exit),
         mock.patch.dict(os.environ, {"COLUMNS": "200", "NO_COLOR": "1"}),
         contextlib.chdir(folder),
         contextlib.redirect_stdout(out),

@@ -1,4 +1,4 @@
-"""The command line, in a fresh process wherever it runs nodes."""
+"""The command line, in a fresh process where that is the subject."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ def test_a_run_leaves_a_full_summary_and_a_file_that_runs_again(tmp_path: Path) 
     assert (results / "log.txt").exists()
     msgspec.json.decode((results / "summary.json").read_bytes(), type=Summary)
 
-    again = command("run", results / "config.toml", "--out", "again", "-q", folder=tmp_path)
+    again = command_here("run", results / "config.toml", "--out", "again", "-q", folder=tmp_path)
     assert (again.returncode, again.stdout) == (0, "")
     assert summary(tmp_path / "again")["digest"] == first["digest"]
-    other = command("run", path, "--set", "run.seed=1", "-q", folder=tmp_path)
+    other = command_here("run", path, "--set", "run.seed=1", "-q", folder=tmp_path)
     assert other.returncode == 0
     assert summary(results)["digest"] != first["digest"]
 
@@ -70,7 +70,7 @@ def test_the_results_of_an_earlier_run_are_kept_once(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Noise", run="duration = 1")
     runs = tmp_path / "runs"
     for seed in range(3):
-        done = command("run", path, "--set", f"run.seed={seed}", folder=tmp_path)
+        done = command_here("run", path, "--set", f"run.seed={seed}", folder=tmp_path)
         assert done.returncode == 0
         kept = "the earlier run in runs/sample is now runs/sample.1"
         assert (kept in done.stderr) == (seed > 0)
@@ -79,7 +79,7 @@ def test_the_results_of_an_earlier_run_are_kept_once(tmp_path: Path) -> None:
     assert seeds == [1, 2]
     (runs / "sample.1" / ".visnav-run").unlink()
     (runs / "sample.1" / "summary.json").write_text("mine")
-    done = command("run", path, folder=tmp_path)
+    done = command_here("run", path, folder=tmp_path)
     assert done.returncode == 2
     assert "runs/sample.1: expected a new or empty folder" in done.stderr
     assert summary(runs / "sample")["seed"] == 2
@@ -238,7 +238,7 @@ def test_settings_describes_what_every_file_may_have(tmp_path: Path) -> None:
 
 def test_log_events_prints_each_event_with_arrays_by_shape(tmp_path: Path) -> None:
     path = config_file(tmp_path, "Speaker", "Painter", run="duration = 0.25")
-    done = command("run", path, "--log", "events", "-q", folder=tmp_path)
+    done = command_here("run", path, "--log", "events", "-q", folder=tmp_path)
     assert done.returncode == 0
     log = (tmp_path / "runs" / "sample" / "log.txt").read_text()
     assert log.count("events: speaker.pings Ping speaker: count=") == 3

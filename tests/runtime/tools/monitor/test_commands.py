@@ -21,7 +21,6 @@ import pytest
 
 from tests.runtime.tools.samples_cli import (
     ROOT,
-    command,
     command_here,
     config_file,
     start,
@@ -146,7 +145,7 @@ def test_the_screen_and_the_run_share_a_terminal(tmp_path: Path, sockets: Path) 
 @pytest.mark.slow
 def test_a_trace_is_written_and_read(tmp_path: Path, sockets: Path) -> None:
     path = config_file(tmp_path, run="duration = 1", settings=LOOP)
-    done = command("run", path, "-q", "--trace", "t.json.gz", folder=tmp_path)
+    done = command_here("run", path, "-q", "--trace", "t.json.gz", folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     told = command_here("trace", "t.json.gz", folder=tmp_path)
     assert "path 1: drone/front Image → vo PoseEstimate → pilot VelocitySetpoint" in told.stdout
