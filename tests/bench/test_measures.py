@@ -48,6 +48,7 @@ def test_stall_rows_are_statistics_of_what_was_collected() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(240)
 def test_lockstep_is_compared_with_a_bare_loop() -> None:
     """Both fly; the run takes longer than the bare loop, and cameras longer than none."""
     bare, run, cameras = lockstep.measure(seconds=5, repeats=3)  # medians, as one may be held up
@@ -77,6 +78,7 @@ def test_throughput_covers_handlers_streams_and_workers() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(240)
 def test_the_parts_of_a_frame_add_up() -> None:
     """To the whole; each that is measured by itself takes some time, and none takes it all."""
     rows = {row.part: row for row in lockstep.measure_parts(seconds=2, repeats=1)}
