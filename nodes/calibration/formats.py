@@ -28,7 +28,7 @@ from events import CameraAnnouncement
 from events.frames import axes_of
 from events.geometry import inverse, pose_matrix, pose_tuples
 from nodes.data.dataset.recording import Rig, real, templates
-from nodes.ros2.messages.publications import TopicKind, publication
+from nodes.ros2.messages.mappings import TopicKind, publication
 from nodes.ros2.messages.topics import PublishingConfig
 
 DEPTH_FACTOR = 5000.0

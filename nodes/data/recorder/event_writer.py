@@ -20,6 +20,7 @@ from nodes.data.mcap import native
 from nodes.data.mcap.mcap_file import McapWriter
 from nodes.data.mcap.native import HOLDERS
 from nodes.data.recorder.pipe import McapRecorderConfig
+from nodes.ros2.messages.mappings import LARGE, SMALL
 from nodes.ros2.messages.publishing import Publishing
 from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, Topic, ros_name
 from nodes.ros2.messages.typestore import Stamps, TypeStore
@@ -123,10 +124,7 @@ class EventWriter:
             return None
         if issubclass(cls, Announcement):
             return self._ros.announced
-        for base, put in self._ros.large.items():
-            if issubclass(cls, base):
-                return put
-        return self._ros.small if self._ros.knows(cls) else None
+        return self._ros.put if issubclass(cls, LARGE + SMALL) else None
 
     def _write_own(
         self, kind: str, source: str, frame: bytes | bytearray, announcement: bool

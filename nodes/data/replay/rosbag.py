@@ -15,53 +15,31 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 
 from events import (
     Announcement,
     CameraAnnouncement,
-    DepthImage,
     EstimatorAnnouncement,
     Event,
     Image,
-    Imu,
     ImuAnnouncement,
     Odometry,
-    PoseEstimate,
 )
 from events.frames import convert_rotation, convert_vector, multiply, normalize, rotate
 from events.geometry import Pose
 from nodes.data.mcap import layout
 from nodes.data.replay.folders import vehicle_at
 from nodes.data.replay.reader import BagTopic, Reader, ReplayError, Timed, Use, Wants
-from nodes.ros2.messages.calibration import camera_announcement
-from nodes.ros2.messages.images import decode_compressed
-from nodes.ros2.messages.incoming import READERS, MessageContext, estimate
+from nodes.ros2.messages.incoming import MessageContext, camera_announcement
+from nodes.ros2.messages.mappings import READERS
 from nodes.ros2.messages.typestore import Bag, Stamps
 from runtime.errors import VisnavError, suggest
 from runtime.time.schedule import SECOND
 
-TYPES: dict[Use, tuple[str, ...]] = {
-    "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
-    "depth": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
-    "camera": ("sensor_msgs/msg/CameraInfo",),
-    "imu": ("sensor_msgs/msg/Imu",),
-    "odometry": ("nav_msgs/msg/Odometry",),
-    "truth": (
-        "nav_msgs/msg/Odometry",
-        "geometry_msgs/msg/PoseStamped",
-        "geometry_msgs/msg/TransformStamped",
-    ),
-    "estimate": (
-        "nav_msgs/msg/Odometry",
-        "geometry_msgs/msg/PoseStamped",
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "nav_msgs/msg/Path",
-    ),
-}
+TYPES = {use: tuple(t for t, to in READERS if to == use) for use in get_args(Use)}
 """What can be read of which type of message."""
 
 _PARTS = {
@@ -194,14 +172,7 @@ class Mountings:
 _SAME_CLOCK = 60 * SECOND
 """Nanoseconds between stamp and receipt above which they are of different clocks."""
 
-_EVENTS: dict[Use, type[Event]] = {
-    "image": Image,
-    "depth": DepthImage,
-    "imu": Imu,
-    "odometry": Odometry,
-    "truth": Odometry,
-    "estimate": PoseEstimate,
-}
+_EVENTS = {use: row.becomes or row.events[0] for (_, use), row in READERS.items() if use in TYPES}
 
 _LATER = 1 << 62
 """Stands for the stamp of a message that has none."""
@@ -276,38 +247,10 @@ class RosBag(Reader):
         context = MessageContext(
             source=topic.source, now=_LATER, stamps=self._stamps, frame_id=topic.frame_id
         )
-        if topic.use == "truth" or topic.use == "odometry":
-            return self._truth(topic, type_, message, context)
-        if type_ == "sensor_msgs/msg/CompressedImage":
-            return _compressed(topic.use, message, context)
-        event = READERS[type_, topic.use](message, context)
+        use = "truth" if topic.use == "odometry" else topic.use  # the vehicle's
+        event = READERS[type_, use].read(message, context)
         assert event is not None
         return event
-
-    def _truth(
-        self, topic: BagTopic, type_: str, message: Any, context: MessageContext
-    ) -> Odometry:
-        """Read a true pose; it is in ``map`` unless the settings say otherwise."""
-        context = msgspec.structs.replace(context, frame_id=topic.frame_id or "map")
-        if type_ == "nav_msgs/msg/Odometry":
-            event = READERS[type_, "odometry"](message, context)
-            assert isinstance(event, Odometry)
-            return msgspec.structs.replace(event, child_frame_id="base_link")
-        if type_ == "geometry_msgs/msg/TransformStamped":
-            moved = message.transform
-            where = SimpleNamespace(position=moved.translation, orientation=moved.rotation)
-            message = SimpleNamespace(header=message.header, pose=where)
-        pose = estimate(message, context)
-        assert isinstance(pose, PoseEstimate)
-        return Odometry(
-            stamp=pose.stamp,
-            source=pose.source,
-            frame_id=pose.frame_id,
-            position=pose.position,
-            orientation=pose.orientation,
-            linear_velocity=(0.0, 0.0, 0.0),  # nobody says
-            angular_velocity=(0.0, 0.0, 0.0),
-        )
 
     def _first_messages(self) -> dict[str, tuple[str, int, Any]]:
         """Return type, time of receipt and content of each topic's first message."""
@@ -421,14 +364,3 @@ def _stamp(message: Any) -> int:
     """Return a header's stamp (ns); 0 if it has none."""
     stamp = message.header.stamp
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
-
-
-def _compressed(use: Use, message: Any, context: MessageContext) -> Event:
-    stamp, frame_id = context.stamp(message.header), context.frame(message.header, "")
-    pixels = decode_compressed(message)
-    if use == "depth":
-        return DepthImage(stamp=stamp, source=context.source, frame_id=frame_id, data=pixels)
-    encoding = "rgb8" if pixels.ndim == 3 else "mono8"
-    return Image(
-        stamp=stamp, source=context.source, frame_id=frame_id, encoding=encoding, data=pixels
-    )

@@ -27,7 +27,8 @@ from nodes.data.export import mounting
 from nodes.data.replay.reader import BagTopic
 from nodes.data.replay.rosbag import chosen, open_bag, readable
 from nodes.judging.evaluation.record import EstimatorRecord
-from nodes.ros2.messages.incoming import READERS, MessageContext
+from nodes.ros2.messages.incoming import MessageContext
+from nodes.ros2.messages.mappings import READERS
 from nodes.ros2.messages.typestore import Bag
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import read_euroc, read_kitti, read_tum, read_vslamlab
@@ -79,7 +80,7 @@ def _estimate(type_: str, message: Any) -> PoseEstimate:
     length = float(np.linalg.norm([q.w, q.x, q.y, q.z]))
     if not abs(length - 1.0) < 0.01:
         raise ValueError(f"expected a quaternion of length 1, found one of length {length:.6g}")
-    event = READERS[type_, "estimate"](message, MessageContext(source="bag", now=_NEVER))
+    event = READERS[type_, "estimate"].read(message, MessageContext(source="bag", now=_NEVER))
     assert isinstance(event, PoseEstimate)
     # A run begins at 0; a node that forgets the stamp sends many of these, which are counted.
     return msgspec.structs.replace(event, stamp=0) if event.stamp == _NEVER else event

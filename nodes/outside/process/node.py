@@ -22,7 +22,7 @@ from nodes.outside.native import LinkAnswer, LinkError, describe
 from nodes.outside.native.client import SAMPLE
 from nodes.outside.process.launch import Launch, ProcessConfig, ProgramError
 from nodes.outside.process.program import KINDS, Feed, Program
-from nodes.ros2.messages.publications import TopicKind, publication
+from nodes.ros2.messages.mappings import TopicKind, publication
 from nodes.ros2.messages.topics import PublishingConfig
 from runtime import Node, on
 from runtime.channels.bundles import Field, Matcher, Slot

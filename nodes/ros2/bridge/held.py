@@ -23,7 +23,7 @@ from nodes.ros2.bridge.keys import Message, Token
 from nodes.ros2.bridge.publisher import Publisher
 from nodes.ros2.bridge.session import Session
 from nodes.ros2.bridge.settings import Ros2BridgeConfig
-from nodes.ros2.messages.publications import IMAGES, publication
+from nodes.ros2.messages.mappings import PUBLISHED, publication
 from nodes.ros2.messages.topics import Topic, topic_name
 from nodes.ros2.messages.typestore import Stamps
 from runtime import Node
@@ -61,7 +61,8 @@ class HeldEstimator:
         self._topics, self._stamps = topics, stamps
         self._max_size = config.max_message_size
         self._needs = [topic_name(config.namespace, each) for each in self.subscription.needs]
-        found = [publication(kind, self.subscription.answers_to, config) for kind in IMAGES]
+        images = [row.kind for row in PUBLISHED if row.image]
+        found = [publication(kind, self.subscription.answers_to, config) for kind in images]
         self._images = [each.topic for each in found if each is not None]
         self._owed = -1  # stamp of the newest image
         self._sequences: dict[bytes, int] = {}  # by GID

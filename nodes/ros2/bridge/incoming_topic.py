@@ -36,8 +36,8 @@ from nodes.ros2.bridge.settings import (
     event_type,
     import_mapping,
 )
-from nodes.ros2.messages.calibration import camera_announcement
-from nodes.ros2.messages.incoming import READERS, MessageContext, Reader
+from nodes.ros2.messages.incoming import MessageContext, camera_announcement
+from nodes.ros2.messages.mappings import READERS
 from nodes.ros2.messages.topics import Qos, Topic, ros_name, topic_name
 from nodes.ros2.messages.typestore import MessageBuilder, MessageError, Stamps, TypeStore
 from runtime import Stream
@@ -68,7 +68,10 @@ class IncomingTopic:
         self.received = 0
         self._store = store
         self._complaints = complaints
-        self._read = _reader(subscription)
+        if subscription.use:
+            self._read = READERS[subscription.type, subscription.use].read
+        else:
+            self._read = import_mapping(subscription.topic, subscription.mapping)
 
     def complain(self, kind: str, detail: str) -> None:
         """Count, and now and then log, something wrong with this topic."""
@@ -171,12 +174,6 @@ def topic(store: TypeStore, name: str, type_: str, qos: Qos) -> Topic:
         return Topic(name=name, type=type_, hash=store.hash(type_), qos=qos)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
-
-
-def _reader(subscription: Subscription) -> Reader:
-    if subscription.use:
-        return READERS[subscription.type, subscription.use]
-    return import_mapping(subscription.topic, subscription.mapping)
 
 
 BUDGET = 0.0005

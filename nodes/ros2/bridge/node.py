@@ -36,7 +36,8 @@ from nodes.ros2.bridge.publisher import Publisher
 from nodes.ros2.bridge.session import Session, SessionError
 from nodes.ros2.bridge.settings import Ros2BridgeConfig, event_type
 from nodes.ros2.bridge.simulation_services import Services
-from nodes.ros2.messages.publishing import LARGE, SMALL, Publishing
+from nodes.ros2.messages.mappings import LARGE, SMALL
+from nodes.ros2.messages.publishing import Publishing
 from nodes.ros2.messages.typestore import Stamps, TypeStore
 from runtime import Node, Output, Stream, Tick, every, on
 from runtime.channels.ports import Handles
@@ -206,8 +207,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             publishing.begin()
         for text in publishing.unannounced():
             self.log.warning("%s", text)
-        for kind, events in self._queues.items():
-            self.start(self._publish_all(events, publishing.large[kind]))
+        for events in self._queues.values():
+            self.start(self._publish_all(events, publishing.put))
         for outgoing in self._outgoing:
             outgoing.publisher = (self._line or session).publisher(outgoing.topic)
             put = functools.partial(outgoing.put, publishing.builder)
@@ -252,18 +253,16 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
     @on(*LARGE)
     def images_and_clouds(self, event: Event) -> None:
         """Publish an image or a point cloud beside the loop."""
-        kind = next(kind for kind in self._queues if isinstance(event, kind))
         if self._line is None:
-            self._queues[kind].offer(event)
+            next(s for kind, s in self._queues.items() if isinstance(event, kind)).offer(event)
         elif self._publishing is not None:
-            put = self._publishing.large[kind]
-            self._line.publish_image(event, put, self._publishing.clock)
+            self._line.publish_image(event, self._publishing.put, self._publishing.clock)
 
     @on(*SMALL)
     def measurements(self, event: Event) -> None:
         """Publish what is small, at once."""
         if self._publishing is not None:
-            self._publish(self._publishing.small, event)
+            self._publish(self._publishing.put, event)
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from events import Event
-from nodes.ros2.messages.incoming import READERS
+from nodes.ros2.messages.mappings import READERS
 from nodes.ros2.messages.topics import (
     Positive,
     PublishingConfig,
@@ -93,8 +93,9 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             raise ValueError(f'{self.topic}: expected either as = "…" or mapping = "…"')
         if self.mapping:
             _importable(self.topic, "mapping", "module:function", self.mapping)
-        if self.use and (self.type, self.use) not in READERS:
-            known = [f"{use} from {type_}" for type_, use in READERS]
+        readers = [key for key, row in READERS.items() if not row.bags]
+        if self.use and (self.type, self.use) not in readers:
+            known = [f"{use} from {type_}" for type_, use in readers]
             raise ValueError(
                 f"{self.topic}: expected one of: {', '.join(known)}; "
                 f"found {self.use} from {self.type}"

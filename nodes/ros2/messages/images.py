@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from events import DepthImage, Image, LidarScan
+from events import LidarScan
 from nodes.ros2.messages.typestore import Time, TypeStore
 
 
@@ -244,8 +244,8 @@ class CloudWriter:
         return frame, rows
 
 
-def read_image(message: Any, source: str, stamp: int, frame_id: str) -> Image:
-    """Read a colour or grey image.
+def image_pixels(message: Any) -> npt.NDArray[np.uint8]:
+    """Return the pixels of an Image: RGB, shape (height, width, 3), or grey.
 
     Raises:
         ValueError: The encoding is another, or sizes do not fit each other.
@@ -256,17 +256,15 @@ def read_image(message: Any, source: str, stamp: int, frame_id: str) -> Image:
             f"encoding: expected one of {', '.join(_PIXEL_BYTES)}, found {message.encoding!r:.80}"
         )
     pixels = _rows(message, channels).reshape(message.height, message.width, channels)
-    if channels == 1:
-        return Image(
-            stamp=stamp, source=source, frame_id=frame_id, encoding="mono8", data=pixels[:, :, 0]
-        )
     turn = _TURNS.get(message.encoding)
-    rgb: Any = np.ascontiguousarray(pixels) if turn is None else cv2.cvtColor(pixels, turn)
-    return Image(stamp=stamp, source=source, frame_id=frame_id, data=rgb)
+    found: npt.NDArray[Any] = pixels[:, :, 0] if channels == 1 else np.ascontiguousarray(pixels)
+    return found if turn is None else np.asarray(cv2.cvtColor(pixels, turn), np.uint8)
 
 
-def read_depth(message: Any, source: str, stamp: int, frame_id: str) -> DepthImage:
-    """Read depth in metres (``32FC1``) or millimetres (``16UC1``); what is not known is ``inf``.
+def depth_pixels(message: Any) -> npt.NDArray[np.float32]:
+    """Return the metres of an Image of metres (``32FC1``) or millimetres (``16UC1``).
+
+    What is not known is ``inf``.
 
     Raises:
         ValueError: The encoding is another, or sizes do not fit each other.
@@ -280,7 +278,7 @@ def read_depth(message: Any, source: str, stamp: int, frame_id: str) -> DepthIma
     )
     metres = rows.astype(np.float32) * np.float32(1.0 if size == 4 else 0.001)
     metres[~(metres > 0.0)] = np.inf
-    return DepthImage(stamp=stamp, source=source, frame_id=frame_id, data=metres)
+    return metres
 
 
 def decoded_pixels(code: npt.NDArray[np.uint8]) -> npt.NDArray[Any]:
@@ -329,7 +327,6 @@ class CompressedDepthWriter:
         self,
         store: TypeStore,
         frame_id: str,
-        *,
         inverse: bool = True,
         farthest: float = 10.0,
         quantization: float = 100.0,

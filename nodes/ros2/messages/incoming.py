@@ -1,22 +1,27 @@
 """ROS messages to events, in our frames. What makes no sense is refused with a ValueError.
 
-`READERS` has a function for each type of message and use; a mapping of the user's own is called
-alike. World ENU becomes NED, body FLU FRD; optical axes stay. See `frames`. Images are in
-`images`.
+A function for each row of `mappings`; a mapping of the user's own is called alike. World ENU
+becomes NED, body FLU FRD; optical axes stay.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import inf, isfinite
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from events import (
+    CameraAnnouncement,
+    CameraInfo,
+    DepthImage,
     Event,
     FluidPressure,
+    Image,
     Imu,
     MagneticField,
     NavSatFix,
@@ -29,7 +34,9 @@ from events import (
     Vector3,
     VelocitySetpoint,
 )
+from events.camera_info import COEFFICIENTS
 from events.frames import (
+    OPTICAL_TO_FRD,
     axes_of,
     convert_covariance,
     convert_rotation,
@@ -37,7 +44,7 @@ from events.frames import (
     normalize,
     yaw_of,
 )
-from nodes.ros2.messages.images import read_depth, read_image
+from nodes.ros2.messages.images import decode_compressed, depth_pixels, image_pixels
 from nodes.ros2.messages.typestore import Stamps
 
 
@@ -222,42 +229,131 @@ def fix(message: Any, context: MessageContext) -> Event:
 
 def image(message: Any, context: MessageContext) -> Event:
     """Read an Image as a colour or grey image."""
-    header = message.header
-    return read_image(message, context.source, context.stamp(header), context.frame(header, ""))
+    return _image(message, context, image_pixels(message))
+
+
+def compressed_image(message: Any, context: MessageContext) -> Event:
+    """Read a CompressedImage as a colour or grey image."""
+    return _image(message, context, decode_compressed(message))
 
 
 def depth(message: Any, context: MessageContext) -> Event:
     """Read an Image as depth."""
-    header = message.header
-    return read_depth(message, context.source, context.stamp(header), context.frame(header, ""))
+    return _depth(message, context, depth_pixels(message))
+
+
+def compressed_depth(message: Any, context: MessageContext) -> Event:
+    """Read a CompressedImage as depth."""
+    return _depth(message, context, decode_compressed(message))
+
+
+def true_odometry(message: Any, context: MessageContext) -> Event:
+    """Read an Odometry as the true pose of a body, in ``map`` unless settings say otherwise."""
+    context = msgspec.structs.replace(context, frame_id=context.frame_id or "map")
+    return msgspec.structs.replace(odometry(message, context), child_frame_id="base_link")
+
+
+def true_pose(message: Any, context: MessageContext) -> Event:
+    """Read a PoseStamped as the true pose of a body, like `true_odometry`."""
+    frame_id = context.frame_id or "map"
+    place, orientation = _pose(message.pose, frame_id, "base_link")
+    return Odometry(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=frame_id,
+        position=place,
+        orientation=orientation,
+        linear_velocity=(0.0, 0.0, 0.0),  # nobody says
+        angular_velocity=(0.0, 0.0, 0.0),
+    )
+
+
+def true_transform(message: Any, context: MessageContext) -> Event:
+    """Read a TransformStamped as the true pose of a body, like `true_odometry`."""
+    moved = message.transform
+    pose = SimpleNamespace(position=moved.translation, orientation=moved.rotation)
+    return true_pose(SimpleNamespace(header=message.header, pose=pose), context)
 
 
 def nothing(message: Any, context: MessageContext) -> None:
     """Make no event of a message."""
 
 
-READERS: dict[tuple[str, str], Reader] = {
-    ("geometry_msgs/msg/PoseStamped", "estimate"): estimate,
-    ("geometry_msgs/msg/PoseWithCovarianceStamped", "estimate"): estimate_with_covariance,
-    ("nav_msgs/msg/Odometry", "estimate"): estimate_with_covariance,
-    ("nav_msgs/msg/Odometry", "odometry"): odometry,
-    ("nav_msgs/msg/Path", "estimate"): newest,
-    ("geometry_msgs/msg/Twist", "velocity"): velocity,
-    ("geometry_msgs/msg/TwistStamped", "velocity"): stamped_velocity,
-    ("geometry_msgs/msg/PoseStamped", "position"): position,
-    ("geometry_msgs/msg/PoseStamped", "pose"): pose,
-    ("sensor_msgs/msg/Image", "image"): image,
-    ("sensor_msgs/msg/Image", "depth"): depth,
-    ("sensor_msgs/msg/Imu", "imu"): imu,
-    ("sensor_msgs/msg/Range", "range"): distance,
-    ("sensor_msgs/msg/FluidPressure", "pressure"): pressure,
-    ("sensor_msgs/msg/MagneticField", "magnetic_field"): magnetic_field,
-    ("sensor_msgs/msg/NavSatFix", "fix"): fix,
-    ("sensor_msgs/msg/CameraInfo", "camera"): nothing,
-    ("std_msgs/msg/Header", "done"): nothing,
-    ("builtin_interfaces/msg/Time", "done"): nothing,
-}
-"""By type of message and use."""
+def camera_announcement(
+    message: Any, source: str, images: tuple[str, ...], frame_id: str = ""
+) -> CameraAnnouncement:
+    """Return the announcement of a camera that looks ahead from the body's origin.
+
+    Args:
+        message: A ``sensor_msgs/msg/CameraInfo``.
+        images: Which kinds of them there are.
+        frame_id: If set, stands in the place of the message's own.
+
+    Raises:
+        ValueError: The message is no calibration of a camera.
+    """
+    info = camera_info(message)
+    return CameraAnnouncement(
+        stamp=0,
+        source=source,
+        images=images,
+        info=info,
+        rate=30.0,  # nobody says
+        latency=0.0,
+        baseline=abs(float(message.p[3])) / info.fx,
+        frame_id=frame_id or message.header.frame_id,
+        parent_frame_id="base_link",
+        position=(0.0, 0.0, 0.0),
+        orientation=OPTICAL_TO_FRD,
+    )
+
+
+def camera_info(message: Any) -> CameraInfo:
+    """Read the intrinsics of a CameraInfo.
+
+    Raises:
+        ValueError: It describes no camera with a distortion that `CameraInfo` knows.
+    """
+    fx, skew, cx, _, fy, cy, *_ = (float(value) for value in message.k)
+    coefficients = tuple(float(value) for value in message.d)
+    sizes = 1 <= message.width <= 16384 and 1 <= message.height <= 16384
+    finite = isfinite(fx + fy + cx + cy + sum(coefficients))
+    if not (sizes and fx > 0.0 and fy > 0.0 and skew == 0.0 and finite):
+        raise ValueError(
+            f"expected a calibrated camera, found {message.width} x {message.height} pixels "
+            f"with K = {message.k.tolist()} and D = {list(coefficients[:8])}"
+        )
+    part = message.roi.width not in {0, message.width} or message.roi.height not in {
+        0,
+        message.height,
+    }
+    if part or message.binning_x > 1 or message.binning_y > 1:
+        raise ValueError(
+            "expected a calibration of whole images, found binning of "
+            f"{message.binning_x} x {message.binning_y} and a region of interest of "
+            f"{message.roi.width} x {message.roi.height} pixels"
+        )
+    model = message.distortion_model
+    if not any(coefficients) and model != "equidistant":
+        model, coefficients = "plumb_bob", (0.0,) * 5
+    expected = COEFFICIENTS.get(model, 0)
+    # plumb_bob of four has no k3; OpenCV's rational model may have more, of a thin prism and tilt.
+    coefficients += (0.0,) * (expected - len(coefficients) if len(coefficients) == 4 else 0)
+    if not expected or len(coefficients) < expected or any(coefficients[expected:]):
+        known = ", ".join(f"{name} with {count}" for name, count in COEFFICIENTS.items())
+        raise ValueError(
+            f"expected one of {known} coefficients, found {model!r:.80} with {len(message.d)}"
+        )
+    return CameraInfo(
+        width=int(message.width),
+        height=int(message.height),
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        distortion_model=model,
+        distortion=coefficients[:expected],
+    )
 
 
 def _estimate(
@@ -274,6 +370,25 @@ def _estimate(
         position=place,
         orientation=orientation,
         covariance=tuple(given),
+    )
+
+
+def _image(message: Any, context: MessageContext, pixels: npt.NDArray[Any]) -> Event:
+    return Image(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=context.frame(message.header, ""),
+        encoding="rgb8" if pixels.ndim == 3 else "mono8",
+        data=pixels,
+    )
+
+
+def _depth(message: Any, context: MessageContext, metres: npt.NDArray[Any]) -> Event:
+    return DepthImage(
+        stamp=context.stamp(message.header),
+        source=context.source,
+        frame_id=context.frame(message.header, ""),
+        data=metres,
     )
 
 

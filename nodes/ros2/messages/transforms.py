@@ -6,6 +6,8 @@ in ``odom`` stand where they should. Poses in, transforms in ROS's names and axe
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from events import (
     Announcement,
     BodyAnnouncement,
@@ -14,16 +16,26 @@ from events import (
     Odometry,
     PoseEstimate,
     PoseStamped,
+    Quaternion,
     SensorAnnouncement,
     TransformStamped,
+    Vector3,
     VehicleAnnouncement,
 )
 from events.frames import OPTICAL_TO_FLU, Axes, convert_rotation, convert_vector, inverse, multiply
 from events.geometry import Pose, relative
-from nodes.ros2.messages.messages import Transform
 from nodes.ros2.messages.topics import FrameNames, ros_name
 
 _LINK_IN_OPTICAL = inverse(OPTICAL_TO_FLU)
+
+
+class Transform(NamedTuple):
+    """A frame in its parent, already in ROS's names and axes."""
+
+    parent: str
+    child: str
+    translation: Vector3
+    rotation: Quaternion
 
 
 class Transforms:
@@ -76,9 +88,9 @@ class Transforms:
             self._bodies.add(announcement.source)
 
     def add_static(self, event: TransformStamped) -> bool:
-        """Add a fixed transform that a node sent; tell whether it is new."""
+        """Add a transform that a node sent, if it is fixed; tell whether it is new."""
         vehicle, child = self._names.vehicles.of(event.source), event.child_frame_id
-        if self._names.camera(child) or self._is_fixed(vehicle, child):
+        if not event.static or self._names.camera(child) or self._is_fixed(vehicle, child):
             return False
         self._fixed[vehicle, child] = event.frame_id, (event.translation, event.rotation)
         return True
@@ -97,6 +109,20 @@ class Transforms:
             assert frames is not None
             found.append(Transform(frames.link, frames.optical, (0.0, 0.0, 0.0), OPTICAL_TO_FLU))
         return found
+
+    def of(
+        self, event: Odometry | PoseEstimate | PoseStamped | TransformStamped
+    ) -> list[Transform]:
+        """Return where an event puts frames that move."""
+        match event:
+            case Odometry():
+                return self.odometry(event)
+            case PoseEstimate():
+                return self.estimate(event)
+            case PoseStamped():
+                return self.pose(event)
+            case TransformStamped():
+                return self.moving(event)
 
     def odometry(self, event: Odometry) -> list[Transform]:
         """Return where a true pose puts a vehicle's body, or one that has a frame of its own."""

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from events import Event, TrackedFeatures, TrackingLost, Vector3
 from events.frames import convert_vector
-from nodes.ros2.messages.publications import TOPICS
+from nodes.ros2.messages.mappings import PUBLISHED
 from nodes.ros2.messages.topics import Topic
 from nodes.ros2.messages.typestore import TypeStore
 from nodes.viewers.common import INLIER, OUTLIER, VEHICLE, Box, Colour, Trail, describe
@@ -103,7 +103,7 @@ class RosTopics:
 
     def __init__(self, server: Server, store: TypeStore) -> None:
         self.server = server
-        self._definitions = {type_: store.definition(type_) for _, type_, _ in TOPICS.values()}
+        self._definitions = {row.type: store.definition(row.type) for row in PUBLISHED}
         self._stamps = threading.local()  # of what each thread puts
 
     def publisher(self, topic: Topic) -> RosTopic:

@@ -30,7 +30,8 @@ from events import (
 )
 from events.frames import convert_vector
 from events.geometry import Pose
-from nodes.ros2.messages import publishing as ros
+from nodes.ros2.messages import mappings as ros
+from nodes.ros2.messages.publishing import Publishing as RosPublishing
 from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, ros_name
 from nodes.ros2.messages.typestore import Stamps, TypeStore
 from nodes.trajectory import RecentPoses
@@ -82,9 +83,10 @@ class Publishing:
         )
         store = TypeStore()
         topics = RosTopics(server, store)
-        self._ros: ros.Publishing[RosTopic] = ros.Publishing(topics, store, published, Stamps().out)
+        self._ros: RosPublishing[RosTopic]
+        self._ros = RosPublishing(topics, store, published, Stamps().out)
         self._ros.warm_up()
-        self._put = topics.stamped(self._ros.small)
+        self._put = topics.stamped(self._ros.put)
         self._names = self._ros.names
         self._frames: dict[str, str] = {}  # sources of images, by optical frame
         self._estimators: dict[str, str] = {}  # parent frames, by source
@@ -95,10 +97,10 @@ class Publishing:
         """What makes their entities, by source: their frames' names depend on who else there is."""
         self._plan = PlanSelection()
         self.large: dict[type[Event], Callable[[Any], None]] = {
-            kind: topics.stamped(put) for kind, put in self._ros.large.items() if kind in LARGE
+            **dict.fromkeys(LARGE, self._put),
+            PointCloud: self._cloud,
+            TrackedFeatures: self._features,
         }
-        self.large[PointCloud] = topics.stamped(self._cloud)
-        self.large[TrackedFeatures] = self._features
         server.declare("/scene", "SceneUpdate")
         server.declare("/log", "Log")
 
@@ -134,7 +136,7 @@ class Publishing:
     def _cloud(self, event: PointCloud) -> None:
         """Put a point cloud, in the frame of an estimator if it is that."""
         frame = self._renamed.get(event.frame_id, event.frame_id)
-        self._ros.large[PointCloud](msgspec.structs.replace(event, frame_id=frame))
+        self._put(msgspec.structs.replace(event, frame_id=frame))
 
     # At once.
 

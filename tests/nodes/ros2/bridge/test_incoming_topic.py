@@ -10,14 +10,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from events import Event, FluidPressure, MagneticField, NavSatFix, Range
+from events import Event, FluidPressure, Imu, MagneticField, NavSatFix, Range
 from nodes.ros2.bridge.incoming_topic import IncomingTopic
 from nodes.ros2.bridge.keys import Complaints
 from nodes.ros2.bridge.settings import Ros2BridgeConfig, Subscription
+from nodes.ros2.messages import outgoing
 from nodes.ros2.messages.images import ImageWriter
-from nodes.ros2.messages.incoming import READERS
-from nodes.ros2.messages.messages import Messages
-from nodes.ros2.messages.topics import FrameNames
+from nodes.ros2.messages.mappings import READERS
 from nodes.ros2.messages.typestore import MessageError, Stamps, TypeStore
 from tests.nodes.ros2.bridge.mappings import Battery
 from tests.nodes.ros2.messages import samples
@@ -43,54 +42,51 @@ class Ear:
 
 def valid(type_: str) -> bytes:
     """Return a message of a type, as sane as can be."""
-    store, messages = samples.store(), Messages(samples.store(), FrameNames())
-    make: Any = store.message
+    store = samples.store()
+    make, header = store.message, store.header((3, 7), "map")
     vector = make("geometry_msgs/msg/Vector3")(x=1.0, y=2.0, z=3.0)
     twist = make("geometry_msgs/msg/Twist")(linear=vector, angular=vector)
-    header = store.header((3, 7), "map")
+    common: dict[str, Any] = {"stamp": samples.STAMP, "source": "s"}
+    odometry = samples.message(outgoing.odometry, samples.odometry())
+    message: Any
     match type_.rpartition("/")[2]:
         case "Odometry":
-            return bytes(messages.odometry((3, 7), samples.odometry()))
+            message = odometry
         case "Twist":
-            return bytes(store.serialize(twist))
+            message = twist
         case "TwistStamped":
-            return bytes(store.serialize(make(type_)(header=header, twist=twist)))
+            message = make(type_)(header=header, twist=twist)
         case "Image":
             pixels = np.zeros((3, 4, 3), np.uint8)
             return bytes(ImageWriter(store, "f", "rgb8").write((3, 7), pixels))
         case "CameraInfo":
-            return bytes(messages.camera_info((3, 7), samples.camera()))
+            message = samples.calibration(samples.camera())
         case "Imu":
-            orientation = make("geometry_msgs/msg/Quaternion")(x=0.0, y=0.0, z=0.0, w=1.0)
-            zeros = np.zeros(9)
-            return bytes(
-                store.serialize(
-                    make(type_)(header, orientation, zeros, vector, zeros, vector, zeros)
-                )
-            )
+            imu = Imu(**common, angular_velocity=(1, 2, 3), linear_acceleration=(1, 2, 3))
+            message = samples.message(outgoing.imu, imu)
         case "Range":
-            event = Range(stamp=1, source="s", range=1.5, min_range=0.5, max_range=4.0)
-            return bytes(messages.range((3, 7), event))
+            event = Range(**common, range=1.5, min_range=0.5, max_range=4.0)
+            message = samples.message(outgoing.distance, event)
         case "FluidPressure":
-            pressure = FluidPressure(stamp=1, source="s", fluid_pressure=1e5)
-            return bytes(messages.pressure((3, 7), pressure))
+            pressure = FluidPressure(**common, fluid_pressure=1e5)
+            message = samples.message(outgoing.pressure, pressure)
         case "MagneticField":
-            field = MagneticField(stamp=1, source="s", magnetic_field=(1e-5, 2e-5, 3e-5))
-            return bytes(messages.magnetic_field((3, 7), field))
+            field = MagneticField(**common, magnetic_field=(1e-5, 2e-5, 3e-5))
+            message = samples.message(outgoing.magnetic_field, field)
         case "NavSatFix":
-            fix = NavSatFix(stamp=1, source="s", latitude=47.0, longitude=8.0, altitude=400.0)
-            return bytes(messages.fix((3, 7), fix))
+            fix = NavSatFix(**common, latitude=47.0, longitude=8.0, altitude=400.0)
+            message = samples.message(outgoing.fix, fix)
+        case "Path":
+            pose = make("geometry_msgs/msg/PoseStamped")(header=header, pose=odometry.pose.pose)
+            message = make(type_)(header=header, poses=[pose])
         case name:
-            data = messages.odometry((3, 7), samples.odometry())
-            odometry: Any = store.deserialize(bytes(data), "nav_msgs/msg/Odometry")
             inner = odometry.pose if "Covariance" in name else odometry.pose.pose
-            if name == "Path":
-                pose = make("geometry_msgs/msg/PoseStamped")(header=header, pose=inner)
-                return bytes(store.serialize(make(type_)(header=header, poses=[pose])))
-            return bytes(store.serialize(make(type_)(header=header, pose=inner)))
+            message = make(type_)(header=header, pose=inner)
+    return bytes(store.serialize(message))
 
 
-ALL = sorted(each for each in READERS if each[1] != "done")  # that becomes no event
+ALL = sorted(key for key, row in READERS.items() if row.use != "done" and not row.bags)
+"""But for what becomes no event."""
 
 
 @pytest.mark.parametrize(("type_", "use"), ALL)

@@ -25,9 +25,8 @@ from events import (
 )
 from nodes.ros2.bridge.keys import data_key
 from nodes.ros2.bridge.node import Ros2Bridge
-from nodes.ros2.messages.images import ImageWriter, read_image
-from nodes.ros2.messages.messages import Messages
-from nodes.ros2.messages.topics import FrameNames, Topic
+from nodes.ros2.messages.images import ImageWriter, image_pixels
+from nodes.ros2.messages.topics import Topic
 from nodes.ros2.messages.typestore import TypeStore
 from runtime.errors import ConfigError, FatalError, MissingDependencyError
 from runtime.testing import run_node
@@ -180,7 +179,7 @@ def test_a_camera_of_ros_is_waited_for_and_announced(
     type_ = "sensor_msgs/msg/CameraInfo"
     topic = Topic(name="/eye/camera_info", type=type_, hash=samples.store().hash(type_))
     info = samples.camera().info
-    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera())
+    data = samples.store().serialize(samples.calibration(samples.camera()))
     done = threading.Event()
 
     def publish() -> None:
@@ -216,16 +215,16 @@ def test_images_are_read_in_order_beside_the_loop(
     caplog.set_level("INFO")
     threads = []
 
-    def read(*given: Any) -> Image:
+    def read(message: Any) -> np.ndarray:
         threads.append(threading.current_thread())
-        return read_image(*given)
+        return image_pixels(message)
 
     writer = ImageWriter(samples.store(), "eye", "bgr8")
     pixels = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
     images = [bytes(writer.write((0, n), pixels)) for n in range(1, 6)]
     session = TakingSession([*images, b"nonsense"])
     monkeypatch.setattr("nodes.ros2.bridge.node.Session", lambda *_, **__: session)
-    monkeypatch.setattr("nodes.ros2.messages.incoming.read_image", read)
+    monkeypatch.setattr("nodes.ros2.messages.incoming.image_pixels", read)
     table = {"topic": "/eye", "type": "sensor_msgs/msg/Image", "as": "image"}
     found = run_node(Ros2Bridge, config={"subscriptions": [table]}, duration=0.1).of(Image)
     assert [each.stamp for each in found] == [1, 2, 3, 4, 5]

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from math import sqrt
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from events import (
+    Announcement,
     CameraAnnouncement,
     CameraInfo,
     EstimatorAnnouncement,
@@ -16,7 +20,10 @@ from events import (
     Odometry,
     VehicleAnnouncement,
 )
-from nodes.ros2.messages.typestore import TypeStore
+from nodes.ros2.messages import outgoing
+from nodes.ros2.messages.outgoing import Outgoing
+from nodes.ros2.messages.topics import PublishingConfig
+from nodes.ros2.messages.typestore import Stamps, TypeStore
 
 S = sqrt(0.5)
 EAST = (S, 0.0, 0.0, S)
@@ -29,6 +36,28 @@ STAMP = 3_000_000_007
 def store() -> TypeStore:
     """Return the type store, which takes a while to make."""
     return TypeStore()
+
+
+def message(
+    write: Callable[[Outgoing, Any], Any],
+    event: Any,
+    *announced: Announcement,
+    **sensors: Announcement,
+) -> Any:
+    """Return what ROS reads in the message of an event; `sensors` are announced by kind."""
+    out = Outgoing(store(), PublishingConfig(), Stamps().out)
+    for each in announced:
+        out.announced(each)
+    for kind, sensor in sensors.items():
+        out.sensors[kind, sensor.source] = sensor
+    made = write(out, event)
+    return store().deserialize(bytes(store().serialize(made)), made.__msgtype__)
+
+
+def calibration(camera: CameraAnnouncement) -> Any:
+    """Return the CameraInfo of a camera's image."""
+    taken = msgspec.structs.replace(image(), source=camera.source)
+    return message(outgoing.camera_info, taken, camera)
 
 
 def vehicle() -> VehicleAnnouncement:

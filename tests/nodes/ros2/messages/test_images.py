@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 
 from events import LidarScan
+from nodes.ros2.messages import incoming
 from nodes.ros2.messages.images import (
     CloudWriter,
     CompressedWriter,
     ImageWriter,
-    read_depth,
-    read_image,
+    depth_pixels,
+    image_pixels,
 )
+from nodes.ros2.messages.incoming import MessageContext
 from tests.nodes.ros2.messages import samples
 
+CONTEXT = MessageContext(source="s", now=1_000_000_002)
 IMAGE = "sensor_msgs/msg/Image"
 RANDOM = np.random.default_rng(0)
 
@@ -60,7 +63,7 @@ def test_depth_in_millimetres_is_read_back_as_metres() -> None:
     data = ImageWriter(samples.store(), "f", "16UC1").write((1, 2), metres)
     message = samples.store().deserialize(bytes(data), IMAGE)
     assert (message.encoding, message.step, message.data.nbytes) == ("16UC1", 6, 12)
-    read = read_depth(message, "camera", 0, "f").data
+    read = depth_pixels(message)
     expected = np.array([[0.5, np.inf, np.inf], [2.0, np.inf, 65.535]])
     np.testing.assert_allclose(read, expected, rtol=1e-6)
 
@@ -157,10 +160,10 @@ def test_images_come_back_as_they_went() -> None:
         ("rgba8", np.concatenate([data, full], axis=2)),
         ("bgra8", np.concatenate([data[..., ::-1], full], axis=2)),
     ):
-        event = read_image(parsed(encoding, pixels), "s", 1, "f")
+        event: Any = incoming.image(parsed(encoding, pixels), CONTEXT)
         np.testing.assert_array_equal(event.data, data)
-        assert (event.encoding, event.stamp, event.frame_id) == ("rgb8", 1, "f")
-    grey = read_image(parsed("mono8", data[..., 0]), "s", 1, "f")
+        assert (event.encoding, event.stamp, event.frame_id) == ("rgb8", 1_000_000_002, "f")
+    grey: Any = incoming.image(parsed("mono8", data[..., 0]), CONTEXT)
     np.testing.assert_array_equal(grey.data, data[..., 0])
     assert grey.encoding == "mono8"
 
@@ -168,21 +171,21 @@ def test_images_come_back_as_they_went() -> None:
 def test_rows_may_be_filled_up() -> None:
     message = parsed("mono8", np.arange(24, dtype=np.uint8).reshape(3, 8))
     message.width = 5
-    event = read_image(message, "s", 1, "f")
-    np.testing.assert_array_equal(event.data, np.arange(24).reshape(3, 8)[:, :5])
+    np.testing.assert_array_equal(image_pixels(message), np.arange(24).reshape(3, 8)[:, :5])
     message = parsed("bgr8", np.arange(36, dtype=np.uint8).reshape(3, 4, 3))
     message.width = 3
-    event = read_image(message, "s", 1, "f")
-    np.testing.assert_array_equal(event.data, np.arange(36).reshape(3, 4, 3)[:, :3, ::-1])
+    np.testing.assert_array_equal(
+        image_pixels(message), np.arange(36).reshape(3, 4, 3)[:, :3, ::-1]
+    )
 
 
 def test_depth_comes_in_metres_and_what_is_unknown_is_infinite() -> None:
     metres = np.array([[1.5, np.nan, np.inf], [0.0, -1.0, 2.0]], np.float32)
-    found = read_depth(parsed("32FC1", metres), "s", 1, "f").data
+    found = depth_pixels(parsed("32FC1", metres))
     inf = np.inf
     np.testing.assert_array_equal(found, np.array([[1.5, inf, inf], [inf, inf, 2.0]], np.float32))
     millimetres = np.array([[1500, 0, 2]], np.uint16)
-    found = read_depth(parsed("16UC1", millimetres), "s", 1, "f").data
+    found = depth_pixels(parsed("16UC1", millimetres))
     np.testing.assert_allclose(found, [[1.5, inf, 0.002]], rtol=1e-6)
 
 
@@ -205,6 +208,6 @@ def test_a_header_that_does_not_fit_its_data_is_refused(lie: dict[str, Any]) -> 
     for field, value in lie.items():
         setattr(message, field, value)
     with pytest.raises(ValueError, match="expected"):
-        read_image(message, "s", 1, "f")
+        image_pixels(message)
     with pytest.raises(ValueError, match="expected"):
-        read_depth(message, "s", 1, "f")
+        depth_pixels(message)

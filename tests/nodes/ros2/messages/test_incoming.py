@@ -27,10 +27,9 @@ from events import (
 )
 from events.frames import normalize
 from nodes.ros2.bridge.settings import Subscription
-from nodes.ros2.messages.calibration import camera_announcement, camera_info
-from nodes.ros2.messages.incoming import READERS, MessageContext
-from nodes.ros2.messages.messages import Messages
-from nodes.ros2.messages.topics import FrameNames
+from nodes.ros2.messages import outgoing
+from nodes.ros2.messages.incoming import MessageContext, camera_announcement, camera_info
+from nodes.ros2.messages.mappings import READERS
 from nodes.ros2.messages.typestore import Stamps
 from tests.nodes.ros2.messages import samples
 from tests.nodes.ros2.messages.samples import S
@@ -72,7 +71,7 @@ def pose(
 
 def read(message: Any, use: str, **context: Any) -> Any:
     given: dict[str, Any] = {"source": "s", "now": NOW} | context
-    return READERS[message.__msgtype__, use](message, MessageContext(**given))
+    return READERS[message.__msgtype__, use].read(message, MessageContext(**given))
 
 
 def test_a_pose_in_the_map_becomes_an_estimate_in_ned() -> None:
@@ -120,7 +119,6 @@ def test_what_is_published_comes_back_as_it_was(
     rotation: tuple[float, float, float, float],
     frame_id: str,
 ) -> None:
-    store, messages = samples.store(), Messages(samples.store(), FrameNames())
     covariance = tuple(float(i) for i in range(36))
     estimate = PoseEstimate(
         stamp=samples.STAMP,
@@ -130,10 +128,7 @@ def test_what_is_published_comes_back_as_it_was(
         orientation=normalize(rotation),
         covariance=covariance,
     )
-    data = messages.pose_with_covariance((3, 7), estimate, "body")
-    back = read(
-        store.deserialize(bytes(data), "geometry_msgs/msg/PoseWithCovarianceStamped"), "estimate"
-    )
+    back = read(samples.message(outgoing.estimate_with_covariance, estimate), "estimate")
     assert back.position == position
     np.testing.assert_allclose(np.abs(np.dot(back.orientation, estimate.orientation)), 1.0)
     assert back.covariance == covariance
@@ -146,15 +141,13 @@ def test_what_is_published_comes_back_as_it_was(
         linear_velocity=position,
         angular_velocity=position,
     )
-    data = messages.odometry((3, 7), odometry)
-    event = read(store.deserialize(bytes(data), "nav_msgs/msg/Odometry"), "odometry")
+    event = read(samples.message(outgoing.odometry, odometry), "odometry")
     assert (event.linear_velocity, event.angular_velocity) == (position, position)
     assert (event.position, event.stamp, event.frame_id) == (position, samples.STAMP, frame_id)
     measured = Imu(
         stamp=samples.STAMP, source="s", angular_velocity=position, linear_acceleration=position
     )
-    data = messages.imu((3, 7), measured, None)
-    assert read(store.deserialize(bytes(data), "sensor_msgs/msg/Imu"), "imu") == measured
+    assert read(samples.message(outgoing.imu, measured), "imu") == measured
 
 
 def test_a_twist_is_a_velocity_along_the_heading() -> None:
@@ -186,7 +179,6 @@ def test_a_pose_becomes_a_place_with_a_heading() -> None:
 
 
 def test_small_sensors_come_back_as_they_went() -> None:
-    messages = Messages(samples.store(), FrameNames())
     covariance = (1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0)
     common: dict[str, Any] = {"stamp": samples.STAMP, "source": "s"}
     down = Range(
@@ -197,31 +189,18 @@ def test_small_sensors_come_back_as_they_went() -> None:
     fix = NavSatFix(
         **common, latitude=47.5, longitude=8.5, altitude=450.0, position_covariance=covariance
     )
-    cases: list[tuple[bytearray, str, str, Event]] = [
-        (messages.range((3, 7), down), "sensor_msgs/msg/Range", "range", down),
-        (
-            messages.pressure((3, 7), pressure),
-            "sensor_msgs/msg/FluidPressure",
-            "pressure",
-            pressure,
-        ),
-        (
-            messages.magnetic_field((3, 7), field),
-            "sensor_msgs/msg/MagneticField",
-            "magnetic_field",
-            field,
-        ),
-        (messages.fix((3, 7), fix), "sensor_msgs/msg/NavSatFix", "fix", fix),
-    ]
-    for data, type_, use, sent in cases:
-        message: Any = samples.store().deserialize(bytes(data), type_)
+    for write, use, sent in (
+        (outgoing.distance, "range", down),
+        (outgoing.pressure, "pressure", pressure),
+        (outgoing.magnetic_field, "magnetic_field", field),
+        (outgoing.fix, "fix", fix),
+    ):
+        message = samples.message(write, sent)
         assert read(message, use) == sent
     message.status.status = -1
     with pytest.raises(ValueError, match="expected a fix, found none"):
         read(message, "fix")
-    far: Any = samples.store().deserialize(
-        bytes(messages.range((3, 7), down)), "sensor_msgs/msg/Range"
-    )
+    far = samples.message(outgoing.distance, down)
     far.range = 4.5
     event = read(far, "range")
     assert isinstance(event, Range)
@@ -232,19 +211,16 @@ def test_a_setpoint_is_for_the_vehicle_that_the_subscription_names() -> None:
     context = MessageContext(source="ros", now=NOW, vehicle="drone2")
     twist = make("geometry_msgs/msg/Twist", linear=vector(1, 0, 0), angular=vector(0, 0, 0))
     for message, use in ((twist, "velocity"), (pose(), "position"), (pose(), "pose")):
-        event = READERS[message.__msgtype__, use](message, context)
+        event = READERS[message.__msgtype__, use].read(message, context)
         assert isinstance(event, Setpoint)
         assert event.vehicle == "drone2"
 
 
 def test_a_calibration_becomes_an_announcement() -> None:
-    names = FrameNames()
-    data = Messages(samples.store(), names).camera_info((0, 0), samples.camera())
-    message = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
-    found = camera_announcement(message, "ros/eye", ("rgb",))
+    found = camera_announcement(samples.calibration(samples.camera()), "ros/eye", ("rgb",))
     assert found.info == samples.camera().info
     assert (found.source, found.images) == ("ros/eye", ("rgb",))
-    assert found.frame_id == "drone/camera_optical"
+    assert found.frame_id == "camera_optical_frame"
 
 
 LENSES = [
@@ -264,8 +240,7 @@ LENSES = [
 @pytest.mark.parametrize("info", LENSES, ids=["radtan", "rational", "kb4", "ideal fisheye"])
 def test_each_distortion_goes_to_ros_and_back(info: CameraInfo) -> None:
     camera = msgspec.structs.replace(samples.camera(), info=info, baseline=0.11)
-    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), camera)
-    message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
+    message = samples.calibration(camera)
     assert message.distortion_model == info.distortion_model
     assert message.p[3] == pytest.approx(-50.0 * 0.11)  # as stereo_image_proc reads it
     found = camera_announcement(message, "eye", ("rgb",))
@@ -274,8 +249,7 @@ def test_each_distortion_goes_to_ros_and_back(info: CameraInfo) -> None:
 
 
 def test_coefficients_may_be_as_few_or_as_many_as_calibrators_write() -> None:
-    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera())
-    message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
+    message = samples.calibration(samples.camera())
     message.d = np.array([-0.3, 0.1, 1e-3, -2e-3])
     assert camera_info(message).distortion == (-0.3, 0.1, 1e-3, -2e-3, 0.0)
     message.distortion_model, message.d = "rational_polynomial", np.r_[np.full(8, 0.1), np.zeros(6)]
@@ -291,8 +265,7 @@ def part(width: int, height: int) -> Any:
 
 
 def test_a_calibration_may_name_the_whole_image() -> None:
-    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera())
-    message = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
+    message = samples.calibration(samples.camera())
     message.roi, message.binning_x, message.binning_y = part(64, 48), 1, 1
     assert camera_announcement(message, "eye", ("rgb",)).info == samples.camera().info
 
@@ -300,8 +273,7 @@ def test_a_calibration_may_name_the_whole_image() -> None:
 @pytest.mark.parametrize("frame", ["eye_optical", "eye_imu_optical_frame"])
 def test_optical_axes_stay_as_they_are(frame: str) -> None:
     """Of a camera's own IMU, and of an odometry whose body is the camera."""
-    data = Messages(samples.store(), FrameNames()).odometry((3, 7), samples.odometry())
-    message: Any = samples.store().deserialize(bytes(data), "nav_msgs/msg/Odometry")
+    message = samples.message(outgoing.odometry, samples.odometry())
     message.child_frame_id = frame
     q = message.pose.pose.orientation
     q.w, q.x, q.y, q.z = S, -S, 0.0, 0.0  # looks north: x (right) is east, y is down
@@ -343,8 +315,7 @@ def test_optical_axes_stay_as_they_are(frame: str) -> None:
     ],
 )
 def test_a_calibration_that_is_none_is_refused(wrong: dict[str, Any]) -> None:
-    data = Messages(samples.store(), FrameNames()).camera_info((0, 0), samples.camera())
-    message = samples.store().deserialize(bytes(data), "sensor_msgs/msg/CameraInfo")
+    message = samples.calibration(samples.camera())
     for field, value in wrong.items():
         setattr(message, field, value)
     with pytest.raises(ValueError, match="expected"):

@@ -15,9 +15,8 @@ from events import (
     TransformStamped,
 )
 from events.geometry import pose_matrix
-from nodes.ros2.messages.messages import Transform
 from nodes.ros2.messages.topics import FrameNames
-from nodes.ros2.messages.transforms import Transforms
+from nodes.ros2.messages.transforms import Transform, Transforms
 from tests.nodes.ros2.messages import samples
 
 

@@ -1,0 +1,293 @@
+"""The table of all mappings between events and ROS messages, and what follows from it.
+
+Bridge, recorder, replay, judge and viewers read it: who adds a mapping adds a row, and its function
+to `outgoing` or `incoming`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any
+
+import msgspec
+
+from events import (
+    Announcement,
+    BarometerAnnouncement,
+    BodyAnnouncement,
+    CameraAnnouncement,
+    DepthImage,
+    EstimatorAnnouncement,
+    Event,
+    FluidPressure,
+    Image,
+    Imu,
+    ImuAnnouncement,
+    LidarAnnouncement,
+    LidarScan,
+    MagneticField,
+    MagnetometerAnnouncement,
+    NavSatAnnouncement,
+    NavSatFix,
+    Odometry,
+    PointCloud,
+    PoseEstimate,
+    PoseSetpoint,
+    PoseStamped,
+    PositionSetpoint,
+    Range,
+    RangeAnnouncement,
+    Score,
+    SegmentationImage,
+    TrackedFeatures,
+    TransformStamped,
+    VehicleAnnouncement,
+    VelocitySetpoint,
+    Wind,
+)
+from nodes.ros2.messages import incoming, outgoing
+from nodes.ros2.messages.incoming import Reader
+from nodes.ros2.messages.outgoing import Outgoing
+from nodes.ros2.messages.topics import PublishingConfig, Qos, TopicGroup, ros_name, topic_name
+
+TopicKind = str
+"""The `kind` of a mapping."""
+
+Kind = type[Event]
+Events = tuple[Kind, ...]
+
+_CAMERA_INFO, _IMAGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Image"
+_COMPRESSED, _POINTS = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2"
+_ODOMETRY, _TREE = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+_POSE, _TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
+_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+_SENSOR = Qos(depth=5, reliable=False)
+"""As rclcpp's ``SensorDataQoS``; the setting `sensor_qos` may have it reliable."""
+
+_COLOURS, _DEPTH = ("rgb", "grey"), ("depth",)
+
+
+def _source(_: Outgoing, event: Event) -> str:
+    return event.source
+
+
+def _of_camera(out: Outgoing, event: Event) -> str | None:
+    return event.source if event.source in out.cameras else None
+
+
+def _always(_: PublishingConfig) -> bool:
+    return True
+
+
+class Mapping(msgspec.Struct, frozen=True):
+    """Between events and one type of ROS message: how it is published, how it is read, or both.
+
+    Attributes:
+        kind: Name of what is published.
+        topic: Its topic, `{}` standing for the source of the events.
+        type: Of the messages.
+        group: To which it belongs in the setting ``publish``.
+        events: What becomes such messages; an event of several rows in the order of the table.
+        write: Makes the message.
+        announced: By whom; its topic is then there from the start.
+        gives: Of what a camera says that it gives, one at least of these.
+        qos: Quality of service.
+        large: Whether a message takes long to make.
+        image: Whether an estimator may subscribe to it for its images.
+        source: Returns what `{}` stands for; `None` for an event that has no such message.
+        wanted: Whether settings let it be published, beside `group`.
+        use: What the messages become, as settings name it.
+        read: Makes the event.
+        becomes: Type of the events that are read, if it is not `events`.
+        bags: Whether only replays of bags read it.
+    """
+
+    kind: TopicKind = ""
+    topic: str = ""
+    type: str = ""
+    group: TopicGroup = "transforms"
+    events: Events = ()
+    write: Callable[[Outgoing, Any], Any] = outgoing.nothing
+    announced: Events = ()
+    gives: tuple[str, ...] = ()
+    qos: Qos = Qos()
+    large: bool = False
+    image: bool = False
+    source: Callable[[Outgoing, Any], str | None] = _source
+    wanted: Callable[[PublishingConfig], object] = _always
+    use: str = ""
+    read: Reader = incoming.nothing
+    becomes: Kind | None = None
+    bags: bool = False
+
+
+# fmt: off
+MAPPINGS = (
+    # Images and point clouds, each with its camera's calibration before it.
+    Mapping("info", "{}/camera_info", _CAMERA_INFO, "images", (Image,), outgoing.camera_info,
+            (CameraAnnouncement,), _COLOURS, _SENSOR, large=True, source=_of_camera, use="camera"),
+    Mapping("image", "{}/image_raw", _IMAGE, "images", (Image,), outgoing.image,
+            (CameraAnnouncement,), _COLOURS, _SENSOR, large=True, image=True,
+            wanted=lambda config: config.raw_images, use="image", read=incoming.image),
+    Mapping("compressed", "{}/image_raw/compressed", _COMPRESSED, "images",
+            (Image,), outgoing.compressed_image,
+            (CameraAnnouncement,), _COLOURS, _SENSOR, large=True, image=True,
+            wanted=lambda config: config.compressed_images,
+            use="image", read=incoming.compressed_image, bags=True),
+    Mapping("depth_info", "{}/depth/camera_info", _CAMERA_INFO, "depth_images",
+            (DepthImage,), outgoing.camera_info,
+            (CameraAnnouncement,), _DEPTH, _SENSOR, large=True, source=_of_camera),
+    Mapping("depth", "{}/depth/image_raw", _IMAGE, "depth_images", (DepthImage,), outgoing.depth,
+            (CameraAnnouncement,), _DEPTH, _SENSOR, large=True, image=True,
+            wanted=lambda config: config.raw_depth, use="depth", read=incoming.depth),
+    Mapping("compressed_depth", "{}/depth/image_raw/compressedDepth", _COMPRESSED, "depth_images",
+            (DepthImage,), outgoing.compressed_depth,
+            (CameraAnnouncement,), _DEPTH, _SENSOR, large=True, image=True,
+            wanted=lambda config: config.compressed_depth,
+            use="depth", read=incoming.compressed_depth, bags=True),
+    Mapping("segmentation", "{}/segmentation/image_raw", _IMAGE, "segmentation_images",
+            (SegmentationImage,), outgoing.segmentation,
+            (CameraAnnouncement,), ("segmentation",), _SENSOR, large=True, image=True),
+    Mapping("cloud", "{}/points", _POINTS, "point_clouds", (PointCloud,), outgoing.cloud,
+            large=True),
+    Mapping("lidar", "{}/points", _POINTS, "lidar_scans", (LidarScan,), outgoing.lidar,
+            (LidarAnnouncement,), qos=_SENSOR, large=True, image=True),
+    # Where bodies are, are thought to be, and are to go.
+    Mapping("odometry", "{}/odom", _ODOMETRY, "odometry", (Odometry,), outgoing.odometry,
+            (VehicleAnnouncement,), use="odometry", read=incoming.odometry),
+    Mapping("pose", "{}/pose", _POSE, "camera_poses", (PoseStamped,), outgoing.pose,
+            (CameraAnnouncement,),
+            source=lambda out, event: None if event.source in out.bodies else event.source),
+    Mapping("body_pose", "{}/pose", _POSE, "body_poses", (PoseStamped,), outgoing.pose,
+            (BodyAnnouncement,),
+            source=lambda out, event: event.source if event.source in out.bodies else None),
+    Mapping("estimate", "{}/pose", _POSE, "estimates", (PoseEstimate,), outgoing.estimate,
+            (EstimatorAnnouncement,), wanted=lambda config: not config.covariance,
+            use="estimate", read=incoming.estimate),
+    Mapping("estimate", "{}/pose", _COVARIANCE, "estimates",
+            (PoseEstimate,), outgoing.estimate_with_covariance,
+            (EstimatorAnnouncement,), wanted=lambda config: config.covariance,
+            use="estimate", read=incoming.estimate_with_covariance),
+    Mapping("tf", "/tf", _TREE, "transforms",
+            (Odometry, PoseStamped, PoseEstimate, TransformStamped), outgoing.transforms,
+            qos=Qos(depth=100),
+            source=lambda _, event: None if getattr(event, "static", False) else ""),
+    Mapping("tf_static", "/tf_static", _TREE, "transforms", (), outgoing.fixed_transforms,
+            qos=Qos(depth=1, transient_local=True)),
+    Mapping("path", "{}/path", "nav_msgs/msg/Path", "paths",
+            (Odometry, PoseEstimate), outgoing.path,
+            (VehicleAnnouncement, EstimatorAnnouncement), qos=Qos(depth=1),
+            use="estimate", read=incoming.newest, becomes=PoseEstimate),
+    Mapping(type=_ODOMETRY, becomes=PoseEstimate,
+            use="estimate", read=incoming.estimate_with_covariance),
+    Mapping(type=_ODOMETRY, becomes=Odometry,
+            use="truth", read=incoming.true_odometry, bags=True),
+    Mapping(type=_POSE, becomes=Odometry, use="truth", read=incoming.true_pose, bags=True),
+    Mapping(type="geometry_msgs/msg/TransformStamped", becomes=Odometry,
+            use="truth", read=incoming.true_transform, bags=True),
+    Mapping(type="geometry_msgs/msg/Twist", becomes=VelocitySetpoint,
+            use="velocity", read=incoming.velocity),
+    Mapping(type=_TWIST, becomes=VelocitySetpoint,
+            use="velocity", read=incoming.stamped_velocity),
+    Mapping(type=_POSE, becomes=PositionSetpoint, use="position", read=incoming.position),
+    Mapping(type=_POSE, becomes=PoseSetpoint, use="pose", read=incoming.pose),
+    # What small sensors measure.
+    Mapping("imu", "{}/imu", "sensor_msgs/msg/Imu", "imu", (Imu,), outgoing.imu,
+            (ImuAnnouncement,), qos=_SENSOR, use="imu", read=incoming.imu),
+    Mapping("range", "{}/range", "sensor_msgs/msg/Range", "ranges", (Range,), outgoing.distance,
+            (RangeAnnouncement,), qos=_SENSOR, use="range", read=incoming.distance),
+    Mapping("pressure", "{}/pressure", "sensor_msgs/msg/FluidPressure", "pressures",
+            (FluidPressure,), outgoing.pressure,
+            (BarometerAnnouncement,), qos=_SENSOR, use="pressure", read=incoming.pressure),
+    Mapping("magnetic", "{}/mag", "sensor_msgs/msg/MagneticField", "magnetic_fields",
+            (MagneticField,), outgoing.magnetic_field, (MagnetometerAnnouncement,),
+            qos=_SENSOR, use="magnetic_field", read=incoming.magnetic_field),
+    Mapping("fix", "{}/fix", "sensor_msgs/msg/NavSatFix", "fixes", (NavSatFix,), outgoing.fix,
+            (NavSatAnnouncement,), qos=_SENSOR, use="fix", read=incoming.fix),
+    Mapping("fix_velocity", "{}/vel", _TWIST, "fixes", (NavSatFix,), outgoing.fix_velocity,
+            (NavSatAnnouncement,), qos=_SENSOR),
+    Mapping("wind", "{}/wind", "geometry_msgs/msg/Vector3Stamped", "wind", (Wind,), outgoing.wind),
+    # The rest.
+    Mapping("score", "scores/{}", "std_msgs/msg/Float64", "scores", (Score,), outgoing.score,
+            source=lambda _, event: f"{event.subject}/{event.metric}"),
+    Mapping("clock", "/clock", "rosgraph_msgs/msg/Clock", "clock", (), outgoing.clock,
+            qos=Qos(depth=1, reliable=False), wanted=lambda config: config.time == "simulated"),
+    Mapping(type="std_msgs/msg/Header", use="done"),
+    Mapping(type="builtin_interfaces/msg/Time", use="done"),
+)
+# fmt: on
+
+PUBLISHED = tuple(row for row in MAPPINGS if row.kind)
+"""What is made of events."""
+
+READERS = {(row.type, row.use): row for row in MAPPINGS if row.use}
+"""By type of message and use."""
+
+LARGE: tuple[type[Event], ...] = tuple(
+    dict.fromkeys(each for row in PUBLISHED if row.large for each in row.events)
+)
+"""Events whose messages take long to make: in threads, one for each of these types."""
+
+SMALL: tuple[type[Event], ...] = (
+    *dict.fromkeys(each for row in PUBLISHED if not row.large for each in row.events),
+    TrackedFeatures,  # no message: it tells whose estimates an estimator's are
+)
+"""All other events of which messages are made, or made in another way."""
+
+
+@cache
+def rows_of(event: type[Event]) -> tuple[Mapping, ...]:
+    """Return the messages that events of a type become."""
+    return tuple(row for row in PUBLISHED if issubclass(event, row.events))
+
+
+class Publication(msgspec.Struct, frozen=True, kw_only=True):
+    """A topic to publish, of events of this source."""
+
+    kind: TopicKind
+    source: str
+    topic: str
+    type: str
+    qos: Qos
+
+
+def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Publication | None:
+    """Return the topic for the events of a source; `None` if it is not to be published."""
+    rows = (row for row in PUBLISHED if row.kind == kind and row.group in config.publish)
+    row = next((row for row in rows if row.wanted(config)), None)
+    if row is None:
+        return None
+    name, sensor = row.topic.format(ros_name(source)), row.qos is _SENSOR
+    above, _, last = name.rpartition("/")
+    if sensor and above.endswith(f"/{last}"):  # /drone/imu, not /drone/imu/imu
+        name = above
+    full = topic_name(config.namespace, name)
+    given = config.topics.get(full, config.topics.get(name))
+    return Publication(
+        kind=kind,
+        source=source,
+        topic=full if given is None else topic_name(config.namespace, given),
+        type=row.type,
+        qos=Qos(depth=5) if sensor and config.sensor_qos == "reliable" else row.qos,
+    )
+
+
+def announced_topics(announcement: Announcement, config: PublishingConfig) -> Iterator[Publication]:
+    """Yield the topics for what a node announced."""
+    source, images = announcement.source, set[str]()
+    if isinstance(announcement, CameraAnnouncement):
+        images = {*announcement.images}
+    kinds = [
+        row.kind
+        for row in PUBLISHED
+        if isinstance(announcement, row.announced)
+        and (not row.gives or images.intersection(row.gives))
+    ]
+    found = dict.fromkeys((kind, source) for kind in kinds)
+    if images >= {"rgb", "grey"}:  # which it sends as images of another source
+        found |= {(kind, f"{source}/grey"): None for kind in ("image", "compressed")}
+    for each in found:
+        if publication_ := publication(*each, config):
+            yield publication_

@@ -1,0 +1,411 @@
+"""Events to ROS messages, in ROS's frames and axes: a function for each row of `mappings`.
+
+A function takes what all have in common (`Outgoing`) and an event, and returns a message, or the
+bytes of one (`images`, `paths`), or `None` if there is nothing to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from events import (
+    Announcement,
+    BodyAnnouncement,
+    CameraAnnouncement,
+    DepthImage,
+    Event,
+    FluidPressure,
+    Image,
+    Imu,
+    LidarScan,
+    MagneticField,
+    NavSatFix,
+    Odometry,
+    PointCloud,
+    PoseEstimate,
+    PoseStamped,
+    Quaternion,
+    Range,
+    Score,
+    SegmentationImage,
+    TransformStamped,
+    Vector3,
+    Wind,
+)
+from events.frames import (
+    Axes,
+    convert_covariance,
+    convert_points,
+    convert_rotation,
+    convert_vector,
+)
+from nodes.ros2.messages.images import (
+    CloudWriter,
+    CompressedDepthWriter,
+    CompressedWriter,
+    ImageWriter,
+)
+from nodes.ros2.messages.paths import Paths
+from nodes.ros2.messages.topics import FrameNames, PublishingConfig
+from nodes.ros2.messages.transforms import Transform, Transforms
+from nodes.ros2.messages.typestore import Time, TypeStore
+
+_ZEROS_9, _ZEROS_36 = np.zeros(9), np.zeros(36)
+_UNKNOWN = np.array([-1.0, *[0.0] * 8])
+"""A covariance that says: this is not measured (sensor_msgs/Imu)."""
+
+
+class Outgoing:
+    """What messages are made of beside the event: types, frames, settings, announcements.
+
+    Args:
+        time: Returns the time in messages of a stamp (ns).
+
+    Attributes:
+        names: What ROS calls the frames of the run.
+        cameras: By source.
+        bodies: Sources of what moves by itself.
+        sensors: What was announced of a topic, by its kind and source.
+    """
+
+    def __init__(
+        self, store: TypeStore, config: PublishingConfig, time: Callable[[int], Time]
+    ) -> None:
+        self.store, self.config, self.time = store, config, time
+        self.names = FrameNames()
+        self.transforms = Transforms(self.names, config.vehicle, config.tf)
+        self.paths = Paths(store, self.names, config)
+        self.cameras: dict[str, CameraAnnouncement] = {}
+        self.bodies: set[str] = set()
+        self.sensors: dict[tuple[str, str], Any] = {}
+        self._writers: dict[tuple[Any, ...], Any] = {}
+
+    def announced(self, announcement: Announcement) -> None:
+        """Note what a node announced."""
+        if isinstance(announcement, CameraAnnouncement):
+            self.cameras[announcement.source] = announcement
+        elif isinstance(announcement, BodyAnnouncement):
+            self.bodies.add(announcement.source)
+        self.transforms.announced(announcement)
+
+    def make(self, type_: str, **fields: Any) -> Any:
+        """Return a message of which all fields are given."""
+        return self.store.message(type_)(**fields)
+
+    def header(self, event: Any, frame_id: str | None = None) -> Any:
+        """Return the header of an event's message, by default in the event's frame."""
+        frame = self.names.name(event.frame_id if frame_id is None else frame_id, event.source)
+        return self.store.header(self.time(event.stamp), frame)
+
+    def written(self, event: Any, writer: type[Any], *settings: Any) -> bytearray:
+        """Return the message of an image, by a writer that is kept for the next one."""
+        frame = self.names.name(event.frame_id, event.source)
+        key = (writer, event.source, frame, *settings)
+        if key not in self._writers:
+            self._writers[key] = writer(self.store, frame, *settings)
+        message: bytearray = self._writers[key].write(self.time(event.stamp), event.data)
+        return message
+
+    def points(self, event: PointCloud | LidarScan) -> tuple[CloudWriter, Time, Any]:
+        """Return a cloud's writer, its time in messages, and its points in ROS's axes."""
+        writer = CloudWriter(self.store, self.names.name(event.frame_id, event.source))
+        points = convert_points(self.names.axes(event.frame_id), event.points)
+        return writer, self.time(event.stamp), points
+
+    def xyz(self, vector: Vector3, type_: str = "geometry_msgs/msg/Vector3") -> Any:
+        """Return a ``Vector3`` or ``Point`` of a vector in ROS's axes."""
+        x, y, z = vector
+        return self.make(type_, x=x, y=y, z=z)
+
+    def vector(self, axes: Axes, vector: Vector3) -> Any:
+        """Return a ``geometry_msgs/msg/Vector3`` of a vector in our axes."""
+        return self.xyz(convert_vector(axes, vector))
+
+    def quaternion(self, rotation: Quaternion) -> Any:
+        """Return a ``geometry_msgs/msg/Quaternion`` of a rotation in ROS's axes."""
+        w, x, y, z = rotation
+        return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def pose(self, event: Odometry | PoseStamped | PoseEstimate, child: Axes) -> Any:
+        """Return a ``geometry_msgs/msg/Pose`` of a frame with these axes."""
+        axes = self.names.axes(event.frame_id)
+        return self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.xyz(convert_vector(axes, event.position), "geometry_msgs/msg/Point"),
+            orientation=self.quaternion(convert_rotation(axes, child, event.orientation)),
+        )
+
+    def twist(self, linear: Vector3, angular: Vector3) -> Any:
+        """Return a ``geometry_msgs/msg/Twist`` of vectors in ROS's axes."""
+        made = self.xyz(linear), self.xyz(angular)
+        return self.make("geometry_msgs/msg/Twist", linear=made[0], angular=made[1])
+
+    def with_covariance(self, part: str, value: Any, covariance: Any = _ZEROS_36) -> Any:
+        """Return a ``PoseWithCovariance`` or ``TwistWithCovariance``; zeros: nothing is known."""
+        fields = {part: value, "covariance": covariance}
+        return self.make(f"geometry_msgs/msg/{part.capitalize()}WithCovariance", **fields)
+
+    def tree(self, time: Time, transforms: Sequence[Transform]) -> Any:
+        """Return a ``tf2_msgs/msg/TFMessage``, if there are any transforms."""
+        found = [
+            self.make(
+                "geometry_msgs/msg/TransformStamped",
+                header=self.store.header(time, each.parent),
+                child_frame_id=each.child,
+                transform=self.make(
+                    "geometry_msgs/msg/Transform",
+                    translation=self.xyz(each.translation),
+                    rotation=self.quaternion(each.rotation),
+                ),
+            )
+            for each in transforms
+        ]
+        return self.make("tf2_msgs/msg/TFMessage", transforms=found) if found else None
+
+
+def nothing(*_: Any) -> None:
+    """Make no message."""
+
+
+# Images and point clouds, which take long: in threads, one for each type of event.
+
+
+def camera_info(out: Outgoing, event: Image | DepthImage) -> Any:
+    """Return a sensor_msgs/CameraInfo: K, D, R (one) and P, with a stereo rig's baseline."""
+    camera = out.cameras[event.source]
+    info = camera.info
+    none = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+    # K, and of a stereo rig's right camera -fx times its baseline.
+    projection = np.column_stack([info.matrix(), [0.0 - info.fx * camera.baseline, 0.0, 0.0]])
+    return out.make(
+        "sensor_msgs/msg/CameraInfo",
+        header=out.header(event, camera.frame_id),
+        height=info.height,
+        width=info.width,
+        distortion_model=info.distortion_model,
+        d=np.array(info.distortion, np.float64),
+        k=info.matrix().ravel(),
+        r=np.eye(3).ravel(),
+        p=projection.ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=out.make("sensor_msgs/msg/RegionOfInterest", **none),
+    )
+
+
+def image(out: Outgoing, event: Image) -> bytearray:
+    """Return a sensor_msgs/Image of colours or grey."""
+    return out.written(event, ImageWriter, event.encoding)
+
+
+def compressed_image(out: Outgoing, event: Image) -> bytearray:
+    """Return a sensor_msgs/CompressedImage."""
+    config = out.config
+    return out.written(event, CompressedWriter, config.compressed_images, config.jpeg_quality)
+
+
+def depth(out: Outgoing, event: DepthImage) -> bytearray:
+    """Return a sensor_msgs/Image of metres or millimetres."""
+    encoding = "16UC1" if out.config.raw_depth == "millimetres" else "32FC1"
+    return out.written(event, ImageWriter, encoding)
+
+
+def compressed_depth(out: Outgoing, event: DepthImage) -> bytearray:
+    """Return a sensor_msgs/CompressedImage of depth."""
+    config = out.config
+    settings = config.compressed_depth == "inverse", config.depth_max, config.depth_quantization
+    return out.written(event, CompressedDepthWriter, *settings)
+
+
+def segmentation(out: Outgoing, event: SegmentationImage) -> bytearray:
+    """Return a sensor_msgs/Image of numbers."""
+    return out.written(event, ImageWriter, "32SC1")
+
+
+def cloud(out: Outgoing, event: PointCloud) -> bytearray:
+    """Return a sensor_msgs/PointCloud2 with colours."""
+    writer, time, points = out.points(event)
+    return writer.cloud(time, points, event.colors)
+
+
+def lidar(out: Outgoing, event: LidarScan) -> bytearray:
+    """Return a sensor_msgs/PointCloud2 of a lidar's turn."""
+    writer, time, points = out.points(event)
+    return writer.scan(time, points, event)
+
+
+# What is small.
+
+
+def odometry(out: Outgoing, event: Odometry) -> Any:
+    """Return a nav_msgs/Odometry: the pose in its parent, the twist in the body."""
+    axes = out.names.axes(event.child_frame_id)
+    linear, angular = event.linear_velocity, event.angular_velocity
+    twist = out.twist(convert_vector(axes, linear), convert_vector(axes, angular))
+    return out.make(
+        "nav_msgs/msg/Odometry",
+        header=out.header(event),
+        child_frame_id=out.names.name(event.child_frame_id, event.source),
+        pose=out.with_covariance("pose", out.pose(event, axes)),
+        twist=out.with_covariance("twist", twist),
+    )
+
+
+def pose(out: Outgoing, event: PoseStamped) -> Any:
+    """Return a geometry_msgs/PoseStamped of a camera's optical frame, or of a body."""
+    camera = out.cameras.get(event.source)
+    axes: Axes = "body" if camera is None else out.names.axes(camera.frame_id)
+    made = out.pose(event, axes)
+    return out.make("geometry_msgs/msg/PoseStamped", header=out.header(event), pose=made)
+
+
+def estimate(out: Outgoing, event: PoseEstimate) -> Any:
+    """Return a geometry_msgs/PoseStamped."""
+    made = out.pose(event, out.names.axes(event.child_frame_id))
+    return out.make("geometry_msgs/msg/PoseStamped", header=out.header(event), pose=made)
+
+
+def estimate_with_covariance(out: Outgoing, event: PoseEstimate) -> Any:
+    """Return a geometry_msgs/PoseWithCovarianceStamped; zeros if nothing is known."""
+    covariance = _ZEROS_36
+    if event.covariance:
+        axes = out.names.axes(event.frame_id)
+        covariance = convert_covariance(axes, np.array(event.covariance))
+    made = out.pose(event, out.names.axes(event.child_frame_id))
+    return out.make(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=out.header(event),
+        pose=out.with_covariance("pose", made, covariance),
+    )
+
+
+def transforms(
+    out: Outgoing, event: Odometry | PoseStamped | PoseEstimate | TransformStamped
+) -> Any:
+    """Return a tf2_msgs/TFMessage of where an event puts frames that move."""
+    return out.tree(out.time(event.stamp), out.transforms.of(event))
+
+
+def fixed_transforms(out: Outgoing, _: Event | None) -> Any:
+    """Return a tf2_msgs/TFMessage of all frames that do not move."""
+    return out.tree(out.time(0), out.transforms.static())
+
+
+def path(out: Outgoing, event: Odometry | PoseEstimate) -> bytearray | None:
+    """Return a nav_msgs/Path of a source, if that is due."""
+    return out.paths.message(event, out.time(event.stamp))
+
+
+def imu(out: Outgoing, event: Imu) -> Any:
+    """Return a sensor_msgs/Imu without orientation.
+
+    The covariances are those of one sample: squared noise density times rate.
+    """
+    axes, noise = out.names.axes(event.frame_id), out.sensors.get(("imu", event.source))
+    gyroscope = accelerometer = _ZEROS_9
+    if noise is not None:
+        gyroscope = _diagonal(noise.gyroscope_noise_density**2 * noise.rate)
+        accelerometer = _diagonal(noise.accelerometer_noise_density**2 * noise.rate)
+    return out.make(
+        "sensor_msgs/msg/Imu",
+        header=out.header(event),
+        orientation=out.quaternion((1.0, 0.0, 0.0, 0.0)),
+        orientation_covariance=_UNKNOWN,
+        angular_velocity=out.vector(axes, event.angular_velocity),
+        angular_velocity_covariance=gyroscope,
+        linear_acceleration=out.vector(axes, event.linear_acceleration),
+        linear_acceleration_covariance=accelerometer,
+    )
+
+
+def distance(out: Outgoing, event: Range) -> Any:
+    """Return a sensor_msgs/Range of a sensor that looks along its frame's x axis."""
+    type_ = out.store.message("sensor_msgs/msg/Range")
+    sensor, more = out.sensors.get(("range", event.source)), {}
+    if "variance" in type_.__annotations__:  # since Iron; 0 says: not known
+        more["variance"] = 0.0 if sensor is None else sensor.noise**2
+    return type_(
+        header=out.header(event),
+        radiation_type=type_.INFRARED,
+        field_of_view=event.field_of_view,
+        min_range=event.min_range,
+        max_range=event.max_range,
+        range=event.range,
+        **more,
+    )
+
+
+def pressure(out: Outgoing, event: FluidPressure) -> Any:
+    """Return a sensor_msgs/FluidPressure."""
+    return out.make(
+        "sensor_msgs/msg/FluidPressure",
+        header=out.header(event, _frame(out, "pressure", event)),
+        fluid_pressure=event.fluid_pressure,
+        variance=event.variance,
+    )
+
+
+def magnetic_field(out: Outgoing, event: MagneticField) -> Any:
+    """Return a sensor_msgs/MagneticField; a covariance of zeros says: not known."""
+    sensor = out.sensors.get(("magnetic", event.source))
+    return out.make(
+        "sensor_msgs/msg/MagneticField",
+        header=out.header(event),
+        magnetic_field=out.vector(out.names.axes(event.frame_id), event.magnetic_field),
+        magnetic_field_covariance=_ZEROS_9 if sensor is None else _diagonal(sensor.noise**2),
+    )
+
+
+def fix(out: Outgoing, event: NavSatFix) -> Any:
+    """Return a sensor_msgs/NavSatFix, whose status is the event's; its covariance is in ENU."""
+    status = out.store.message("sensor_msgs/msg/NavSatStatus")
+    type_ = out.store.message("sensor_msgs/msg/NavSatFix")
+    covariance, known = _ZEROS_9, type_.COVARIANCE_TYPE_UNKNOWN
+    if event.position_covariance:
+        covariance = convert_covariance("world", np.array(event.position_covariance))
+        known = type_.COVARIANCE_TYPE_KNOWN
+    return type_(
+        header=out.header(event, _frame(out, "fix", event)),
+        status=status(status=event.status, service=status.SERVICE_GPS),
+        latitude=event.latitude,
+        longitude=event.longitude,
+        altitude=event.altitude,
+        position_covariance=covariance,
+        position_covariance_type=known,
+    )
+
+
+def fix_velocity(out: Outgoing, event: NavSatFix) -> Any:
+    """Return a geometry_msgs/TwistStamped of a receiver's velocity, in ``map``."""
+    twist = out.twist(convert_vector("world", event.velocity), (0.0, 0.0, 0.0))
+    return out.make("geometry_msgs/msg/TwistStamped", header=out.header(event, "map"), twist=twist)
+
+
+def wind(out: Outgoing, event: Wind) -> Any:
+    """Return a geometry_msgs/Vector3Stamped of the air's velocity, in ``map``."""
+    header, vector = out.header(event, "map"), out.vector("world", event.velocity)
+    return out.make("geometry_msgs/msg/Vector3Stamped", header=header, vector=vector)
+
+
+def score(out: Outgoing, event: Score) -> Any:
+    """Return a std_msgs/Float64."""
+    return out.make("std_msgs/msg/Float64", data=event.value)
+
+
+def clock(out: Outgoing, now: int) -> Any:
+    """Return a rosgraph_msgs/Clock of a time (ns)."""
+    sec, nanosec = out.time(now)
+    time = out.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return out.make("rosgraph_msgs/msg/Clock", clock=time)
+
+
+def _frame(out: Outgoing, kind: str, event: Event) -> str:
+    sensor = out.sensors.get((kind, event.source))
+    return "base_link" if sensor is None else str(sensor.frame_id)
+
+
+def _diagonal(variance: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.diag([variance] * 3).ravel()
