@@ -51,15 +51,19 @@ class Packed(msgspec.Struct, frozen=True):
         for array, offset in zip(self.arrays, self.offsets, strict=True):
             whole[offset : offset + array.nbytes] = array.reshape(-1).view(np.uint8)
 
-    def frame(self) -> bytes:
-        """Return the frame: the one copy there is of the arrays."""
-        parts: list[Buffer] = [_LENGTH.pack(len(self.head)), self.head]
+    def parts(self) -> list[bytes | memoryview]:
+        """Return the frame in parts, none of them empty; no array is copied."""
+        parts: list[bytes | memoryview] = [_LENGTH.pack(len(self.head)) + self.head]
         place = _LENGTH.size + len(self.head)
         for array, offset in zip(self.arrays, self.offsets, strict=True):
             parts += [bytes(offset - place), array.reshape(-1).view(np.uint8).data]
             place = offset + array.nbytes
         parts.append(bytes(self.size - place))
-        return b"".join(parts)
+        return [part for part in parts if len(part)]
+
+    def frame(self) -> bytes:
+        """Return the frame: the one copy there is of the arrays."""
+        return b"".join(self.parts())
 
 
 def kind_of(event: type[Event]) -> str:

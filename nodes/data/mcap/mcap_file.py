@@ -112,19 +112,24 @@ class McapWriter:
         return self._file.size
 
     def channel(
-        self, topic: str, type_: str, definition: str, metadata: Mapping[str, str] | None = None
+        self,
+        topic: str,
+        type_: str,
+        definition: Callable[[str], str],
+        metadata: Mapping[str, str] | None = None,
     ) -> int:
         """Add a topic of CDR messages; return its number.
 
         Args:
             type_: ``sensor_msgs/msg/Image``.
-            definition: Text of the type and of those it is made of.
+            definition: Returns the text of the type and of those it is made of.
         """
-        schema = self._schemas.get(type_)
-        if schema is None:
-            schema = self._writer.register_schema(type_, "ros2msg", definition.encode())
-            self._schemas[type_] = schema
-        channel = self._writer.register_channel(topic, "cdr", schema, dict(metadata or {}))
+        if type_ not in self._schemas:
+            text = definition(type_).encode()
+            self._schemas[type_] = self._writer.register_schema(type_, "ros2msg", text)
+        channel = self._writer.register_channel(
+            topic, "cdr", self._schemas[type_], dict(metadata or {})
+        )
         self._topics[channel] = {
             "name": topic,
             "type": type_,

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 import cv2
+import msgspec
 
 from events import Announcement, Event
 from nodes.data.mcap import native
@@ -67,7 +68,6 @@ class EventWriter:
         self._ros = Publishing(self, self._store, published, Stamps().out)
         self._puts: dict[str, Any] = {}
         self._own: dict[tuple[str, str, str], int] = {}
-        self._definitions: dict[str, str] = {}
         self._begun = False
         self._time = 0
         self._holder = ""
@@ -89,11 +89,9 @@ class EventWriter:
         if not announcement and not self._begun:
             self._begun = True
             self._ros.begin()
-        try:
-            put = self._puts[kind]
-        except KeyError:
-            put = self._puts[kind] = self._putter(kind)
-        if put is not None:
+        if kind not in self._puts:
+            self._puts[kind] = self._putter(kind)
+        if (put := self._puts[kind]) is not None:
             try:
                 put(unpack(frame))
             except (ValueError, TypeError, OverflowError, struct.error, cv2.error) as error:
@@ -104,18 +102,18 @@ class EventWriter:
     def publisher(self, topic: Topic) -> RecordedTopic:
         """Add a topic of ROS's messages to the file."""
         qos = {"offered_qos_profiles": _LATCHED if topic.qos.transient_local else ""}
-        return RecordedTopic(self, topic, self._add_channel(topic.name, topic.type, qos))
+        channel = self._add_channel(topic.name, topic.type, qos)
 
-    def put(self, topic: RecordedTopic, message: bytes | bytearray) -> None:
-        """Write a message of the event at hand."""
-        if topic.topic.type in HOLDERS:
-            self._holder = topic.topic.name
-        self._writer.write(topic.channel, self._time, message)
+        def put(message: bytearray) -> None:
+            """Write a message of the event at hand."""
+            if topic.type in HOLDERS:
+                self._holder = topic.name
+            self._writer.write(channel, self._time, message)
+
+        return RecordedTopic(topic, put)
 
     def _add_channel(self, topic: str, type_: str, metadata: dict[str, str]) -> int:
-        if type_ not in self._definitions:
-            self._definitions[type_] = self._store.definition(type_)
-        return self._writer.channel(topic, type_, self._definitions[type_], metadata)
+        return self._writer.channel(topic, type_, self._store.definition, metadata)
 
     def _putter(self, kind: str) -> Any:
         """Return what writes ROS's messages of a kind of event; `None` if there are none."""
@@ -144,19 +142,12 @@ class EventWriter:
         self._writer.write(channel, self._time, native.message(frame, arrays=not self._holder))
 
 
-class RecordedTopic:
+class RecordedTopic(msgspec.Struct, frozen=True):
     """A topic of ROS's messages in the file."""
 
-    wanted = True
-
-    def __init__(self, writer: EventWriter, topic: Topic, channel: int) -> None:
-        self.topic = topic
-        self.channel = channel
-        self._writer = writer
-
-    def put(self, message: bytes | bytearray) -> None:
-        """Write a message."""
-        self._writer.put(self, message)
+    topic: Topic
+    put: Callable[[bytearray], None]
+    wanted: bool = True
 
 
 def _type_of(kind: str) -> type[Event] | None:

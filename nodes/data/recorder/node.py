@@ -9,8 +9,8 @@ from pathlib import Path
 
 from events import Announcement, Event
 from nodes.data.mcap.layout import RecordingError
-from nodes.data.recorder.pipe import Backlog, McapRecorderConfig, WriteRequest
-from nodes.data.recorder.writer_process import STANDSTILL, WriterProcess
+from nodes.data.recorder.pipe import McapRecorderConfig, WriteRequest
+from nodes.data.recorder.writer_process import STANDSTILL, Backlog, WriterProcess
 from nodes.trajectory.table import part_name
 from runtime import Input, Node
 from runtime.workers.worker import spare_cores

@@ -6,12 +6,6 @@ i64 LE   time of publication (ns), or of the end
 u32 LE   length of the frame
 u8       0: an event, 1: an announcement, 2: the end
 frame    of `runtime.wire`
-
-What waits to be written, bounded by bytes: one thread puts, another takes, and neither locks.
-
-References only: putting an event copies and encodes nothing.
-
-The recorder's settings in a run's file.
 """
 
 from __future__ import annotations
@@ -20,16 +14,11 @@ import os
 import select
 import struct
 import sys
-import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import IO, Annotated, Literal, NamedTuple
 
 import msgspec
-import numpy as np
-from typing_extensions import Buffer
 
-from events import Event
 from nodes.data.mcap.mcap_file import Compression
 from nodes.ros2.messages.typestore import Distribution
 from runtime import NodeConfig
@@ -37,143 +26,6 @@ from runtime.paths import OutputPath
 from runtime.wire import Packed
 
 WhenFull = Literal["wait", "drop_images", "drop_oldest"]
-
-SMALL = 512
-"""Bytes that an event without arrays is reckoned at."""
-
-_LARGE = 1 << 14
-"""Bytes from which an event is one of those that ``drop_images`` drops."""
-
-
-class Waiting(NamedTuple):
-    """An event that waits.
-
-    Attributes:
-        time: When it was published (ns).
-        event: The event.
-        size: Bytes that it is reckoned at.
-    """
-
-    time: int
-    event: Event
-    size: int
-
-
-class Backlog:
-    """A queue between the loop and the thread that writes.
-
-    Args:
-        limit: Bytes that may wait.
-        when_full: What happens beyond: ``wait`` keeps everything, and `is_full` shows it;
-            ``drop_images`` drops what is large, and the oldest only if there is nothing but small
-            events; ``drop_oldest`` makes room, whatever it costs.
-    """
-
-    def __init__(self, limit: int, when_full: WhenFull) -> None:
-        self.limit = limit
-        self.when_full = when_full
-        self.dropped = 0
-        """Events."""
-        self.peak = 0
-        """Bytes."""
-        self._queue: deque[Waiting] = deque()
-        # One counter for each side, so that no addition is ever lost between the two.
-        self._put = 0
-        self._dropped_bytes = 0
-        self._written = 0
-        self._sizes: dict[type[Event], Callable[[Event], int]] = {}
-        self._room = threading.Event()
-
-    @property
-    def bytes(self) -> int:
-        """Return how many bytes wait, those being written included."""
-        return self._put - self._dropped_bytes - self._written
-
-    @property
-    def is_full(self) -> bool:
-        """Tell whether more waits than should."""
-        return self.bytes > self.limit
-
-    # On the loop.
-
-    def put(self, time: int, event: Event) -> None:
-        """Add an event, or drop one."""
-        kind = type(event)
-        size_of = self._sizes.get(kind)
-        if size_of is None:
-            size_of = self._sizes[kind] = _size_of(event)
-        size = size_of(event)
-        waiting = self._put - self._dropped_bytes - self._written + size
-        if waiting > self.limit and self.when_full != "wait":
-            if self.when_full == "drop_images" and size >= _LARGE:
-                self.dropped += 1
-                return
-            spare = self.limit // 4 if self.when_full == "drop_images" else 0
-            while waiting > self.limit + spare and self._drop_oldest():
-                waiting = self.bytes + size
-        if waiting > self.peak:
-            self.peak = waiting
-        self._put += size
-        self._queue.append(Waiting(time, event, size))
-
-    def _drop_oldest(self) -> bool:
-        try:
-            oldest = self._queue.popleft()
-        except IndexError:
-            return False
-        self._dropped_bytes += oldest.size
-        self.dropped += 1
-        return True
-
-    # In other threads.
-
-    def take(self) -> Waiting | None:
-        """Return the oldest; `None` if nothing waits. Call `done` when it is written."""
-        try:
-            return self._queue.popleft()
-        except IndexError:
-            return None
-
-    def done(self, waiting: Waiting) -> None:
-        """Note that an event is written, and needs no memory any more."""
-        self._written += waiting.size
-        if not self._room.is_set() and self.bytes <= self.limit // 2:
-            self._room.set()
-
-    def wait_for_room(self, timeout: float | None = None) -> bool:
-        """Wait until half of the room is free, or `release` is called; tell whether that came.
-
-        Args:
-            timeout: Real seconds to wait at most.
-        """
-        self._room.clear()
-        return self.bytes <= self.limit // 2 or self._room.wait(timeout)
-
-    def release(self) -> None:
-        """Let go of whoever waits: nothing will be written any more."""
-        self.limit = 1 << 62
-        self._room.set()
-
-
-def _size_of(event: Event) -> Callable[[Event], int]:
-    """Return a function that tells the size of events of this type."""
-    arrays = [
-        name for name in event.__struct_fields__ if isinstance(getattr(event, name), np.ndarray)
-    ]
-    if not arrays:
-        return _small
-
-    def size(of: Any) -> int:
-        content: int = sum(getattr(of, name).nbytes for name in arrays)
-        return SMALL + content
-
-    return size
-
-
-def _small(_: Event) -> int:
-    return SMALL
-
-
 Bytes = Annotated[int, msgspec.Meta(ge=1 << 16)]
 ChunkBytes = Annotated[int, msgspec.Meta(ge=1 << 16, le=1 << 28)]
 
@@ -218,8 +70,6 @@ class WriteRequest(msgspec.Struct, frozen=True):
     """A file to write, and how.
 
     Attributes:
-        path: The file to write.
-        config: The recorder's settings.
         attachment: A file to add, if it is there.
         niceness: How much to stand back for others.
         cores: To run on; all if empty.
@@ -227,11 +77,16 @@ class WriteRequest(msgspec.Struct, frozen=True):
     """
 
     path: str
-    config: McapRecorderConfig
-    attachment: str
-    niceness: int
-    cores: tuple[int, ...]
+    config: McapRecorderConfig = McapRecorderConfig()
+    attachment: str = ""
+    niceness: int = 0
+    cores: tuple[int, ...] = ()
     metadata: str = ""
+
+    def command(self) -> list[str]:
+        """Return the command that starts such a process."""
+        text = msgspec.json.encode(self).decode()
+        return [sys.executable, "-m", "nodes.data.recorder.process", text]
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -240,7 +95,6 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     Attributes:
         what: ``ready``, ``complaint``, ``error``, ``missing`` (a library) or ``done``;
             ``gone`` stands for a process that ended without a reply.
-        text: For messages.
         written: Events in the file.
         size: Bytes of the file.
     """
@@ -251,22 +105,12 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     size: int = 0
 
 
-def command(request: WriteRequest) -> list[str]:
-    """Return the command that starts such a process."""
-    text = msgspec.json.encode(request).decode()
-    return [sys.executable, "-m", "nodes.data.recorder.process", text]
-
-
 EVENT, ANNOUNCEMENT, END = 0, 1, 2
 
 _HEAD = struct.Struct("<qIB")
-_LENGTH = struct.Struct("<I")
 _PART = 1 << 16
 """Bytes written at once: the kernel does not let go of the core meanwhile, and the loop may need
 it."""
-
-_MOST = 512
-"""Buffers of a call of writev(2), which takes 1024."""
 
 
 class Piece(NamedTuple):
@@ -277,50 +121,17 @@ class Piece(NamedTuple):
     frame: bytearray
 
 
-def pieces(time: int, packed: Packed, what: int) -> list[Buffer]:
-    """Return the bytes of an event, as buffers, none of them copied."""
-    head = _LENGTH.pack(len(packed.head)) + packed.head
-    found: list[Buffer] = [_HEAD.pack(time, packed.size, what) + head]
-    at = len(head)
-    for array, offset in zip(packed.arrays, packed.offsets, strict=True):
-        if offset > at:
-            found.append(bytes(offset - at))
-        if array.nbytes:
-            found.append(array.reshape(-1).view(np.uint8).data)
-        at = offset + array.nbytes
-    if packed.size > at:
-        found.append(bytes(packed.size - at))
-    return found
-
-
-def end(time: int) -> bytes:
-    """Return what ends the pipe in order."""
-    return _HEAD.pack(time, 0, END)
-
-
-def write_all(file: int, buffers: Sequence[Buffer]) -> None:
-    """Write buffers to a file descriptor, waiting as long as it takes; Python's lock is free.
+def write(file: IO[bytes], time: int, what: int, event: Packed | None = None) -> None:
+    """Write a piece to a buffered pipe; Python's lock is free while that waits.
 
     Raises:
         OSError: Nobody reads any more.
     """
-    views = [part for buffer in buffers for part in _parts(memoryview(buffer).cast("B"))]
-    while views:
-        written = os.writev(file, views[:1] if len(views[0]) == _PART else _some(views))
-        while views and written >= len(views[0]):
-            written -= len(views.pop(0))
-        if written:
-            views[0] = views[0][written:]
-
-
-def _parts(view: memoryview) -> list[memoryview]:
-    return [view[at : at + _PART] for at in range(0, len(view), _PART)]
-
-
-def _some(views: list[memoryview]) -> list[memoryview]:
-    """Return the views before the next large part."""
-    large = (n for n, view in enumerate(views[:_MOST]) if len(view) == _PART)
-    return views[: next(large, _MOST)]
+    file.write(_HEAD.pack(time, 0 if event is None else event.size, what))
+    for part in () if event is None else event.parts():
+        view = memoryview(part)
+        for at in range(0, len(view), _PART):
+            file.write(view[at : at + _PART])
 
 
 def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator[Piece]:
@@ -328,7 +139,6 @@ def read_all(file: int, idle: float, while_idle: Callable[[], None]) -> Iterator
 
     Args:
         idle: Seconds without anything after which `while_idle` is called, again and again.
-        while_idle: See `idle`.
     """
     while True:
         while not select.select([file], [], [], idle)[0]:
@@ -347,9 +157,6 @@ def _read(file: int, size: int) -> bytearray:
     """Return as many bytes, or fewer at the end."""
     buffer = bytearray(size)
     view, got = memoryview(buffer), 0
-    while got < size:
-        count = os.readv(file, [view[got:]])
-        if count == 0:
-            return bytearray(view[:got])
+    while got < size and (count := os.readv(file, [view[got:]])):
         got += count
-    return buffer
+    return bytearray(view[:got]) if got < size else buffer

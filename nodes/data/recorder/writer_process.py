@@ -1,6 +1,9 @@
-"""The process that writes, as the run sees it: a thread feeds it, and another reads its replies.
+"""The process that writes, as the run sees it: what waits for it, and the threads that serve it.
 
-The loop puts events into the backlog, and calls nothing here that waits.
+The loop puts events into the backlog, and calls nothing here that waits. One thread feeds the
+process, and another reads its replies. It is no `runtime.workers.Worker`: that copies what it is
+given on the loop, and ends its process soon after the run; this one outlives a run that is killed,
+or whose disk is slow, and closes its file in order.
 """
 
 from __future__ import annotations
@@ -14,18 +17,26 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
-from typing_extensions import Buffer
+import numpy as np
 
-from events import Announcement
+from events import Announcement, Event
 from nodes.data.mcap.layout import RecordingError
 from nodes.data.recorder import pipe
-from nodes.data.recorder.pipe import Backlog, Reply, Waiting, WriteRequest, command
+from nodes.data.recorder.pipe import Reply, WhenFull, WriteRequest
 from runtime.errors import MissingDependencyError, WireError
 from runtime.wire import pack
+
+SMALL = 512
+"""Bytes that an event without arrays is reckoned at."""
+
+_LARGE = 1 << 14
+"""Bytes from which an event is one of those that ``drop_images`` drops."""
 
 _PAUSE = 0.005
 """Seconds between two looks at an empty backlog: cheaper than waking the thread at every event."""
@@ -47,12 +58,122 @@ _PIPE = 1 << 20
 """Bytes that the pipe holds: Linux allows no more without privileges."""
 
 
+class Waiting(NamedTuple):
+    """An event that waits: when it was published (ns), and the bytes that it is reckoned at."""
+
+    time: int
+    event: Event
+    size: int
+
+
+class Backlog:
+    """A queue of references, bounded by bytes: the loop puts, a thread takes, and neither locks.
+
+    Args:
+        limit: Bytes that may wait.
+        when_full: What happens beyond: ``wait`` keeps everything, and `is_full` shows it;
+            ``drop_images`` drops what is large, and the oldest only if there is nothing but small
+            events; ``drop_oldest`` makes room, whatever it costs.
+
+    Attributes:
+        dropped: Events.
+        peak: Bytes.
+    """
+
+    def __init__(self, limit: int, when_full: WhenFull) -> None:
+        self.limit = limit
+        self.when_full = when_full
+        self.dropped = self.peak = 0
+        self._queue: deque[Waiting] = deque()
+        # One counter for each side, so that no addition is ever lost between the two.
+        self._put = self._dropped_bytes = self._written = 0
+        self._arrays: dict[type[Event], list[str]] = {}
+        """Names of fields."""
+        self._room = threading.Event()
+
+    @property
+    def bytes(self) -> int:
+        """Return how many bytes wait, those being written included."""
+        return self._put - self._dropped_bytes - self._written
+
+    @property
+    def is_full(self) -> bool:
+        """Tell whether more waits than should."""
+        return self.bytes > self.limit
+
+    # On the loop.
+
+    def put(self, time: int, event: Event) -> None:
+        """Add an event, or drop one."""
+        size = self._size(event)
+        waiting = self.bytes + size
+        if waiting > self.limit and self.when_full != "wait":
+            if self.when_full == "drop_images" and size >= _LARGE:
+                self.dropped += 1
+                return
+            spare = self.limit // 4 if self.when_full == "drop_images" else 0
+            while waiting > self.limit + spare and self._drop_oldest():
+                waiting = self.bytes + size
+        self.peak = max(self.peak, waiting)
+        self._put += size
+        self._queue.append(Waiting(time, event, size))
+
+    def _size(self, event: Event) -> int:
+        names = self._arrays.get(type(event))
+        if names is None:
+            values = {name: getattr(event, name) for name in event.__struct_fields__}
+            names = [name for name, value in values.items() if isinstance(value, np.ndarray)]
+            self._arrays[type(event)] = names
+        return SMALL + sum(getattr(event, name).nbytes for name in names) if names else SMALL
+
+    def _drop_oldest(self) -> bool:
+        if (oldest := self.take()) is None:
+            return False
+        self._dropped_bytes += oldest.size
+        self.dropped += 1
+        return True
+
+    # In other threads.
+
+    def take(self) -> Waiting | None:
+        """Return the oldest; `None` if nothing waits. Call `done` when it is written."""
+        try:
+            return self._queue.popleft()
+        except IndexError:
+            return None
+
+    def done(self, waiting: Waiting) -> None:
+        """Note that an event is written, and needs no memory any more."""
+        self._written += waiting.size
+        if not self._room.is_set() and self.bytes <= self.limit // 2:
+            self._room.set()
+
+    def wait_for_room(self, timeout: float | None = None) -> bool:
+        """Wait until half of the room is free, or `release` is called; tell whether that came.
+
+        Args:
+            timeout: Real seconds to wait at most.
+        """
+        self._room.clear()
+        return self.bytes <= self.limit // 2 or self._room.wait(timeout)
+
+    def release(self) -> None:
+        """Let go of whoever waits: nothing will be written any more."""
+        self.limit = 1 << 62
+        self._room.set()
+
+
 class WriterProcess:
     """Hands a backlog to a process that writes it.
 
     Args:
         failed: Called in a thread, once, with what ended the writing.
         complain: Called in a thread with what could not be recorded.
+
+    Attributes:
+        error: What ended the writing.
+        result: The last reply of the process.
+        unwritten: Events that are not in the file.
 
     Raises:
         RecordingError: The file cannot be made.
@@ -70,10 +191,7 @@ class WriterProcess:
         self.backlog = backlog
         self.error: RecordingError | None = None
         self.result = Reply("")
-        """The last reply of the process."""
-        self.unwritten = 0
-        """Events that are not in the file."""
-        self._handed = 0
+        self.unwritten = self._handed = 0
         self._seen: tuple[object, ...] = ()
         self._seen_at = time.monotonic()
         self._cores = request.cores
@@ -82,7 +200,8 @@ class WriterProcess:
         self._closing = threading.Event()
         self._end = 0
         self._child = subprocess.Popen(  # noqa: S603  # our own module
-            command(request),
+            request.command(),
+            bufsize=_AT_ONCE,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             process_group=0,  # so that a terminal's Ctrl-C does not reach it
@@ -90,13 +209,12 @@ class WriterProcess:
         )
         assert self._child.stdin is not None
         assert self._child.stdout is not None
-        self._replies = self._child.stdout
-        self._file = self._child.stdin.fileno()
+        self._replies, self._events = self._child.stdout, self._child.stdin
         with contextlib.suppress(OSError, AttributeError):  # elsewhere it is smaller
-            fcntl.fcntl(self._file, fcntl.F_SETPIPE_SZ, _PIPE)
+            fcntl.fcntl(self._events, fcntl.F_SETPIPE_SZ, _PIPE)
         first = self._reply()
         if first.what != "ready":
-            self._child.stdin.close()
+            self._events.close()
             self._replies.close()
             self._child.wait()
             if first.what == "missing":
@@ -169,82 +287,67 @@ class WriterProcess:
     # The thread that feeds.
 
     def _feed(self) -> None:
-        self._stay_with_the_loop()
+        # Off the busy cores: there this thread might wait for its turn with Python's lock, and
+        # then the loop would wait for that, too.
+        if self._cores and (spare := os.sched_getaffinity(0) - {*self._cores}):
+            os.sched_setaffinity(0, spare)
         try:
             self._hand_over()
-            pipe.write_all(self._file, [pipe.end(self._end)])
+            pipe.write(self._events, self._end, pipe.END)
+            self._events.flush()
         except OSError:
             pass  # the process is gone, and the listener knows why
         finally:
-            assert self._child.stdin is not None
             with contextlib.suppress(OSError):
-                self._child.stdin.close()
+                self._events.close()
             self.backlog.release()
-        while not self._closing.wait(_PAUSE):
-            self._let_go()
-        self._let_go()
-
-    def _stay_with_the_loop(self) -> None:
-        """Keep this thread off the busy cores: there it might wait for its turn with Python's lock.
-
-        Then the loop would wait for that, too.
-        """
-        if not (self._cores and hasattr(os, "sched_setaffinity")):
-            return
-        if spare := os.sched_getaffinity(0) - {*self._cores}:
-            os.sched_setaffinity(0, spare)
+        closed = False
+        while not closed:
+            closed = self._closing.wait(_PAUSE)
+            while (waiting := self.backlog.take()) is not None:
+                self.unwritten += 1
+                self.backlog.done(waiting)
 
     def _hand_over(self) -> None:
-        parts: list[Buffer] = []
         taken: list[Waiting] = []
-        size = 0
-        while True:
-            closing = self._closing.is_set()  # before the look: what was put before it is written
-            waiting = self.backlog.take()
-            if waiting is not None:
-                taken.append(waiting)
-                size += waiting.size
-                parts += self._pieces(waiting)
-                if size < _AT_ONCE and len(taken) < _IN_A_ROW:
-                    continue
-            if taken:
-                try:
-                    pipe.write_all(self._file, parts)
-                except OSError:
-                    self.unwritten += len(taken)
-                    raise
-                self._handed += len(taken)
-                for each in taken:
-                    self.backlog.done(each)
-                parts, taken, size = [], [], 0
-            elif closing:
-                return
-            else:
-                self._closing.wait(_PAUSE)
-
-    def _pieces(self, waiting: Waiting) -> list[Buffer]:
-        event = waiting.event
-        what = pipe.ANNOUNCEMENT if isinstance(event, Announcement) else pipe.EVENT
         try:
-            return pipe.pieces(waiting.time, pack(event), what)
+            while True:
+                closing = self._closing.is_set()  # before the look: what came before is written
+                if (waiting := self.backlog.take()) is not None:
+                    taken.append(waiting)
+                    self._write(waiting)
+                    if sum(each.size for each in taken) < _AT_ONCE and len(taken) < _IN_A_ROW:
+                        continue
+                if taken:
+                    self._events.flush()
+                    self._handed += len(taken)
+                    for each in taken:
+                        self.backlog.done(each)
+                    taken = []
+                elif closing:
+                    return
+                else:
+                    self._closing.wait(_PAUSE)
+        except OSError:
+            self.unwritten += len(taken)
+            raise
+
+    def _write(self, waiting: Waiting) -> None:
+        is_announced = isinstance(waiting.event, Announcement)
+        try:
+            packed = pack(waiting.event)
         except WireError as error:
             self._complain(str(error))
-            return []
-
-    def _let_go(self) -> None:
-        while (waiting := self.backlog.take()) is not None:
-            self.unwritten += 1
-            self.backlog.done(waiting)
+            return
+        pipe.write(
+            self._events, waiting.time, pipe.ANNOUNCEMENT if is_announced else pipe.EVENT, packed
+        )
 
     # The thread that listens.
 
     def _listen(self) -> None:
-        while True:
-            reply = self._reply()
-            if reply.what == "complaint":
-                self._complain(reply.text)
-                continue
-            break
+        while (reply := self._reply()).what == "complaint":
+            self._complain(reply.text)
         self._replies.close()
         self.result = reply
         if reply.what != "done":

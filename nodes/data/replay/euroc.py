@@ -34,6 +34,7 @@ from nodes.data.replay.folders import (
     FolderReader,
     Rows,
     as_pair,
+    camera_at,
     read_image,
     vehicle_at,
     while_seen,
@@ -43,7 +44,6 @@ from nodes.trajectory.formats import euroc_rows
 from nodes.trajectory.table import read_rows
 
 _TRUTH = "state_groundtruth_estimate0"
-_BODY = "base_link"
 _MODELS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 """Kalibr's names of distortion models, and ours."""
 
@@ -110,7 +110,7 @@ class Euroc(FolderReader):
         super().__init__(folder, vehicle)
         self._images: dict[str, list[tuple[int, Path]]] = {}
         self._depths: dict[str, tuple[list[tuple[int, Path]], float]] = {}
-        self._imu_frame = _BODY
+        self._imu_frame = "base_link"
         try:
             cameras = [self._camera(camera) for camera in sorted(folder.glob("cam[0-9]*"))]
             if len(cameras) == 2:
@@ -122,8 +122,6 @@ class Euroc(FolderReader):
             truth = folder / _TRUTH / "data.csv"
             rows = euroc_rows(truth, tolerance=UNIT_TOLERANCE) if truth.is_file() else ()
             self._truth = sorted((stamp, values) for _, stamp, values in rows)
-        except ReplayError:
-            raise
         except ValueError as error:
             raise ReplayError(str(error)) from None
         stamps = [row[0] for row in self._imu]
@@ -160,15 +158,9 @@ class Euroc(FolderReader):
     def _odometry(self, stamp: int, values: list[float]) -> Odometry:
         """Return the truth; the data set has no angular velocity, so that is 0."""
         x, y, z, qw, qx, qy, qz, u, v, w = values[:10]
-        return Odometry(
-            stamp=stamp - self._origin,
-            source=self._vehicle,
-            child_frame_id=_BODY,
-            position=flip_yz((x, y, z)),
-            orientation=rotation_to_ned((qw, qx, qy, qz)),
-            linear_velocity=rotate_inverse((qw, qx, qy, qz), (u, v, w)),
-            angular_velocity=(0.0, 0.0, 0.0),
-        )
+        turn = qw, qx, qy, qz
+        velocity = rotate_inverse(turn, (u, v, w))
+        return self._pose(stamp, flip_yz((x, y, z)), rotation_to_ned(turn), velocity)
 
     def _camera(self, folder: Path) -> CameraAnnouncement:
         sensor = read_sensor(folder / "sensor.yaml")
@@ -195,22 +187,13 @@ class Euroc(FolderReader):
             factor = read_sensor(depth / "sensor.yaml").number("depth_factor")
             self._depths[source] = self._index(depth), factor
             images.append("depth")
-        return CameraAnnouncement(
-            stamp=0,
-            source=source,
-            images=tuple(images),
-            info=sensor.converted(
-                {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-                | {"distortion_model": model, "distortion": lens},
-                CameraInfo,
-            ),
-            rate=sensor.number("rate_hz"),
-            latency=0.0,
-            frame_id=f"{source}_optical",
-            parent_frame_id=_BODY,
-            position=position,
-            orientation=orientation,
+        info = sensor.converted(
+            {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+            | {"distortion_model": model, "distortion": lens},
+            CameraInfo,
         )
+        rate = sensor.number("rate_hz")
+        return camera_at(source, tuple(images), info, rate, position, orientation)
 
     def _imu_announcement(self) -> ImuAnnouncement:
         sensor = read_sensor(self._folder / "imu0" / "sensor.yaml")

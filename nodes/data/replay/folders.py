@@ -17,12 +17,16 @@ import numpy.typing as npt
 from events import (
     Announcement,
     CameraAnnouncement,
+    CameraInfo,
     DepthImage,
     Event,
     Image,
     Odometry,
+    Quaternion,
+    Vector3,
     VehicleAnnouncement,
 )
+from events.frames import OPTICAL_TO_FRD
 from events.geometry import pose_matrix
 from nodes.data.replay.reader import Reader, ReplayError, Timed, Wants
 
@@ -52,6 +56,29 @@ def vehicle_at(pose: Odometry) -> VehicleAnnouncement:
         control_rate=0.0,
         position=pose.position,
         orientation=pose.orientation,
+    )
+
+
+def camera_at(
+    source: str,
+    images: tuple[str, ...],
+    info: CameraInfo,
+    rate: float,
+    position: Vector3 = (0.0, 0.0, 0.0),
+    orientation: Quaternion = OPTICAL_TO_FRD,
+) -> CameraAnnouncement:
+    """Return the announcement of a camera on the body; by default in its origin, looking ahead."""
+    return CameraAnnouncement(
+        stamp=0,
+        source=source,
+        images=images,
+        info=info,
+        rate=rate,
+        latency=0.0,
+        frame_id=f"{source}_optical",
+        parent_frame_id="base_link",
+        position=position,
+        orientation=orientation,
     )
 
 
@@ -122,6 +149,23 @@ class FolderReader(Reader):
     @abstractmethod
     def _rows(self) -> Iterator[Rows]:
         """Yield what there is."""
+
+    def _pose(
+        self,
+        stamp: int,
+        position: Vector3,
+        orientation: Quaternion,
+        velocity: Vector3 = (0.0, 0.0, 0.0),
+    ) -> Odometry:
+        """Return the truth; velocities that a data set does not have are 0."""
+        return Odometry(
+            stamp=stamp - self._origin,
+            source=self._vehicle,
+            position=position,
+            orientation=orientation,
+            linear_velocity=velocity,
+            angular_velocity=(0.0, 0.0, 0.0),
+        )
 
     def _image(self, source: str, stamp: int, path: Path) -> Image:
         return read_image(path, stamp - self._origin, source, f"{source}_optical")

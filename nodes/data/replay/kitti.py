@@ -22,7 +22,7 @@ import numpy as np
 from events import CameraAnnouncement, CameraInfo, Image, Odometry, Quaternion, Vector3
 from events.frames import OPTICAL_TO_FRD
 from events.geometry import pose_matrix, pose_tuples
-from nodes.data.replay.folders import FolderReader, Rows, as_pair, read_image, vehicle_at
+from nodes.data.replay.folders import FolderReader, Rows, as_pair, camera_at, read_image, vehicle_at
 from nodes.data.replay.reader import ReplayError
 from nodes.trajectory.formats import read_kitti
 from nodes.trajectory.table import Row, read_rows
@@ -54,28 +54,15 @@ class Kitti(FolderReader):
             }
             projections = read_rows(folder / "calib.txt", None, (13,), "name: 12 numbers")
             self._announce({row.fields[0].rstrip(":"): row for row in projections})
-        except ReplayError:
-            raise
         except ValueError as error:
             raise ReplayError(str(error)) from None
 
     def _rows(self) -> Iterator[Rows]:
         """Yield truth and images."""
-        yield Rows(Odometry, self._vehicle, self._truth, self._odometry)
+        yield Rows(Odometry, self._vehicle, self._truth, self._pose)
         for source, paths in self._images.items():
             rows = list(zip(self._stamps, paths, strict=True))
             yield Rows(Image, source, rows, partial(self._image, source))
-
-    def _odometry(self, stamp: int, position: Vector3, orientation: Quaternion) -> Odometry:
-        """Return the truth; the data set has no velocities, so they are 0."""
-        return Odometry(
-            stamp=stamp - self._origin,
-            source=self._vehicle,
-            position=position,
-            orientation=orientation,
-            linear_velocity=(0.0, 0.0, 0.0),
-            angular_velocity=(0.0, 0.0, 0.0),
-        )
 
     def _poses(self) -> list[tuple[int, Vector3, Quaternion]]:
         path = self._folder.parent.parent / "poses" / f"{self._folder.name}.txt"
@@ -91,7 +78,7 @@ class Kitti(FolderReader):
         seconds = (self._stamps[-1] - self._stamps[0]) / 1e9
         rate = (len(self._stamps) - 1) / seconds if seconds > 0 else 10.0
         if self._truth:
-            self._announcements.append(vehicle_at(self._odometry(*self._truth[0])))
+            self._announcements.append(vehicle_at(self._pose(*self._truth[0])))
         if not self._images:
             raise ReplayError(f"{self._folder}: expected images in image_0 to image_3, found none")
         cameras: dict[str, CameraAnnouncement] = {}
@@ -124,16 +111,5 @@ def _camera(source: str, row: Row, image: Path, rate: float) -> CameraAnnounceme
     )
     moved = np.eye(4)
     moved[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
-    position, orientation = pose_tuples(_AXES @ moved)
-    return CameraAnnouncement(
-        stamp=0,
-        source=source,
-        images=("rgb" if first.encoding == "rgb8" else "grey",),
-        info=info,
-        rate=rate,
-        latency=0.0,
-        frame_id=f"{source}_optical",
-        parent_frame_id="base_link",
-        position=position,
-        orientation=orientation,
-    )
+    images = ("rgb" if first.encoding == "rgb8" else "grey",)
+    return camera_at(source, images, info, rate, *pose_tuples(_AXES @ moved))

@@ -17,7 +17,6 @@ from pathlib import Path
 
 from events import (
     Announcement,
-    CameraAnnouncement,
     DepthImage,
     Image,
     Odometry,
@@ -30,6 +29,7 @@ from nodes.data.replay.euroc import noted_epoch, read_sensor
 from nodes.data.replay.folders import (
     FolderReader,
     Rows,
+    camera_at,
     read_image,
     vehicle_at,
     while_seen,
@@ -65,13 +65,10 @@ class TumRgbd(FolderReader):
     ) -> None:
         super().__init__(folder, vehicle)
         self._source = f"{vehicle}/camera"
-        self._frame_id = f"{self._source}_optical"
         try:
             self._rgb = self._index("rgb.txt")
             depth = self._index("depth.txt") if (folder / "depth.txt").is_file() else []
             self._truth = self._poses()
-        except ReplayError:
-            raise
         except ValueError as error:
             raise ReplayError(str(error)) from None
         self._depth = self._paired(depth)
@@ -108,15 +105,7 @@ class TumRgbd(FolderReader):
         yield Rows(Image, source, self._rgb, partial(self._image, source))
 
     def _odometry(self, stamp: int, position: Vector3, optical: Quaternion) -> Odometry:
-        """Return the truth; the data set has no velocities, so they are 0."""
-        return Odometry(
-            stamp=stamp - self._origin,
-            source=self._vehicle,
-            position=position,
-            orientation=multiply(optical, inverse(OPTICAL_TO_FRD)),
-            linear_velocity=(0.0, 0.0, 0.0),
-            angular_velocity=(0.0, 0.0, 0.0),
-        )
+        return self._pose(stamp, position, multiply(optical, inverse(OPTICAL_TO_FRD)))
 
     def _camera_pose(self, stamp: int, position: Vector3, optical: Quaternion) -> PoseStamped:
         return PoseStamped(
@@ -141,23 +130,11 @@ class TumRgbd(FolderReader):
         return sorted((stamp, path) for stamp, (_, path) in taken.items())
 
     def _announced(self, camera: Pinhole, rate: float) -> list[Announcement]:
-        first = read_image(self._rgb[0][1], 0, self._source, self._frame_id)
+        first = read_image(self._rgb[0][1], 0, self._source, "")
         height, width = first.data.shape[:2]
-        images = ("rgb" if first.encoding == "rgb8" else "grey",)
-        announced: list[Announcement] = [
-            CameraAnnouncement(
-                stamp=0,
-                source=self._source,
-                images=(*images, "depth") if self._depth else images,
-                info=camera.info(width, height),
-                rate=rate,
-                latency=0.0,
-                frame_id=self._frame_id,
-                parent_frame_id="base_link",
-                position=(0.0, 0.0, 0.0),
-                orientation=OPTICAL_TO_FRD,
-            )
-        ]
+        kinds = ("rgb" if first.encoding == "rgb8" else "grey", *(["depth"] if self._depth else []))
+        announced: list[Announcement]
+        announced = [camera_at(self._source, kinds, camera.info(width, height), rate)]
         if self._truth:
             begin = self._rgb[0][0]
             row = next((row for row in self._truth if row[0] >= begin), self._truth[0])

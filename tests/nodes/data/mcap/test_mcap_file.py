@@ -42,7 +42,7 @@ def write(path: Path, *, close: bool = True, compression: Compression = "zstd") 
 
 
 def fill(writer: McapWriter) -> None:
-    channel = writer.channel("/chatter", TYPE, DEFINITION, {"kind": "test"})
+    channel = writer.channel("/chatter", TYPE, lambda _: DEFINITION, {"kind": "test"})
     for number in range(CHUNKS):
         second = number * 1_000_000_000
         writer.write(channel, second, bytes((number * 7 + k * k) % 251 for k in range(500)))
@@ -129,7 +129,7 @@ def test_a_damaged_first_chunk_takes_its_topics_along(tmp_path: Path) -> None:
     """Without an index nothing else names them; that is said, and the file can be mended."""
     path = tmp_path / "a.mcap"
     writer = write(path, close=False, compression="none")
-    other = writer.channel("/other", TYPE, DEFINITION)
+    other = writer.channel("/other", TYPE, lambda _: DEFINITION)
     writer.write(other, 9_000_000_000, b"there")
     writer.end_chunk()
     data = bytearray(path.read_bytes())

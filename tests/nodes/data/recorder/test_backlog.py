@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 
 from events import Image
-from nodes.data.recorder.pipe import SMALL, Backlog, WhenFull
+from nodes.data.recorder.pipe import WhenFull
+from nodes.data.recorder.writer_process import SMALL, Backlog
 from tests.nodes.data.recorder.samples import depth, image, imu
 
 LARGE = SMALL + 400 * 400 * 3

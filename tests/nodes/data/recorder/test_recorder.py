@@ -18,9 +18,9 @@ from events import Event, Image, Odometry
 from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import McapWriter, contents, read
 from nodes.data.recorder import McapRecorder, McapRecorderConfig, pipe
-from nodes.data.recorder.pipe import Backlog, WriteRequest
+from nodes.data.recorder.pipe import WriteRequest
 from nodes.data.recorder.process import FileWriter
-from nodes.data.recorder.writer_process import WriterProcess
+from nodes.data.recorder.writer_process import Backlog, WriterProcess
 from nodes.data.replay.recorded import Recorded
 from runtime import Tick, every
 from runtime.errors import FatalError, NodeError
@@ -127,20 +127,16 @@ def test_what_a_failed_chunk_had_is_not_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nor what comes after it: the process stops reading."""
-    request = WriteRequest(
-        path=str(tmp_path / "a.mcap"), config=McapRecorderConfig(), attachment="", niceness=0,
-        cores=(),
-    )  # fmt: skip
-    process = FileWriter(request)
+    process = FileWriter(WriteRequest(str(tmp_path / "a.mcap")))
 
     def fail(_: McapWriter) -> None:
         raise RecordingError("full")
 
     monkeypatch.setattr(McapWriter, "end_chunk", fail)
     there, here = os.pipe()
-    for stamp in (0, SECOND, 2 * SECOND):
-        pipe.write_all(here, pipe.pieces(stamp, pack(imu(stamp)), pipe.EVENT))
-    os.close(here)
+    with os.fdopen(here, "wb") as file:
+        for stamp in (0, SECOND, 2 * SECOND):
+            pipe.write(file, stamp, pipe.EVENT, pack(imu(stamp)))
     reply = process.run(there)
     os.close(there)
     assert (reply.what, reply.text, reply.written) == ("error", "full", 0)
@@ -183,7 +179,7 @@ def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> 
     """The run hears of it, and simulated time does not wait for what will not come."""
     path, failures = tmp_path / "a.mcap", list[RecordingError]()
     config = McapRecorderConfig(chunk_size=1 << 16)
-    request = WriteRequest(path=str(path), config=config, attachment="", niceness=0, cores=())
+    request = WriteRequest(str(path), config)
     backlog = Backlog(1 << 18, "wait")
     process = WriterProcess(request, backlog, failures.append, lambda _: None)
     process.start()
@@ -208,9 +204,7 @@ def test_a_process_that_is_killed_leaves_what_it_had_written(tmp_path: Path) -> 
 def test_a_run_that_is_killed_leaves_a_whole_file(tmp_path: Path) -> None:
     """To the process that writes, that is the end of its input; it closes the file."""
     path = tmp_path / "a.mcap"
-    request = WriteRequest(
-        path=str(path), config=McapRecorderConfig(), attachment="", niceness=0, cores=()
-    )
+    request = WriteRequest(str(path))
     backlog = Backlog(1 << 18, "wait")
     process = WriterProcess(request, backlog, lambda _: None, lambda _: None)
     process.start()
@@ -258,7 +252,7 @@ def test_a_process_that_cannot_be_woken_is_ended_and_what_it_had_written_is_kept
     monkeypatch.setattr("nodes.data.recorder.writer_process.STANDSTILL", 0.3)
     path, failures = tmp_path / "a.mcap", list[RecordingError]()
     config = McapRecorderConfig(chunk_size=1 << 16)
-    request = WriteRequest(path=str(path), config=config, attachment="", niceness=0, cores=())
+    request = WriteRequest(str(path), config)
     process = WriterProcess(request, Backlog(1 << 30, "wait"), failures.append, lambda _: None)
     process.start()
     process.backlog.put(1, big(1))
