@@ -17,10 +17,13 @@ from events import (
     TrackedFeatures,
 )
 from nodes.viewers.common import ImageSelection
-from nodes.viewers.foxglove.publishing import LARGE, SMALL, Publishing
+from nodes.viewers.foxglove.publishing import SMALL, Publishing
 from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 from runtime import Node, Stream, Tick, every, on
 from runtime.errors import MissingDependencyError, VisnavError
+
+_QUEUED = (Image, DepthImage, PointCloud, LidarScan, TrackedFeatures)
+"""Events whose messages take long to make."""
 
 WAITING = 8
 """Images of one kind that wait to be passed on; the oldest is dropped, and counted."""
@@ -52,7 +55,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         self._selection = ImageSelection(self.config.image_rate)
         self._queues: dict[type[Event], Stream[Any]] = {
             kind: Stream(f"{self.name}.{kind.__name__}", WAITING, "drop_oldest", soon=True)
-            for kind in LARGE
+            for kind in _QUEUED
         }
 
     async def on_startup(self) -> None:
@@ -92,8 +95,9 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         publishing = self._publishing
         assert publishing is not None
         publishing.begin()
-        for kind, put in publishing.large.items():
-            self.start(self._pass_on(self._queues[kind], put))
+        for kind, events in self._queues.items():
+            put = publishing.features if kind is TrackedFeatures else publishing.put
+            self.start(self._pass_on(events, put))
 
     async def on_shutdown(self) -> None:
         """Stop listening."""
@@ -115,7 +119,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
     def features(self, event: TrackedFeatures) -> None:
         """Pass on the features of those images."""
         if self._publishing is not None:
-            self._publishing.small(event)
+            self._publishing.put(event)
         if self._selection.selected(event.frame_id, event.stamp):
             self._queues[TrackedFeatures].offer(event)
 
@@ -128,7 +132,7 @@ class FoxgloveServer(Node[FoxgloveConfig]):
     def measurements(self, event: Event) -> None:
         """Pass on what is small, at once."""
         if self._publishing is not None:
-            self._publishing.small(event)
+            self._publishing.put(event)
 
     @every(hz="clock_rate")
     def send_time(self, tick: Tick) -> None:  # noqa: ARG002

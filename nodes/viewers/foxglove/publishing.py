@@ -21,7 +21,6 @@ from events import (
     PointCloud,
     PoseEstimate,
     PositionSetpoint,
-    SegmentationImage,
     TrackedFeatures,
     TrackingEvent,
     TransformStamped,
@@ -30,7 +29,7 @@ from events import (
 )
 from events.frames import convert_vector
 from events.geometry import Pose
-from nodes.ros2.messages import mappings as ros
+from nodes.ros2.messages import mappings
 from nodes.ros2.messages.publishing import Publishing as RosPublishing
 from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, ros_name
 from nodes.ros2.messages.typestore import Stamps, TypeStore
@@ -48,17 +47,11 @@ from nodes.viewers.common import (
 from nodes.viewers.foxglove.messages import Messages, RosTopic, RosTopics
 from nodes.viewers.foxglove.server import FoxgloveConfig, Server
 
-LARGE: tuple[type[Event], ...] = (
-    *(kind for kind in ros.LARGE if kind is not SegmentationImage),
-    TrackedFeatures,
-)
-"""Events whose messages take long to make: `Publishing.large` has a function for each."""
-
 SMALL: tuple[type[Event], ...] = (
-    *(kind for kind in ros.SMALL if kind is not TrackedFeatures),
+    *(kind for kind in mappings.SMALL if kind is not TrackedFeatures),
     *(PlannedPose, PositionSetpoint, TrackingEvent, VehicleEvent),
 )
-"""Events that `Publishing.small` takes."""
+"""Events whose messages are made at once."""
 
 _LEFT_OUT = {"clock", "paths", "camera_poses", "body_poses", "segmentation_images"}
 """Groups of ROS's topics that repeat what the protocol, the scene or transforms have, or that
@@ -96,11 +89,6 @@ class Publishing:
         self._bodies: dict[str, Callable[[], Any]] = {}
         """What makes their entities, by source: their frames' names depend on who else there is."""
         self._plan = PlanSelection()
-        self.large: dict[type[Event], Callable[[Any], None]] = {
-            **dict.fromkeys(LARGE, self._put),
-            PointCloud: self._cloud,
-            TrackedFeatures: self._features,
-        }
         server.declare("/scene", "SceneUpdate")
         server.declare("/log", "Log")
 
@@ -123,26 +111,20 @@ class Publishing:
         self._ros.begin()
         self._server.latch("/scene", self._whole_scene, 0)
 
-    # Beside the loop.
-
-    def _features(self, event: TrackedFeatures) -> None:
-        """Put the features that an estimator tracks in an image."""
+    def features(self, event: TrackedFeatures) -> None:
+        """Put the features that an estimator tracks in an image; beside the loop."""
         if (camera := self._frames.get(event.frame_id)) is not None:
             topic = f"/{ros_name(camera)}/features/{ros_name(event.source)}"
             self._server.declare(topic, "ImageAnnotations")
             if self._server.wanted(topic):
                 self._server.log(topic, self._make.features(event), event.stamp)
 
-    def _cloud(self, event: PointCloud) -> None:
-        """Put a point cloud, in the frame of an estimator if it is that."""
-        frame = self._renamed.get(event.frame_id, event.frame_id)
-        self._put(msgspec.structs.replace(event, frame_id=frame))
-
-    # At once.
-
-    def small(self, event: Event) -> None:
-        """Put the messages of an event that is no image and no point cloud."""
+    def put(self, event: Event) -> None:
+        """Put the messages of an event: images and point clouds beside the loop, the rest on it."""
         match event:
+            case PointCloud():  # in the frame of an estimator if it is that
+                frame = self._renamed.get(event.frame_id, event.frame_id)
+                self._put(msgspec.structs.replace(event, frame_id=frame))
             case Odometry():
                 self._odometry(event)
             case PoseEstimate():
@@ -179,8 +161,6 @@ class Publishing:
         self._place(event, parent, body, (event.position, event.orientation))
         colour = estimate_colour(list(self._estimators).index(source))
         self._extend(f"estimate/{source}", parent, colour, event)
-
-    # What these share.
 
     def _vehicle(self, source: str, frame_id: str) -> None:
         if source not in self._truths:

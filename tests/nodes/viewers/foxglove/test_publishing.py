@@ -13,7 +13,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from events import Announcement, Event, PointCloud, PoseStamped, Range, TrackingLost
+from events import (
+    Announcement,
+    Event,
+    PointCloud,
+    PoseStamped,
+    Range,
+    TrackedFeatures,
+    TrackingLost,
+)
 from nodes.ros2.messages import images
 from nodes.ros2.messages.images import LIDAR_POINT, POINT
 from nodes.viewers.foxglove.publishing import Publishing
@@ -58,7 +66,10 @@ class Stage:
     def put(self, *events: Event) -> None:
         """Put events as the node does."""
         for event in events:
-            self.publishing.large.get(type(event), self.publishing.small)(event)
+            if isinstance(event, TrackedFeatures):
+                self.publishing.features(event)
+            else:
+                self.publishing.put(event)
 
     def look(self, viewer: Viewer, *topics: str) -> None:
         """Subscribe, and wait until the server knows."""
@@ -304,7 +315,7 @@ def test_each_of_two_vehicles_has_its_cameras_path_and_estimates(
 ) -> None:
     stage = Stage(server, SECOND_VEHICLE, SECOND_CAMERA, PERSON)
     second = msgspec.structs.replace(odometry(0), source="other", position=(9.0, 0.0, 0.0))
-    stage.publishing.small(msgspec.structs.replace(features(0), frame_id="other/camera_optical"))
+    stage.publishing.put(msgspec.structs.replace(features(0), frame_id="other/camera_optical"))
     stage.put(odometry(0), second, estimate(0, (1.0, 0.0, 0.0), "odom"))
     stage.look(viewer, "/tf_static", "/tf", "/scene")
     frames = placed(read(viewer, "/tf_static"))
@@ -329,7 +340,7 @@ def test_an_estimator_s_frames_keep_their_names(server: Server, viewer: Viewer) 
     stage.put(odometry(0))
     stage.look(viewer, "/vo/pose", "/tf")
     stage.put(estimate(0, (1.0, 0.0, 0.0), "odom"))
-    stage.publishing.small(msgspec.structs.replace(features(0), frame_id="other/camera_optical"))
+    stage.publishing.put(msgspec.structs.replace(features(0), frame_id="other/camera_optical"))
     stage.put(estimate(MS, (1.0, 0.0, 0.0), "odom"))
     assert [read(viewer, "/vo/pose").header.frame_id for _ in range(2)] == ["vo/odom"] * 2
     for _ in range(2):
