@@ -1,15 +1,11 @@
-"""A run's trajectories, as files for evo and for the tools of other data sets.
+"""``export``: a run's trajectories, measurements and calibration, as files for other tools.
 
-A run leaves them as ``trajectories/truth.tum`` and ``trajectories/<estimator>.tum``, in ``map``
-(NED) or the estimator's own frame, just as the estimator sent them; nothing here aligns them.
-
-Stamps of an export are Unix time: its files say which epoch is the run's time 0. TUM's files keep
-the run's frames; EuRoC's world is z up (north, west, up), as that data set's own; KITTI's poses are
-those of the left camera, from identity.
-
-A recorded run's small sensors as CSV files: one for each sensor and kind of measurement.
-
-``export``: a run's trajectories, measurements and calibration, as files for other tools.
+A run leaves trajectories as ``trajectories/truth.tum`` and ``trajectories/<estimator>.tum``, in
+``map`` (NED) or the estimator's own frame, just as the estimator sent them; nothing here aligns
+them. Stamps of an export are Unix time: its files say which epoch is the run's time 0. TUM's files
+keep the run's frames; EuRoC's world is z up (north, west, up), as that data set's own; KITTI's
+poses are those of the left camera, from identity. Measurements are CSV files: one for each sensor
+and kind.
 """
 
 from __future__ import annotations

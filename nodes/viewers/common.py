@@ -1,9 +1,4 @@
-"""Colours, the shape of a vehicle, and words for the log.
-
-Paths in short pieces, so that each pose is sent to a viewer once, and where estimates lie.
-
-Which images and which plan are shown.
-"""
+"""What viewers show alike: colours and shapes, paths in pieces, which images and which plan."""
 
 from __future__ import annotations
 

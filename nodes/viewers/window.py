@@ -1,12 +1,8 @@
-"""A window that shows images and reports keys, by GLFW and OpenGL. It runs in a worker process.
+"""A window as a node: shows one camera's images and turns keys into events.
 
-The only module that imports glfw and OpenGL, and not before a `GlfwWindow` is made. No events and
-no asyncio here: what happens in the window goes back to the node as small structs.
-
-A window as a node: shows one camera's images and turns keys into events.
-
-What a key does is decided in `nodes.pilots.teleop`; the window itself is in
-`nodes.viewers.window`.
+The window itself, by GLFW and OpenGL, runs in a worker process; the only module that imports glfw
+and OpenGL, and not before a `GlfwWindow` is made. What a key does is decided in
+`nodes.pilots.teleop`.
 """
 
 from __future__ import annotations

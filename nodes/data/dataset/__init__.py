@@ -1,7 +1,6 @@
 """Data sets in the layouts of EuRoC, TUM RGB-D and TUM monoVO, recorded while a run goes on.
 
-`node` listens; `euroc`, `tum_rgbd` and `tum_mono` are the layouts, `recording` what they have in
-common, files of rows and of images included, and `rig` is the choice of sensors.
+`node` listens; `euroc` and `tum` are the layouts, `recording` is what they have in common.
 """
 
 from nodes.data.dataset.node import DatasetConfig, DatasetWriter

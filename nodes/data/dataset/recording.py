@@ -1,9 +1,7 @@
-"""What recordings of all layouts have in common: events in, rows and images out.
+"""What data sets of all layouts have in common: a rig of sensors, events in, rows and images out.
 
 Rows are written at once; an image is returned as a `ImageFile`, for whoever has time to write
 it. Nothing here waits or knows a clock.
-
-Which sensors a data set is made of, chosen among those that are announced.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
-"""The layout of TUM's monoVO data set, with its photometric calibration, for one camera.
+"""The layouts of two of TUM's benchmarks, for one camera.
 
-J. Engel, V. Usenko, D. Cremers, "A photometrically calibrated benchmark for monocular visual
-odometry", arXiv:1607.02555, 2016; as DSO reads it.
-
-The layout of TUM's RGB-D benchmark, for one camera.
-
-J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and
-cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. Stamps have nine decimals in place of six.
+monoVO, with its photometric calibration, as DSO reads it: J. Engel, V. Usenko, D. Cremers, "A
+photometrically calibrated benchmark for monocular visual odometry", arXiv:1607.02555, 2016.
+RGB-D: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and
+cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; stamps have nine decimals in place of six.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""The bytes of an MCAP file from outside: its records, and whether its index can be trusted.
+"""The bytes of an MCAP file from outside: its records, its index, and how they reach the disk.
 
 Needs no mcap. Of the format (mcap.dev/spec) no more stands here than what finds the records of a
-file that may be torn or damaged anywhere; what is in them is for `mcap_file`.
-
-Writing to a disk that may be full: in pieces that are there, or are not.
+file that may be torn or damaged anywhere (mcap's own readers stop there); what is in them is for
+`native`. A file is written in pieces that are there or are not, for its disk may be full.
 """
 
 from __future__ import annotations

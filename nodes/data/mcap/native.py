@@ -1,13 +1,10 @@
-"""Events as they are, in a recording: `runtime.wire`'s frames, as messages that ROS can carry.
+"""What stands in an MCAP file: its records, sound or not, and events as they are.
 
-The message is a ``std_msgs/msg/UInt8MultiArray``, so that a file holds nothing but CDR: ``ros2
-bag`` refuses files in which encodings are mixed. Its data is a frame; or, if the arrays stand in
-another message of the same time, only the frame's beginning, up to its arrays, which are then
-taken from that message.
-
-What stands in an MCAP file, sound or not: its records, by its index or one after the other.
-
-The only module that imports mcap (mcap.dev/spec).
+The only module that imports mcap (mcap.dev/spec). Records are found by the index, or one after the
+other. An event is a ``std_msgs/msg/UInt8MultiArray``, so that a file holds nothing but CDR: ``ros2
+bag`` refuses files in which encodings are mixed. Its data is a frame of `runtime.wire`; or, if the
+arrays stand in another message of the same time, only the frame's beginning, up to its arrays,
+which are then taken from that message.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Mends recordings of runs that were killed, or whose disk was full.
-
-``recover``: a torn recording made whole.
-"""
+"""``recover`` mends recordings of runs that were killed, or whose disk was full."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
-"""What a recording is to a replay, whatever its format: announcements, and events in order of time.
+"""What a recording is to a replay, whatever its format, which of its events are wanted; settings.
 
 All of it is for threads beside the loop, and knows no clock: times count from the recording's
 beginning.
-
-Which events of a recording are sent again: by type, and by source.
-
-A replay's settings in a run's file.
 """
 
 from __future__ import annotations

@@ -1,13 +1,10 @@
-"""Bags of ROS that others made: their messages as events, in our frames (`ros_messages.incoming`).
+"""Bags of ROS that others made: their messages as events, in our frames (`nodes.ros2.messages`).
 
 Messages with a header keep its stamp, unless that is zero; they are sent at their time of receipt.
 Where the two are of different clocks (a simulator's and the recording machine's), each counts
-from its own first. Cameras sit where ``/tf_static`` puts their optical frames in ``base_link``; one
-that it does not know looks ahead from the body's origin.
-
-What a file need not say of a ROS bag: which topics are read as what, and where cameras sit.
-
-Topics are known by type and name, cameras by the bag's fixed transforms (``/tf_static``).
+from its own first. Topics that settings do not name are known by type and name. Cameras sit where
+``/tf_static`` puts their optical frames in ``base_link``; one that it does not know looks ahead
+from the body's origin.
 """
 
 from __future__ import annotations

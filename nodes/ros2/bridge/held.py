@@ -20,8 +20,7 @@ import msgspec
 from events import Event
 from nodes.ros2.bridge.incoming_topic import IncomingTopic
 from nodes.ros2.bridge.keys import Message, Token
-from nodes.ros2.bridge.publisher import Publisher
-from nodes.ros2.bridge.session import Session
+from nodes.ros2.bridge.session import Publisher, Session
 from nodes.ros2.bridge.settings import Ros2BridgeConfig
 from nodes.ros2.messages.mappings import PUBLISHED, publication
 from nodes.ros2.messages.topics import Topic, topic_name

@@ -1,11 +1,8 @@
-"""A topic that the bridge subscribes to: its messages to events, and all that may be wrong.
+"""Topics by settings of the user's: from messages to events, and by mappings of their own back.
 
-Passes messages from the threads that read topics to the loop: bounded, one wake-up a burst.
-
-What comes faster than is allowed is dropped where it is read, before its bytes are copied. The
-loop is given back between messages when they have held it for `BUDGET`.
-
-A topic that is published by a mapping of the user's own, from events to messages of any type.
+Whatever may be wrong with a message is counted. Messages pass from the threads that read topics to
+the loop bounded, with one wake-up for a burst: what comes faster than is allowed is dropped where
+it is read, before its bytes are copied, and the loop is given back when it was held for `BUDGET`.
 """
 
 from __future__ import annotations
@@ -27,8 +24,7 @@ from events import (
     PilotAnnouncement,
 )
 from nodes.ros2.bridge.keys import Complaints, Message
-from nodes.ros2.bridge.publisher import Publisher
-from nodes.ros2.bridge.session import Session
+from nodes.ros2.bridge.session import Publisher, Session
 from nodes.ros2.bridge.settings import (
     OwnPublication,
     Ros2BridgeConfig,

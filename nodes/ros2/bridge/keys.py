@@ -1,13 +1,9 @@
-"""How rmw_zenoh_cpp names things on Zenoh: data keys, liveliness tokens, QoS as text.
+"""Names, attachments and complaints: what goes with messages on Zenoh, as rmw_zenoh_cpp has it.
 
-Source: rmw_zenoh, docs/design.md and liveliness_utils.cpp. zenoh-plugin-ros2dds names topics
-otherwise (`ros2dds_key`). Nothing here talks to Zenoh.
-
-What goes with every message: its number, when it was sent, and by whom.
-
-A ROS process that gets a malformed attachment ends, so there is one place that makes them.
-
-What is wrong with messages from outside: it is always counted, and seldom logged.
+Data keys, liveliness tokens and QoS as text are those of rmw_zenoh's docs/design.md and
+liveliness_utils.cpp; zenoh-plugin-ros2dds names topics otherwise (`ros2dds_key`). With every
+message go its number, when it was sent, and by whom: a ROS process that gets a malformed attachment
+ends, so there is one place that makes them. Nothing here talks to Zenoh.
 """
 
 from __future__ import annotations

@@ -32,10 +32,9 @@ from events import (
 from nodes.ros2.bridge.held import HeldLine, held_estimators, why_no_answers
 from nodes.ros2.bridge.incoming_topic import Inbox, IncomingTopic, OutgoingTopic
 from nodes.ros2.bridge.keys import Complaints, NodeName
-from nodes.ros2.bridge.publisher import Publisher
-from nodes.ros2.bridge.session import Session, SessionError
+from nodes.ros2.bridge.services import Services
+from nodes.ros2.bridge.session import Publisher, Session, SessionError
 from nodes.ros2.bridge.settings import Ros2BridgeConfig, event_type
-from nodes.ros2.bridge.simulation_services import Services
 from nodes.ros2.messages.mappings import LARGE, SMALL
 from nodes.ros2.messages.publishing import Publishing
 from nodes.ros2.messages.typestore import Stamps, TypeStore

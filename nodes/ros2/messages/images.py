@@ -1,20 +1,16 @@
-"""Images and point clouds as messages, and images back as events. An image is copied once at most.
+"""Images and point clouds as messages, JPEG and PNG, and their pixels back.
 
 Nearly all of such a message is its data, so the rest is serialised once by `typestore`, and then
-only stamp, length and data are written, into a buffer that is used again. The bytes are those
-that rosbags would make. A writer belongs to one topic and one thread at a time.
+only stamp, length and data are written, into a buffer that is used again: an image is copied once
+at most. The bytes are those that rosbags would make. A writer belongs to one topic and one thread
+at a time.
 
-Compressed depth as compressed_depth_image_transport has it (its codec.cpp): 16 bits, as PNG.
-
-Twelve bytes come before the PNG: an int32 0 (inverse depth), then a and b as float32.
+Compressed depth is a PNG of 16 bits, as compressed_depth_image_transport has it (its codec.cpp),
+after twelve bytes: an int32 0 (inverse depth), then a and b as float32. 0 stands for no depth.
 
 - ``32FC1``: a depth z becomes ``a / z + b`` with ``a = q (q + 1)`` and ``b = 1 - a / z_max``. Here
   ``q`` is its setting ``depth_quantization``, 100, and ``z_max`` its ``depth_max``, 10 m.
 - ``16UC1``: whole millimetres, up to 65.535 m; all twelve bytes are zero.
-
-In both, 0 stands for no depth.
-
-Images and depth images as JPEG and PNG.
 """
 
 from __future__ import annotations

@@ -1,14 +1,9 @@
-"""Topics: their names as ROS allows them, their types and their quality of service.
+"""Topics and frames: their names as ROS allows them, quality of service, and what is published.
 
-What is published of a run, and how: the settings that all who make ROS messages share.
-
-Definitions of services that rosbags does not come with, as in their packages' ``.srv`` files.
-
-Comments, constants and default values are left out: the hash of a type does not depend on them.
-An action is made of services and messages, as in https://design.ros2.org/articles/actions.html.
-Sources: std_srvs and action_msgs of ROS 2 Jazzy, simulation_interfaces 2.1.0.
-
-What ROS calls the frames of a run (REP 103 and REP 105), and how their axes lie.
+Frames and how their axes lie are those of REP 103 and REP 105. The definitions of services that
+rosbags does not come with are as in their packages' ``.srv`` files, without comments, constants and
+default values, on which the hash of a type does not depend: std_srvs and action_msgs of ROS 2
+Jazzy, simulation_interfaces 2.1.0.
 """
 
 from __future__ import annotations

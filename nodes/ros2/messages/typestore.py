@@ -1,11 +1,8 @@
 """Message types, their hashes, CDR, and bags: the only module that imports rosbags.
 
 Messages are objects of the classes that rosbags makes from the types' definitions; their fields
-have the names in ROS's files.
-
-What a user's own mapping from events to messages is given: it builds messages of any type.
-
-A mapping is called with the event and a `MessageBuilder`::
+have the names in ROS's files. A mapping of the user's own is called with an event and a
+`MessageBuilder`::
 
     def battery(event: Battery, builder: MessageBuilder) -> Any:
         return builder.make(
@@ -13,8 +10,6 @@ A mapping is called with the event and a `MessageBuilder`::
             header=builder.header(event.stamp, "base_link", event.source),
             percentage=event.percentage,
         )
-
-Times: nanoseconds of the run's clock to seconds and nanoseconds of a ROS message, and back.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Messages that Foxglove has and ROS has not: paths and bodies, features in images, the log.
+"""Messages of the server: Foxglove's own (paths and bodies, features, the log), and ROS's as CDR.
 
 Paths and bodies are in ROS's frames and axes, as all else is.
-
-Where ROS's messages go: topics of the server, whose messages are CDR.
 """
 
 from __future__ import annotations

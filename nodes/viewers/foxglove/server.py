@@ -1,16 +1,13 @@
-"""The library and its server: the only module that imports foxglove, and not before it is asked to.
+"""The library, its server, and the door to it: the only module that imports foxglove, once asked
+to.
 
 The server has threads of its own. To make and log a small message takes about 4 µs where nobody
 looks, and 30 µs where somebody does (most of it to wake such a thread): done on the loop.
 
-The door of the server: who may come in is decided here, before a viewer meets the library.
-
 The library takes every WebSocket, and a browser opens one for any page that asks. So the library
 listens on an address of this machine that nobody can guess (one of the 16 million of 127.0.0.0/8),
-and this gate on the port that is known: it reads each viewer's first request, and then passes bytes
-in both directions, in threads that hold no lock of Python's while they wait.
-
-The server's settings in a run's file.
+and a gate on the port that is known: it reads each viewer's first request, decides who may come in,
+and then passes bytes in both directions, in threads that hold no lock of Python's while they wait.
 """
 
 from __future__ import annotations

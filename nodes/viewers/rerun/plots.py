@@ -1,7 +1,4 @@
-"""Curves over time, and a log in words.
-
-Depth images with colours as points in the world. No Rerun here.
-"""
+"""Curves over time, a log in words, and depth images with colours as points in the world."""
 
 from __future__ import annotations
 

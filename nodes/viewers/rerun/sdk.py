@@ -1,8 +1,6 @@
-"""The library and its program: the only module that imports rerun, and not before it is asked.
+"""The view's settings, and the library and its program, for a worker's process.
 
-For a worker's process.
-
-The view's settings in a run's file.
+The only module that imports rerun, and not before it is asked.
 """
 
 from __future__ import annotations

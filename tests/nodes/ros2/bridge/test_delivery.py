@@ -27,8 +27,7 @@ from nodes.ros2.bridge.keys import (
     pack,
     unpack,
 )
-from nodes.ros2.bridge.publisher import Publisher
-from nodes.ros2.bridge.session import CLOSING, Session
+from nodes.ros2.bridge.session import CLOSING, Publisher, Session
 from nodes.ros2.messages.topics import Qos, Topic
 from tests.nodes.ros2.bridge.network import free_port, zenoh_session
 from tests.nodes.ros2.bridge.peer import DOMAIN, KEPT, PLAIN

@@ -26,7 +26,7 @@ from events import (
 )
 from nodes.ros2.bridge.keys import SIZE, Attachment, pack, unpack
 from nodes.ros2.bridge.node import Ros2Bridge
-from nodes.ros2.bridge.service_server import WAITING
+from nodes.ros2.bridge.services import WAITING
 from nodes.ros2.messages.topics import DEFINITIONS, SIMULATION, TRIGGER
 from nodes.ros2.messages.typestore import TypeStore
 from runtime import Node, Output, on

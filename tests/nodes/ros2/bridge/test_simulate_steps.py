@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from nodes.ros2.bridge.keys import Attachment, pack
-from nodes.ros2.bridge.simulation_services import KEPT
+from nodes.ros2.bridge.services import KEPT
 from nodes.ros2.messages.topics import CANCEL_GOAL, DEFINITIONS, STEPS
 from nodes.ros2.messages.typestore import TypeStore
 from runtime.config.model import Config, NodeSpec, RunConfig
