@@ -1,5 +1,4 @@
-"""The library, its server, and the door to it: the only module that imports foxglove, once asked
-to.
+"""The library, its server, and the door to it: the only module that imports foxglove.
 
 The server has threads of its own. To make and log a small message takes about 4 µs where nobody
 looks, and 30 µs where somebody does (most of it to wake such a thread): done on the loop.
