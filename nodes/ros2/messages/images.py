@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from events import LidarScan
 from nodes.ros2.messages.typestore import Time, TypeStore
 
 
@@ -77,8 +76,7 @@ _FLOAT32, _UINT16 = 7, 4
 """Of sensor_msgs/msg/PointField."""
 
 _XYZ = [("x", 0, _FLOAT32), ("y", 4, _FLOAT32), ("z", 8, _FLOAT32)]
-_COLOURED = [*_XYZ, ("rgb", 12, _FLOAT32)]
-_MEASURED = [*_XYZ, ("intensity", 12, _FLOAT32), ("ring", 16, _UINT16), ("time", 18, _FLOAT32)]
+_MEASURED = [("intensity", 12, _FLOAT32), ("ring", 16, _UINT16), ("time", 18, _FLOAT32)]
 
 _PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
 _TURNS = {
@@ -139,105 +137,43 @@ class ImageWriter:
         self._pixels = flat.reshape(data.shape)
 
 
-class CompressedWriter:
-    """Writes ``sensor_msgs/msg/CompressedImage`` as image_transport's plugin does.
+def cloud(
+    store: TypeStore,
+    header: Any,
+    points: npt.NDArray[np.float32],
+    kind: np.dtype[np.void],
+) -> tuple[bytearray, npt.NDArray[np.void]]:
+    """Return a ``sensor_msgs/msg/PointCloud2`` with its points, and its rows for the rest.
 
     Args:
-        frame_id: Optical frame.
-        quality: Of a JPEG, 1 to 100.
+        header: ``std_msgs/msg/Header``.
+        points: Metres in ROS's axes, shape (n, 3).
+        kind: `POINT` or `LIDAR_POINT`.
     """
-
-    def __init__(
-        self, store: TypeStore, frame_id: str, format_: Literal["jpeg", "png"], quality: int
-    ) -> None:
-        self._store = store
-        self._frame_id = frame_id
-        self._format = format_
-        self._quality = quality
-
-    def write(self, time: Time, data: npt.NDArray[np.uint8]) -> bytearray:
-        """Return the message.
-
-        Args:
-            time: Seconds and nanoseconds.
-            data: Pixels, shape (height, width, 3) in RGB, or (height, width).
-        """
-        colour = data.ndim == 3
-        format_ = f"{'rgb8' if colour else 'mono8'}; {self._format} compressed "
-        message = self._store.message(COMPRESSED)
-        return self._store.serialize(
-            message(
-                header=self._store.header(time, self._frame_id),
-                format=format_ + ("bgr8" if colour else "mono8"),
-                data=encode_image(data, self._format, self._quality),
-            )
+    count = len(points)
+    field = store.message("sensor_msgs/msg/PointField")
+    fields = [*_XYZ, ("rgb", 12, _FLOAT32)] if kind == POINT else [*_XYZ, *_MEASURED]
+    frame = store.serialize(
+        store.message("sensor_msgs/msg/PointCloud2")(
+            header=header,
+            height=1,
+            width=count,
+            fields=[field(name=n, offset=at, datatype=t, count=1) for n, at, t in fields],
+            is_bigendian=False,
+            point_step=kind.itemsize,
+            row_step=kind.itemsize * count,
+            data=_NONE,
+            is_dense=bool(np.isfinite(points).all()),
         )
-
-
-class CloudWriter:
-    """Writes ``sensor_msgs/msg/PointCloud2``."""
-
-    def __init__(self, store: TypeStore, frame_id: str) -> None:
-        self._store = store
-        self._frame_id = frame_id
-
-    def cloud(
-        self, time: Time, points: npt.NDArray[np.float32], colors: npt.NDArray[np.uint8]
-    ) -> bytearray:
-        """Return the message of a cloud, with the fields x, y, z and rgb.
-
-        Args:
-            time: Seconds and nanoseconds.
-            points: Metres in ROS's axes, shape (n, 3).
-            colors: Red, green, blue, shape (n, 3), or (0, 3) for none: then all are white.
-        """
-        frame, rows = self._rows(time, points, POINT, _COLOURED)
-        rows["bgr"] = colors[:, ::-1] if len(colors) else 255
-        return frame
-
-    def scan(self, time: Time, points: npt.NDArray[np.float32], scan: LidarScan) -> bytearray:
-        """Return the message of a lidar's turn, with the fields of `LIDAR_POINT`.
-
-        Args:
-            time: Seconds and nanoseconds.
-            points: Metres in ROS's axes, shape (n, 3).
-        """
-        frame, rows = self._rows(time, points, LIDAR_POINT, _MEASURED)
-        rows["intensity"], rows["ring"], rows["time"] = scan.intensities, scan.rings, scan.times
-        return frame
-
-    def _rows(
-        self,
-        time: Time,
-        points: npt.NDArray[np.float32],
-        kind: np.dtype[np.void],
-        fields: list[tuple[str, int, int]],
-    ) -> tuple[bytearray, npt.NDArray[np.void]]:
-        """Return a message with its points, and a view of its rows for the rest."""
-        count = len(points)
-        message = self._store.message("sensor_msgs/msg/PointCloud2")
-        field = self._store.message("sensor_msgs/msg/PointField")
-        frame = self._store.serialize(
-            message(
-                header=self._store.header(time, self._frame_id),
-                height=1,
-                width=count,
-                fields=[field(name=n, offset=at, datatype=t, count=1) for n, at, t in fields],
-                is_bigendian=False,
-                point_step=kind.itemsize,
-                row_step=kind.itemsize * count,
-                data=_NONE,
-                is_dense=bool(np.isfinite(points).all()),
-            )
-        )
-        dense = frame.pop()  # follows the data
-        begin, size = len(frame), count * kind.itemsize
-        _LENGTH.pack_into(frame, begin - 4, size)
-        frame += bytearray(size + 1)
-        frame[-1] = dense
-        rows = np.frombuffer(frame, kind, count, begin)
-        rows["xyz"] = points
-        return frame, rows
+    )
+    dense = frame.pop()  # follows the data
+    begin, size = len(frame), count * kind.itemsize
+    _LENGTH.pack_into(frame, begin - 4, size)
+    frame += bytearray(size + 1)
+    frame[-1] = dense
+    rows = np.frombuffer(frame, kind, count, begin)
+    rows["xyz"] = points
+    return frame, rows
 
 
 def image_pixels(message: Any) -> npt.NDArray[np.uint8]:
@@ -303,58 +239,27 @@ def _rows(message: Any, pixel: int) -> npt.NDArray[np.uint8]:
 
 HEAD = struct.Struct("<iff")
 
-_INVERSE_DEPTH = 0
-_MILLIMETRES = 1000.0
-_LARGEST = 65535.0
 
-
-class CompressedDepthWriter:
-    """Writes ``sensor_msgs/msg/CompressedImage``.
+def inverse_depth(depth: npt.NDArray[np.float32], farthest: float, quantization: float) -> bytes:
+    """Return inverse depth as compressed_depth_image_transport has it.
 
     Args:
-        frame_id: Optical frame.
-        inverse: Whether inverse depth is written, and not millimetres.
-        farthest: Metres; what is farther away becomes unknown. Of inverse depth only.
-        quantization: Larger for finer steps; what is nearer than about q² / 65535 m appears
-            to be there. Of inverse depth only.
+        depth: Metres, shape (height, width); ``inf`` where there is none.
+        farthest: Metres; what is farther away becomes unknown.
+        quantization: Larger for finer steps; what is nearer than about q² / 65535 m appears to be
+            there.
     """
+    most = np.float32(farthest)
+    a = np.float32(quantization * (quantization + 1.0))
+    b = np.float32(1.0) - a / most
+    known = (depth > 0.0) & (depth < most)
+    steps = np.minimum(np.rint(a / np.where(known, depth, most) + b), 65535.0)
+    return HEAD.pack(0, a, b) + encode_depth(np.where(known, steps, 0.0).astype(np.uint16))
 
-    def __init__(
-        self,
-        store: TypeStore,
-        frame_id: str,
-        inverse: bool = True,
-        farthest: float = 10.0,
-        quantization: float = 100.0,
-    ) -> None:
-        self._store = store
-        self._frame_id = frame_id
-        self._inverse = inverse
-        self._farthest = np.float32(farthest)
-        self._a = np.float32(quantization * (quantization + 1.0) if inverse else 0.0)
-        self._b = np.float32(1.0) - self._a / self._farthest if inverse else np.float32(0.0)
-        self._format = f"{'32FC1' if inverse else '16UC1'}; compressedDepth png"
 
-    def write(self, time: Time, depth: npt.NDArray[np.float32]) -> bytearray:
-        """Return the message.
-
-        Args:
-            time: Seconds and nanoseconds.
-            depth: Metres, shape (height, width); ``inf`` where there is none.
-        """
-        steps = self._steps(depth) if self._inverse else depth_in_steps(depth, _MILLIMETRES)
-        head = HEAD.pack(_INVERSE_DEPTH, self._a, self._b)
-        message = self._store.message(COMPRESSED)(
-            header=self._store.header(time, self._frame_id),
-            format=self._format,
-            data=np.frombuffer(head + encode_depth(steps), np.uint8),
-        )
-        return self._store.serialize(message)
-
-    def _steps(self, depth: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
-        known = (depth > 0.0) & (depth < self._farthest)
-        steps = np.rint(self._a / np.where(known, depth, self._farthest) + self._b)
-        return np.where(known, np.minimum(steps, _LARGEST), 0.0).astype(np.uint16)
+def depth_in_millimetres(depth: npt.NDArray[np.float32]) -> bytes:
+    """Return whole millimetres of depth as compressed_depth_image_transport has them."""
+    return bytes(HEAD.size) + encode_depth(depth_in_steps(depth, 1000.0))
 
 
 def decode_compressed(message: Any) -> npt.NDArray[Any]:

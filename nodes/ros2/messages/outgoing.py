@@ -42,12 +42,8 @@ from events.frames import (
     convert_rotation,
     convert_vector,
 )
-from nodes.ros2.messages.images import (
-    CloudWriter,
-    CompressedDepthWriter,
-    CompressedWriter,
-    ImageWriter,
-)
+from nodes.ros2.messages import images
+from nodes.ros2.messages.images import COMPRESSED, LIDAR_POINT, POINT, ImageWriter
 from nodes.ros2.messages.paths import Paths
 from nodes.ros2.messages.topics import FrameNames, PublishingConfig
 from nodes.ros2.messages.transforms import Transform, Transforms
@@ -81,7 +77,7 @@ class Outgoing:
         self.cameras: dict[str, CameraAnnouncement] = {}
         self.bodies: set[str] = set()
         self.sensors: dict[tuple[str, str], Any] = {}
-        self._writers: dict[tuple[Any, ...], Any] = {}
+        self._writers: dict[tuple[str, str, str], ImageWriter] = {}
 
     def announced(self, announcement: Announcement) -> None:
         """Note what a node announced."""
@@ -100,20 +96,23 @@ class Outgoing:
         frame = self.names.name(event.frame_id if frame_id is None else frame_id, event.source)
         return self.store.header(self.time(event.stamp), frame)
 
-    def written(self, event: Any, writer: type[Any], *settings: Any) -> bytearray:
-        """Return the message of an image, by a writer that is kept for the next one."""
-        frame = self.names.name(event.frame_id, event.source)
-        key = (writer, event.source, frame, *settings)
+    def image(self, event: Image | DepthImage | SegmentationImage, encoding: str) -> bytearray:
+        """Return a ``sensor_msgs/msg/Image``, by a writer that is kept for the next one."""
+        key = event.source, self.names.name(event.frame_id, event.source), encoding
         if key not in self._writers:
-            self._writers[key] = writer(self.store, frame, *settings)
-        message: bytearray = self._writers[key].write(self.time(event.stamp), event.data)
-        return message
+            self._writers[key] = ImageWriter(self.store, *key[1:])
+        return self._writers[key].write(self.time(event.stamp), event.data)
 
-    def points(self, event: PointCloud | LidarScan) -> tuple[CloudWriter, Time, Any]:
-        """Return a cloud's writer, its time in messages, and its points in ROS's axes."""
-        writer = CloudWriter(self.store, self.names.name(event.frame_id, event.source))
+    def compressed(self, event: Image | DepthImage, form: str, data: Any) -> Any:
+        """Return a ``sensor_msgs/msg/CompressedImage``."""
+        return self.make(COMPRESSED, header=self.header(event), format=form, data=data)
+
+    def rows(
+        self, event: PointCloud | LidarScan, kind: np.dtype[np.void]
+    ) -> tuple[bytearray, np.ndarray[Any, np.dtype[np.void]]]:
+        """Return a cloud's message with its points in ROS's axes, and its rows for the rest."""
         points = convert_points(self.names.axes(event.frame_id), event.points)
-        return writer, self.time(event.stamp), points
+        return images.cloud(self.store, self.header(event), points, kind)
 
     def xyz(self, vector: Vector3, type_: str = "geometry_msgs/msg/Vector3") -> Any:
         """Return a ``Vector3`` or ``Point`` of a vector in ROS's axes."""
@@ -198,43 +197,51 @@ def camera_info(out: Outgoing, event: Image | DepthImage) -> Any:
 
 def image(out: Outgoing, event: Image) -> bytearray:
     """Return a sensor_msgs/Image of colours or grey."""
-    return out.written(event, ImageWriter, event.encoding)
+    return out.image(event, event.encoding)
 
 
-def compressed_image(out: Outgoing, event: Image) -> bytearray:
-    """Return a sensor_msgs/CompressedImage."""
-    config = out.config
-    return out.written(event, CompressedWriter, config.compressed_images, config.jpeg_quality)
+def compressed_image(out: Outgoing, event: Image) -> Any:
+    """Return a sensor_msgs/CompressedImage as image_transport's plugin does."""
+    form, colour = out.config.compressed_images or "png", event.data.ndim == 3
+    names = ("rgb8", "bgr8") if colour else ("mono8", "mono8")
+    code = images.encode_image(event.data, form, out.config.jpeg_quality)
+    return out.compressed(event, f"{names[0]}; {form} compressed {names[1]}", code)
 
 
 def depth(out: Outgoing, event: DepthImage) -> bytearray:
     """Return a sensor_msgs/Image of metres or millimetres."""
     encoding = "16UC1" if out.config.raw_depth == "millimetres" else "32FC1"
-    return out.written(event, ImageWriter, encoding)
+    return out.image(event, encoding)
 
 
-def compressed_depth(out: Outgoing, event: DepthImage) -> bytearray:
+def compressed_depth(out: Outgoing, event: DepthImage) -> Any:
     """Return a sensor_msgs/CompressedImage of depth."""
-    config = out.config
-    settings = config.compressed_depth == "inverse", config.depth_max, config.depth_quantization
-    return out.written(event, CompressedDepthWriter, *settings)
+    config, inverse = out.config, out.config.compressed_depth == "inverse"
+    if inverse:
+        code = images.inverse_depth(event.data, config.depth_max, config.depth_quantization)
+    else:
+        code = images.depth_in_millimetres(event.data)
+    form = f"{'32FC1' if inverse else '16UC1'}; compressedDepth png"
+    return out.compressed(event, form, np.frombuffer(code, np.uint8))
 
 
 def segmentation(out: Outgoing, event: SegmentationImage) -> bytearray:
     """Return a sensor_msgs/Image of numbers."""
-    return out.written(event, ImageWriter, "32SC1")
+    return out.image(event, "32SC1")
 
 
 def cloud(out: Outgoing, event: PointCloud) -> bytearray:
-    """Return a sensor_msgs/PointCloud2 with colours."""
-    writer, time, points = out.points(event)
-    return writer.cloud(time, points, event.colors)
+    """Return a sensor_msgs/PointCloud2 with colours: white where there are none."""
+    message, rows = out.rows(event, POINT)
+    rows["bgr"] = event.colors[:, ::-1] if len(event.colors) else 255
+    return message
 
 
 def lidar(out: Outgoing, event: LidarScan) -> bytearray:
     """Return a sensor_msgs/PointCloud2 of a lidar's turn."""
-    writer, time, points = out.points(event)
-    return writer.scan(time, points, event)
+    message, rows = out.rows(event, LIDAR_POINT)
+    rows["intensity"], rows["ring"], rows["time"] = event.intensities, event.rings, event.times
+    return message
 
 
 # What is small.

@@ -29,6 +29,7 @@ S = sqrt(0.5)
 EAST = (S, 0.0, 0.0, S)
 """A body (FRD in NED) that looks east."""
 
+DEFAULTS = PublishingConfig()
 STAMP = 3_000_000_007
 
 
@@ -42,10 +43,11 @@ def message(
     write: Callable[[Outgoing, Any], Any],
     event: Any,
     *announced: Announcement,
+    config: PublishingConfig = DEFAULTS,
     **sensors: Announcement,
 ) -> Any:
     """Return what ROS reads in the message of an event; `sensors` are announced by kind."""
-    out = Outgoing(store(), PublishingConfig(), Stamps().out)
+    out = Outgoing(store(), config, Stamps().out)
     for each in announced:
         out.announced(each)
     for kind, sensor in sensors.items():

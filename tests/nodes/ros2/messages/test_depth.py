@@ -10,14 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from nodes.ros2.messages.images import HEAD, CompressedDepthWriter, decode_compressed
+from events import DepthImage
+from nodes.ros2.messages import outgoing
+from nodes.ros2.messages.images import HEAD, decode_compressed
+from nodes.ros2.messages.topics import PublishingConfig
 from tests.nodes.ros2.messages import samples
 
 
 def message(depth: np.ndarray, farthest: float = 10.0) -> Any:
-    writer = CompressedDepthWriter(samples.store(), "eye", farthest=farthest)
-    data = writer.write((3, 7), depth)
-    return samples.store().deserialize(bytes(data), "sensor_msgs/msg/CompressedImage")
+    event = DepthImage(stamp=samples.STAMP, source="s", frame_id="eye", data=depth)
+    config = PublishingConfig(compressed_depth="inverse", depth_max=farthest)
+    return samples.message(outgoing.compressed_depth, event, config=config)
 
 
 def decoded(data: np.ndarray) -> np.ndarray:

@@ -8,21 +8,26 @@ import cv2
 import numpy as np
 import pytest
 
-from events import LidarScan
-from nodes.ros2.messages import incoming
+from events import Image, LidarScan, PointCloud
+from nodes.ros2.messages import incoming, outgoing
 from nodes.ros2.messages.images import (
-    CloudWriter,
-    CompressedWriter,
     ImageWriter,
     depth_pixels,
     image_pixels,
 )
 from nodes.ros2.messages.incoming import MessageContext
+from nodes.ros2.messages.outgoing import Outgoing
+from nodes.ros2.messages.topics import PublishingConfig
+from nodes.ros2.messages.typestore import Stamps
 from tests.nodes.ros2.messages import samples
 
 CONTEXT = MessageContext(source="s", now=1_000_000_002)
 IMAGE = "sensor_msgs/msg/Image"
 RANDOM = np.random.default_rng(0)
+
+
+def out() -> Outgoing:
+    return Outgoing(samples.store(), PublishingConfig(), Stamps().out)
 
 
 def by_rosbags(encoding: str, data: np.ndarray, stamp: tuple[int, int], frame: str) -> bytes:
@@ -79,7 +84,8 @@ def test_a_writer_follows_a_new_size_and_takes_views() -> None:
 def test_a_cloud_has_the_bytes_that_rosbags_makes(count: int) -> None:
     points = RANDOM.random((count, 3), np.float32)
     colours = RANDOM.integers(0, 256, (count, 3), np.uint8)
-    data = CloudWriter(samples.store(), "map").cloud((1, 2), points, colours)
+    event = PointCloud(stamp=1, source="s", frame_id="a_optical", points=points, colors=colours)
+    data = outgoing.cloud(out(), event)
     message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
     assert bytes(samples.store().serialize(message)) == bytes(data)
     assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
@@ -95,7 +101,8 @@ def test_a_cloud_has_the_bytes_that_rosbags_makes(count: int) -> None:
 
 def test_a_cloud_with_points_that_are_nowhere_is_not_dense() -> None:
     points = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]], np.float32)
-    data = CloudWriter(samples.store(), "map").cloud((1, 2), points, np.empty((0, 3), np.uint8))
+    none = np.empty((0, 3), np.uint8)
+    data = outgoing.cloud(out(), PointCloud(stamp=1, source="s", points=points, colors=none))
     message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
     assert not message.is_dense
 
@@ -106,13 +113,13 @@ def test_a_turn_of_a_lidar_has_the_fields_of_velodynes_driver(count: int) -> Non
     scan = LidarScan(
         stamp=1,
         source="drone/lidar",
-        frame_id="lidar",
+        frame_id="a_optical",
         points=RANDOM.random((count, 3), np.float32),
         intensities=RANDOM.random(count, np.float32),
         times=np.sort(RANDOM.random(count, np.float32)),
         rings=RANDOM.integers(0, 16, count, np.uint16),
     )
-    data = CloudWriter(samples.store(), "lidar").scan((1, 2), scan.points, scan)
+    data = outgoing.lidar(out(), scan)
     message: Any = samples.store().deserialize(bytes(data), "sensor_msgs/msg/PointCloud2")
     assert bytes(samples.store().serialize(message)) == bytes(data)
     assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
@@ -135,9 +142,12 @@ def test_a_png_holds_the_image_and_names_it_as_image_transport_does(
     shape: tuple[int, ...],
 ) -> None:
     data = RANDOM.integers(0, 256, shape, np.uint8)
-    written = CompressedWriter(samples.store(), "f", "png", 90).write((1, 2), data)
-    message: Any = samples.store().deserialize(bytes(written), "sensor_msgs/msg/CompressedImage")
     colour = len(shape) == 3
+    event = Image(
+        stamp=1, source="s", frame_id="f", encoding="rgb8" if colour else "mono8", data=data
+    )
+    config = PublishingConfig(compressed_images="png")
+    message = samples.message(outgoing.compressed_image, event, config=config)
     assert message.format == (
         "rgb8; png compressed bgr8" if colour else "mono8; png compressed mono8"
     )
