@@ -221,7 +221,7 @@ def imu_axes(rig: Rig, *, ros: bool) -> Floats:
 
 def _topic(kind: TopicKind, source: str) -> str:
     found = publication(kind, source, PublishingConfig())
-    return "" if found is None else found.topic
+    return "" if found is None else found.name
 
 
 def pair(rig: Rig) -> tuple[CameraAnnouncement, ...]:

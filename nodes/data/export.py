@@ -311,12 +311,11 @@ def export(
     word for is refused.
     """
     from nodes.calibration.export import export_calibration
-    from nodes.data import export as exports
     from runtime.errors import ConfigError
 
     try:
-        if form.value in exports.FORMATS:
-            written = exports.export_trajectories(run, form.value, out, epoch)
+        if form.value in FORMATS:
+            written = export_trajectories(run, form.value, out, epoch)
         elif form is Format.csv:
             written = export_measurements(run, out, epoch)
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -14,7 +14,7 @@ from nodes.data.dataset.euroc import Euroc
 from nodes.data.dataset.recording import ImageFile, Recording, choose
 from nodes.data.dataset.tum import TumMono, TumRgbd
 from nodes.trajectory.table import EPOCH, epoch_of, part_name
-from runtime import Input, Node, NodeConfig, on
+from runtime import Input, Node, NodeConfig, Stream, on
 from runtime.errors import ConfigError
 from runtime.paths import OutputPath
 
@@ -86,14 +86,12 @@ class DatasetWriter(Node[DatasetConfig]):
         self._open()
         for _ in range(_AT_ONCE):
             self.start(self._write())
-        self.start(self._take_depth_images())
-        async for image in self.images:
-            if (file := self._image(image)) is not None:
-                await self._queue.put(file)
+        self.start(self._take(self.depth_images))
+        await self._take(self.images)
 
-    async def _take_depth_images(self) -> None:
-        async for depth in self.depth_images:
-            if (file := self._depth(depth)) is not None:
+    async def _take(self, images: Stream[Any]) -> None:
+        async for image in images:
+            if (file := self._note(image)) is not None:
                 await self._queue.put(file)
 
     async def _write(self) -> None:
@@ -125,10 +123,9 @@ class DatasetWriter(Node[DatasetConfig]):
         """Write what has come and is not written yet, and say what is missing."""
         if self._recording is None:
             return
-        for _ in range(self.images.statistics().buffered):
-            self._image(self.images.receive_nowait())
-        for _ in range(self.depth_images.statistics().buffered):
-            self._depth(self.depth_images.receive_nowait())
+        for images in (self.images, self.depth_images):
+            for _ in range(images.statistics().buffered):
+                self._note(images.receive_nowait())
         await self.offload(_finish, self._recording, list(self._unwritten))
         for each in self._recording.warnings():
             self.log.warning("%s", each)
@@ -152,16 +149,11 @@ class DatasetWriter(Node[DatasetConfig]):
                 self.log.fatal("%s", error)
         return self._recording
 
-    def _image(self, event: Image) -> ImageFile | None:
-        recording = self._open()
-        return self._keep(recording.image(event) if recording is not None else None)
-
-    def _depth(self, event: DepthImage) -> ImageFile | None:
-        recording = self._open()
-        return self._keep(recording.depth(event) if recording is not None else None)
-
-    def _keep(self, file: ImageFile | None) -> ImageFile | None:
-        """Remember an image until it is written, should the run end before."""
+    def _note(self, event: Image | DepthImage) -> ImageFile | None:
+        """Note an image, and remember it until it is written, should the run end before."""
+        if (recording := self._open()) is None:
+            return None
+        file = recording.image(event) if isinstance(event, Image) else recording.depth(event)
         if file is not None:
             self._unwritten.add(file)
         return file

@@ -71,13 +71,8 @@ def describe(frame: bytes | bytearray | memoryview) -> tuple[str, str]:
     Raises:
         WireError: It is no frame.
     """
-    try:
-        (length,) = _LENGTH.unpack_from(frame)
-        view = memoryview(frame)[_LENGTH.size : _LENGTH.size + length]
-        kind, _, found = _decode(view)
-        return kind, _source(found).source
-    except (struct.error, msgspec.DecodeError) as error:
-        raise WireError(f"expected an event, found something else: {error}") from error
+    kind, _, found, _ = _head(memoryview(frame), _source)
+    return kind, found.source
 
 
 def lacking(data: bytes) -> list[Shape]:
@@ -99,14 +94,8 @@ def fields(data: bytes) -> dict[str, Any]:
     Raises:
         WireError: It is no message of ours.
     """
-    try:
-        (length,) = _LENGTH.unpack_from(data, _HEAD.size)
-        begin = _HEAD.size + _LENGTH.size
-        _, _, found = _decode(memoryview(data)[begin : begin + length])
-        decoded: dict[str, Any] = msgspec.msgpack.decode(found)
-    except (struct.error, msgspec.DecodeError) as error:
-        raise WireError(f"expected an event, found something else: {error}") from error
-    return decoded
+    found: dict[str, Any] = _head(memoryview(data)[_HEAD.size :], msgspec.msgpack.decode)[2]
+    return found
 
 
 def event(data: bytes, arrays: Sequence[npt.NDArray[Any]] = ()) -> Event:
@@ -137,15 +126,26 @@ class _Source(msgspec.Struct):
 _source = msgspec.msgpack.Decoder(_Source).decode
 
 
-def _shapes(data: bytes) -> tuple[list[tuple[str, list[int], int]], int, int]:
+Shapes = list[tuple[str, list[int], int]]
+
+
+def _shapes(data: bytes) -> tuple[Shapes, int, int]:
     """Return the arrays of a frame, where they begin in it, and where its head ends."""
+    _, shapes, _, end = _head(memoryview(data)[_HEAD.size :])
+    return shapes, -(-end // ALIGNED) * ALIGNED, end
+
+
+def _head(
+    frame: memoryview, decode: Callable[[msgspec.Raw], Any] = lambda _: None
+) -> tuple[str, Shapes, Any, int]:
+    """Return a frame's kind, its arrays, its decoded fields, and where its head ends."""
     try:
-        (length,) = _LENGTH.unpack_from(data, _HEAD.size)
+        (length,) = _LENGTH.unpack_from(frame)
         end = _LENGTH.size + length
-        _, shapes, _ = _decode(memoryview(data)[_HEAD.size + _LENGTH.size : _HEAD.size + end])
+        kind, shapes, found = _decode(frame[_LENGTH.size : end])
+        return kind, shapes, decode(found), end
     except (struct.error, msgspec.DecodeError) as error:
         raise WireError(f"expected an event, found something else: {error}") from error
-    return shapes, -(-end // ALIGNED) * ALIGNED, end
 
 
 Array = npt.NDArray[Any]

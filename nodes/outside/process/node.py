@@ -336,7 +336,7 @@ class Process(Estimator[ProcessConfig]):
 
         def topic(kind: TopicKind, source: str) -> str:
             found = publication(kind, source, self._bridge or PublishingConfig())
-            return "" if found is None else found.topic
+            return "" if found is None else found.name
 
         rig = self._rig()
         vehicles = (each for each in self._vehicles if rig and each.source == rig.body)

@@ -62,7 +62,7 @@ class HeldEstimator:
         self._needs = [topic_name(config.namespace, each) for each in self.subscription.needs]
         images = [row.kind for row in PUBLISHED if row.image]
         found = [publication(kind, self.subscription.answers_to, config) for kind in images]
-        self._images = [each.topic for each in found if each is not None]
+        self._images = [each.name for each in found if each is not None]
         self._owed = -1  # stamp of the newest image
         self._sequences: dict[bytes, int] = {}  # by GID
         self._there: dict[str, None] = {}  # tokens of its publishers

@@ -49,7 +49,14 @@ from events import (
 from nodes.ros2.messages import incoming, outgoing
 from nodes.ros2.messages.incoming import Reader
 from nodes.ros2.messages.outgoing import Outgoing
-from nodes.ros2.messages.topics import PublishingConfig, Qos, TopicGroup, ros_name, topic_name
+from nodes.ros2.messages.topics import (
+    PublishingConfig,
+    Qos,
+    Topic,
+    TopicGroup,
+    ros_name,
+    topic_name,
+)
 
 TopicKind = str
 """The `kind` of a mapping."""
@@ -243,17 +250,7 @@ def rows_of(event: type[Event]) -> tuple[Mapping, ...]:
     return tuple(row for row in PUBLISHED if issubclass(event, row.events))
 
 
-class Publication(msgspec.Struct, frozen=True, kw_only=True):
-    """A topic to publish, of events of this source."""
-
-    kind: TopicKind
-    source: str
-    topic: str
-    type: str
-    qos: Qos
-
-
-def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Publication | None:
+def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Topic | None:
     """Return the topic for the events of a source; `None` if it is not to be published."""
     rows = (row for row in PUBLISHED if row.kind == kind and row.group in config.publish)
     row = next((row for row in rows if row.wanted(config)), None)
@@ -265,17 +262,15 @@ def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Publi
         name = above
     full = topic_name(config.namespace, name)
     given = config.topics.get(full, config.topics.get(name))
-    return Publication(
-        kind=kind,
-        source=source,
-        topic=full if given is None else topic_name(config.namespace, given),
+    return Topic(
+        name=full if given is None else topic_name(config.namespace, given),
         type=row.type,
         qos=Qos(depth=5) if sensor and config.sensor_qos == "reliable" else row.qos,
     )
 
 
-def announced_topics(announcement: Announcement, config: PublishingConfig) -> Iterator[Publication]:
-    """Yield the topics for what a node announced."""
+def announced_topics(announcement: Announcement) -> Iterator[tuple[TopicKind, str]]:
+    """Yield kind and source of the topics for what a node announced."""
     source, images = announcement.source, set[str]()
     if isinstance(announcement, CameraAnnouncement):
         images = {*announcement.images}
@@ -285,9 +280,6 @@ def announced_topics(announcement: Announcement, config: PublishingConfig) -> It
         if isinstance(announcement, row.announced)
         and (not row.gives or images.intersection(row.gives))
     ]
-    found = dict.fromkeys((kind, source) for kind in kinds)
+    yield from dict.fromkeys((kind, source) for kind in kinds)
     if images >= {"rgb", "grey"}:  # which it sends as images of another source
-        found |= {(kind, f"{source}/grey"): None for kind in ("image", "compressed")}
-    for each in found:
-        if publication_ := publication(*each, config):
-            yield publication_
+        yield from ((kind, f"{source}/grey") for kind in ("image", "compressed"))

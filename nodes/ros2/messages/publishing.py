@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, Protocol, TypeVar
 
+import msgspec
+
 from events import (
     Announcement,
     EstimatorAnnouncement,
@@ -20,7 +22,6 @@ from events import (
 from nodes.ros2.messages import outgoing
 from nodes.ros2.messages.mappings import (
     PUBLISHED,
-    Publication,
     TopicKind,
     announced_topics,
     publication,
@@ -100,9 +101,9 @@ class Publishing(Generic[P]):
         elif isinstance(announcement, EstimatorAnnouncement):
             self._estimators.append(announcement.source)
         self._out.announced(announcement)
-        for found in announced_topics(announcement, self._config):
-            self._declare(found)
-            self._out.sensors[found.kind, found.source] = announcement
+        for key in announced_topics(announcement):
+            if self._declare(*key) is not None:
+                self._out.sensors[key] = announcement
 
     def warm_up(self) -> None:
         """Make everything that a first message needs, while there is time."""
@@ -162,17 +163,15 @@ class Publishing(Generic[P]):
         try:
             publisher = self._publishers[kind, source]
         except KeyError:
-            found = publication(kind, source, self._config)
-            publisher = None if found is None else self._declare(found)
-            self._publishers[kind, source] = publisher
+            publisher = self._declare(kind, source)
         return publisher if publisher is not None and publisher.wanted else None
 
-    def _declare(self, found: Publication) -> P:
+    def _declare(self, kind: TopicKind, source: str) -> P | None:
         with self._lock:  # two threads may want one for the first time together
-            key = (found.kind, found.source)
-            known = self._publishers.get(key)
-            if known is None:
-                hash_ = self._store.hash(found.type)
-                topic = Topic(name=found.topic, type=found.type, hash=hash_, qos=found.qos)
-                known = self._publishers[key] = self._sink.publisher(topic)
-            return known
+            if (kind, source) not in self._publishers:
+                made, topic = None, publication(kind, source, self._config)
+                if topic is not None:
+                    hashed = msgspec.structs.replace(topic, hash=self._store.hash(topic.type))
+                    made = self._sink.publisher(hashed)
+                self._publishers[kind, source] = made
+            return self._publishers[kind, source]

@@ -58,13 +58,13 @@ class Topic(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         name: With its leading slash.
         type: ``sensor_msgs/msg/Image``.
-        hash: ``RIHS01_…``, or `NO_HASH`.
+        hash: ``RIHS01_…``, or `NO_HASH`; empty where nobody needs it.
         qos: Of this end.
     """
 
     name: str
     type: str
-    hash: str
+    hash: str = ""
     qos: Qos = Qos()
 
 
