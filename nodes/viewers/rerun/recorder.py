@@ -78,7 +78,7 @@ class Recorder:
         self._config = config
         library = load()
         self._rrb = library.blueprint
-        self._stream = library.log.RecordingStream("visnav")
+        self._stream = library.RecordingStream("visnav")
         self._viewer: Viewer | None = None
         if config.mode == "save":
             self._stream.save(file)
@@ -86,7 +86,7 @@ class Recorder:
             self._viewer = Viewer(config)
             self._stream.connect_grpc(self._viewer.data)
         self._stream.send_recording_name(name)
-        self._entities = EntityLog(library.log, self._stream)
+        self._entities = EntityLog(library, self._stream)
         self._world = World(self._entities, config)
         self._plots = Plots(self._entities, self._world.colours)
         self._puts: dict[type[Event], Callable[[Any], None]] = {

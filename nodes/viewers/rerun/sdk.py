@@ -85,19 +85,7 @@ _PR_SET_PDEATHSIG = 1
 """prctl(2): which signal a process gets when its parent ends."""
 
 
-class Library(msgspec.Struct, frozen=True):
-    """Rerun's two modules.
-
-    Attributes:
-        log: ``rerun``.
-        blueprint: ``rerun.blueprint``.
-    """
-
-    log: Any
-    blueprint: Any
-
-
-def load() -> Library:
+def load() -> Any:
     """Import the library.
 
     Raises:
@@ -110,7 +98,7 @@ def load() -> Library:
         raise MissingDependencyError(
             f"the view needs rerun ({error}): {install_command('rerun')}"
         ) from error
-    return Library(rerun, rerun.blueprint)
+    return rerun
 
 
 def check_display() -> None:
