@@ -295,8 +295,8 @@ class WriterProcess:
             self._hand_over()
             pipe.write(self._events, self._end, pipe.END)
             self._events.flush()
-        except OSError:
-            pass  # the process is gone, and the listener knows why
+        except (OSError, ValueError):
+            pass  # the process is gone, or its pipe is closed, and the listener knows why
         finally:
             with contextlib.suppress(OSError):
                 self._events.close()
@@ -328,7 +328,7 @@ class WriterProcess:
                     return
                 else:
                     self._closing.wait(_PAUSE)
-        except OSError:
+        except (OSError, ValueError):
             self.unwritten += len(taken)
             raise
 
