@@ -78,7 +78,7 @@ def test_a_flight_that_is_killed_is_read_but_for_its_last_second(tmp_path: Path)
     tasks = Path(f"/proc/{flight.pid}/task").glob("*/children")  # a thread started it
     children = [int(pid) for task in tasks for pid in task.read_text().split()]
     writers = [
-        pid for pid in children if b"mcap_recorder" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        pid for pid in children if b"recorder.process" in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]
     assert len(writers) == 1
     os.kill(flight.pid, signal.SIGKILL)
