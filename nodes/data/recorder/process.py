@@ -3,24 +3,174 @@
 Started by `writer_process` as ``python -m nodes.data.recorder.process``. It is a process of its
 own because encoding holds Python's lock, and would keep the run's loop from it for milliseconds;
 and because it outlives a run that is killed, and closes the file in order.
+
+Events become ROS's messages, as the bridge makes them, and messages of their own. A large array
+stands in the file once, in ROS's message; the event's own message then lacks it, has the same time,
+and names that topic in its channel.
 """
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import os
+import re
 import signal
+import struct
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import cv2
 import msgspec
 
+from events import Announcement, Event
+from nodes.data.mcap import native
 from nodes.data.mcap.layout import RecordingError
 from nodes.data.mcap.mcap_file import McapWriter
+from nodes.data.mcap.native import HOLDERS
 from nodes.data.recorder import pipe
-from nodes.data.recorder.event_writer import EventWriter
-from nodes.data.recorder.pipe import Reply, WriteRequest
+from nodes.data.recorder.pipe import McapRecorderConfig, Reply, WriteRequest
+from nodes.ros2.messages.mappings import LARGE, SMALL
+from nodes.ros2.messages.publishing import Publishing
+from nodes.ros2.messages.topics import ALL_GROUPS, PublishingConfig, Topic, ros_name
+from nodes.ros2.messages.typestore import Stamps, TypeStore
 from runtime.errors import MissingDependencyError, WireError
+from runtime.wire import event_type, unpack
+
+PREFIX = "/visnav"
+"""Before the topics of events as they are."""
+
+_LEFT_OUT = ("clock", "paths")
+"""Groups of topics that only repeat what others have."""
+
+_LATCHED = (
+    "- history: keep_last\n  depth: 1\n  reliability: reliable\n  durability: transient_local\n"
+    "  deadline: {sec: 9223372036, nsec: 854775807}\n"
+    "  lifespan: {sec: 9223372036, nsec: 854775807}\n"
+    "  liveliness: automatic\n  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}\n"
+    "  avoid_ros_namespace_conventions: false\n"
+)
+"""As rosbag2 writes it; a player then offers the transforms to those that come late."""
+
+
+class EventWriter:
+    """Writes events to a file. It is a `Sink`: where `Publishing` puts ROS's messages.
+
+    Args:
+        complain: Called for events that are recorded as they are, but not as ROS's messages.
+    """
+
+    def __init__(
+        self, writer: McapWriter, config: McapRecorderConfig, complain: Callable[[str], None]
+    ) -> None:
+        self._writer = writer
+        self._complain = complain
+        self._store = TypeStore(config.distribution)
+        published = PublishingConfig(
+            publish=tuple(group for group in ALL_GROUPS if group not in _LEFT_OUT),
+            raw_images=config.image_format == "raw",
+            compressed_images="" if config.image_format == "raw" else config.image_format,
+            raw_depth=config.depth_format == "raw",
+            compressed_depth="" if config.depth_format == "raw" else "millimetres",
+            jpeg_quality=config.jpeg_quality,
+        )
+        self._ros = Publishing(self, self._store, published, Stamps().out)
+        self._puts: dict[str, Any] = {}
+        self._own: dict[tuple[str, str, str], int] = {}
+        self._begun = False
+        self._time = 0
+        self._holder = ""
+        """Topic that has got the arrays of the event at hand."""
+
+    def write(self, time: int, frame: bytes | bytearray, announcement: bool) -> None:
+        """Write an event.
+
+        Args:
+            time: When it was published (ns).
+            frame: The event, as `runtime.wire` has it.
+
+        Raises:
+            WireError: It is no frame.
+        """
+        self._time = time
+        self._holder = ""
+        kind, source = native.describe(frame)
+        if not announcement and not self._begun:
+            self._begun = True
+            self._ros.begin()
+        if kind not in self._puts:
+            self._puts[kind] = self._putter(kind)
+        if (put := self._puts[kind]) is not None:
+            try:
+                put(unpack(frame))
+            except (ValueError, TypeError, OverflowError, struct.error, cv2.error) as error:
+                self._holder = ""
+                self._complain(f"{kind} of {source} has no message: {error}")
+        self._write_own(kind, source, frame, announcement)
+
+    def publisher(self, topic: Topic) -> RecordedTopic:
+        """Add a topic of ROS's messages to the file."""
+        qos = {"offered_qos_profiles": _LATCHED if topic.qos.transient_local else ""}
+        channel = self._add_channel(topic.name, topic.type, qos)
+
+        def put(message: bytearray) -> None:
+            """Write a message of the event at hand."""
+            if topic.type in HOLDERS:
+                self._holder = topic.name
+            self._writer.write(channel, self._time, message)
+
+        return RecordedTopic(topic, put)
+
+    def _add_channel(self, topic: str, type_: str, metadata: dict[str, str]) -> int:
+        return self._writer.channel(topic, type_, self._store.definition, metadata)
+
+    def _putter(self, kind: str) -> Any:
+        """Return what writes ROS's messages of a kind of event; `None` if there are none."""
+        cls = _type_of(kind)
+        if cls is None:
+            return None
+        if issubclass(cls, Announcement):
+            return self._ros.announced
+        return self._ros.put if issubclass(cls, LARGE + SMALL) else None
+
+    def _write_own(
+        self, kind: str, source: str, frame: bytes | bytearray, announcement: bool
+    ) -> None:
+        channel = self._own.get((kind, source, self._holder))
+        if channel is None:
+            metadata = {
+                "kind": kind,
+                "source": source,
+                "announcement": "true" if announcement else "",
+                "arrays": self._holder,
+            }
+            name = re.sub(r"\W", "_", kind.rpartition(":")[2])
+            topic = f"{PREFIX}/{ros_name(source)}/{name}"
+            channel = self._add_channel(topic, native.TYPE, metadata)
+            self._own[kind, source, self._holder] = channel
+        self._writer.write(channel, self._time, native.message(frame, arrays=not self._holder))
+
+
+class RecordedTopic(msgspec.Struct, frozen=True):
+    """A topic of ROS's messages in the file."""
+
+    topic: Topic
+    put: Callable[[bytearray], None]
+    wanted: bool = True
+
+
+def _type_of(kind: str) -> type[Event] | None:
+    """Return a type of event, imported if need be; `None` for what only its own process knows."""
+    with contextlib.suppress(WireError):
+        return event_type(kind)
+    with contextlib.suppress(Exception):  # a module of the user's own, which may do anything
+        importlib.import_module(kind.partition(":")[0])
+        return event_type(kind)
+    return None
+
 
 LONGEST = 0.4
 """Seconds, real and of the run's clock, after which a chunk ends."""

@@ -10,8 +10,8 @@ import pytest
 from events import Event, FluidPressure, NavSatFix, Range
 from nodes.data.export import export_measurements
 from nodes.data.mcap.mcap_file import McapWriter
-from nodes.data.recorder.event_writer import EventWriter
 from nodes.data.recorder.pipe import McapRecorderConfig
+from nodes.data.recorder.process import EventWriter
 from runtime.wire import pack
 
 

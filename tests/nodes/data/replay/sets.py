@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 from events import Announcement, Event
 from nodes.data.dataset import DatasetWriter
 from nodes.data.mcap.mcap_file import McapWriter
-from nodes.data.recorder.event_writer import EventWriter
 from nodes.data.recorder.pipe import McapRecorderConfig
+from nodes.data.recorder.process import EventWriter
 from nodes.data.replay.node import open_reader
 from nodes.data.replay.reader import Reader, ReplayConfig
 from runtime.testing import run_node
