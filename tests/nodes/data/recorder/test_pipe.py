@@ -62,3 +62,11 @@ def test_silence_is_noticed() -> None:
     assert [each.what for each in pipe.read_all(there, 0.001, while_idle)] == [pipe.END]
     assert len(calls) == 2
     os.close(there)
+
+
+def test_nobody_reading_is_an_error() -> None:
+    """It must not be taken for success."""
+    there, here = os.pipe()
+    os.close(there)
+    with pytest.raises(BrokenPipeError), os.fdopen(here, "wb") as file:
+        pipe.write(file, 9, pipe.END)
