@@ -44,7 +44,7 @@ class Publisher:
     """Puts messages on a topic.
 
     Args:
-        put: Puts a message with its attachment, and tells whether the session is still open.
+        put: Zenoh's.
         matched: Tells whether somebody subscribes to the topic.
         gid_: Of the endpoint; if ``None``, messages have no attachment.
         max_wait: Real seconds that `put` waits for a peer that does not read; then the message is
@@ -63,7 +63,7 @@ class Publisher:
     def __init__(
         self,
         topic: Topic,
-        put: Callable[[bytearray, bytes | None], bool],
+        put: Callable[..., object],
         matched: Callable[[], bool],
         gid_: bytes | None,
         max_wait: float,
@@ -86,8 +86,12 @@ class Publisher:
             attachment = pack(Attachment(number, time.time_ns(), self._gid))
         if self.kept.maxlen:
             self.kept.append((bytes(message), attachment))
-        # Zenoh says nothing of a message that it gives up.
-        gone_out = self._put(message, attachment) and time.monotonic() - begin < self._max_wait
+        try:
+            self._put(message, attachment=attachment)
+        except zenoh.ZError:  # the session is closed
+            gone_out = False
+        else:  # Zenoh says nothing of a message that it gives up
+            gone_out = time.monotonic() - begin < self._max_wait
         self.sent += gone_out
         self.failed += not gone_out
         if self.note is not None:
@@ -209,7 +213,7 @@ class Session:
             )
         publisher = Publisher(
             topic,
-            functools.partial(_put, declared.put),
+            declared.put,
             lambda: plain.matching_status.matching,  # an advanced publisher does not know
             self._show(topic, "MP"),
             self._max_wait if waits else math.inf,
@@ -339,14 +343,6 @@ class Session:
 
     def _keep(self, token: str) -> None:
         self._kept.append(self._session.liveliness().declare_token(token))
-
-
-def _put(put: Any, message: bytearray, attachment: bytes | None) -> bool:
-    try:
-        put(message, attachment=attachment)
-    except zenoh.ZError:
-        return False
-    return True
 
 
 def _answer(publisher: Publisher, key: str, query: zenoh.Query) -> None:
