@@ -24,8 +24,16 @@ def test_our_nodes_exchange_pings(mode: Mode, nodes: int) -> None:
     assert (samples > 0).all()
 
 
-def test_a_row_sums_up_the_samples_of_all_rounds() -> None:
+def test_a_measurement_has_a_process_of_its_own() -> None:
+    case = Case(samples=20, warm_up=2)
+    samples = driver._measure("bench.systems.in_process", "plain calls", case)
+    assert samples.shape == (20,)
+    assert (samples > 0).all()
+
+
+def test_a_row_sums_up_the_samples_of_all_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two rounds of one system at two numbers of nodes: two rows, with both rounds' medians."""
+    monkeypatch.setattr(driver, "_measure", lambda *which: find(*which[:2]).measure(which[2]))
     outcome = measure_all(
         "small", nodes=(2, 3), samples=60, warm_up=5, repeats=2, only=("plain calls",)
     )
