@@ -71,149 +71,90 @@ class Table(NamedTuple):
         yield ""
 
 
-_LATE = (
-    Column("p50 µs", "late_p50_us", ".0f"),
-    Column("p99 µs", "late_p99_us", ".0f"),
-    Column("max µs", "late_max_us", ".0f"),
-    Column("ratio of p99", "ratio_p99", ".2f"),
-)
+def _table(title: str, columns: str, texts: int = 1) -> Table:
+    """Return a table; its columns are a line as ``heading: key spec | heading: key``."""
+    found = []
+    for column in columns.split(" | "):
+        heading, _, figure = column.partition(": ")
+        key, _, spec = figure.partition(" ")
+        found.append(Column(heading, key, spec))
+    return Table(title, found, texts)
 
-_TICK = tuple(column._replace(heading=f"tick {column.heading}") for column in _LATE)
+
+_LATE = (
+    "p50 µs: late_p50_us .0f | p99 µs: late_p99_us .0f | max µs: late_max_us .0f | "
+    "ratio of p99: ratio_p99 .2f"
+)
+_TICK = " | ".join(f"tick {column}" for column in _LATE.split(" | "))
 
 TABLES = {
-    "stall": Table(
+    "stall": _table(
         "Lateness of a 400 Hz tick while a 512×512 RGB-D camera runs at 10 Hz; ms between ticks",
-        (
-            Column("camera", "mode"),
-            *_LATE,
-            Column("mean ms", "update_mean_ms", ".2f"),
-            Column("median", "update_median_ms", ".2f"),
-            Column("sd", "update_sd_ms", ".2f"),
-            Column("missed", "missed"),
-            Column("frames", "frames"),
-            Column("fetch ms", "fetch_ms_median", "?.1f"),
-        ),
+        f"camera: mode | {_LATE} | mean ms: update_mean_ms .2f | median: update_median_ms .2f | "
+        "sd: update_sd_ms .2f | missed: missed | frames: frames | "
+        "fetch ms: fetch_ms_median ?.1f",
     ),
-    "throughput": Table(
+    "throughput": _table(
         "Throughput",
-        (
-            Column("what", "case"),
-            Column("at once", "batch"),
-            Column("µs each", "per_event_us", "us"),
-            Column("a second", "events_per_second", ",.0f"),
-            Column("MB a second", "megabytes_per_second", "?,.0f"),
-        ),
+        "what: case | at once: batch | µs each: per_event_us us | "
+        "a second: events_per_second ,.0f | MB a second: megabytes_per_second ?,.0f",
     ),
-    "idle": Table(
+    "idle": _table(
         "One timer node",
-        (
-            Column("Hz", "hz", "g"),
-            Column("seconds", "seconds", ".1f"),
-            Column("ticks", "ticks"),
-            Column("% of a core", "cpu_percent", ".2f"),
-        ),
+        "Hz: hz g | seconds: seconds .1f | ticks: ticks | % of a core: cpu_percent .2f",
         texts=0,
     ),
-    "lockstep": Table(
+    "lockstep": _table(
         "Simulated time",
-        (
-            Column("case", "case"),
-            Column("simulated seconds a second", "speed", ".1f"),
-            Column("the runtime's own share of the time", "share", ".0%"),
-        ),
+        "case: case | simulated seconds a second: speed .1f | "
+        "the runtime's own share of the time: share .0%",
     ),
-    "parts": Table(
+    "parts": _table(
         "Processor time of a frame (all processes; RGB-D with noise, odometry, evaluation)",
-        (Column("part", "part"), Column("ms", "ms", ".1f"), Column("share", "share", ".0%")),
+        "part: part | ms: ms .1f | share: share .0%",
     ),
-    "bridge": Table(
+    "bridge": _table(
         "A run in two processes on one machine, beside bare Zenoh sessions in the same two",
-        (
-            Column("event", "case"),
-            Column("bytes", "bytes", ","),
-            Column("round trip µs", "ours_us", "us"),
-            Column("Zenoh's", "zenoh_us", "us"),
-            Column("ratio", "ratio", ".2f"),
-            Column("a second", "ours_per_second", ",.0f"),
-            Column("Zenoh's", "zenoh_per_second", ",.0f"),
-            Column("p99 µs", "ours_p99_us", "us"),
-            Column("Zenoh's", "zenoh_p99_us", "us"),
-        ),
+        "event: case | bytes: bytes , | round trip µs: ours_us us | Zenoh's: zenoh_us us | "
+        "ratio: ratio .2f | a second: ours_per_second ,.0f | "
+        "Zenoh's: zenoh_per_second ,.0f | p99 µs: ours_p99_us us | Zenoh's: zenoh_p99_us us",
     ),
-    "link": Table(
-        "An RGB-D frame to a program and its answer back, through the native interface and by a "
-        "worker's call",
-        (
-            Column("frame", "case"),
-            Column("bytes", "bytes", ","),
-            Column("µs", "link_us", "us"),
-            Column("worker's", "worker_us", "us"),
-            Column("ratio", "ratio", ".2f"),
-        ),
+    "link": _table(
+        "An RGB-D frame to a program and its answer back, through the native interface and by "
+        "a worker's call",
+        "frame: case | bytes: bytes , | µs: link_us us | worker's: worker_us us | ratio: ratio .2f",
     ),
-    "held": Table(
-        "A flight in lockstep with 512×512 RGB-D at 30 Hz, with an odometry in a program outside "
-        "and in a worker: simulated seconds a second",
-        (
-            Column("way", "case"),
-            Column("flights each", "rounds"),
-            Column("outside", "outside_speed", ".2f"),
-            Column("worker", "worker_speed", ".2f"),
-            Column("ratio", "ratio", ".2f"),
-            Column("equal estimates", "equal"),
-        ),
+    "held": _table(
+        "A flight in lockstep with 512×512 RGB-D at 30 Hz, with an odometry in a program "
+        "outside and in a worker: simulated seconds a second",
+        "way: case | flights each: rounds | outside: outside_speed .2f | "
+        "worker: worker_speed .2f | ratio: ratio .2f | equal estimates: equal",
     ),
-    "ros_images": Table(
+    "ros_images": _table(
         "An image as a message of ROS 2, by the bridge and by rosbags' `serialize_cdr`",
-        (
-            Column("image", "case"),
-            Column("bytes", "bytes", ","),
-            Column("µs", "ours_us", "us"),
-            Column("rosbags'", "rosbags_us", "us"),
-            Column("ratio", "ratio", ".2f"),
-            Column("p99 µs", "ours_p99_us", "us"),
-            Column("rosbags'", "rosbags_p99_us", "us"),
-        ),
+        "image: case | bytes: bytes , | µs: ours_us us | rosbags': rosbags_us us | "
+        "ratio: ratio .2f | p99 µs: ours_p99_us us | rosbags': rosbags_p99_us us",
     ),
-    "recording": Table(
+    "recording": _table(
         "Lateness of a 400 Hz tick while a run with 512×512 RGB-D at 30 Hz is recorded",
-        (
-            Column("run", "case"),
-            *_LATE,
-            Column("frames", "frames"),
-            Column("MB", "megabytes", ".0f"),
-            Column("dropped", "dropped"),
-        ),
+        f"run: case | {_LATE} | frames: frames | MB: megabytes .0f | dropped: dropped",
     ),
-    "flood": Table(
+    "flood": _table(
         "Lateness of a 400 Hz tick while messages of ROS 2 come from another process",
-        (
-            Column("window", "case"),
-            Column("messages a second", "messages_per_second", ",.0f"),
-            *_LATE,
-            Column("of p50", "ratio_p50", ".2f"),
-        ),
+        f"window: case | messages a second: messages_per_second ,.0f | {_LATE} | "
+        "of p50: ratio_p50 .2f",
     ),
-    "airsim": Table(
+    "airsim": _table(
         "A client of AirSim's that asks again as soon as it has its answer, and a 400 Hz tick "
-        "meanwhile; AirSim itself is reported to give 3 to 20 images a second (not measured here)",
-        (
-            Column("what it asks for", "case"),
-            Column("a second", "per_second", ",.0f"),
-            Column("round trip µs", "median_us", "us"),
-            Column("p99 µs", "p99_us", "us"),
-            *_TICK,
-        ),
+        "meanwhile; AirSim itself is reported to give 3 to 20 images a second (not measured "
+        "here)",
+        "what it asks for: case | a second: per_second ,.0f | round trip µs: median_us us | "
+        f"p99 µs: p99_us us | {_TICK}",
     ),
-    "changes": Table(
+    "changes": _table(
         "Changes",
-        (
-            Column("what", "what"),
-            Column("before µs", "before_us", "us"),
-            Column("after µs", "after_us", "us"),
-            Column("ratio", "ratio", ".2f"),
-            Column("noise", "noise", ".2f"),
-        ),
+        "what: what | before µs: before_us us | after µs: after_us us | ratio: ratio .2f | "
+        "noise: noise .2f",
     ),
 }
 """By what is measured, as `bench.page.Results` names it."""
