@@ -77,9 +77,8 @@ def stall(
     """Measure how late a 400 Hz tick is without a camera, with one inline and beside the loop."""
     from bench.stall import measure
 
-    with _status() as say:
-        rows = measure(seconds=seconds, repeats=repeats, rate=rate, size=size, progress=say)
-    _finish(json, stall=rows)
+    options: dict[str, Any] = {"seconds": seconds, "repeats": repeats, "rate": rate, "size": size}
+    _show(json, stall=lambda say: measure(progress=say, **options))
 
 
 @app.command()
@@ -87,10 +86,7 @@ def throughput(json: Json = None) -> None:
     """Measure events and images a second, through handlers, streams and workers."""
     from bench.throughput import measure
 
-    with _status() as say:
-        say("throughput")
-        rows = measure()
-    _finish(json, throughput=rows)
+    _show(json, throughput=lambda _: measure())
 
 
 @app.command()
@@ -99,12 +95,9 @@ def idle(
     seconds: Annotated[float, typer.Option(min=0.5, help="Length of the run.")] = 10.0,
 ) -> None:
     """Measure the processor time of one 100 Hz timer node."""
-    from bench.throughput import measure_idle as measure
+    from bench.throughput import measure_idle
 
-    with _status() as say:
-        say("idle")
-        row = measure(seconds)
-    _finish(json, idle=[row])
+    _show(json, idle=lambda _: [measure_idle(seconds)])
 
 
 @app.command()
@@ -116,11 +109,11 @@ def lockstep(
     """Measure simulated seconds a second beside a bare loop, and where a frame's time goes."""
     from bench.lockstep import measure, measure_parts
 
-    with _status() as say:
-        rows = measure(seconds=seconds, repeats=repeats, progress=say)
-        say("parts of a frame")
-        shares = measure_parts(seconds=seconds / 3, repeats=repeats)
-    _finish(json, lockstep=rows, parts=shares)
+    _show(
+        json,
+        lockstep=lambda say: measure(seconds=seconds, repeats=repeats, progress=say),
+        parts=lambda _: measure_parts(seconds=seconds / 3, repeats=repeats),
+    )
 
 
 @app.command()
@@ -134,11 +127,11 @@ def bridge(
     """Measure what crosses between two processes beside raw Zenoh, and ROS images' encoding."""
     from bench.bridge import measure, measure_ros_images
 
-    with _status() as say:
-        rows = measure(samples, say)
-        say("images for ROS")
-        ros = measure_ros_images(repeats)
-    _finish(json, bridge=rows, ros_images=ros)
+    _show(
+        json,
+        bridge=lambda say: measure(samples, say),
+        ros_images=lambda _: measure_ros_images(repeats),
+    )
 
 
 @app.command()
@@ -147,12 +140,9 @@ def link(
     samples: Annotated[int, typer.Option(min=30, help="Frames each way, in turns.")] = 1000,
 ) -> None:
     """Measure a frame to a program outside and back, beside a call of a worker."""
-    from bench.outside import measure_link as measure
+    from bench.outside import measure_link
 
-    with _status() as say:
-        say("native interface")
-        rows = measure(samples)
-    _finish(json, link=rows)
+    _show(json, link=lambda _: measure_link(samples))
 
 
 @app.command()
@@ -162,11 +152,9 @@ def held(
     repeats: Annotated[int, typer.Option(min=1, help="Flights of each side, in turns.")] = 5,
 ) -> None:
     """Measure a flight with an odometry outside that is held for, beside the same in a worker."""
-    from bench.outside import measure_held as measure
+    from bench.outside import measure_held
 
-    with _status() as say:
-        rows = measure(seconds=seconds, repeats=repeats, progress=say)
-    _finish(json, held=rows)
+    _show(json, held=lambda say: measure_held(seconds=seconds, repeats=repeats, progress=say))
 
 
 @app.command()
@@ -177,11 +165,10 @@ def recording(
     rate: Annotated[float, typer.Option(min=1.0, help="Hertz of the camera.")] = 30.0,
 ) -> None:
     """Measure how late a 400 Hz tick is while a run is recorded, and while it is not."""
-    from bench.lateness import measure_recording as measure
+    from bench.lateness import measure_recording
 
-    with _status() as say:
-        rows = measure(seconds=seconds, repeats=repeats, rate=rate, progress=say)
-    _finish(json, recording=rows)
+    options: dict[str, Any] = {"seconds": seconds, "repeats": repeats, "rate": rate}
+    _show(json, recording=lambda say: measure_recording(progress=say, **options))
 
 
 @app.command()
@@ -195,9 +182,7 @@ def flood(
     """Measure how late a 400 Hz tick is while ROS 2 messages flood in."""
     from bench.flood import measure
 
-    with _status() as say:
-        rows = measure(windows=windows, rate=rate, progress=say)
-    _finish(json, flood=rows)
+    _show(json, flood=lambda say: measure(windows=windows, rate=rate, progress=say))
 
 
 @app.command()
@@ -208,9 +193,7 @@ def airsim(
     """Measure how quickly AirSim's server answers, and how late a 400 Hz tick is meanwhile."""
     from bench.airsim import measure
 
-    with _status() as say:
-        rows = measure(rounds=rounds, progress=say)
-    _finish(json, airsim=rows)
+    _show(json, airsim=lambda say: measure(rounds=rounds, progress=say))
 
 
 @app.command("all")
@@ -310,13 +293,22 @@ def _status() -> Iterator[Callable[..., None]]:
         )
 
 
-def _finish(json: Path | None, **measured: list[Any]) -> None:
-    """Show the tables of what was measured, and write all rows to a file if one is given."""
+def _show(json: Path | None, **benchmarks: Callable[[Callable[..., None]], list[Any]]) -> None:
+    """Run benchmarks and show their tables; write all rows to a file if one is given.
+
+    Args:
+        benchmarks: By the names of their tables; each gets what says how far it is.
+    """
     from rich.console import Console
 
     from bench.results import write_json
     from bench.tables import TABLES
 
+    measured = {}
+    with _status() as say:
+        for name, measure in benchmarks.items():
+            say(name.replace("_", " "))
+            measured[name] = measure(say)
     for name, rows in measured.items():
         Console().print(TABLES[name].terminal(rows))
     if json is not None:

@@ -14,6 +14,7 @@ import os
 import re
 import socket
 from collections.abc import AsyncIterator
+from http import HTTPStatus
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import parse_qs, urlsplit
@@ -229,16 +230,6 @@ LONGEST_HEAD = 16 << 10
 LONGEST_BODY = 64 << 10
 """Bytes of a request at most."""
 
-_REASONS = {
-    200: "OK",
-    400: "Bad Request",
-    403: "Forbidden",
-    404: "Not Found",
-    405: "Method Not Allowed",
-    413: "Content Too Large",
-    503: "Service Unavailable",
-}
-
 
 class HttpError(Exception):
     """A request that cannot be served."""
@@ -340,7 +331,7 @@ def server_sent(data: bytes) -> bytes:
 
 
 def _head(status: int, kind: str, headers: dict[str, str]) -> bytes:
-    lines = [f"HTTP/1.1 {status} {_REASONS[status]}", f"content-type: {kind}"]
+    lines = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}", f"content-type: {kind}"]
     lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
     lines += [
         "cache-control: no-store",
