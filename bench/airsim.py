@@ -24,8 +24,8 @@ import numpy as np
 
 from bench.lateness import LateRow, figures, hover, lateness, ratios
 from bench.system import free_port
-from sims.airsim.client.rpc import RpcClient
-from sims.airsim.structures import ImageRequest
+from sims.airsim.client.connection import RpcClient
+from sims.airsim.wire import ImageRequest
 
 WINDOW = 1.0
 """Seconds."""
@@ -115,7 +115,7 @@ async def ask(port: int, rounds: int) -> None:
     client = await _connect(port)
     calls = {case: msgspec.to_builtins(call) for case, call in CASES.items()}
     for call in calls.values():
-        await client.call(*call)
+        await client.send(*call)
     await asyncio.sleep(1.0)  # for the vehicle to have taken off
     for _ in range(rounds):
         for call in calls.values():
@@ -131,17 +131,19 @@ async def _window(client: RpcClient, call: tuple[Any, ...]) -> Window:
         return Window(begin, time.monotonic_ns(), [])
     trips = []
     while now - begin < WINDOW * 1e9:
-        await client.call(*call)
+        await client.send(*call)
         now, before = time.monotonic_ns(), now
         trips.append(now - before)
     return Window(begin, now, trips)
 
 
 async def _connect(port: int) -> RpcClient:
+    loop = asyncio.get_running_loop()
     async with asyncio.timeout(120.0):
         while True:
             try:
-                return await RpcClient.connect("127.0.0.1", port)
+                connected = await loop.create_connection(RpcClient, "127.0.0.1", port)
+                return connected[1]
             except OSError:
                 await asyncio.sleep(0.1)
 

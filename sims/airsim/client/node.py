@@ -15,23 +15,18 @@ import events as ev
 from runtime import Node, Output, Worker, on
 from runtime.errors import UncheckableError
 from runtime.time.schedule import SECOND
-from sims.airsim.client import conversion
-from sims.airsim.client.calls import Calls
-from sims.airsim.client.images import ImageSet, ImageSource
-from sims.airsim.client.orders import Orders
-from sims.airsim.client.remote import FRAME, ask
-from sims.airsim.client.rpc import RpcCallError
-from sims.airsim.client.settings import AirsimClientConfig
-from sims.airsim.structures import CollisionInfo, ImuData, MultirotorState
+from sims.airsim.client import remote
+from sims.airsim.client.connection import Connection, ImageSet, ImageSource, RpcCallError
+from sims.airsim.client.remote import FRAME, AirsimClientConfig, Orders, ask
+from sims.airsim.wire import CollisionInfo, ImuData, MultirotorState
 from sims.simulator import Addressee
 
 T = TypeVar("T")
 E = TypeVar("E", bound=ev.Event)
 
+# If the server's clock is further off (ns), or behind after a loss, it is another one.
 _NEW_CLOCK = 60 * SECOND
-"""If the server's clock is further off (ns), or behind after a loss, it is another one."""
-_LAST_WORDS = 2.0
-"""Real seconds that a server has for each of the last calls."""
+_LAST_CALLS = 2.0  # real seconds that a server has for each of the last calls
 
 
 class AirsimClient(Node[AirsimClientConfig]):
@@ -59,27 +54,19 @@ class AirsimClient(Node[AirsimClientConfig]):
         config = self.config
         self._lockstep = self.clock.kind == "lockstep"
         self.deterministic = self._lockstep  # type: ignore[misc]  # while the server steps exactly
-        self.counts: Counter[str] = Counter()
-        """How often each thing went wrong."""
+        self.counts: Counter[str] = Counter()  # how often each thing went wrong
         self._where = config.host, config.port
         self._addressee = Addressee(self.name, self.siblings(AirsimClient), self.sources)
         limit = float(config.call_timeout)
-        self._state, self._commands = (
-            Calls(self, self._where, limit),
-            Calls(self, self._where, limit),
-        )
-        self._connected = 0
-        """How often the connections were made."""
+        self._state = Connection(self, self._where, limit)
+        self._commands = Connection(self, self._where, limit)
+        self._connected = 0  # how often the connections were made
         self._mending = asyncio.Lock()
         self._was_paused = True
-        self._shift = 0
-        """The server's clock less the run's (ns)."""
-        self._newest: dict[str, int] = {}
-        """Stamps by kind of event, or by camera."""
+        self._shift = 0  # the server's clock less the run's (ns)
+        self._newest: dict[str, int] = {}  # stamps by kind of event, or by camera
         self._pose: ev.Odometry | None = None
         self._orders: Orders | None = None
-
-    # Before the run.
 
     async def on_startup(self) -> None:
         """Connect, ask what is there, and take a first set of images."""
@@ -98,15 +85,13 @@ class AirsimClient(Node[AirsimClientConfig]):
         """Ask for all that is announced; the first images of a server may take their time."""
         config = self.config
         call = functools.partial(self._state.call, limit=float(config.start_timeout))
-        self._remote = remote = await ask(call, config, self.name, self.log.warning)
-        for camera in remote.first.resampled:
+        self._remote = found = await ask(call, config, self.name, self.log.warning)
+        for camera in found.first.resampled:
             self.log.warning("%s: its depth has another size than its image: resampled", camera)
-        if remote.clock_speed != 1.0 and not self._lockstep:
-            self.log.warning(
-                "expected a ClockSpeed of 1 in real time, found %g", remote.clock_speed
-            )
-        limit = float(config.call_timeout)
-        what = self._where, remote.vehicle, remote.cosys, remote.wanted, limit
+        speed, limit = found.clock_speed, float(config.call_timeout)
+        if speed != 1.0 and not self._lockstep:
+            self.log.warning("expected a ClockSpeed of 1 in real time, found %g", speed)
+        what = self._where, found.vehicle, found.cosys, found.wanted, limit
         self._source: Worker[ImageSource] = await self.worker(
             ImageSource, *what, timeout=2.0 * limit + 10.0
         )
@@ -120,8 +105,6 @@ class AirsimClient(Node[AirsimClientConfig]):
         peers = (each.config for each in self.siblings(AirsimClient))
         if self._lockstep and [(p.host, p.port) for p in peers].count(self._where) > 1:
             yield "port: expected one AirsimClient for each server in lockstep, found several"
-
-    # In the run.
 
     async def run(self) -> None:
         """Send the cameras' poses on the body, then what the server gives, until the end."""
@@ -199,15 +182,13 @@ class AirsimClient(Node[AirsimClientConfig]):
             await self._follow(state.timestamp - self._shift - self.clock.now())
         if sample is not None:
             before = self._newest.get("imu")
-            if event := self._made("imu", sample.time_stamp, conversion.imu, sample):
-                if (
-                    before is not None
-                    and event.stamp - before > 1.5 * SECOND / self.config.imu_rate
-                ):
+            if event := self._made("imu", sample.time_stamp, remote.imu, sample):
+                longest = 1.5 * SECOND / self.config.imu_rate
+                if before is not None and event.stamp - before > longest:
                     self.counts["gaps between samples of the IMU"] += 1
                 self.imu.send(event)
         if state is not None:
-            found = self._made("state", state.timestamp, conversion.odometry, state, origin)
+            found = self._made("state", state.timestamp, remote.odometry, state, origin)
             if found is not None:
                 self._pose = found
                 self.odometry.send(found)
@@ -237,10 +218,9 @@ class AirsimClient(Node[AirsimClientConfig]):
         contact = await self._ask("simGetCollisionInfo", CollisionInfo, self._remote.vehicle)
         if contact is not None and contact.has_collided and self._pose is not None:
             known = contact, self._remote.origin, self._pose
-            event = self._made("collision", contact.time_stamp, conversion.collision, *known)
-            if event is not None and (
-                event.normal[2] > -0.7 or event.speed > 1.0
-            ):  # not: it stands
+            event = self._made("collision", contact.time_stamp, remote.collision, *known)
+            stands = event is not None and event.normal[2] <= -0.7 and event.speed <= 1.0
+            if event is not None and not stands:
                 self.vehicle_events.send(event)
 
     def _send_images(self, found: ImageSet) -> None:
@@ -251,7 +231,7 @@ class AirsimClient(Node[AirsimClientConfig]):
         )
         for name, camera in self._remote.cameras.items():
             known = found.poses[name], self._remote.origin
-            pose = self._made(name, found.stamp, conversion.camera_pose, *known)
+            pose = self._made(name, found.stamp, remote.camera_pose, *known)
             if pose is None:
                 continue
             self.camera_poses.send(pose)
@@ -268,8 +248,6 @@ class AirsimClient(Node[AirsimClientConfig]):
         if self._orders is not None and self._pose is not None:
             for event in await self._orders.obey(self.clock.now(), self._pose):
                 self.vehicle_events.send(event(stamp=self.clock.now(), source=self.name))
-
-    # What the server says, and when it says nothing any more.
 
     async def _ask(self, method: str, kind: type[T], *arguments: Any) -> T | None:
         """Call a method, and return what it gave; `None` if that cannot be used."""
@@ -365,8 +343,6 @@ class AirsimClient(Node[AirsimClientConfig]):
             self._shift = state.timestamp - before
         return state
 
-    # After the run.
-
     async def on_shutdown(self) -> None:
         """Give the vehicle back, let the server's time run again, and log what went wrong."""
         for what, count in sorted(self.counts.items()):
@@ -374,10 +350,10 @@ class AirsimClient(Node[AirsimClientConfig]):
         with contextlib.suppress(OSError, RpcCallError):
             if self._orders is not None:
                 vehicle, call = self._remote.vehicle, self._commands.call
-                await call("cancelLastTask", vehicle, limit=_LAST_WORDS)
-                await call("enableApiControl", False, vehicle, limit=_LAST_WORDS)
+                await call("cancelLastTask", vehicle, limit=_LAST_CALLS)
+                await call("enableApiControl", False, vehicle, limit=_LAST_CALLS)
             if not self._was_paused:
-                await self._state.call("simPause", False, limit=_LAST_WORDS)
+                await self._state.call("simPause", False, limit=_LAST_CALLS)
         self._close()
 
     def _close(self) -> None:

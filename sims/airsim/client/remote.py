@@ -1,53 +1,137 @@
-"""What a server says of its vehicle, as a simulator would announce it."""
+"""A server's vehicle: what is asked of it at the start, what it measures, and orders to it.
+
+Events are made of AirSim's structures out of the vehicle's local NED, into ``map``; that raises
+`ValueError` if a number is not finite, or a rotation is none.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Awaitable, Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
+from msgspec.structs import astuple
 
 import events as ev
-from events.frames import OPTICAL_TO_FRD, inverse, multiply, normalize, rotate_inverse
+from events.frames import (
+    OPTICAL_TO_FRD,
+    inverse,
+    multiply,
+    normalize,
+    rotate,
+    rotate_inverse,
+    yaw_of,
+)
+from runtime import Duration, NodeConfig
 from runtime.errors import ConfigError
 from sims.airsim import settings
-from sims.airsim.client.conversion import odometry, pose_of, vector
-from sims.airsim.client.images import ImageSet, Wanted, decode, requests
-from sims.airsim.client.rpc import RpcCallError
-from sims.airsim.client.settings import AirsimClientConfig, RemoteCamera
-from sims.airsim.structures import CameraInfo, MultirotorState, Pose
+from sims.airsim.client.connection import (
+    Connection,
+    ImageSet,
+    RpcCallError,
+    Wanted,
+    decode,
+    requests,
+)
+from sims.airsim.wire import (
+    CameraInfo,
+    CollisionInfo,
+    ImuData,
+    MultirotorState,
+    Pose,
+    YawMode,
+)
 
+Rate = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+Kind = Literal["rgb", "depth", "segmentation"]
 Call = Callable[..., Awaitable[Any]]
 """Calls a method of the server with its arguments, and gives the result."""
 
 FRAME = "base_link"
 _KINDS = {0: "rgb", 1: "depth", 5: "segmentation", 7: "segmentation"}
+# Kilograms and newtons of AirSim's default quadrotor, for which no method asks.
 _MASS, _THRUST = 1.0, 4 * 4.18
-"""Kilograms and newtons of AirSim's default quadrotor, for which no method asks."""
+# Velocity towards a set-point of position, for each metre that it is away (1/s), and at most.
+_PULL, _FASTEST = 1.0, 5.0
+_LONGEST_LANDING = 3600.0  # seconds: at AirSim's 0.2 m/s, a limit of 60 s ends it 12 m below
+
+_PHASES: dict[type[ev.Command], tuple[set[str], str]] = {
+    ev.Arm: ({"disarmed"}, "armed"),
+    ev.Takeoff: ({"disarmed", "armed"}, "taking off"),
+    ev.Hover: ({"taking off", "flying", "landing"}, "flying"),
+    ev.Land: ({"taking off", "flying"}, "landing"),
+    ev.Disarm: ({"armed", "taking off", "flying", "landing"}, "disarmed"),
+}  # in which phases a command is taken, and to which it leads
+
+
+class RemoteCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A camera of the server's vehicle; its size, field of view and mount come from the server.
+
+    Attributes:
+        name: As the server has it: ``0``, ``front_center``.
+        images: What is asked for. Segmentation is asked for as the type "infrared", whose grey
+            level is the object's ID.
+    """
+
+    name: Annotated[str, msgspec.Meta(min_length=1)]
+    images: tuple[Kind, ...] = ("rgb", "depth")
+
+    def __post_init__(self) -> None:
+        if not self.images or len(set(self.images)) != len(self.images):
+            raise ValueError(f"images: expected one or more kinds, each once, found {self.images}")
+
+
+class AirsimClientConfig(NodeConfig):
+    """Settings of the client.
+
+    Attributes:
+        host: Where the server is.
+        port: The server's.
+        vehicle: Name that the vehicle has there; empty for the first by name.
+        flavour: Whose server it is: ``airsim`` (and Colosseum's), ``cosys``, or ``auto``: by the
+            version that the server reports.
+        cameras: The cameras whose images are asked for; if none is given, those of the server's
+            settings, or else the camera ``0``.
+        image_rate: Sets of images per second; in real time at most so many.
+        imu_rate: Samples of the IMU and of the true state per second; in lockstep also steps.
+        control_rate: Rate at which the newest set-point is sent, Hz.
+        takeover: Whether it takes API control and passes on commands and set-points; if not,
+            somebody else flies.
+        setpoint_timeout: Age beyond which a set-point is ignored, unless it is one of position.
+        start_timeout: Real time in which the server has to answer at the start, and after a loss.
+        call_timeout: Real time after which a call without a reply is given up, and its connection
+            is replaced.
+        on_loss: What follows when a connection is lost: the run stops, or goes on with a new one.
+    """
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 41451
+    vehicle: str = ""
+    flavour: Literal["auto", "airsim", "cosys"] = "auto"
+    cameras: tuple[RemoteCamera, ...] = ()
+    image_rate: Rate = 20
+    imu_rate: Rate = 100
+    control_rate: Rate = 50
+    takeover: bool = True
+    setpoint_timeout: Duration = Duration(0.5)  # immutable
+    start_timeout: Duration = Duration(30.0)
+    call_timeout: Duration = Duration(10.0)
+    on_loss: Literal["stop", "reconnect"] = "stop"
 
 
 class Remote(NamedTuple):
-    """The server's vehicle.
+    """The server's vehicle, as a simulator would announce it."""
 
-    Attributes:
-        vehicle: Its name there.
-        cosys: Whether the server is Cosys-AirSim's.
-        origin: Origin of its local frame in ``map``, metres NED.
-        clock_speed: Simulated seconds per real second.
-        wanted: What is asked for at each request for images.
-        first: The images of the first one.
-        announcements: The vehicle, its IMU, and then its cameras by their names.
-    """
-
-    vehicle: str
-    cosys: bool
-    origin: ev.Vector3
-    clock_speed: float
-    wanted: tuple[Wanted, ...]
-    first: ImageSet
-    announcements: tuple[ev.Announcement, ...]
-    cameras: dict[str, ev.CameraAnnouncement]
+    vehicle: str  # its name on the server
+    cosys: bool  # whether the server is Cosys-AirSim's
+    origin: ev.Vector3  # of its local frame in ``map``, metres NED
+    clock_speed: float  # simulated seconds per real second
+    wanted: tuple[Wanted, ...]  # what is asked for at each request for images
+    first: ImageSet  # the images of the first one
+    announcements: tuple[ev.Announcement, ...]  # the vehicle, its IMU, and then its cameras
+    cameras: dict[str, ev.CameraAnnouncement]  # by their names
 
 
 async def ask(
@@ -163,9 +247,226 @@ async def _origin(
     """Return where a vehicle's local frame is: by where its pawn is, or else by the settings."""
     try:
         found = await call("simGetObjectPose", vehicle, *((True,) if cosys else ()))
-        x, y, z = vector(msgspec.convert(found, Pose).position)
+        x, y, z = astuple(msgspec.convert(found, Pose).position)
         if math.isfinite(x + y + z):
             return x - local[0], y - local[1], z - local[2]
     except (RpcCallError, msgspec.ValidationError):
         pass
     return (*own.get("position", (0.0, 0.0)), -own.get("height", 0.0))
+
+
+def pose_of(found: Pose, origin: ev.Vector3 = (0.0, 0.0, 0.0)) -> tuple[ev.Vector3, ev.Quaternion]:
+    """Return a pose as events have it, in the frame in which its own frame's origin is given."""
+    (x, y, z), turn = astuple(found.position), astuple(found.orientation)
+    return (x + origin[0], y + origin[1], z + origin[2]), normalize(turn)
+
+
+def odometry(stamp: int, source: str, found: MultirotorState, origin: ev.Vector3) -> ev.Odometry:
+    """Return the true state of a vehicle."""
+    state = found.kinematics_estimated
+    position, orientation = pose_of(Pose(state.position, state.orientation), origin)
+    return ev.Odometry(
+        stamp=stamp,
+        source=source,
+        position=position,
+        orientation=orientation,
+        linear_velocity=rotate_inverse(orientation, astuple(state.linear_velocity)),
+        angular_velocity=astuple(state.angular_velocity),
+    )
+
+
+def imu(stamp: int, source: str, found: ImuData) -> ev.Imu:
+    """Return a sample of the IMU."""
+    turn, force = astuple(found.angular_velocity), astuple(found.linear_acceleration)
+    return ev.Imu(stamp=stamp, source=source, angular_velocity=turn, linear_acceleration=force)
+
+
+def camera_pose(stamp: int, source: str, found: Pose, origin: ev.Vector3) -> ev.PoseStamped:
+    """Return the pose of a camera's optical frame."""
+    position, turn = pose_of(found, origin)
+    orientation = normalize(multiply(turn, OPTICAL_TO_FRD))
+    return ev.PoseStamped(stamp=stamp, source=source, position=position, orientation=orientation)
+
+
+def collision(
+    stamp: int, source: str, found: CollisionInfo, origin: ev.Vector3, vehicle: ev.Odometry
+) -> ev.Collision:
+    """Return a contact; its speed is that of the vehicle against the normal."""
+    normal, place = astuple(found.normal), Pose(found.impact_point)
+    velocity = rotate(vehicle.orientation, vehicle.linear_velocity)
+    return ev.Collision(
+        stamp=stamp,
+        source=source,
+        other=found.object_name,
+        position=pose_of(place, origin)[0],
+        normal=normal,
+        speed=max(-sum(a * b for a, b in zip(normal, velocity, strict=True)), 0.0),
+    )
+
+
+class Orders:
+    """What a vehicle has been ordered to do, and how far it has come.
+
+    Phases and refusals are those of `sims.vehicle.Autopilot`, so that the same pilot flies both.
+    A take-off is AirSim's, and then a climb to the altitude asked for. A set-point holds on the
+    server for three periods: some may be late, none may stay.
+
+    Args:
+        vehicle: Name of the vehicle on the server.
+        flying: Whether it is in the air already.
+        timeout: Age at which set-points end, ns; those of position hold.
+        period: Seconds between two calls of `obey`.
+        refused: Is told what the server refused.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        vehicle: str,
+        flying: bool,
+        timeout: int,
+        period: float,
+        refused: Callable[[str], None],
+    ) -> None:
+        self.phase = "flying" if flying else "disarmed"
+        self._connection, self._vehicle, self._refused = connection, vehicle, refused
+        self._timeout, self._duration = timeout, 3.0 * period
+        self._queue: list[ev.Command] = []
+        self._setpoint: ev.Setpoint | None = None
+        self._task: asyncio.Future[Any] | None = None
+        """The take-off or landing whose reply is to come."""
+
+    def take(self, order: ev.Command | ev.Setpoint) -> str:
+        """Take an order for the next `obey`, and return why it is refused; empty if it is not."""
+        if isinstance(order, ev.Setpoint):
+            allowed, then = {"armed", "flying"}, "flying"
+        else:
+            allowed, then = _PHASES.get(type(order), (set[str](), ""))
+        if self.phase not in allowed:
+            return self.phase
+        if isinstance(order, ev.Setpoint):
+            self._setpoint = order
+        else:
+            self._setpoint = None
+            if isinstance(order, ev.Takeoff) and self.phase == "disarmed":
+                self._queue.append(ev.Arm(stamp=order.stamp, source=order.source))
+            self._queue.append(order)
+        self.phase = then
+        return ""
+
+    def resume(self) -> None:
+        """Go on with a new connection: the reply to a task of the old one will not come."""
+        self._task = None
+        if self.phase == "landing":
+            self._queue.append(ev.Land(stamp=0, source=""))
+
+    async def obey(self, now: int, pose: ev.Odometry) -> list[type[ev.VehicleEvent]]:
+        """Pass on what was ordered since the last call, and return what happened to the vehicle.
+
+        Raises:
+            OSError: The connection is lost.
+        """
+        happened: list[type[ev.VehicleEvent]] = []
+        queue, self._queue = self._queue, []
+        for order in queue:
+            self._task = None
+            match order:
+                case ev.Arm() | ev.Disarm():
+                    happened += await self._arm(isinstance(order, ev.Arm))
+                case ev.Takeoff():
+                    x, y, z = pose.position
+                    self._setpoint = ev.PositionSetpoint(
+                        stamp=now,
+                        source=order.source,
+                        position=(x, y, z - order.altitude),
+                        yaw=yaw_of(pose.orientation),
+                    )
+                    self._task = self._send("takeoff", 20.0)
+                case ev.Land():
+                    self._task = self._send("land", _LONGEST_LANDING)
+                case _:
+                    self._send("hover")
+        if self._task is not None:
+            await self._connection.settle()  # if it ended before now, its reply is here then
+            if self._task.done():
+                happened += await self._ended(self._task)
+        elif self.phase == "taking off" and _is_there(self._setpoint, pose):
+            self.phase = "flying"
+            happened.append(ev.TakenOff)
+        if self._setpoint is not None and self._task is None:
+            lasting = isinstance(self._setpoint, ev.PositionSetpoint)
+            if lasting or now - self._setpoint.stamp <= self._timeout:
+                self._send(*move(self._setpoint, pose, self._duration))
+                await self._connection.settle()  # before time goes on, it is with the server
+        elif queue:
+            await self._connection.settle()
+        return happened
+
+    async def _ended(self, task: asyncio.Future[Any]) -> list[type[ev.VehicleEvent]]:
+        """Go on after a task: stop the motors after a landing."""
+        self._task = None
+        if self.phase != "landing":
+            return []
+        if task.exception() is not None:
+            self.phase = "flying"
+        elif task.result() is True:
+            self.phase = "disarmed"
+            return [ev.Landed, *await self._arm(False)]
+        else:  # somebody else's command came between
+            self._task = self._send("land", _LONGEST_LANDING)
+        return []
+
+    async def _arm(self, arm: bool) -> list[type[ev.VehicleEvent]]:
+        try:
+            if await self._connection.call("armDisarm", arm, self._vehicle) is not True:
+                self._refused(f"armDisarm: {arm}")
+        except RpcCallError as error:
+            self._refused(f"armDisarm: {error}")
+        return [ev.Armed if arm else ev.Disarmed]
+
+    def _send(self, method: str, *arguments: Any) -> asyncio.Future[Any]:
+        """Send a task whose reply comes when it ends; an error of it is told, not dropped."""
+        task = self._connection.send(method, *arguments, self._vehicle)
+
+        def note(done: asyncio.Future[Any]) -> None:
+            if isinstance(error := done.exception(), RpcCallError):
+                self._refused(f"{method}: {error}")
+
+        task.add_done_callback(note)
+        return task
+
+
+def move(setpoint: ev.Setpoint, pose: ev.Odometry, duration: float) -> tuple[Any, ...]:
+    """Return the call that makes a vehicle at a pose follow a set-point for some seconds.
+
+    Returns:
+        The method and its arguments but for the vehicle's name.
+    """
+    match setpoint:
+        case ev.PositionSetpoint():
+            apart = [a - b for a, b in zip(setpoint.position, pose.position, strict=True)]
+            pull = _PULL * min(1.0, _FASTEST / max(_PULL * math.hypot(*apart), 1e-9))
+            velocity = [f + pull * d for f, d in zip(setpoint.velocity, apart, strict=True)]
+            mode = YawMode(False, math.degrees(setpoint.yaw))
+            return ("moveByVelocity", *velocity, duration, 0, mode)
+        case ev.VelocitySetpoint():
+            method = "moveByVelocity" + ("BodyFrame" if setpoint.frame_id == "heading" else "")
+            mode = YawMode(True, math.degrees(setpoint.yaw_rate))
+            return (method, *setpoint.velocity, duration, 0, mode)
+        case ev.AttitudeSetpoint():
+            w, x, y, z = setpoint.orientation
+            roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+            pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+            angles = roll, pitch, yaw_of(setpoint.orientation)
+            return ("moveByRollPitchYawThrottle", *angles, setpoint.thrust, duration)
+        case ev.BodyRateSetpoint():
+            rates = setpoint.angular_velocity
+            return ("moveByAngleRatesThrottle", *rates, setpoint.thrust, duration)
+    raise ValueError(f"{type(setpoint).__name__} is no set-point of a multirotor")
+
+
+def _is_there(setpoint: ev.Setpoint | None, pose: ev.Odometry) -> bool:
+    """Return whether a climb is over: near its end, and slow."""
+    assert isinstance(setpoint, ev.PositionSetpoint)
+    velocity = rotate(pose.orientation, pose.linear_velocity)
+    return abs(setpoint.position[2] - pose.position[2]) < 0.1 and math.hypot(*velocity) < 0.2

@@ -1,51 +1,63 @@
-"""The cameras that clients know by name: settings, AirSim's defaults, and what clients change.
+"""The cameras that clients know by name, and the images that they take of them.
 
 A change is the server's only: the cameras of the run's file, their images and announcements stay
-as they are. Source of the default mounts: the multirotor's blueprint in AirSim 1.8.1.
+as they are. All images of one call show one state, at one time, from its true poses.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec.structs import asdict, astuple
 
 from events.base import Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_rpy, multiply, normalize, rotate
-from sims.airsim.server.methods import RpcError, rpc
-from sims.airsim.server.rendering import Eye, Mount
+from runtime import Worker
+from runtime.host import Sibling
+from runtime.logs import NodeLogger
+from runtime.node import Node
+from sims.airsim.server.methods import Caller, Flavour, RpcError, rpc
+from sims.airsim.server.rendering import Eye, Form, ImageType, Mount, Renderer, Wanted
 from sims.airsim.server.vehicles import ServedVehicle
-from sims.airsim.structures import CameraInfo, Pose, ProjectionMatrix, Quaternionr
+from sims.airsim.settings import DEFAULT_CAMERAS, default_mount
+from sims.airsim.wire import (
+    CameraInfo,
+    CosysImageResponse,
+    ImageRequest,
+    ImageResponse,
+    Pose,
+    ProjectionMatrix,
+    Quaternionr,
+)
+from sims.cameras import GraphicsError
 from sims.cameras.spec import CameraSpec, Pixels, camera_info, eyes
 from sims.cameras.view import View
-from sims.simulator import Simulator
+from sims.world import SharedWorld
 
-if TYPE_CHECKING:
-    from sims.airsim.server.node import AirsimServer
+DrawnState = Callable[[], tuple[int, npt.NDArray[np.float64]]]
+"""Gives the world's state as it is to be drawn now: see `Vehicles.drawn_state`."""
 
 FieldOfView = Annotated[float, msgspec.Meta(ge=1.0, le=170.0)]
-FARTHEST = 1e6
-"""Metres from its vehicle up to which a client may put a camera."""
+FARTHEST = 1e6  # metres from its vehicle up to which a client may put a camera
+MOST = 64  # images of one call, and calls that wait for their images at a time
+ABANDONED = 8  # calls of clients that have left with more of which the renderer is full
+TIMEOUT = 600.0  # real seconds after which the renderer hangs; the longest call takes some 30
+LONGEST = 100_000_000  # bytes of all images of one call: Cosys-AirSim's client takes no more
 
-_DEFAULTS: tuple[tuple[tuple[str, ...], Vector3, Vector3], ...] = (
-    (("front_center", "0", "", "fpv"), (0.46, 0.0, 0.0), (0.0, 0.0, 0.0)),
-    (("front_right", "1"), (0.46, 0.125, 0.0), (0.0, 0.0, 0.0)),
-    (("front_left", "2"), (0.46, -0.125, 0.0), (0.0, 0.0, 0.0)),
-    (("bottom_center", "3"), (0.0, 0.0, 0.12), (0.0, -90.0, 0.0)),
-    (("back_center", "4"), (-0.46, 0.0, 0.0), (0.0, 0.0, 180.0)),
-)
-"""Names, position (metres FRD) and orientation (degrees) of the cameras that are always there."""
+_RESPONSES = {"airsim": ImageResponse, "cosys": CosysImageResponse}
 
 
 class Capture(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a camera takes images of one type.
 
     Attributes:
-        image_type: AirSim's number of the type; see `sims.airsim.server.image_types`.
+        image_type: AirSim's number of the type; see `sims.airsim.server.rendering`.
         width: Width of the images, pixels.
         height: Height of the images, pixels.
         fov: **Horizontal** field of view, degrees.
@@ -80,37 +92,16 @@ class ServedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Camera(msgspec.Struct):
-    """One camera as clients know it.
+    """One camera as clients know it."""
 
-    Attributes:
-        body: Number of the body that carries it.
-        mount: Where on it.
-        specs: How it takes images, by their type; those of other types as type -1.
-    """
-
-    body: int
-    mount: Mount
+    body: int  # number of the body that carries it
+    mount: Mount  # where on it
+    # How it takes images, by their type; those of other types as type -1.
     specs: dict[int, CameraSpec]
 
     def eye(self, image_type: int) -> Eye:
         """Return what an image of a type is drawn from."""
         return Eye(self.body, self.mount, self.specs.get(image_type, self.specs[-1]))
-
-
-def default_mount(name: str, free: bool) -> tuple[Vector3, Vector3]:
-    """Return where AirSim's camera of a name is.
-
-    Args:
-        name: Any of its names; of one that AirSim does not have, the body's origin, forward.
-        free: Whether it is that of the computer-vision mode.
-
-    Returns:
-        Position, metres FRD; roll, pitch, yaw, degrees.
-    """
-    for names, (x, y, z), orientation in _DEFAULTS:
-        if name in names:
-            return (0.0, y, 0.0) if free else (x, y, z), orientation
-    return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 
 class Cameras:
@@ -123,12 +114,18 @@ class Cameras:
         ValueError: A camera of the settings is of no vehicle, or is there twice.
     """
 
-    def __init__(self, server: AirsimServer) -> None:
-        self._server = server
+    def __init__(
+        self,
+        carriers: Sequence[Sibling],
+        entries: Sequence[ServedCamera],
+        model: Any,
+        drawn_state: DrawnState,
+        log: NodeLogger,
+    ) -> None:
+        self._model, self._drawn_state = model, drawn_state
         self._named: dict[str, dict[str, Camera]] = {}
-        carriers = server.siblings(Simulator)
         known = {each.name for each in carriers}
-        for entry in server.config.cameras:
+        for entry in entries:
             if entry.vehicle not in {"", *known}:
                 raise ValueError(
                     f"cameras: {entry.name}: vehicle: expected {' or '.join(sorted(known))}, "
@@ -136,16 +133,15 @@ class Cameras:
                 )
         for each in carriers:
             free = not each.node.vehicle
-            body = server.world.model.body(each.name if free else f"{each.name}/base_link").id
-            entries = [e for e in server.config.cameras if e.vehicle in {"", each.name}]
-            named = cameras_by_name(each.config.cameras, entries, body, free)
+            body = model.body(each.name if free else f"{each.name}/base_link").id
+            own = [entry for entry in entries if entry.vehicle in {"", each.name}]
+            named = cameras_by_name(each.config.cameras, own, body, free)
             self._named[each.name] = named
-            for names, _, _ in _DEFAULTS:
-                if given := {e.name for e in (*entries, *each.config.cameras)} & set(names):
-                    server.log.info("%s: %s are one camera, %s", each.name, names, min(given))
-        specs = [
-            s for named in self._named.values() for c in named.values() for s in c.specs.values()
-        ]
+            for names, _, _ in DEFAULT_CAMERAS:
+                if given := {e.name for e in (*own, *each.config.cameras)} & set(names):
+                    log.info("%s: %s are one camera, %s", each.name, names, min(given))
+        cameras = (camera for named in self._named.values() for camera in named.values())
+        specs = [spec for camera in cameras for spec in camera.specs.values()]
         width, height = np.max([(1, 1), *(View(camera_info(s)).largest() for s in specs)], axis=0)
         self.largest = int(width), int(height)
 
@@ -165,7 +161,7 @@ class Cameras:
 
     def pose(self, vehicle: ServedVehicle, eye: Eye, qpos: npt.NDArray[np.float64]) -> Pose:
         """Return a camera's pose in the vehicle's local frame, x forward, in a state (nq,)."""
-        model = self._server.world.model
+        model = self._model
         start = int(model.jnt_qposadr[model.body_jntadr[eye.body]])
         x, y, z, *turn = qpos[start : start + 7].tolist()
         body = flip_yz_rotation(normalize((turn[0], turn[1], turn[2], turn[3])))
@@ -174,35 +170,38 @@ class Cameras:
         return Pose(vehicle.local((place[0], place[1], place[2])), Quaternionr(*orientation))
 
     @rpc("simGetCameraInfo", cosys=2)
-    def info(self, camera: str, vehicle: str, external: bool = False) -> CameraInfo:
+    def info(self, camera: str, vehicle: ServedVehicle, external: bool = False) -> CameraInfo:
         """Return true pose, field of view and projection of a camera's scene images."""
-        on = self._server.find_vehicle(vehicle)
-        eye = self.find(on, camera, external).eye(0)
+        eye = self.find(vehicle, camera, external).eye(0)
         info = camera_info(eye.spec)
         tangent, longer = info.width / (2.0 * info.fx), max(info.width, info.height)
         across, down = (longer / (side * tangent) for side in (info.width, info.height))
         first, second = (0.0, across, 0.0, 0.0), (0.0, 0.0, -down, 0.0)
         projection = ProjectionMatrix((first, second, (0.0, 0.0, 0.0, 10.0), (-1.0, 0.0, 0.0, 0.0)))
-        _, qpos = self._server.drawn_state()
+        _, qpos = self._drawn_state()
         fov = eye.spec.fov if eye.spec.intrinsics is None else math.degrees(2 * math.atan(tangent))
-        return CameraInfo(self.pose(on, eye, qpos), fov, projection)
+        return CameraInfo(self.pose(vehicle, eye, qpos), fov, projection)
 
     @rpc("simSetCameraPose", cosys=3)
-    def set_pose(self, camera: str, pose: Pose, vehicle: str, external: bool = False) -> None:
+    def set_pose(
+        self, camera: str, pose: Pose, vehicle: ServedVehicle, external: bool = False
+    ) -> None:
         """Set a camera's pose relative to its vehicle; images of the run's own nodes stay."""
-        position = msgspec.structs.astuple(pose.position)
-        turn = msgspec.structs.astuple(pose.orientation)
+        position = astuple(pose.position)
+        turn = astuple(pose.orientation)
         if not (all(abs(each) <= FARTHEST for each in (*position, *turn)) and any(turn)):
             raise RpcError(f"expected a rotation, and numbers up to {FARTHEST:g}, found {pose}")
-        found = self.find(self._server.find_vehicle(vehicle), camera, external)
+        found = self.find(vehicle, camera, external)
         found.mount = position, normalize(turn)
 
     @rpc("simSetCameraFov", cosys=3)
-    def set_fov(self, camera: str, degrees: float, vehicle: str, external: bool = False) -> None:
+    def set_fov(
+        self, camera: str, degrees: float, vehicle: ServedVehicle, external: bool = False
+    ) -> None:
         """Set the horizontal field of view of all of a camera's images, 1 to 170 degrees."""
         if not 1.0 <= degrees <= 170.0:
             raise RpcError(f"expected a field of view of 1 to 170 degrees, found {degrees}")
-        found = self.find(self._server.find_vehicle(vehicle), camera, external)
+        found = self.find(vehicle, camera, external)
         found.specs = {
             kind: msgspec.structs.replace(spec, fov=degrees, intrinsics=None)
             for kind, spec in found.specs.items()
@@ -210,18 +209,18 @@ class Cameras:
 
     @rpc("simGetDistortionParams", cosys=2)
     def distortion(
-        self, camera: str, vehicle: str, external: bool = False
+        self, camera: str, vehicle: ServedVehicle, external: bool = False
     ) -> tuple[float, float, float, float, float]:
         """Return five zeros, K1, K2, K3, P1 and P2: the images are those of an ideal pinhole."""
-        self.find(self._server.find_vehicle(vehicle), camera, external)
+        self.find(vehicle, camera, external)
         return 0.0, 0.0, 0.0, 0.0, 0.0
 
     @rpc("simSetDistortionParam", cosys=4)
     def set_distortion(
-        self, camera: str, name: str, value: float, vehicle: str, external: bool = False
+        self, camera: str, name: str, value: float, vehicle: ServedVehicle, external: bool = False
     ) -> None:
         """Accept zeros and refuse distortion: the images are those of an ideal pinhole."""
-        self.find(self._server.find_vehicle(vehicle), camera, external)
+        self.find(vehicle, camera, external)
         if value != 0.0:
             raise RpcError(f"not supported by visnav-runtime: distortion ({name} = {value})")
 
@@ -235,10 +234,7 @@ def cameras_by_name(
     unless they are given, too.
 
     Args:
-        files: Its own cameras.
         entries: Those of the server's settings, which go before its own of the same name.
-        body: Number of the body that carries them.
-        free: Whether it is that of the computer-vision mode.
 
     Raises:
         ValueError: Two entries have one name.
@@ -250,7 +246,7 @@ def cameras_by_name(
         raise ValueError(f"cameras: expected names of their own on a vehicle, found {found}")
     given |= named
     cameras = given.copy()
-    for names, _, _ in _DEFAULTS:
+    for names, _, _ in DEFAULT_CAMERAS:
         first = next((given[name] for name in names if name in given), None)
         camera = first or _of_entry(ServedCamera(name=names[0]), body, free)
         cameras |= {name: camera for name in names if name not in given}
@@ -291,3 +287,176 @@ def _of_entry(entry: ServedCamera, body: int, free: bool) -> Camera:
 def _mount(position: Vector3, degrees: Vector3) -> Mount:
     roll, pitch, yaw = (math.radians(angle) for angle in degrees)
     return position, from_rpy(roll, pitch, yaw)
+
+
+class _Exposure(NamedTuple):
+    """The images of one call before they are drawn: the state that they show, and what is known."""
+
+    stamp: int
+    qpos: npt.NDArray[np.float64]
+    ids: npt.NDArray[np.uint8]
+    wanted: list[Wanted]
+    known: list[ImageResponse]
+
+
+class Images:
+    """Takes images of what clients ask for.
+
+    Args:
+        segmentation_ids: Gives the ID of each geom, and last that of nothing.
+    """
+
+    def __init__(
+        self,
+        node: Node[Any],
+        world: SharedWorld,
+        cameras: Cameras,
+        drawn_state: DrawnState,
+        segmentation_ids: Callable[[], npt.NDArray[np.uint8]],
+        processes: int,
+        threads: int,
+    ) -> None:
+        self._node, self._world, self._cameras = node, world, cameras
+        self._drawn_state, self._segmentation_ids = drawn_state, segmentation_ids
+        self._processes, self._threads = processes, threads
+        self._renderer: Worker[Renderer] | None = None
+        self._starting = asyncio.Lock()
+        self._idle = asyncio.Semaphore(processes)
+        self._waiting = 0
+        self._told = False
+
+    async def start(self) -> None:
+        """Start what renders, unless that is done."""
+        async with self._starting:
+            if self._renderer is None:
+                self._renderer = await self._node.worker(
+                    Renderer,
+                    await self._node.offload(lambda: self._world.model_bytes),
+                    f"{self._node.name}/camera",
+                    self._cameras.largest,
+                    self._threads,
+                    self._world.dynamics,
+                    processes=self._processes,
+                    timeout=TIMEOUT,
+                )
+
+    @rpc("simGetImages", cosys=2)
+    def get_images(
+        self,
+        caller: Caller,
+        requests: list[ImageRequest],
+        vehicle: ServedVehicle,
+        external: bool = False,
+    ) -> Awaitable[list[ImageResponse]]:
+        """Return images of one instant, with one stamp, and the camera's true pose of then."""
+        return self.take(requests, vehicle, caller.flavour, external=external)
+
+    @rpc("simGetImage")
+    def get_image(
+        self,
+        caller: Caller,
+        camera: str,
+        image_type: int,
+        vehicle: ServedVehicle,
+        external: bool | str = "",
+    ) -> Awaitable[bytes]:
+        """Return an image as PNG; it is empty if images of that type are not drawn."""
+        caller.flavour = "airsim" if isinstance(external, bool) else "cosys"
+        self._cameras.find(vehicle, camera, external)
+        requests = [ImageRequest(camera, image_type)]
+        if image_type not in ImageType.__members__.values():
+            if not self._told:
+                self._node.log.warning("simGetImage: %s", _not_drawn(image_type))
+            self._told, requests = True, []
+        exposure = self._expose(requests, vehicle, caller.flavour)
+
+        async def png() -> bytes:
+            return b"".join([each.image_data_uint8 for each in await self._develop(exposure)])
+
+        return png()
+
+    def take(
+        self,
+        requests: Sequence[ImageRequest],
+        vehicle: ServedVehicle,
+        flavour: Flavour = "airsim",
+        *,
+        external: bool = False,
+    ) -> Awaitable[list[ImageResponse]]:
+        """Take images of the present state, and return an awaitable of them.
+
+        The state is that of the call. Simulated time does not wait for the images.
+
+        Args:
+            flavour: Whose structures, and order of colours, are wanted.
+            external: Whether cameras that no vehicle carries are meant: there are none.
+
+        Raises:
+            RpcError: There is no such camera or type, or it is too much.
+        """
+        return self._develop(self._expose(requests, vehicle, flavour, external))
+
+    def _expose(
+        self,
+        requests: Sequence[ImageRequest],
+        vehicle: ServedVehicle,
+        flavour: Flavour,
+        external: bool = False,
+    ) -> _Exposure:
+        if len(requests) > MOST:
+            raise RpcError(f"expected at most {MOST} images of one call, found {len(requests)}")
+        stamp, qpos = self._drawn_state()
+        exposure = _Exposure(stamp, qpos, self._segmentation_ids(), [], [])
+        length = 0
+        for each in requests:
+            camera = self._cameras.find(vehicle, each.camera_name, external)
+            if each.image_type not in ImageType.__members__.values():
+                raise RpcError(_not_drawn(each.image_type))
+            eye = camera.eye(each.image_type)
+            form: Form = "png" if each.compress else "rgb" if flavour == "cosys" else "bgr"
+            form = "float" if each.pixels_as_float else form
+            exposure.wanted.append(Wanted(eye, ImageType(each.image_type), form))
+            pose = self._cameras.pose(vehicle, eye, qpos)
+            width, height = eye.spec.width, eye.spec.height
+            length += width * height * (5 if form == "float" else 3)
+            known = asdict(each) | {
+                "camera_position": pose.position,
+                "camera_orientation": pose.orientation,
+                "time_stamp": stamp,
+                "width": width,
+                "height": height,
+            }
+            if flavour == "airsim":
+                del known["annotation_name"]
+            exposure.known.append(_RESPONSES[flavour](**known))
+        if length > LONGEST:
+            raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")
+        return exposure
+
+    async def _develop(self, exposure: _Exposure) -> list[ImageResponse]:
+        abandoned = 0 if self._renderer is None else self._renderer.outstanding()
+        if self._waiting >= MOST or abandoned > ABANDONED + self._processes:
+            raise RpcError(f"expected at most {MOST} calls that wait for images")
+        self._waiting += 1
+        try:
+            await self.start()
+            assert self._renderer is not None
+            async with self._idle:
+                images = await self._renderer.call_untimed(Renderer.take, *exposure[:4])
+        except GraphicsError as error:
+            raise RpcError(str(error)) from None
+        finally:
+            self._waiting -= 1
+        return [
+            msgspec.structs.replace(each, image_data_float=msgspec.Raw(image.data))
+            if each.pixels_as_float
+            else msgspec.structs.replace(each, image_data_uint8=image.tobytes())
+            for each, image in zip(exposure.known, images, strict=True)
+        ]
+
+
+def _not_drawn(image_type: int) -> str:
+    return (
+        f"not supported by visnav-runtime: images of type {image_type}: expected one of "
+        + ", ".join(f"{each.value} ({each.name.lower()})" for each in ImageType)
+    )

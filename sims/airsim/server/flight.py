@@ -1,35 +1,39 @@
-"""Methods that let a vehicle fly; each replies when its task has ended.
+"""Methods that take control of a vehicle, put it somewhere, and let it fly.
 
-Positions are of the vehicle's local frame. Durations and timeouts are simulated seconds; a task
-that reaches its timeout has failed.
+Those that let it fly reply when their task has ended. Positions are of the vehicle's local frame.
+Durations and timeouts are simulated seconds; a task that reaches its timeout has failed.
 """
 
 from __future__ import annotations
 
-import functools
 import math
-from math import radians
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Callable
+from functools import partial
+from math import isnan, radians
+from typing import Annotated, Any
 
 import msgspec
+from msgspec.structs import astuple
 
-from events import MotorSetpoint, Vector3
-from events.frames import from_geodetic, from_yaw, rotate, yaw_of
+from events import Arm, Disarm, MotorSetpoint, PoseSetpoint, Reset, Teleport, Vector3
+from events.frames import from_geodetic, from_yaw, normalize, rotate, yaw_of
 from sims.airsim.server import moves
-from sims.airsim.server.carrot import lookahead_of
 from sims.airsim.server.methods import Finite, RpcError, rpc
-from sims.airsim.server.tasks import Reply, Task
-from sims.airsim.server.vehicles import ServedMultirotor
+from sims.airsim.server.moves import Reply, Task, Tasks, lookahead_of
+from sims.airsim.server.vehicles import (
+    Collisions,
+    Commanded,
+    ServedMultirotor,
+    ServedVehicle,
+    Vehicles,
+)
+from sims.airsim.wire import KinematicsState, Number, Pose, YawMode
+from sims.vehicle import State
+from sims.vehicle.autopilot import FARTHEST
 
-if TYPE_CHECKING:
-    from sims.airsim.server.node import AirsimServer
-
-Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
-"""In SI units or degrees; no vehicle goes farther or faster."""
 Speed = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
 
-_SLOW = 0.5
-"""Metres per second of take-off, hovering and going home."""
+_SLOW = 0.5  # m/s of take-off, hovering and going home
 _AHEAD = lookahead_of(-1.0, 1.0, _SLOW)
 
 
@@ -41,15 +45,136 @@ class Corner(msgspec.Struct, frozen=True):
     z_val: Number = 0.0
 
 
-class YawMode(msgspec.Struct, frozen=True):
-    """A heading in degrees, or degrees per second; clockwise from north seen from above."""
+class Control:
+    """Control of vehicles, and where clients put them.
 
-    is_rate: bool = True
-    yaw_or_rate: Number = 0.0
+    Args:
+        resets: What else `reset` brings back to the start.
+    """
 
-    def heading(self, drivetrain: int) -> moves.Heading:
-        """Return where to look; `drivetrain` is 1 for ``ForwardOnly``."""
-        return moves.Heading(drivetrain == 1, self.is_rate, radians(self.yaw_or_rate))
+    def __init__(
+        self,
+        vehicles: Vehicles,
+        tasks: Tasks,
+        collisions: Collisions,
+        *resets: Callable[[], None],
+    ) -> None:
+        self._vehicles, self._tasks, self._collisions = vehicles, tasks, collisions
+        self._resets = resets
+
+    @rpc("enableApiControl")
+    def enable_api_control(self, is_enabled: bool, vehicle: ServedVehicle) -> None:
+        """Let clients command a vehicle, or not; a vehicle that counts as armed is armed then."""
+        vehicle.api_control = is_enabled
+        if is_enabled and vehicle.armed:
+            self._arm(vehicle)
+
+    @rpc("isApiControlEnabled")
+    def is_api_control_enabled(self, vehicle: ServedVehicle) -> bool:
+        """Return whether clients may command a vehicle."""
+        return vehicle.api_control
+
+    @rpc("armDisarm")
+    def arm_disarm(self, arm: bool, vehicle: ServedMultirotor) -> bool:
+        """Arm, or stop the motors, in the air too; ``False`` without API control."""
+        if not vehicle.api_control:
+            return False
+        vehicle.armed = arm
+        if arm:
+            self._arm(vehicle)
+        elif vehicle.motors_on:
+            vehicle.motors_on = False
+            self._tasks.order(vehicle, Disarm)
+        return True
+
+    @rpc("reset")
+    def reset(self) -> None:
+        """Bring all vehicles, objects and the wind back to the start; time goes on."""
+        for vehicle in self._vehicles.values():
+            self._tasks.cancel(vehicle)
+            if isinstance(vehicle, ServedMultirotor):
+                self._tasks.order(vehicle, Reset)
+            else:
+                self._move(vehicle, vehicle.start)
+            vehicle.release()
+            self._collisions.forget(vehicle)
+        for reset in self._resets:
+            reset()
+
+    @rpc("simSetVehiclePose")
+    def set_vehicle_pose(self, pose: Pose, ignore_collision: bool, vehicle: ServedVehicle) -> None:  # noqa: ARG002
+        """Put a vehicle at rest into a pose, whatever is there; if it flies, it stays there.
+
+        Numbers that are NaN keep what they stand for.
+        """
+        self._put(vehicle, KinematicsState(pose.position, pose.orientation))
+
+    @rpc("simSetKinematics")
+    def set_kinematics(
+        self,
+        state: KinematicsState,
+        ignore_collision: bool,  # noqa: ARG002
+        vehicle: ServedVehicle,
+    ) -> None:
+        """Put a vehicle into a pose with velocities; accelerations are left to the physics.
+
+        Numbers that are NaN keep what they stand for.
+        """
+        self._put(vehicle, state)
+
+    @rpc("simAddVehicle")
+    def add_vehicle(self, name: str, vehicle_type: str, pose: Pose, pawn_path: str) -> bool:  # noqa: ARG002
+        """Return ``False``: the vehicles of a run are those of its file."""
+        return False
+
+    def _put(self, vehicle: ServedVehicle, wanted: KinematicsState) -> None:
+        state = _merged(vehicle, wanted)
+        if isinstance(vehicle, ServedMultirotor):
+            order = partial(
+                Teleport,
+                position=state.position,
+                orientation=state.orientation,
+                linear_velocity=state.velocity,
+                angular_velocity=state.angular_velocity,
+            )
+            self._tasks.order(vehicle, order)
+            found = vehicle.physics.state()
+            self._collisions.forget(vehicle)
+        else:
+            if max(map(abs, state.position)) <= FARTHEST:
+                self._move(vehicle, state)
+            found = vehicle.state()
+        if found.position != state.position:
+            raise RpcError(
+                f"vehicle '{vehicle.name}' cannot be put there: it is too far, too fast, or too "
+                "deep inside something, or the vehicle follows a file; see the run's log"
+            )
+
+    def _move(self, camera: ServedVehicle, to: State) -> None:
+        order = partial(PoseSetpoint, position=to.position, orientation=to.orientation)
+        self._tasks.order(camera, order)
+
+    def _arm(self, vehicle: ServedVehicle) -> None:
+        if isinstance(vehicle, ServedMultirotor) and not vehicle.motors_on:
+            vehicle.motors_on = True
+            self._tasks.order(vehicle, Arm)
+
+
+def _merged(vehicle: ServedVehicle, wanted: KinematicsState) -> State:
+    """Return a wanted state in ``map``; what of it is NaN is as the vehicle's present one."""
+    now = vehicle.state()
+    orientation = astuple(wanted.orientation)
+    return State(
+        _kept(vehicle.in_map(wanted.position), now.position),
+        now.orientation if any(map(isnan, orientation)) else normalize(orientation),
+        _kept(astuple(wanted.linear_velocity), now.velocity),
+        _kept(astuple(wanted.angular_velocity), now.angular_velocity),
+    )
+
+
+def _kept(wanted: Vector3, present: Vector3) -> Vector3:
+    x, y, z = (b if isnan(a) else a for a, b in zip(wanted, present, strict=True))
+    return x, y, z
 
 
 def _by_velocity(name: str, does: str, *, in_body: bool = False, at_height: bool = False) -> Any:
@@ -64,10 +189,9 @@ def _by_velocity(name: str, does: str, *, in_body: bool = False, at_height: bool
         duration: Finite,
         drivetrain: int,
         yaw_mode: YawMode,
-        vehicle_name: str,
+        vehicle: Commanded,
     ) -> Reply:
-        vehicle = self.tasks.commanded(vehicle_name)
-        heading = yaw_mode.heading(drivetrain)
+        heading = _heading(yaw_mode, drivetrain)
         x, y = vx, vy
         if in_body:
             yaw = yaw_of(vehicle.state().orientation)
@@ -76,7 +200,7 @@ def _by_velocity(name: str, does: str, *, in_body: bool = False, at_height: bool
         if at_height:
             height = vehicle.origin[2] + vz_or_z
             task = moves.by_velocity_at(x, y, height, heading, duration)
-        return self.tasks.start(vehicle, task)
+        return self.start(vehicle, task)
 
     move.__doc__ = does
     return move
@@ -93,20 +217,20 @@ def _by_attitude(name: str, does: str, *, turns: bool = False, spins: bool = Fal
         yaw: Number,
         z_or_throttle: Number,
         duration: Finite,
-        vehicle_name: str,
+        vehicle: Commanded,
     ) -> Reply:
-        vehicle = self.tasks.commanded(vehicle_name)
         parameters = vehicle.physics.parameters
         if name.endswith("Z"):
             thrust = moves.at_height(parameters, vehicle.origin[2] + z_or_throttle)
         else:
-            thrust = moves.at_throttle(parameters, z_or_throttle)
+            share = moves.share_of(parameters, z_or_throttle)
+            thrust = lambda _: share  # noqa: E731
         if spins:
-            return self.tasks.start(vehicle, moves.by_rates((roll, pitch, yaw), thrust, duration))
+            return self.start(vehicle, moves.by_rates((roll, pitch, yaw), thrust, duration))
         now = yaw_of(vehicle.state().orientation)
         angle, rate = (now, _bounded(vehicle, yaw)) if turns else (yaw, 0.0)
         task = moves.by_attitude(roll, pitch, angle, rate, thrust, duration)
-        return self.tasks.start(vehicle, task)
+        return self.start(vehicle, task)
 
     move.__doc__ = does
     return move
@@ -119,9 +243,8 @@ class Flight:
     yaw already. A throttle is taken as AirSim's quadrotor's, of which 0.587 carries the weight.
     """
 
-    def __init__(self, server: AirsimServer) -> None:
-        self._server = server
-        self.tasks = server.tasks
+    def __init__(self, tasks: Tasks) -> None:
+        self.start, self._cancel = tasks.start, tasks.cancel
 
     by_velocity = _by_velocity("moveByVelocity", "Move at a velocity north, east, down.")
     by_velocity_z = _by_velocity(
@@ -165,24 +288,18 @@ class Flight:
         front_left: Number,
         rear_right: Number,
         duration: Finite,
-        vehicle_name: str,
+        vehicle: Commanded,
     ) -> Reply:
         """Drive each motor, 0 to 1; 0.587 of all four carries the weight."""
-        vehicle = self.tasks.commanded(vehicle_name)
-        share = functools.partial(moves.share_of, vehicle.physics.parameters)
-        order = functools.partial(
-            MotorSetpoint,
-            motor1=share(front_right),
-            motor2=share(rear_left),
-            motor3=share(front_left),
-            motor4=share(rear_right),
-        )
-        return self.tasks.start(vehicle, Task(lambda _elapsed, _state: order, duration))
+        throttles = front_right, rear_left, front_left, rear_right
+        parameters = vehicle.physics.parameters
+        a, b, c, d = (moves.share_of(parameters, throttle) for throttle in throttles)
+        order = partial(MotorSetpoint, motor1=a, motor2=b, motor3=c, motor4=d)
+        return self.start(vehicle, Task(lambda _elapsed, _state: order, duration))
 
     @rpc("takeoff")
-    def takeoff(self, timeout: Finite, vehicle_name: str) -> Reply:
+    def takeoff(self, timeout: Finite, vehicle: Commanded) -> Reply:
         """Climb 2 m at 0.5 m/s; an error if the vehicle moves."""
-        vehicle = self.tasks.commanded(vehicle_name)
         state = vehicle.state()
         speed = math.hypot(*state.velocity)
         if speed > 0.05:
@@ -194,26 +311,24 @@ class Flight:
         return self._fly_slowly(vehicle, (x, y, z - 2.0), timeout)
 
     @rpc("land")
-    def land(self, timeout: Finite, vehicle_name: str) -> Reply:
+    def land(self, timeout: Finite, vehicle: Commanded) -> Reply:
         """Go down at 0.2 m/s, and stop the motors on the ground; the vehicle counts as armed."""
-        return self.tasks.start(self.tasks.commanded(vehicle_name), moves.landing(timeout))
+        return self.start(vehicle, moves.landing(timeout))
 
     @rpc("goHome")
-    def go_home(self, timeout: Finite, vehicle_name: str) -> Reply:
+    def go_home(self, timeout: Finite, vehicle: Commanded) -> Reply:
         """Fly straight to where the vehicle was at the start, at 0.5 m/s."""
-        vehicle = self.tasks.commanded(vehicle_name)
         return self._fly_slowly(vehicle, vehicle.origin, timeout)
 
     @rpc("hover")
-    def hover(self, vehicle_name: str) -> Reply:
+    def hover(self, vehicle: Commanded) -> Reply:
         """Stop, and hold the place; replies within 0.2 s."""
-        vehicle = self.tasks.commanded(vehicle_name)
         return self._fly_slowly(vehicle, vehicle.state().position, math.inf)
 
     @rpc("cancelLastTask")
-    def cancel(self, vehicle_name: str) -> None:
+    def cancel(self, vehicle: ServedMultirotor) -> None:
         """End the vehicle's task, whose reply is ``False``; it hovers 60 ms later."""
-        self.tasks.cancel(self._server.find_multirotor(vehicle_name).name)
+        self._cancel(vehicle)
 
     @rpc("moveToPosition")
     def to_position(
@@ -227,10 +342,10 @@ class Flight:
         yaw_mode: YawMode,
         lookahead: Number,
         adaptive: Number,
-        vehicle_name: str,
+        vehicle: Commanded,
     ) -> Reply:
         """Fly straight to a position; ends within 0.5 m of it."""
-        how = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle_name
+        how = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle
         return self.on_path([Corner(x, y, z)], *how)
 
     @rpc("moveToZ")
@@ -242,12 +357,11 @@ class Flight:
         yaw_mode: YawMode,
         lookahead: Number,
         adaptive: Number,
-        vehicle_name: str,
+        vehicle: Commanded,
     ) -> Reply:
         """Fly straight up or down to a height."""
-        vehicle = self.tasks.commanded(vehicle_name)
         place = vehicle.local(vehicle.state().position)
-        how = velocity, timeout, 0, yaw_mode, lookahead, adaptive, vehicle_name
+        how = velocity, timeout, 0, yaw_mode, lookahead, adaptive, vehicle
         return self.on_path([Corner(place.x_val, place.y_val, z)], *how)
 
     @rpc("moveToGPS")
@@ -262,16 +376,15 @@ class Flight:
         yaw_mode: YawMode,
         lookahead: Number,
         adaptive: Number,
-        vehicle_name: str,
+        vehicle: Commanded,
     ) -> Reply:
         """Fly straight to a place on the earth, degrees, and metres above the ellipsoid."""
-        vehicle = self.tasks.commanded(vehicle_name)
         place = from_geodetic((latitude, longitude, altitude), vehicle.config.origin)
         if math.dist(place, vehicle.origin) > 1e6:
             raise RpcError("expected a place within 1000 km")
-        local = vehicle.local(place)
-        how = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle_name
-        return self.on_path([Corner(local.x_val, local.y_val, local.z_val)], *how)
+        corner = Corner(*astuple(vehicle.local(place)))
+        how = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle
+        return self.on_path([corner], *how)
 
     @rpc("moveOnPath")
     def on_path(
@@ -283,40 +396,42 @@ class Flight:
         yaw_mode: YawMode,
         lookahead: Number,
         adaptive: Number,
-        vehicle_name: str,
+        vehicle: Commanded,
     ) -> Reply:
         """Follow a point that runs ahead along a path; ends within 0.5 m of the last point."""
-        vehicle = self.tasks.commanded(vehicle_name)
         if drivetrain == 1 and yaw_mode.is_rate:
             raise RpcError("Yaw cannot be specified as rate if drivetrain is ForwardOnly")
         ahead = lookahead_of(lookahead, adaptive, velocity)
         ox, oy, oz = vehicle.origin
         corners = [(ox + each.x_val, oy + each.y_val, oz + each.z_val) for each in path]
         whole = [vehicle.state().position, *corners]
-        heading = yaw_mode.heading(drivetrain)
+        heading = _heading(yaw_mode, drivetrain)
         task = moves.along_path(whole, velocity, ahead, heading, timeout)
-        return self.tasks.start(vehicle, task if path else Task(task.steer, 0.0))
+        return self.start(vehicle, task if path else Task(task.steer, 0.0))
 
     @rpc("rotateToYaw")
-    def to_yaw(self, yaw: Number, timeout: Finite, margin: Number, vehicle_name: str) -> Reply:
+    def to_yaw(self, yaw: Number, timeout: Finite, margin: Number, vehicle: Commanded) -> Reply:
         """Hold the place, and turn to a heading in degrees until it is met to a margin."""
-        vehicle = self.tasks.commanded(vehicle_name)
         place = vehicle.state().position
-        task = moves.to_yaw(place, radians(yaw), radians(margin), timeout)
-        return self.tasks.start(vehicle, task)
+        return self.start(vehicle, moves.to_yaw(place, radians(yaw), radians(margin), timeout))
 
     @rpc("rotateByYawRate")
-    def by_turning(self, yaw_rate: Number, duration: Finite, vehicle_name: str) -> Reply:
+    def by_turning(self, yaw_rate: Number, duration: Finite, vehicle: Commanded) -> Reply:
         """Hold the place, and turn at degrees per second, within the vehicle's limits."""
-        vehicle = self.tasks.commanded(vehicle_name)
         state = vehicle.state()
         rate, yaw = _bounded(vehicle, radians(yaw_rate)), yaw_of(state.orientation)
-        return self.tasks.start(vehicle, moves.by_yaw_rate(state.position, yaw, rate, duration))
+        task = moves.by_yaw_rate(state.position, yaw, rate, duration)
+        return self.start(vehicle, task)
 
     def _fly_slowly(self, vehicle: ServedMultirotor, place: Vector3, timeout: float) -> Reply:
         path = [vehicle.state().position, place]
         task = moves.along_path(path, _SLOW, _AHEAD, moves.Heading(), timeout)
-        return self.tasks.start(vehicle, task)
+        return self.start(vehicle, task)
+
+
+def _heading(yaw_mode: YawMode, drivetrain: int) -> moves.Heading:
+    """Return where to look; `drivetrain` is 1 for ``ForwardOnly``."""
+    return moves.Heading(drivetrain == 1, yaw_mode.is_rate, radians(yaw_mode.yaw_or_rate))
 
 
 def _bounded(vehicle: ServedMultirotor, yaw_rate: float) -> float:

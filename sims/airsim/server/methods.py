@@ -1,4 +1,4 @@
-"""From a call's name and arguments to a handler: the table of methods.
+"""Table of methods: from a call's name and arguments to a handler.
 
 A group of methods is a class whose functions are marked with `rpc`. The name, the annotated
 parameters and the docstring of each give arity, conversion, errors and documentation.
@@ -7,14 +7,15 @@ parameters and the docstring of each give arity, conversion, errors and document
 from __future__ import annotations
 
 import inspect
+import re
 import typing
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
 from runtime.errors import CommandError
-from sims.airsim.server.absent import reason_of_absence
+from runtime.logs import NodeLogger
 
 Flavour = Literal["airsim", "cosys"]
 
@@ -24,9 +25,59 @@ parameters of handlers and for fields of structures: others are refused with the
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+LONGEST_NAME = 100  # characters of an unknown method's name that are repeated in the answer
 
-LONGEST_NAME = 100
-"""Characters of an unknown method's name that are repeated in the answer."""
+_MARKS = "Accept without effect: marks are not drawn."
+_FOG = "Accept without effect: a world's fog is that of its file."
+_SUN = "Accept without effect: a world's lights are those of its file."
+_LIGHT = "Return ``False``: a world's lights are those of its file."
+_GAINS = "Accept without effect: gains are settings of the vehicle's node.", "kp ki kd vehicle_name"
+_SHOWN = "duration is_persistent"
+
+WITHOUT_EFFECT = {
+    "simEnableWeather": (_FOG, "is_enabled"),
+    "simSetWeatherParameter": (_FOG, "parameter value"),
+    "simSetTimeOfDay": (_SUN, "is_enabled start is_start_dst speed interval move_sun"),
+    "simFlushPersistentMarkers": (_MARKS, ""),
+    "simPlotPoints": (_MARKS, f"points rgba size {_SHOWN}"),
+    "simPlotLineStrip": (_MARKS, f"points rgba thickness {_SHOWN}"),
+    "simPlotLineList": (_MARKS, f"points rgba thickness {_SHOWN}"),
+    "simPlotArrows": (_MARKS, f"starts ends rgba thickness arrow_size {_SHOWN}"),
+    "simPlotStrings": (_MARKS, "strings positions scale rgba duration"),
+    "simPlotTransforms": (_MARKS, f"poses scale thickness {_SHOWN}"),
+    "simPlotTransformsWithNames": (
+        _MARKS,
+        "poses names scale thickness text_scale text_rgba duration",
+    ),
+    "simSetTraceLine": (_MARKS, "rgba thickness vehicle"),
+    "simSetLightIntensity": (_LIGHT, "name intensity"),
+    "simSetWorldLightIntensity": (_LIGHT, "name intensity"),
+    "simSetWorldLightVisibility": (_LIGHT, "name is_visible"),
+    "simSetVehicleLightIntensity": (_LIGHT, "vehicle name intensity"),
+    "simSetVehicleLightVisibility": (_LIGHT, "vehicle name is_visible"),
+    "setAngleRateControllerGains": _GAINS,
+    "setAngleLevelControllerGains": _GAINS,
+    "setVelocityControllerGains": _GAINS,
+    "setPositionControllerGains": _GAINS,
+    "simRunConsoleCommand": ("Return ``False``: there is no Unreal Engine.", "command"),
+}
+"""What each does, which begins with what it returns, and its arguments, which may be anything.
+Scripts only need these methods not to fail."""
+
+_UNSUPPORTED = {
+    r"sim\w*Detection\w*|simGetDetections": "make boxes of the segmentation image instead",
+    r"sim\w*(Lens|Filmback|Foc|CurrentFieldOfView)\w*": "cameras are ideal or have the lens of the "
+    "run's file; simSetCameraFov sets the field of view",
+    r"simSwapTextures|simSetObjectMaterial\w*": "a world's textures are those of its file",
+    r"simCreateVoxelGrid": "a server writes no files for its clients",
+    r"moveByManual|moveByRC": "there is no remote control",
+    r"setSafety": "there are no safety checks",
+    r"setCarControls|getCarState|getCarControls": "there are no cars",
+    r"simSetExtForce": "there are no external forces but the wind",
+    r"get(Echo|UWB|Wifi|GPULidar)\w*|sim\w*(Echo|UWB|Wifi|GPULidar)\w*": "there is no such sensor",
+    r"sim\w*Annotation\w*": "there are no annotation layers; use the segmentation image",
+    r"sim\w*InstanceSegmentation\w*": "use simSetSegmentationObjectID and the segmentation image",
+}
 
 
 class RpcError(Exception):
@@ -38,29 +89,27 @@ EXPECTED_ERRORS = (RpcError, ValueError, msgspec.ValidationError, CommandError)
 
 
 class Caller(Protocol):
-    """The client that calls.
+    """The client that calls."""
 
-    Attributes:
-        address: Of the client, for messages.
-        flavour: Whose structures it expects; a handler may set it.
-    """
+    address: str  # of the client, for messages
+    flavour: Flavour  # whose structures it expects; a handler may set it
 
-    address: str
-    flavour: Flavour
+
+class Named:
+    """Base of what handlers get in place of a name that clients send, as vehicles."""
 
 
 def rpc(name: str, *, cosys: int | None = None) -> Callable[[F], F]:
     """Mark a function of a group as the handler of a method.
 
-    Its parameters are converted as annotated (whole numbers to floats; maps to structures). One
-    that is annotated with `Caller` gets the client and is no argument. Defaults stand for
-    arguments that one of the flavours does not have.
+    Its parameters are converted as annotated (whole numbers to floats; maps to structures; names
+    to what has them). One that is annotated with `Caller` gets the client and is no argument.
+    Defaults stand for arguments that one of the flavours does not have.
 
     What a handler does before its first wait is done when it is called, in the order in which
     the requests came: one that waits is a plain function that returns an awaitable.
 
     Args:
-        name: Of the method, on the wire.
         cosys: Number of arguments of Cosys-AirSim's clients, if it is another than AirSim's; a
             call then tells whose client it is.
     """
@@ -73,27 +122,18 @@ def rpc(name: str, *, cosys: int | None = None) -> Callable[[F], F]:
 
 
 class Method(NamedTuple):
-    """One method.
+    """One method: a row of the table, and of the documentation."""
 
-    Attributes:
-        name: On the wire.
-        call: The handler.
-        parameters: Types of its arguments by their names.
-        shapes: Type of the tuple of its arguments, by their number.
-        wants_caller: Whether the client is its first argument.
-        expected: Number of arguments by flavour, for messages.
-        flavours: The flavour of clients that send so many arguments, if it shows.
-        description: First line of the handler's docstring.
-    """
-
-    name: str
-    call: Callable[..., Any]
-    parameters: dict[str, Any]
-    shapes: dict[int, Any]
-    wants_caller: bool
-    expected: dict[Flavour, int]
-    flavours: dict[int, tuple[Flavour]]
-    description: str
+    name: str  # on the wire
+    call: Callable[..., Any]  # the handler
+    parameters: dict[str, Any]  # types of its arguments on the wire, by their names
+    description: str  # first line of the handler's docstring
+    # What its arguments that are names become, by their positions.
+    named: dict[int, Any] = {}  # noqa: RUF012  # never changed
+    defaults: tuple[Any, ...] = ()  # of its last arguments
+    wants_caller: bool = False  # whether the client is its first argument
+    # Number of arguments of Cosys-AirSim's clients, if it is another than AirSim's.
+    cosys: int | None = None
 
 
 class Table:
@@ -101,14 +141,27 @@ class Table:
 
     Args:
         groups: Objects with functions that are marked with `rpc`.
+        finders: What gives that which has a name, by the kinds that handlers ask for.
     """
 
-    def __init__(self, groups: Iterable[object]) -> None:
-        self.methods: dict[str, Method] = {}
+    def __init__(
+        self,
+        groups: Iterable[object],
+        log: NodeLogger,
+        finders: Mapping[Any, Callable[[str], Any]] | None = None,
+    ) -> None:
+        self._log, self._finders = log, finders or {}
+        self._called: set[str] = set()
+        self.methods = constant_methods(self._note)
         for group in groups:
             found = methods_of(group)
             assert not found.keys() & self.methods.keys(), found.keys() & self.methods.keys()
             self.methods |= found
+        # Of the tuple of all arguments.
+        self._shapes = {
+            name: tuple.__class_getitem__(tuple(method.parameters.values()) or ((),))
+            for name, method in self.methods.items()
+        }
 
     def call(self, caller: Caller, name: str, arguments: list[Any]) -> Awaitable[Any] | Any:
         """Call a method, and return its result or an awaitable of it.
@@ -121,28 +174,43 @@ class Table:
         count = len(arguments)
         if method is None:
             name = name[:LONGEST_NAME]
-            if reason := reason_of_absence(name):
+            if reason := reason_unsupported(name):
                 raise RpcError(thrown(name, count, f"not supported by visnav-runtime: {reason}"))
             raise RpcError(
                 f"rpclib: server could not find function '{name}' with argument count {count}."
             )
-        shape = method.shapes.get(count)
-        if shape is None:
-            expected = method.expected[caller.flavour]
+        most, missing = len(method.parameters), len(method.parameters) - count
+        if not 0 <= missing <= len(method.defaults):
+            expected = method.cosys if caller.flavour == "cosys" and method.cosys else most
             raise RpcError(
                 f"rpclib: Function '{name}' was called with an invalid number of arguments. "
                 f"Expected: {expected}, got: {count}"
             )
-        for flavour in method.flavours.get(count, ()):
-            caller.flavour = flavour
+        if method.cosys is not None and count in (most, method.cosys):
+            caller.flavour = "cosys" if count == method.cosys else "airsim"
+        defaults = method.defaults[len(method.defaults) - missing :]
         try:
-            converted = msgspec.convert(arguments, shape)
-            first = (caller,) if method.wants_caller else ()
-            return method.call(*first, *converted)
+            converted = list(msgspec.convert([*arguments, *defaults], self._shapes[name]))
+            for index, kind in method.named.items():
+                converted[index] = self._finders[kind](converted[index])
+            return method.call(*((caller,) if method.wants_caller else ()), *converted)
         except RecursionError:
             raise RpcError(thrown(name, count, "the arguments are nested too deeply")) from None
         except EXPECTED_ERRORS as error:
             raise RpcError(thrown(name, count, str(error))) from None
+
+    def _note(self, method: str) -> None:
+        if method not in self._called:
+            self._called.add(method)
+            self._log.warning("%s has no effect here", method)
+
+
+def reason_unsupported(method: str) -> str:
+    """Return why a method is not there although AirSim has it; empty if AirSim has none either."""
+    for pattern, reason in _UNSUPPORTED.items():
+        if re.fullmatch(pattern, method):
+            return reason
+    return ""
 
 
 def thrown(name: str, count: int, text: str) -> str:
@@ -151,6 +219,28 @@ def thrown(name: str, count: int, text: str) -> str:
         f"rpclib: function '{name}' (called with {count} arg(s)) threw an exception. "
         f"The exception contained this information: {text}."
     )
+
+
+def constant_methods(note: Callable[[str], None] = lambda _: None) -> dict[str, Method]:
+    """Return the methods that always answer the same; `note` is told of calls without effect."""
+    content = "with which the clients of AirSim and of Cosys-AirSim are content."
+    rows: list[tuple[str, Callable[..., Any], str, str]] = [
+        ("ping", lambda: True, "Answer ``True``.", ""),
+        ("getServerVersion", lambda: 4, f"Return 4, {content}", ""),
+        ("getMinRequiredClientVersion", lambda: 1, f"Return 1, {content}", ""),
+    ]
+    for name, (description, arguments) in WITHOUT_EFFECT.items():
+        result = False if description.startswith("Return") else None
+
+        def accept(*_: Any, name: str = name, result: bool | None = result) -> bool | None:
+            note(name)
+            return result
+
+        rows.append((name, accept, description, arguments))
+    return {
+        name: Method(name, call, dict.fromkeys(arguments.split(), Any), description)
+        for name, call, description, arguments in rows
+    }
 
 
 def methods_of(group: object) -> dict[str, Method]:
@@ -162,21 +252,22 @@ def methods_of(group: object) -> dict[str, Method]:
 
 def _method(function: Callable[..., Any], name: str, cosys: int | None) -> Method:
     hints = typing.get_type_hints(function, include_extras=True)
-    signature = [
-        each for each in inspect.signature(function).parameters.values() if each.name != "self"
-    ]
-    wants_caller = bool(signature) and hints[signature[0].name] is Caller
-    parameters = signature[wants_caller:]
-    types = [hints[each.name] for each in parameters]
-    least = sum(each.default is inspect.Parameter.empty for each in parameters)
-    shapes = {
-        count: tuple.__class_getitem__(tuple(types[:count]) or ((),))
-        for count in range(least, len(types) + 1)
+    parameters = {
+        each.name: each.default
+        for each in inspect.signature(function).parameters.values()
+        if each.name != "self"
     }
-    expected: dict[Flavour, int] = {"airsim": len(types), "cosys": cosys or len(types)}
-    first = (inspect.getdoc(function) or "").partition("\n")[0]
-    named = {each.name: hints[each.name] for each in parameters}
-    flavours: dict[int, tuple[Flavour]] = {}
-    if cosys is not None:
-        flavours = {len(types): ("airsim",), cosys: ("cosys",)}
-    return Method(name, function, named, shapes, wants_caller, expected, flavours, first)
+    types = {name: hints[name] for name in parameters}
+    wants_caller = Caller in types.values()
+    if wants_caller:
+        types = {name: type_ for name, type_ in types.items() if type_ is not Caller}
+    named = {index: type_ for index, type_ in enumerate(types.values()) if _is_named(type_)}
+    types = {name: str if _is_named(type_) else type_ for name, type_ in types.items()}
+    defaults = tuple(each for each in parameters.values() if each is not inspect.Parameter.empty)
+    description = (inspect.getdoc(function) or "").partition("\n")[0]
+    return Method(name, function, types, description, named, defaults, wants_caller, cosys)
+
+
+def _is_named(type_: Any) -> bool:
+    kind = typing.get_args(type_)[0] if typing.get_origin(type_) is Annotated else type_
+    return isinstance(kind, type) and issubclass(kind, Named)

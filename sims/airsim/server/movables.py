@@ -9,6 +9,9 @@ it was put into.
 from __future__ import annotations
 
 import math
+import re
+import warnings
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -16,7 +19,6 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sims.airsim.server.regex import whole_matches
 from sims.cameras.stage import LOOK
 from sims.vehicle import Simulation
 from sims.worlds import Scene
@@ -26,15 +28,15 @@ Factor = Annotated[float, msgspec.Meta(ge=0.01, le=1000)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Basic = Literal["Cube", "Sphere", "Cylinder", "Cone"]
 
-AWAY = 1e5
-"""Metres above the world at which what is not there is kept: beyond what cameras and lidars see."""
-
+AWAY = 1e5  # metres above the world, beyond what cameras see, at which what is not there is kept
+# Inertia that a held body has in addition, kg and kg m²: far more than a vehicle's.
 HELD = 100.0
-"""Inertia that a held body has in addition to its own, kg and kg m²: far more than a vehicle's."""
-
+# Bits of MuJoCo's ``contype`` and ``conaffinity``: what geoms are and meet.
 WORLD, MOVABLE = 1, 2
-"""Bits of MuJoCo's ``contype`` and ``conaffinity``: what geoms are and meet."""
+# Of an expression: characters, repetitions, and alternatives; a repetition counts as three.
+LONGEST, MOST_REPETITIONS, MOST_CHOICES = 200, 3, 12
 
+_PIECE = re.compile(r"\\.|\[\^?\]?(?:\\.|[^\]\\])*\]|\(\?|\)?(?:[*+?]|\{[\d,]*\})|.", re.DOTALL)
 _TYPES = {
     "Cube": mujoco.mjtGeom.mjGEOM_BOX,
     "Sphere": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
@@ -43,18 +45,8 @@ _TYPES = {
 }
 _COPIED = (
     *("conaffinity", "condim", "contype", "density", "friction", "gap", "group", "margin", "mass"),
-    *(
-        "material",
-        "meshname",
-        "name",
-        "priority",
-        "rgba",
-        "size",
-        "solimp",
-        "solmix",
-        "solref",
-        "type",
-    ),
+    *("material", "meshname", "name", "priority", "rgba", "size", "solimp", "solmix", "solref"),
+    "type",
 )
 
 
@@ -124,13 +116,7 @@ def have_met(model: Any) -> None:
 
 
 def set_free(model: Any, body: int, free: bool) -> None:
-    """Have physics move a body, or make it one that can be held.
-
-    Args:
-        model: The compiled world, in which `have_met` was called.
-        body: Number of the body.
-        free: Whether physics move it.
-    """
+    """Have physics move a body (`free`), or make it one that can be held; after `have_met`."""
     dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + 6)
     geoms = (model.geom_bodyid == body) & (model.geom_contype != 0)
     model.body_gravcomp[body] = 0.0 if free else 1.0
@@ -258,3 +244,35 @@ def _held(spec: Any, name: str, **options: Any) -> Any:
     body = spec.worldbody.add_body(name=name, gravcomp=1.0, **options)
     body.add_joint(type=mujoco.mjtJoint.mjJNT_FREE, armature=HELD)
     return body
+
+
+def whole_matches(expression: str, texts: Iterable[str], *, ignore_case: bool = False) -> list[str]:
+    """Return the texts that a client's regular expression matches from beginning to end.
+
+    None may keep the run waiting. Python's own search goes back and tries again. What makes that
+    long are repetitions: the time grows with the text's length to the power of their number, and
+    without bounds if one is in another. Each alternative in groups may double it.
+
+    Raises:
+        ValueError: It is no expression; or it is longer, has more repetitions (``*``, ``+``, ``?``,
+            ``{2,3}``) than are allowed, or repeats a group.
+    """
+    pieces = [each for each in _PIECE.findall(expression) if each[0] not in "\\["]
+    repetitions = [each for each in pieces if each[-1] in "*+?}" and each not in ("(?", "}")]
+    if len(expression) > LONGEST or len(repetitions) > MOST_REPETITIONS:
+        raise _error(f"up to {LONGEST} characters and {MOST_REPETITIONS} repetitions", expression)
+    if 3 * len(repetitions) + pieces.count("|") > MOST_CHOICES:
+        raise _error("fewer alternatives", expression)
+    if any(each[0] == ")" for each in repetitions):
+        raise _error("no repeated group", expression)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what Python may read otherwise one day
+            matches = re.compile(expression, re.IGNORECASE if ignore_case else 0).fullmatch
+    except (re.error, OverflowError, RecursionError) as error:
+        raise _error(f"one that can be read ({error})", expression) from None
+    return [text for text in texts if matches(text)]
+
+
+def _error(expected: str, found: str) -> ValueError:
+    return ValueError(f"regular expression: expected {expected}, found {found!r:.80}")

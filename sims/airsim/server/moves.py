@@ -1,51 +1,279 @@
-"""What vehicles can be told to do, as pure tasks: time and state in, set-points out.
+"""Tasks that clients give to vehicles: one each, 50 times a second of simulated time.
 
-Positions and velocities are of ``map``, angles in radians. The rules are AirSim's; what differs is
-in docs/reference/airsim.md.
+A task is pure: time and state come in, set-points go out. Positions and velocities are of ``map``,
+angles in radians. The rules are AirSim's; what differs is in docs/reference/airsim.md. Which
+methods start a task is in `flight`.
 """
 
 from __future__ import annotations
 
+import asyncio
+import bisect
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from math import pi
+from typing import NamedTuple
 
 from events import (
+    Arm,
+    Armed,
     AttitudeSetpoint,
     BodyRateSetpoint,
+    Command,
+    Disarmed,
+    Hover,
     Land,
     PositionSetpoint,
+    Setpoint,
     Vector3,
+    VehicleEvent,
     VelocitySetpoint,
 )
 from events.frames import from_rpy, yaw_of
-from sims.airsim.server.carrot import CLOSE, Carrot, braked
-from sims.airsim.server.tasks import RATE, Order, Task
+from runtime.time.clock import Clock
+from runtime.time.schedule import SECOND
+from sims.airsim.server.vehicles import ServedMultirotor, ServedVehicle
 from sims.vehicle import State, VehicleParameters
 
+RATE = 50  # updates of each task in a simulated second
+HOVER_AFTER = 60_000_000  # ns after a task's last order at which the vehicle holds its place
 HOVER_THROTTLE = 9.80665 / (4.0 * 4.18)
 """Throttle at which AirSim's quadrotor hovers: 1 kg on four rotors of 4.18 N."""
 
-Thrust = Callable[[State], float]
-"""Gives the thrust, 0 to 1 of what all motors can give together."""
+Reply = asyncio.Future[bool]
+Order = Callable[..., Command | Setpoint]
+"""Makes what is sent to the vehicle of a stamp, a source and the vehicle's name."""
+Thrust = Callable[[State], float]  # gives the thrust, 0 to 1 of what all motors can give together
 
-_STILL = 0.05
-"""Metres per second that count as none."""
-_SLOW = 0.2
-"""Metres per second with which a path may end: what comes next begins where it ended."""
-_SETTLING = 5
-"""Updates without progress near the end after which a path has ended."""
-_STUCK = 5 * RATE
-"""Updates without progress after which a path has failed."""
-_GAIN = 1.5
-"""Vertical velocity per metre of error, 1/s."""
-_LIFT_GAIN = 4.0
-"""Vertical acceleration per error in velocity, 1/s."""
-_YAW_GAIN = 3.0
-"""Yaw rate per angle of error, 1/s."""
-_FASTEST = 6.0
-"""Metres per second at which a height is gone to, as AirSim's controller limits it."""
+CLOSE = 0.5  # metres from the end within which a vehicle is not steered along the path any more
+_WINDOW = 64  # segments ahead among which the vehicle's place is sought, which bounds the work
+_SPACING = 0.05  # metres below which the next corner of a path is left out
+_STILL = 0.05  # m/s that count as none
+_SLOW = 0.2  # m/s with which a path may end: what comes next begins where it ended
+_SETTLING = 5  # updates without progress near the end after which a path has ended
+_STUCK = 5 * RATE  # updates without progress after which a path has failed
+_GAIN = 1.5  # vertical velocity per metre of error, 1/s
+_LIFT_GAIN = 4.0  # vertical acceleration per error in velocity, 1/s
+_YAW_GAIN = 3.0  # yaw rate per angle of error, 1/s
+_FASTEST = 6.0  # m/s at which a height is gone to, as AirSim's controller limits it
+
+
+class Task(NamedTuple):
+    """What a vehicle is to do; it is pure: time and state come in, an order goes out."""
+
+    # Called with the seconds since the start and the vehicle's state in ``map``; returns what to
+    # send, `None` for nothing, or how the task has ended.
+    steer: Callable[[float, State], Order | bool | None]
+    limit: float = math.inf  # seconds at which it ends at the latest
+    at_limit: bool = True  # how it has ended then
+
+
+class Tasks:
+    """The running task of each vehicle. A new one ends the older, whose result is `False`.
+
+    A task reaches its vehicle by set-points and commands only. After its last order has stood for
+    `HOVER_AFTER`, the vehicle is told to hover. A task ends when its vehicle is disarmed: with
+    `True` if it was landing.
+
+    Args:
+        owed: Gives the reply for a task's; see `Time.owed`.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        source: str,
+        send: Callable[[Command | Setpoint], None],
+        owed: Callable[[Reply], Reply],
+    ) -> None:
+        self._clock, self._source, self._send, self._owed = clock, source, send, owed
+        self._slots: dict[str, _Slot] = {}
+
+    def order(self, vehicle: ServedVehicle, order: Order) -> None:
+        """Send a command or a set-point to a vehicle, which obeys it at once."""
+        self._send(order(stamp=self._clock.now(), source=self._source, vehicle=vehicle.name))
+
+    def start(self, vehicle: ServedMultirotor, task: Task) -> Reply:
+        """Start a task now, and return the reply to come; its first order is the next update's.
+
+        The older task of the vehicle, if any, is cancelled first. A vehicle whose motors are
+        stopped is armed; whether the client may is asked before.
+        """
+        slot = self._slots.setdefault(vehicle.name, _Slot(vehicle))
+        slot.finish(False)
+        slot.result = result = asyncio.get_running_loop().create_future()
+        if not task.limit > 0.0:
+            slot.finish(task.at_limit)
+            return self._owed(result)
+        slot.task, slot.started = task, self._clock.now()
+        if not vehicle.motors_on:
+            vehicle.motors_on = True
+            self._order(slot, Arm)
+        elif slot.is_landing:  # until it hovers, it would refuse set-points
+            self._order(slot, Hover)
+        return self._owed(result)
+
+    def cancel(self, vehicle: ServedVehicle) -> None:
+        """End the task of a vehicle, if it has one; its result is `False`."""
+        if slot := self._slots.get(vehicle.name):
+            slot.finish(False)
+
+    def note(self, vehicle: ServedMultirotor, event: VehicleEvent) -> None:
+        """Take notice of what happened to a vehicle."""
+        if isinstance(event, Armed):
+            vehicle.motors_on = True
+        elif isinstance(event, Disarmed):  # its task ends with the next update, unless armed again
+            vehicle.motors_on = False
+            if slot := self._slots.get(vehicle.name):
+                slot.ordered = None
+
+    def update(self, stamp: int) -> None:
+        """Let all tasks steer."""
+        for slot in self._slots.values():
+            if not slot.vehicle.motors_on:
+                slot.finish(slot.is_landing)
+                slot.is_landing = False
+            if slot.task is not None:
+                self._steer(slot, slot.task, stamp)
+            is_over = slot.ordered is not None and stamp - slot.ordered >= HOVER_AFTER
+            if is_over and not (slot.task and slot.is_landing):
+                self._order(slot, Hover)
+
+    def _steer(self, slot: _Slot, task: Task, stamp: int) -> None:
+        elapsed = (stamp - slot.started) / SECOND
+        if elapsed >= task.limit:
+            slot.finish(task.at_limit)
+            return
+        order = task.steer(elapsed, slot.vehicle.state())
+        if isinstance(order, bool):
+            slot.finish(order)
+        elif order is not None:
+            self._order(slot, order)
+
+    def _order(self, slot: _Slot, order: Order) -> None:
+        stamp = self._clock.now()
+        event = order(stamp=stamp, source=self._source, vehicle=slot.vehicle.name)
+        slot.is_landing = isinstance(event, Land)
+        slot.ordered = stamp if slot.is_landing or isinstance(event, Setpoint) else None
+        self._send(event)
+
+
+class _Slot:
+    """What is known of one vehicle's tasks."""
+
+    def __init__(self, vehicle: ServedMultirotor) -> None:
+        self.vehicle = vehicle
+        self.task: Task | None = None
+        self.result: asyncio.Future[bool] | None = None
+        self.started = 0
+        # When it was sent what it still follows; `None` if it hovers, or stands.
+        self.ordered: int | None = None
+        self.is_landing = False
+
+    def finish(self, succeeded: bool) -> None:
+        """End the task, if there is one."""
+        if self.result is not None and not self.result.done():
+            self.result.set_result(succeeded)
+        self.task = self.result = None
+
+
+def lookahead_of(lookahead: float, adaptive: float, velocity: float) -> float:
+    """Return how far ahead the lookahead point is, metres; a negative one asks for the default.
+
+    Raises:
+        ValueError: It is zero.
+    """
+    if lookahead == 0.0:
+        raise ValueError("lookahead distance cannot be 0")
+    if lookahead > 0.0:
+        return lookahead
+    return max(velocity * 0.02 * (30.0 if adaptive > 0.0 else 40.0), 0.75)
+
+
+def braked(velocity: float, remaining: float) -> float:
+    """Return the speed (m/s) at which to fly with some metres to go.
+
+    Before the end it falls to 1 m/s, by 3 m/s². (AirSim brakes later, and only from above 3 m/s,
+    and overshoots.)
+    """
+    return min(velocity, math.sqrt(1.0 + 2.0 * 3.0 * max(remaining - CLOSE, 0.0)))
+
+
+class PathFollower:
+    """A vehicle's progress along a path, which never goes back, and the point that runs ahead.
+
+    The method is "pure pursuit" (R. C. Coulter, CMU-RI-TR-92-01, 1992); the rules of look-ahead
+    and ending are those of AirSim's ``moveOnPath``.
+
+    Args:
+        path: Corners, metres; at least one. The first is where the vehicle starts.
+        lookahead: Metres along the path from the vehicle's place to the lookahead point.
+
+    Attributes:
+        progress: Metres along the path up to the point next to the vehicle.
+        length: Of the path, metres.
+        is_last: Whether the lookahead point is at the end of the path.
+    """
+
+    def __init__(self, path: Sequence[Vector3], lookahead: float) -> None:
+        corners = [path[0]]
+        for point in path[1:-1]:
+            if math.dist(point, corners[-1]) >= _SPACING:
+                corners.append(point)
+        if len(path) > 1:
+            corners.append(path[-1])
+        self._corners = corners
+        steps = itertools.starmap(math.dist, itertools.pairwise(corners))
+        self._along = [0.0, *itertools.accumulate(steps)]
+        self._lookahead = lookahead
+        self.length = self._along[-1]
+        self.progress = 0.0
+        self.is_last = False
+
+    def advance(self, position: Vector3) -> Vector3:
+        """Take a vehicle's position (m), and return where the lookahead point is."""
+        self._advance_progress(position)
+        ahead = min(self.progress + self._lookahead, self.length)
+        # Round a sharp corner, it may be where the vehicle is already: then it runs on, up to 5 m.
+        for _ in range(50):
+            if ahead >= self.length or math.dist(self._at(ahead), position) >= CLOSE:
+                break
+            ahead = min(ahead + 0.1, self.length)
+        self.is_last = ahead >= self.length
+        return self._at(ahead)
+
+    def _advance_progress(self, position: Vector3) -> None:
+        along, corners = self._along, self._corners
+        first = max(bisect.bisect_right(along, self.progress) - 1, 0)
+        farthest = self.progress + 2.0 * max(self._lookahead, CLOSE)
+        nearest = math.inf
+        found = self.progress
+        for index in range(first, min(first + _WINDOW, len(corners) - 1)):
+            start, length = along[index], along[index + 1] - along[index]
+            if start > farthest:
+                break
+            if length <= 0.0:
+                continue
+            a, b = corners[index], corners[index + 1]
+            inner = sum((q - p) * (r - p) for p, q, r in zip(a, b, position, strict=True))
+            place = start + min(max(inner / length, 0.0), length)
+            place = min(max(place, self.progress), farthest)
+            apart = math.dist(self._at(place), position)
+            if apart < nearest:
+                nearest, found = apart, place
+        self.progress = found
+
+    def _at(self, place: float) -> Vector3:
+        """Return the point at some metres along the path."""
+        along, corners = self._along, self._corners
+        index = min(bisect.bisect_right(along, place), len(along) - 1) - 1
+        if index < 0 or along[index + 1] <= along[index]:
+            return corners[-1]
+        share = min((place - along[index]) / (along[index + 1] - along[index]), 1.0)
+        x, y, z = (p + share * (q - p) for p, q in zip(*corners[index : index + 2], strict=True))
+        return x, y, z
 
 
 class Heading:
@@ -55,7 +283,6 @@ class Heading:
         follows: Whether to look where the vehicle goes (AirSim's ``ForwardOnly``), unless at a
             rate; the angle is then added.
         is_rate: Whether the angle is a rate, in radians per second.
-        angle: See `is_rate`.
     """
 
     def __init__(self, follows: bool = False, is_rate: bool = True, angle: float = 0.0) -> None:
@@ -95,16 +322,16 @@ def along_path(
     speed; it has failed if there is no progress for 5 s elsewhere (where AirSim waits for the
     timeout), or at the timeout.
     """
-    carrot, least, idle = Carrot(path, lookahead), min(_STILL, 0.1 * speed) / RATE, 0
+    follower, least, idle = PathFollower(path, lookahead), min(_STILL, 0.1 * speed) / RATE, 0
 
     def steer(_: float, state: State) -> Order | bool:
         nonlocal idle
-        before = carrot.progress
-        target = carrot.advance(state.position)
+        before = follower.progress
+        target = follower.advance(state.position)
         x, y, z = (a - b for a, b in zip(target, state.position, strict=True))
-        apart, remaining = math.hypot(x, y, z), carrot.length - carrot.progress
-        is_near = carrot.is_last and apart <= CLOSE
-        idle = idle + 1 if carrot.progress - before <= least else 0
+        apart, remaining = math.hypot(x, y, z), follower.length - follower.progress
+        is_near = follower.is_last and apart <= CLOSE
+        idle = idle + 1 if follower.progress - before <= least else 0
         is_there = is_near or not remaining
         is_slow = math.hypot(*state.velocity) <= _SLOW
         if idle > (_SETTLING if is_there and is_slow else _STUCK):
@@ -179,12 +406,6 @@ def at_height(parameters: VehicleParameters, height: float) -> Thrust:
         return min(max(share, 0.0), 1.0)
 
     return thrust
-
-
-def at_throttle(parameters: VehicleParameters, throttle: float) -> Thrust:
-    """Return the thrust of a throttle of AirSim's quadrotor."""
-    share = share_of(parameters, throttle)
-    return lambda _: share
 
 
 def share_of(parameters: VehicleParameters, throttle: float) -> float:

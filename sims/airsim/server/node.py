@@ -1,4 +1,4 @@
-"""A server for scripts that are written for AirSim: its node.
+"""A server for scripts that are written for AirSim: its node, and the time that it leads.
 
 It stands beside the vehicles in the run's world, reads their true state, and sends them commands
 and set-points as any pilot does.
@@ -7,46 +7,56 @@ and set-points as any pilot does.
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
-from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from collections.abc import Awaitable, Iterable
+from fractions import Fraction
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 
 from events import Announcement, Command, PoseEstimate, Setpoint, VehicleEvent
 from runtime import Duration, NodeConfig, Output, Tick, every, on
 from runtime.node import Node
 from runtime.paths import JsonOrPath, NameOrPath
-from sims.airsim.server.accepted import Accepted
-from sims.airsim.server.cameras import Cameras, ServedCamera
-from sims.airsim.server.collisions import Collisions
-from sims.airsim.server.control import Control
-from sims.airsim.server.estimates import Estimates, ScriptEstimator
-from sims.airsim.server.flight import Flight
-from sims.airsim.server.images import Images
-from sims.airsim.server.listener import Listener
-from sims.airsim.server.methods import Table
-from sims.airsim.server.movables import SpareObject, add_movables
-from sims.airsim.server.objects import Objects
-from sims.airsim.server.recording import Recording, RecordingConfig
-from sims.airsim.server.scenery import Scenery
-from sims.airsim.server.segmentation import Segmentation
-from sims.airsim.server.sensors import SAMPLES, Sensors
-from sims.airsim.server.session import Session
-from sims.airsim.server.state import VehicleState
-from sims.airsim.server.tasks import RATE, Tasks
-from sims.airsim.server.time import Time
-from sims.airsim.server.vehicles import ServedFreeCamera, ServedMultirotor, ServedVehicle, Vehicles
+from runtime.time.clock import Clock
+from runtime.time.schedule import SECOND, Once
+from runtime.time.stepping import Stepping
+from sims.airsim.server.cameras import Cameras, Images, ServedCamera
+from sims.airsim.server.connections import Listener
+from sims.airsim.server.flight import Control, Flight
+from sims.airsim.server.measurements import (
+    SAMPLES,
+    Estimates,
+    Recording,
+    RecordingConfig,
+    ScriptEstimator,
+    Sensors,
+)
+from sims.airsim.server.methods import Table, rpc
+from sims.airsim.server.movables import SpareObject, add_movables, spare_objects
+from sims.airsim.server.moves import RATE, Tasks
+from sims.airsim.server.objects import Objects, Scenery
+from sims.airsim.server.vehicles import (
+    Collisions,
+    Commanded,
+    ServedFreeCamera,
+    ServedMultirotor,
+    ServedVehicle,
+    Vehicles,
+)
 from sims.computer_vision import FreeCamera
 from sims.multirotor import Multirotor
-from sims.simulator import Count
+from sims.simulator import Count, Simulator
 from sims.world import Inhabitant, join_world
 from sims.worlds import Dynamics, Scene
 
+R = TypeVar("R")
+
 PORTS = "ports of AirSim servers"
 """Name under which nodes of this process share where each server listens, by its name."""
+LONGEST_STEP = 1_000_000_000  # seconds, and frames, of a step that a client may ask for
+FRAMES_WITHOUT_CAMERAS = 60  # frames per second if no vehicle has a camera
 
 
 class AirsimServerConfig(NodeConfig):
@@ -115,50 +125,65 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     async def on_startup(self) -> None:
         """Join the world, and listen."""
-        self.deterministic = self.config.time != "running"  # type: ignore[misc]
-        self.world = await join_world(self)
-        self.vehicles = Vehicles(self.world, self.config.default_vehicle)
+        config, log, now = self.config, self.log, self.clock.now
+        self.deterministic = config.time != "running"  # type: ignore[misc]
+        world = await join_world(self)
+        vehicles = Vehicles(world, config.default_vehicle, config.settings, self)
         for cls, served in ((Multirotor, ServedMultirotor), (FreeCamera, ServedFreeCamera)):
             for each in self.siblings(cls):
-                vehicle = served(each.name, self.world, each.config, self.clock.now)
-                self.vehicles[each.name] = vehicle
-        self.collisions = Collisions(self)
-        self.objects = Objects(self)
-        self.cameras = Cameras(self)
-        self.segmentation = Segmentation(self)
-        self.images = Images(self)
-        self.sensors = Sensors(self)
-        self.scenery = Scenery(self)
-        self.recording = Recording(self)
-        self.script_estimates = Estimates(self)
-        self.time = Time(self)
-        self.tasks = Tasks(self)
+                vehicles[each.name] = served(each.name, world, each.config, now)
+
+        def drawn_state() -> tuple[int, Any]:
+            return vehicles.drawn_state(now())
+
+        carriers = self.siblings(Simulator)
+        objects = Objects(world, spare_objects(self.name, config.objects), now, log)
+        cameras = Cameras(carriers, config.cameras, world.model, drawn_state, log)
+        ids, draw = objects.segmentation_ids, (config.camera_processes, config.render_threads)
+        images = Images(self, world, cameras, drawn_state, ids, *draw)
+        scenery = Scenery(world, vehicles, objects, now, log)
+        rates = [
+            camera.rate for each in self.siblings(Multirotor) for camera in each.config.cameras
+        ]
+        rates += [each.config.rate for each in self.siblings(FreeCamera)]
+        frame_rate = max(rates, default=FRAMES_WITHOUT_CAMERAS)
+        self.vehicles = vehicles
+        self.collisions = Collisions(vehicles, objects.identify)
+        self.sensors = Sensors(vehicles, world, config.sensor_names, config.lidar_frame)
+        self.recording = Recording(config.recording, self, vehicles, images)
+        estimators = config.estimators
+        self.script_estimates = Estimates(estimators, vehicles, cameras, now, self._send)
+        self.time = Time(config.time, self.clock, self.stepping, frame_rate)
+        self.tasks = Tasks(self.clock, self.name, self._send, self.time.owed)
+        resets = objects.reset, scenery.reset
         self.table = Table(
             [
-                Session(self),
+                vehicles,
                 self.time,
-                Control(self),
-                VehicleState(self),
+                Control(vehicles, self.tasks, self.collisions, *resets),
+                Flight(self.tasks),
                 self.collisions,
-                self.objects,
-                self.cameras,
-                self.segmentation,
-                self.images,
+                objects,
+                cameras,
+                images,
                 self.sensors,
-                self.scenery,
-                Accepted(self),
+                scenery,
                 self.recording,
                 self.script_estimates,
-                Flight(self),
-            ]
+            ],
+            log,
+            {
+                ServedVehicle: vehicles.find,
+                ServedMultirotor: vehicles.find_multirotor,
+                Commanded: vehicles.find_commanded,
+            },
         )
-        if self.config.time == "running" and not self.checking:
-            await self.images.start()  # simulated time would wait for it later
+        if config.time == "running" and not self.checking:
+            await images.start()  # simulated time would wait for it later
         self._listener: Listener | None = None
         self._waiting: threading.Timer | None = None
         if self.checking:
             return
-        config = self.config
         if config.time != "running" and (reason := self.stepping.fixed()):
             raise ValueError(f'time: expected "running", found "{config.time}": {reason}')
         self._listener = Listener(
@@ -219,8 +244,10 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
         """Take notice of motors that start or stop, and of collisions."""
-        self.tasks.note(event)
-        self.collisions.note(event)
+        vehicle = self.vehicles.get(event.source)
+        if isinstance(vehicle, ServedMultirotor):
+            self.tasks.note(vehicle, event)
+            self.collisions.note(vehicle, event)
 
     @every(hz=RATE)
     def fly(self, tick: Tick) -> None:
@@ -249,28 +276,131 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         """Take note of the vehicles' samples."""
         self.sensors.note(event)
 
-    def find_vehicle(self, name: str) -> ServedVehicle:
-        """Return a multirotor or a free camera; see `Vehicles.find`."""
-        return self.vehicles.find(name)
-
-    def find_multirotor(self, name: str) -> ServedMultirotor:
-        """Return a multirotor; see `Vehicles.find_multirotor`."""
-        return self.vehicles.find_multirotor(name)
-
-    def order(
-        self, kind: type[Command] | type[Setpoint], vehicle: ServedVehicle, **fields: Any
-    ) -> None:
-        """Send a command or a set-point to a vehicle, which obeys it at once."""
-        event = kind(stamp=self.clock.now(), source=self.name, vehicle=vehicle.name, **fields)
+    def _send(self, event: Command | Setpoint | PoseEstimate) -> None:
         if isinstance(event, Setpoint):
             self.setpoints.send(event)
-        else:
+        elif isinstance(event, Command):
             self.commands.send(event)
+        else:
+            self.estimates.send(event)
 
-    def drawn_state(self) -> tuple[int, npt.NDArray[np.float64]]:
-        """Return the world's state as it is to be drawn now: time (ns), and positions.
 
-        These are of the last whole millisecond, so exactly the state that methods tell of; in them
-        free cameras are where they have been put, if only just now. Shape (nq,), a copy.
+class Time:
+    """Pausing and stepping.
+
+    With the server's setting ``time = "awaited"`` time runs while at least one future of a
+    vehicle's task is not done (see `owed`) and no client has paused it, and stands otherwise.
+
+    Args:
+        frame_rate: Images per second of the fastest camera.
+    """
+
+    def __init__(self, mode: str, clock: Clock, stepping: Stepping, frame_rate: float) -> None:
+        self._clock, self._stepping = clock, stepping
+        self._period = SECOND / Fraction(frame_rate).limit_denominator()
+        self._awaited, self._paused = mode == "awaited", mode == "paused"
+        self._owed = 0
+
+    async def begin(self) -> None:
+        """Let time stand from here on, unless it runs from the start; return once it does.
+
+        Raises:
+            CommandError: Time cannot be controlled.
         """
-        return self.vehicles.drawn_state(self.clock.now())
+        if self._awaited or self._paused:
+            self._stepping.pause()
+            await self._stepping.stands()
+
+    def owed(self, task: asyncio.Future[R]) -> asyncio.Future[R]:
+        """Return a future for the reply to a vehicle's task.
+
+        With ``time = "awaited"`` time runs until the task is done, and the reply comes once time
+        stands at that instant, so that what a client does next finds all that was due by then
+        done. While another task goes on, time runs on and the reply comes at once.
+
+        Args:
+            task: Done when the vehicle's task ends; cancelling the returned future leaves it.
+        """
+        if not self._awaited:
+            return task
+        reply: asyncio.Future[R] = task.get_loop().create_future()
+        self._owed += 1
+        self._apply()
+
+        def ended(_: asyncio.Future[R]) -> None:
+            self._owed -= 1
+            self._apply()
+            self._stepping.stands().add_done_callback(lambda _: _copy(task, reply))
+
+        task.add_done_callback(ended)
+        return reply
+
+    @rpc("simPause")
+    def pause(self, is_paused: bool) -> None:
+        """Let the run's time stand, or run on; a run in real time cannot be paused."""
+        if is_paused:
+            self._stepping.pause()
+        elif self._stepping.state != "running" and not self._awaited:
+            self._stepping.resume()
+        self._paused = is_paused
+        self._apply()
+
+    @rpc("simIsPaused")
+    def is_paused(self) -> bool:
+        """Return whether time stands by `simPause` or after a step."""
+        return self._stepping.state == "paused" and (self._paused or not self._awaited)
+
+    @rpc("simContinueForTime")
+    def continue_for_time(
+        self, seconds: Annotated[float, msgspec.Meta(ge=0.0, le=LONGEST_STEP)]
+    ) -> Awaitable[None]:
+        """Let **simulated** time run for some seconds, and then stand; replies once it stands."""
+        return self._continue(round(seconds * SECOND))
+
+    @rpc("simContinueForFrames")
+    def continue_for_frames(
+        self, frames: Annotated[int, msgspec.Meta(ge=0, le=LONGEST_STEP)]
+    ) -> Awaitable[None]:
+        """Let time run for some images of the fastest camera; without any, steps of 1/60 s."""
+        now = self._clock.now()
+        newest = math.ceil((now + 1) / self._period) - 1  # number of the last image by now, from 0
+        return self._continue(max(int((newest + frames) * self._period) - now, 0))
+
+    def _continue(self, ns: int) -> Awaitable[None]:
+        if self._awaited and not self._paused:
+            over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            due = self._clock.now() + ns
+            self._clock.schedule.add(due, Once(lambda: over.set_result(None)))
+            return self.owed(over)
+        if ns > 0:
+            step = self._stepping.step(ns)
+        else:
+            self._stepping.pause()
+            step = self._stepping.stands()
+        self._paused = True
+
+        async def stepped() -> None:
+            await step
+
+        return stepped()
+
+    def _apply(self) -> None:
+        """Let time run if somebody waits for a vehicle, and else stand; a paused one stays."""
+        if not self._awaited or self._paused:
+            return
+        if self._owed == 0:
+            self._stepping.pause()
+        elif self._stepping.state != "running":
+            self._stepping.resume()
+
+
+def _copy(task: asyncio.Future[R], reply: asyncio.Future[R]) -> None:
+    """Give a reply the outcome of its task, unless nobody waits for it any more."""
+    if reply.done():
+        return
+    if task.cancelled():
+        reply.cancel()
+    elif (error := task.exception()) is not None:
+        reply.set_exception(error)
+    else:
+        reply.set_result(task.result())

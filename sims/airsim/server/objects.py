@@ -1,4 +1,4 @@
-"""Methods of the objects in the world: their names, and where they are.
+"""Methods of the world round the vehicles: its objects, wind, lines of sight and extents.
 
 An object is a named geom of the model, with its look, or a named body with all its geoms; a
 vehicle, or a body that moves by itself, is one object whatever it is made of.
@@ -9,36 +9,40 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
-import msgspec
 import mujoco
 import numpy as np
+import numpy.typing as npt
+from msgspec.structs import astuple
 
-from events.frames import flip_yz, flip_yz_rotation
+from events import Vector3
+from events.frames import flip_yz, flip_yz_rotation, from_geodetic
+from runtime.logs import NodeLogger
 from sims.airsim.server.methods import RpcError, rpc
 from sims.airsim.server.movables import (
     AWAY,
     HELD,
     Holder,
+    SpareObject,
     have_met,
     movable_bodies,
     set_free,
-    spare_objects,
+    whole_matches,
 )
-from sims.airsim.server.regex import whole_matches
-from sims.airsim.structures import NAN, Pose, Quaternionr, Vector3r
+from sims.airsim.server.vehicles import FIRST, ServedVehicle, Vehicles
+from sims.airsim.wire import NAN, GeoPoint, Pose, Quaternionr, Vector3r
 from sims.cameras.stage import LOOK
 from sims.vehicle.model import mover_of
+from sims.world import SharedWorld
+from sims.worlds.wind import check_strength
 
-if TYPE_CHECKING:
-    from sims.airsim.server.node import AirsimServer
-
-FARTHEST = 1e4
-"""Metres from the origin within which objects can be put."""
-
-LONGEST_NAME = 100
-"""Characters of the name of an object that is brought in."""
+FARTHEST = 1e4  # metres from the origin within which objects can be put
+FARTHEST_PLACE = 1e9  # degrees, and metres above the sea
+LONGEST_NAME = 100  # characters of the name of an object that is brought in
+MOST_MESSAGES, LONGEST_MESSAGE = 1000, 500  # messages that are logged, and characters of one
+HIDDEN = -1  # ID of an object that is left out of segmentation images: black, as nothing is
 
 _BODY = mujoco.mjtObj.mjOBJ_BODY
 
@@ -46,22 +50,34 @@ UNKNOWN = Pose(Vector3r(NAN, NAN, NAN), Quaternionr(NAN, NAN, NAN, NAN))
 """Pose of an object that is not there."""
 
 
+def initial_id(name: str) -> int:
+    """Return AirSim's first ID of an object: of its lower-cased name 5 and all codes from 97."""
+    return (5 + sum(code for code in map(ord, name.lower()) if code >= 97)) % 256
+
+
 class Objects:
-    """The objects of the world.
+    """The objects of the world, and which number, and so which colour, each has in images.
 
     Whatever changes them does so at the instant of the request.
+
+    Args:
+        spares: The objects that can be brought in, by the names of their bodies.
 
     Attributes:
         geoms: Numbers of each object's geoms in the model, by the object's name, sorted.
     """
 
-    def __init__(self, server: AirsimServer) -> None:
-        self._server = server
-        self._world = server.world
+    def __init__(
+        self,
+        world: SharedWorld,
+        spares: dict[str, SpareObject],
+        now: Callable[[], int],
+        log: NodeLogger,
+    ) -> None:
+        self._world, self._now, self._log = world, now, log
         self._still: Any = None
         self._warned: set[str] = set()
-        model, config = self._world.model, server.config
-        spares = spare_objects(server.name, config.objects)
+        model = world.model
         self._spares = {model.body(name).id: spec for name, spec in spares.items()}
         self.geoms = {
             name: geoms
@@ -73,22 +89,25 @@ class Objects:
         armature = {body: model.dof_armature[model.body_dofadr[body]] for body in bodies.values()}
         self._held = {body for body in armature if armature[body] == HELD or body in self._spares}
         self._at_start = dict(self._bodies), dict(self.geoms), model.qpos0.copy()
-        if self._held and self._world.simulation is not None:
+        if self._held and world.simulation is not None:
             have_met(model)
-            self._holder = Holder.of(self._world.simulation)
+            self._holder = Holder.of(world.simulation)
         for body in self._held:
             self._put(body, self._home(body))
+        self._ids = np.full(model.ngeom + 1, HIDDEN)
+        for name in sorted(self.geoms, key=lambda each: -len(self.geoms[each])):
+            self._number(name, initial_id(name))  # that of a part goes before that of the whole
 
     def reset(self) -> None:
         """Bring all objects back to where they were at the start."""
         self._bodies = dict(self._at_start[0])
-        self._show(dict(self._at_start[1]))
+        self.geoms = dict(self._at_start[1])
         for body in {*self._bodies.values(), *self._held}:
             self._put(body, self._home(body))
 
     def data(self) -> Any:
         """Return MuJoCo's data of the world at the present time, with positions computed."""
-        simulation, now = self._world.simulation, self._server.clock.now()
+        simulation, now = self._world.simulation, self._now()
         if simulation is not None:
             simulation.advance_to(now)
             simulation.refresh()
@@ -100,8 +119,48 @@ class Objects:
         mujoco.mj_kinematics(self._world.model, self._still)
         return self._still
 
-    def pose(self, name: str) -> Pose:
-        """Return where an object is in ``map``; `UNKNOWN` if it is not there."""
+    def identify(self, touched: str) -> tuple[str, int]:
+        """Return name and segmentation ID of the object that a geom or body of the model is of.
+
+        A spare object that is in the world has another name than its body.
+        """
+        model = self._world.model
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, touched)
+        body = mujoco.mj_name2id(model, _BODY, touched)
+        body = int(model.geom_bodyid[geom]) if geom >= 0 else body
+        name = next((name for name, each in self._bodies.items() if each == body), touched)
+        return name, self.segmentation_id(name)
+
+    def segmentation_ids(self) -> npt.NDArray[np.uint8]:
+        """Return the ID of each geom as it is drawn, and last that of nothing, shape (n + 1,)."""
+        return np.maximum(self._ids, 0).astype(np.uint8)
+
+    @rpc("simGetSegmentationObjectID")
+    def segmentation_id(self, name: str) -> int:
+        """Return the ID of an object, whatever the case of its name; -1 if there is none."""
+        known = {each.lower(): geoms for each, geoms in self.geoms.items()}
+        geoms = known.get(name.lower())
+        return int(self._ids[geoms[0]]) if geoms else HIDDEN
+
+    @rpc("simSetSegmentationObjectID")
+    def set_segmentation_id(self, name: str, object_id: int, is_regex: bool = False) -> bool:
+        """Set the ID (at most 255) of the objects of a name; -1 leaves them out, in black."""
+        if is_regex:
+            found = whole_matches(name, self.geoms, ignore_case=True)
+        else:
+            found = [name] if name in self.geoms else []
+        for each in found:
+            self._number(each, min(max(object_id, HIDDEN), 255))
+        return bool(found)
+
+    @rpc("simListSceneObjects")
+    def names(self, expression: str) -> list[str]:
+        """Return the names of objects that a regular expression matches as a whole, sorted."""
+        return whole_matches(expression, self.geoms)
+
+    @rpc("simGetObjectPose", cosys=2)
+    def pose(self, name: str, ned: bool = True) -> Pose:  # noqa: ARG002  # Cosys only
+        """Return an object's pose in the world's NED frame; NaN of one that is not known."""
         if name not in self.geoms:
             return UNKNOWN
         model, data = self._world.model, self.data()
@@ -115,27 +174,6 @@ class Objects:
             mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
         position, rotation = flip_yz(tuple(place.tolist())), flip_yz_rotation(tuple(turn.tolist()))
         return Pose(Vector3r(*position), Quaternionr(*rotation))
-
-    def name_of(self, touched: str) -> str:
-        """Return the name of the object that a geom or body is of, by its name in the model.
-
-        A spare object that is in the world has another one than its body.
-        """
-        model = self._world.model
-        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, touched)
-        body = mujoco.mj_name2id(model, _BODY, touched)
-        body = int(model.geom_bodyid[geom]) if geom >= 0 else body
-        return next((name for name, each in self._bodies.items() if each == body), touched)
-
-    @rpc("simListSceneObjects")
-    def names(self, expression: str) -> list[str]:
-        """Return the names of objects that a regular expression matches as a whole, sorted."""
-        return whole_matches(expression, self.geoms)
-
-    @rpc("simGetObjectPose", cosys=2)
-    def object_pose(self, name: str, ned: bool = True) -> Pose:  # noqa: ARG002  # Cosys only
-        """Return an object's pose in the world's NED frame; NaN of one that is not known."""
-        return self.pose(name)
 
     @rpc("simSetObjectPose")
     def set_pose(self, name: str, pose: Pose, teleport: bool = True) -> bool:  # noqa: ARG002
@@ -175,18 +213,18 @@ class Objects:
         free = [body for body, spare in self._spares.items() if spare.asset == asset]
         if not (free := [body for body in free if body not in used]):
             raise RpcError(f"all objects {asset} are in the world: the settings can have more")
-        wanted = scale.x_val, scale.y_val, scale.z_val
+        wanted = astuple(scale)
         body = next((each for each in free if self._spares[each].scale == wanted), free[0])
         if (found := self._spares[body].scale) != wanted:
             self._warn("simSpawnObject", f"the scale is {found} of the settings, not {wanted}")
         name = name or asset
-        numbered = (f"{name}{number}" for number in itertools.count(1))
         if name in self.geoms:
+            numbered = (f"{name}{number}" for number in itertools.count(1))
             name = next(each for each in numbered if each not in self.geoms)
         self._bodies[name] = body
         geoms = tuple(np.flatnonzero(self._world.model.geom_bodyid == body).tolist())
-        self._show(self.geoms | {name: geoms})
-        self._server.segmentation.added(name)
+        self.geoms = dict(sorted({**self.geoms, name: geoms}.items()))
+        self._number(name, initial_id(name))
         self._put(body, qpos, free=physics)
         return name
 
@@ -195,8 +233,7 @@ class Objects:
         """Take an object out of the world; ``False`` of one that the settings do not let move."""
         if (body := self._bodies.get(name, -1)) not in self._held:
             return False
-        del self._bodies[name]
-        self._show({each: geoms for each, geoms in self.geoms.items() if each != name})
+        del self._bodies[name], self.geoms[name]
         away = self._home(body)
         if body not in self._spares:
             away[2] += AWAY + 100.0 * (len(self._spares) + body)
@@ -216,19 +253,18 @@ class Objects:
         """Return whether an object has this scale: it cannot be changed."""
         return name in self.geoms and self.scale(name) == scale
 
+    def _number(self, name: str, object_id: int) -> None:
+        self._ids[list(self.geoms[name])] = object_id
+
     def _warn(self, method: str, text: str) -> None:
         """Log what a method does not do as asked, when it first happens."""
         if method not in self._warned:
             self._warned.add(method)
-            self._server.log.warning("%s: %s", method, text)
+            self._log.warning("%s: %s", method, text)
 
     def _home(self, body: int) -> Any:
         begin = self._world.model.jnt_qposadr[self._world.model.body_jntadr[body]]
         return self._at_start[2][begin : begin + 7].copy()
-
-    def _show(self, geoms: dict[str, tuple[int, ...]]) -> None:
-        self.geoms.clear()
-        self.geoms.update(sorted(geoms.items()))
 
     def _put(self, body: int, qpos: Any, *, free: bool = False, keep: bool = False) -> None:
         """Put a body somewhere, at rest: held, free, or as it was (`keep`)."""
@@ -238,7 +274,7 @@ class Objects:
         if simulation is None:
             model.qpos0[begin : begin + 7] = qpos
             return
-        simulation.advance_to(self._server.clock.now())
+        simulation.advance_to(self._now())
         if body in self._held:
             if keep:
                 free = model.dof_armature[dof] == 0.0
@@ -249,14 +285,112 @@ class Objects:
         simulation.changed()
 
 
+class Scenery:
+    """Wind, lines of sight, extents, the level, and messages of clients."""
+
+    def __init__(
+        self,
+        world: SharedWorld,
+        vehicles: Vehicles,
+        objects: Objects,
+        now: Callable[[], int],
+        log: NodeLogger,
+    ) -> None:
+        self._world, self._vehicles, self._objects = world, vehicles, objects
+        self._now, self._log = now, log
+        self._messages = 0
+        self._wind_before: Vector3 | None = None
+
+    @rpc("simSetWind")
+    def set_wind(self, velocity: Vector3r) -> None:
+        """Set the mean wind, in the world's NED frame; gusts and turbulence of the file stay."""
+        wind: Vector3 = astuple(velocity)
+        check_strength(wind)
+        self._blow(wind)
+
+    def reset(self) -> None:
+        """Let the wind blow as before clients changed it."""
+        if self._wind_before is not None:
+            self._blow(self._wind_before)
+            self._wind_before = None
+
+    def _blow(self, wind: Vector3) -> None:
+        world = self._world
+        if world.simulation is not None:
+            world.simulation.advance_to(self._now())
+        if self._wind_before is None:
+            self._wind_before = world.air.velocity if world.air is not None else (0.0, 0.0, 0.0)
+        world.set_wind(wind)
+
+    @rpc("simTestLineOfSightToPoint")
+    def sees_point(self, point: GeoPoint, vehicle: ServedVehicle = FIRST) -> bool:
+        """Return whether nothing is between a vehicle and a place on the earth."""
+        return self._is_free(vehicle.state().position, self._in_map(point), vehicle.name)
+
+    @rpc("simTestLineOfSightBetweenPoints")
+    def sees_between(self, first: GeoPoint, second: GeoPoint) -> bool:
+        """Return whether nothing is between two places on the earth."""
+        return self._is_free(self._in_map(first), self._in_map(second))
+
+    @rpc("simGetWorldExtents")
+    def extents(self) -> list[GeoPoint]:
+        """Return the southernmost, westernmost and lowest, and the opposite corner of all objects.
+
+        What is without end, such as a plane, is not counted.
+        """
+        model, data = self._world.model, self._objects.data()
+        shown = {geom for geoms in self._objects.geoms.values() for geom in geoms}
+        bounded = [geom for geom in sorted(shown) if model.geom_rbound[geom] > 0.0]
+        boxes = model.geom_aabb[bounded]
+        axes = data.geom_xmat[bounded].reshape(-1, 3, 3)
+        middle = data.geom_xpos[bounded] + np.einsum("nij,nj->ni", axes, boxes[:, :3])
+        reach = np.einsum("nij,nj->ni", np.abs(axes), boxes[:, 3:])
+        north, west, up = (middle + reach).max(axis=0, initial=-1e9).tolist()
+        south, east, down = (middle - reach).min(axis=0, initial=1e9).tolist()
+        geo_point = self._vehicles.find("").geo_point
+        return [geo_point((south, -west, -down)), geo_point((north, -east, -up))]
+
+    @rpc("simLoadLevel")
+    def load_level(self, name: str) -> bool:
+        """Return whether this is the world's name: another cannot be loaded in a run."""
+        return name == self._world.name
+
+    @rpc("simPrintLogMessage")
+    def message(self, text: str, parameter: str = "", severity: int = 0) -> None:
+        """Log a message: of severity 1 as a warning, of 2 as an error, else as an info."""
+        self._messages += 1
+        if self._messages <= MOST_MESSAGES:
+            write = {1: self._log.warning, 2: self._log.error}.get(severity, self._log.info)
+            text = f"{text}{parameter}"[:LONGEST_MESSAGE]
+            write("a client says: %s", text if text.isprintable() else ascii(text))
+
+    def _is_free(self, start: Vector3, end: Vector3, vehicle: str = "") -> bool:
+        """Return whether nothing but a vehicle is on a straight line, metres in ``map``."""
+        model, data = self._world.model, self._objects.data()
+        body = mujoco.mj_name2id(model, _BODY, f"{vehicle}/base_link")
+        begin, way = np.array(flip_yz(start)), np.subtract(flip_yz(end), flip_yz(start))
+        length = float(np.linalg.norm(way))
+        if not 1e-9 < length < math.inf:
+            return length <= 1e-9
+        found = np.zeros(1, np.int32)
+        ray = begin, way / length, None, 1, body, found
+        distance: float = mujoco.mj_ray(model, data, *ray)
+        return distance < 0.0 or distance >= length
+
+    def _in_map(self, point: GeoPoint) -> Vector3:
+        place: Vector3 = astuple(point)
+        if not all(abs(number) <= FARTHEST_PLACE for number in place):
+            raise ValueError(f"place: expected up to {FARTHEST_PLACE:g}, found {place}")
+        return from_geodetic(place, self._vehicles.find("").config.origin)
+
+
 def _qpos(pose: Pose) -> Any:
     """Return a pose as a free joint has it, shape (7,).
 
     Raises:
         ValueError: It is not finite, or no pose, or beyond all worlds.
     """
-    place = msgspec.structs.astuple(pose.position)
-    turn = msgspec.structs.astuple(pose.orientation)
+    place, turn = astuple(pose.position), astuple(pose.orientation)
     length = math.hypot(*turn)
     if not (math.hypot(*place) < FARTHEST and 1e-3 < length < 1e3):
         raise ValueError(

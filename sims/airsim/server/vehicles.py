@@ -1,4 +1,4 @@
-"""What the server knows of each vehicle, and how it reads where the vehicle is now.
+"""The vehicles as clients see them: where they are, how they move, and what they touch.
 
 There are two kinds: multirotors, and the free cameras of computer-vision mode.
 """
@@ -6,47 +6,62 @@ There are two kinds: multirotors, and the free cameras of computer-vision mode.
 from __future__ import annotations
 
 import functools
+import json
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from events import Vector3
+from events import Collision, Vector3, VehicleEvent
 from events.frames import to_geodetic
-from sims.airsim.server.methods import RpcError
-from sims.airsim.structures import (
+from runtime.node import Node
+from sims.airsim.server.methods import Named, RpcError, rpc
+from sims.airsim.wire import (
     CollisionInfo,
+    ComputerVisionState,
+    EnvironmentState,
     GeoPoint,
     KinematicsState,
+    MultirotorState,
     Pose,
     Quaternionr,
+    RotorParameters,
+    RotorStates,
     Vector3r,
 )
 from sims.cameras import pose_to_qpos
+from sims.cameras.spec import CameraSpec, camera_info, eyes
+from sims.sensors.earth import pressure_at, temperature_at
 from sims.vehicle import Physics, State
+from sims.vehicle.physics import Contact
 from sims.world import SharedWorld
 
 Floats = npt.NDArray[np.float64]
 
-LANDED_SPEED = 0.08
-"""Of each component of velocity (m/s) and angular velocity (rad/s) of what stands, as in AirSim."""
+FIRST: Any = ""
+"""Default of a vehicle in the parameters of handlers: the one that an empty name stands for."""
+
+GAS_CONSTANT = 287.053  # of dry air, J/(kg K)
+LANDED_SPEED = 0.08  # as AirSim's: m/s and rad/s, of each component of the velocity of what stands
+APART = 10  # looks, of 20 ms each, without contact after which the next contact is a new one
+# What a vehicle that was just put somewhere touches for `APART` looks.
+_ANYTHING: dict[str, int] = {"": 0}
 
 
-class ServedVehicle(ABC):
+class ServedVehicle(Named, ABC):
     """A vehicle of the run as AirSim's methods see it.
 
     Its local frame has the axes of ``map`` and its origin where the vehicle is at the start.
 
     Args:
-        name: The node's.
-        world: The world that it is in.
-        config: The node's settings.
         now: Gives the run's time (ns).
 
     Attributes:
-        config: The node's settings.
         api_control: Whether clients may command it.
         armed: Whether clients have it armed.
         collision: Its last collision.
@@ -65,7 +80,7 @@ class ServedVehicle(ABC):
 
     @property
     def start(self) -> State:
-        """Its state at the start, in ``map``: at rest on the ground, if it starts there."""
+        """State at the start, in ``map``: at rest on the ground, if it starts there."""
         return self.world.starts[self.name]
 
     @property
@@ -75,7 +90,7 @@ class ServedVehicle(ABC):
 
     @abstractmethod
     def state(self) -> State:
-        """Return its true state now, in ``map``."""
+        """Return the true state now, in ``map``."""
 
     @abstractmethod
     def accelerations(self) -> tuple[Vector3, Vector3]:
@@ -97,7 +112,7 @@ class ServedVehicle(ABC):
         return position.x_val + x, position.y_val + y, position.z_val + z
 
     def pose(self) -> Pose:
-        """Return its true pose now, in the local frame."""
+        """Return the true pose now, in the local frame."""
         state = self.state()
         return Pose(self.local(state.position), Quaternionr(*state.orientation))
 
@@ -120,11 +135,7 @@ class ServedVehicle(ABC):
 
 
 class ServedMultirotor(ServedVehicle):
-    """A multirotor.
-
-    Attributes:
-        motors_on: Whether its autopilot is armed.
-    """
+    """A multirotor; `motors_on` says whether its autopilot is armed."""
 
     def __init__(self, name: str, world: SharedWorld, config: Any, now: Callable[[], int]) -> None:
         super().__init__(name, world, config, now)
@@ -138,7 +149,7 @@ class ServedMultirotor(ServedVehicle):
 
     @property
     def physics(self) -> Physics:
-        """Its view of the world's physics, of which there is another after one has diverged."""
+        """View of the world's physics, of which there is another after one has diverged."""
         if self._physics.simulation is not self.world.simulation:
             self._physics = self._look()
         return self._physics
@@ -149,7 +160,7 @@ class ServedMultirotor(ServedVehicle):
         return self.physics.time_ns
 
     def state(self) -> State:
-        """Return its true state at the last whole millisecond, in ``map``."""
+        """Return the true state at the last whole millisecond, in ``map``."""
         self.physics.advance_to(self._now())
         return self.physics.state()
 
@@ -166,20 +177,19 @@ class ServedMultirotor(ServedVehicle):
         return max(map(abs, speeds)) < LANDED_SPEED and self.physics.touching()
 
 
+Commanded = Annotated[ServedMultirotor, "one that clients may command"]
+"""Type of parameters of handlers: without API control, or disarmed, the call is refused."""
+
+
 class ServedFreeCamera(ServedVehicle):
     """A free camera: it has no physics, and is where it has been put."""
 
-    _stamp = 0
-
-    @property
-    def stamp(self) -> int:
-        """Time of the state that was last asked for (ns)."""
-        return self._stamp
+    stamp = 0
 
     def state(self) -> State:
-        """Return its true state now, in ``map``."""
-        self._stamp = self._now()
-        return self.world.free_cameras[self.name](self._stamp)
+        """Return the true state now, in ``map``."""
+        self.stamp = self._now()
+        return self.world.free_cameras[self.name](self.stamp)
 
     def accelerations(self) -> tuple[Vector3, Vector3]:
         """Return zeros."""
@@ -187,17 +197,17 @@ class ServedFreeCamera(ServedVehicle):
 
 
 class Vehicles(dict[str, ServedVehicle]):
-    """All vehicles of a run, by name.
+    """All vehicles of a run, by name, and the methods that tell of them.
 
     Args:
-        world: The world that they are in.
         default: Name of the one that an empty name stands for; empty for the first by name.
+        settings: The settings.json that clients get: its text, or a file; empty for one that says
+            what runs.
     """
 
-    def __init__(self, world: SharedWorld, default: str) -> None:
+    def __init__(self, world: SharedWorld, default: str, settings: str, node: Node[Any]) -> None:
         super().__init__()
-        self._world = world
-        self._default = default
+        self._world, self._default, self._settings, self._node = world, default, settings, node
 
     def find(self, name: str) -> ServedVehicle:
         """Return a vehicle of either kind.
@@ -222,8 +232,28 @@ class Vehicles(dict[str, ServedVehicle]):
             raise _unknown("Vehicle API", name)
         return found
 
+    def find_commanded(self, name: str) -> ServedMultirotor:
+        """Return a multirotor that clients may command.
+
+        Raises:
+            RpcError: They may not, where AirSim would do nothing, or wait for ever; or there is
+                none of that name.
+        """
+        vehicle = self.find_multirotor(name)
+        if not vehicle.api_control:
+            raise RpcError(
+                f"vehicle '{vehicle.name}' is not under API control: call enableApiControl first"
+            )
+        if not vehicle.armed:
+            raise RpcError(f"vehicle '{vehicle.name}' is disarmed: call armDisarm first")
+        return vehicle
+
     def drawn_state(self, now: int) -> tuple[int, Floats]:
-        """Return the world's state as it is to be drawn now; see `AirsimServer.drawn_state`."""
+        """Return the world's state as it is to be drawn now: time (ns), and positions.
+
+        These are of the last whole millisecond, so exactly the state that methods tell of; in them
+        free cameras are where they have been put, if only just now. Shape (nq,), a copy.
+        """
         if self._world.simulation is None:
             stamp, qpos = now, self._world.model.qpos0.copy()
         else:
@@ -235,6 +265,178 @@ class Vehicles(dict[str, ServedVehicle]):
             state = state_at(stamp)
             qpos[begin : begin + 7] = pose_to_qpos(state.position, state.orientation)
         return stamp, qpos
+
+    @rpc("listVehicles")
+    def names(self) -> list[str]:
+        """Return the names of all vehicles, sorted."""
+        return sorted(self)
+
+    @rpc("getSettingsString")
+    def settings(self) -> Awaitable[str] | str:
+        """Return the settings.json of the server's settings, or else one that says what runs."""
+        given = self._settings
+        if not given:
+            return json.dumps(self._described())
+        if given.lstrip().startswith("{"):
+            return given
+
+        async def read() -> str:
+            try:
+                return await self._node.offload(Path(given).read_text, "utf-8")
+            except (OSError, UnicodeDecodeError) as error:
+                raise RpcError(f"settings: expected a readable file, found: {error}") from None
+
+        return read()
+
+    @rpc("getMultirotorState")
+    def multirotor_state(self, vehicle: ServedMultirotor) -> MultirotorState:
+        """Return the true state, with its exact stamp, and the last collision."""
+        kinematics = vehicle.kinematics()
+        place = vehicle.geo_point(vehicle.in_map(kinematics.position))
+        landed_state = 0 if vehicle.landed() else 1
+        return MultirotorState(vehicle.collision, kinematics, place, vehicle.stamp, landed_state)
+
+    @rpc("getComputerVisionState")
+    def computer_vision_state(self, vehicle: ServedVehicle) -> ComputerVisionState:
+        """Return a vehicle's true state, of either kind, with its exact stamp."""
+        return ComputerVisionState(vehicle.kinematics(), vehicle.stamp)
+
+    @rpc("simGetVehiclePose")
+    def pose(self, vehicle: ServedVehicle) -> Pose:
+        """Return a vehicle's true pose in its local frame."""
+        return vehicle.pose()
+
+    @rpc("simGetGroundTruthKinematics")
+    def kinematics(self, vehicle: ServedVehicle) -> KinematicsState:
+        """Return how a vehicle truly moves; the accelerations are those of the physics."""
+        return vehicle.kinematics()
+
+    @rpc("simGetGroundTruthEnvironment")
+    def environment(self, vehicle: ServedVehicle) -> EnvironmentState:
+        """Return the standard atmosphere, and the world's gravity, where a vehicle is."""
+        position = vehicle.state().position
+        place = vehicle.geo_point(position)
+        gravity = Vector3r(0.0, 0.0, -float(self._world.model.opt.gravity[2]))
+        pressure, temperature = pressure_at(place.altitude), temperature_at(place.altitude)
+        density = pressure / (GAS_CONSTANT * temperature)
+        local = vehicle.local(position)
+        return EnvironmentState(local, place, gravity, pressure, temperature, density)
+
+    @rpc("getHomeGeoPoint")
+    def home(self, vehicle: ServedVehicle) -> GeoPoint:
+        """Return where on the earth a vehicle was at the start."""
+        return vehicle.geo_point(vehicle.origin)
+
+    @rpc("getRotorStates")
+    def rotors(self, vehicle: ServedMultirotor) -> RotorStates:
+        """Return speed, thrust and torque of all rotors: front right, rear left, the other two.
+
+        Those are front left and rear right. The physics has no speeds: they are those of which the
+        IMU's vibration is made.
+        """
+        vehicle.state()
+        fastest = math.tau * vehicle.config.imu.vibration.rotor_speed
+        thrusts, motors = vehicle.physics.thrusts.tolist(), vehicle.physics.parameters.motors
+        rotors = tuple(
+            RotorParameters(
+                fastest * math.sqrt(max(share, 0.0)),
+                share * motor.max_thrust,
+                share * motor.max_torque,
+            )
+            for share, motor in zip(thrusts, motors, strict=True)
+        )
+        return RotorStates(vehicle.stamp, rotors)
+
+    def _described(self) -> dict[str, Any]:
+        """Return the vehicles with their starts and cameras as settings.json has them."""
+        vehicles = {}
+        for name, vehicle in self.items():
+            flies = isinstance(vehicle, ServedMultirotor)
+            cameras = (eye for camera in vehicle.config.cameras for eye in eyes(camera))
+            vehicles[name] = {
+                "VehicleType": "SimpleFlight" if flies else "ComputerVision",
+                **dict(zip("XYZ", vehicle.origin, strict=True)),
+                "Cameras": {camera.name: _described_camera(camera) for camera in cameras},
+            }
+        types = {vehicle["VehicleType"] for vehicle in vehicles.values()}
+        mode = "ComputerVision" if types == {"ComputerVision"} else "Multirotor"
+        return {"SettingsVersion": 1.2, "SimMode": mode, "Vehicles": vehicles}
+
+
+class Collisions:
+    """The last collision of each vehicle.
+
+    That is what its node tells of as such; and, since with AirSim contact with the ground counts,
+    however gentle, any contact with a thing after a while without one. So standing at the start
+    does not count, and landing does; and the ground under it does not hide a wall.
+
+    Args:
+        identify: Gives name and segmentation ID of the object that a geom or body is of.
+    """
+
+    def __init__(
+        self,
+        vehicles: dict[str, ServedVehicle],
+        identify: Callable[[str], tuple[str, int]],
+    ) -> None:
+        self._vehicles, self._identify = vehicles, identify
+        # By vehicle what it has touched, and how many looks ago.
+        self._touched: dict[str, dict[str, int]] = {}
+
+    @rpc("simGetCollisionInfo")
+    def collision_info(self, vehicle: ServedVehicle) -> CollisionInfo:
+        """Return a vehicle's last collision, and count it as read: ``has_collided`` is cleared."""
+        found = vehicle.collision
+        vehicle.collision = msgspec.structs.replace(found, has_collided=False)
+        return found
+
+    def forget(self, vehicle: ServedVehicle) -> None:
+        """Forget a vehicle's collision, and take what it touches now as no new one."""
+        vehicle.collision = CollisionInfo()
+        self._touched[vehicle.name] = _ANYTHING
+
+    def note(self, vehicle: ServedMultirotor, event: VehicleEvent) -> None:
+        """Take notice of what a vehicle's node tells."""
+        if isinstance(event, Collision):
+            self._take(vehicle, [c for c in vehicle.physics.contacts() if c.other == event.other])
+
+    def watch(self) -> None:
+        """Look what the vehicles touch; to be called 50 times a second."""
+        for vehicle in self._vehicles.values():
+            if not isinstance(vehicle, ServedMultirotor):
+                continue
+            vehicle.state()
+            contacts = vehicle.physics.contacts() if vehicle.physics.touching() else []
+            before = self._touched.get(vehicle.name, _ANYTHING)
+            aged = {name: looks + 1 for name, looks in before.items() if looks < APART}
+            self._touched[vehicle.name] = aged | {each.other: 0 for each in contacts}
+            new = [each for each in contacts if each.other not in before]
+            if new and "" not in before:
+                self._take(vehicle, new)
+
+    def _take(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
+        """Keep the deepest of some contacts as a collision."""
+        contact = max(contacts, key=lambda each: each.depth)
+        vehicle.collision = CollisionInfo(
+            True,
+            contact.depth,
+            vehicle.stamp,
+            Vector3r(*contact.normal),
+            vehicle.local(contact.position),
+            vehicle.local(vehicle.state().position),
+            *self._identify(contact.other),
+        )
+
+
+def _described_camera(camera: CameraSpec) -> dict[str, Any]:
+    info = camera_info(camera)
+    fov = math.degrees(2 * math.atan(info.width / (2 * info.fx)))
+    size = {"Width": info.width, "Height": info.height, "FOV_Degrees": fov}
+    return {
+        **dict(zip("XYZ", camera.position, strict=True)),
+        **dict(zip(("Roll", "Pitch", "Yaw"), camera.orientation, strict=True)),
+        "CaptureSettings": [{"ImageType": type_, **size} for type_ in range(8)],
+    }
 
 
 def _unknown(interface: str, name: str) -> RpcError:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import sims.airsim.server
-from sims.airsim.server.methods import methods_of
+from sims.airsim.server.methods import Method, constant_methods, methods_of
 
 PAGE = Path("docs/reference/airsim.md")
 HEADING = "## Methods\n"
@@ -29,17 +29,18 @@ class Row(NamedTuple):
     description: str
 
 
-def groups() -> Iterator[type]:
-    """Yield the classes in this package that have methods."""
+def methods() -> dict[str, Method]:
+    """Return all methods by name: those of the classes in this package, and constant ones."""
+    found = constant_methods()
     for module in pkgutil.iter_modules(sims.airsim.server.__path__, "sims.airsim.server."):
-        found = inspect.getmembers(importlib.import_module(module.name), inspect.isclass)
-        yield from (each for _, each in found if each.__module__ == module.name)
+        for _, group in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
+            found |= methods_of(group)
+    return found
 
 
 def rows() -> Iterator[Row]:
     """Yield all methods, by name."""
-    methods = {name: method for group in groups() for name, method in methods_of(group).items()}
-    for name, method in sorted(methods.items(), key=lambda item: item[0].lower()):
+    for name, method in sorted(methods().items(), key=lambda item: item[0].lower()):
         arguments = (f"{each}: {_type_name(hint)}" for each, hint in method.parameters.items())
         yield Row(name, ", ".join(arguments), method.description)
 

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from events import Event
 from runtime.config.model import NodeSpec
 from runtime.node import Node
@@ -61,6 +63,12 @@ class Caller:
     def close(self) -> None:
         """Close the connection."""
         self._socket.close()
+
+    def refuses(self, error: str, method: str, *arguments: Any) -> None:
+        """Check that a call is refused with a text that has this in it."""
+        with pytest.raises(RefusedError) as refused:
+            self(method, *arguments)
+        assert error in str(refused.value), (method, arguments)
 
 
 Script = Callable[[Caller], None]

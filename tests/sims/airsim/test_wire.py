@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sims.airsim import wire
-from sims.airsim.structures import ImageResponse, Pose, Vector3r
+from sims.airsim.wire import ImageResponse, Pose, Vector3r
 
 VALUES = st.recursive(
     st.one_of(

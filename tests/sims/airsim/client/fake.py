@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from sims.airsim import structures, wire
-from sims.airsim.structures import (
+from sims.airsim import wire
+from sims.airsim.wire import (
     CameraInfo,
     ImageResponse,
     ImuData,
@@ -72,7 +72,7 @@ class FakeServer:
             "simContinueForTime": self.go_on,
             "getMultirotorState": self.state,
             "getImuData": lambda *_: ImuData(self.time, linear_acceleration=GRAVITY),
-            "simGetCollisionInfo": lambda _: structures.CollisionInfo(),
+            "simGetCollisionInfo": lambda _: wire.CollisionInfo(),
             "simGetImages": self.images,
         }
         self.calls: list[tuple[str, list[Any]]] = []

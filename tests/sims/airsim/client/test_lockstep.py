@@ -23,7 +23,7 @@ from events.frames import OPTICAL_TO_FRD
 from runtime.errors import FatalError, VisnavError
 from runtime.testing import NodeResult, run_node, run_nodes, spec
 from sims.airsim.client import AirsimClient
-from sims.airsim.structures import ImuData, MultirotorState, Vector3r
+from sims.airsim.wire import ImuData, MultirotorState, Vector3r
 from tests.sims.airsim.client.fake import START, FakeServer, HangUp, NoReply
 
 NAN = float("nan")

@@ -15,9 +15,7 @@ from hypothesis import strategies as st
 from events import Command, Hover, Setpoint, Vector3, VelocitySetpoint
 from events.frames import from_yaw
 from sims.airsim.server import moves
-from sims.airsim.server.carrot import CLOSE, Carrot, braked, lookahead_of
-from sims.airsim.server.moves import Heading
-from sims.airsim.server.tasks import RATE, Task
+from sims.airsim.server.moves import CLOSE, RATE, Heading, PathFollower, Task, braked, lookahead_of
 from sims.vehicle import State
 from tests.sims.vehicle.flight import UP, airborne
 
@@ -82,22 +80,22 @@ def test_each_path_ends_near_its_last_point(
 
 
 @given(path=PATHS, positions=st.lists(POINTS, max_size=20), lookahead=st.floats(0.01, 1e6))
-def test_progress_never_goes_back_and_the_carrot_is_on_the_path(
+def test_progress_never_goes_back_and_the_follower_is_on_the_path(
     path: Sequence[Vector3], positions: list[Vector3], lookahead: float
 ) -> None:
-    carrot = Carrot(path, lookahead)
+    follower = PathFollower(path, lookahead)
     length = sum(map(math.dist, path, path[1:]))
-    assert carrot.length <= length + 1e-6
+    assert follower.length <= length + 1e-6
     for position in positions:
-        before = carrot.progress
-        target = carrot.advance(position)
-        assert before <= carrot.progress <= carrot.length
+        before = follower.progress
+        target = follower.advance(position)
+        assert before <= follower.progress <= follower.length
         apart = min(
             (on_segment(a, b, target) for a, b in itertools.pairwise(path)),
             default=math.dist(target, path[0]),
         )
         assert apart < 0.11, "corners closer than 0.05 m are cut"
-        if carrot.is_last:
+        if follower.is_last:
             assert target == pytest.approx(path[-1], abs=1e-4)
 
 

@@ -1,10 +1,17 @@
-"""Typed access to the objects of settings.json, which notes what nobody asks for."""
+"""Reading of settings.json: its text, and typed access to its objects.
+
+What is not known, or has no effect, is noted on the way.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
+
+import json5
 
 from events import Vector3
 from runtime.errors import ConfigError, suggest
@@ -35,26 +42,70 @@ IGNORED = {
         "only eph is simulated": "EpvInitial, EpvFinal, EpvTimeConstant, EPV_TimeConstant",
     }.items()
     for key in keys.split(", ")
-}
-"""Why known keys have no effect."""
+}  # why known keys have no effect
 
 _HOLDS = {
     "DefaultVehicleState": "Armed",
     **dict.fromkeys(("EnableRpc", "RpcEnabled", "AllowAPIAlways", "EnableCollisions"), True),
-}
-"""Values of these that hold here; so do 0, false and an empty text of all."""
+}  # values of these that hold here; so do 0, false and an empty text of all
+
+
+def parse(text: str, where: str) -> tuple[dict[str, Any], str, list[str]]:
+    """Read JSON as people write it: comments, trailing commas, NaN and infinities are accepted.
+
+    Args:
+        where: Begins the message of an error.
+
+    Returns:
+        Its values; the text, made strict JSON if need be; what AirSim would not have taken.
+
+    Raises:
+        ConfigError: It is no JSON, no object, or nested too deep.
+    """
+    strict = text.removeprefix("\ufeff")
+    notes: list[str] = []
+
+    def collect(found: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+        pairs = list(found)
+        counts = Counter(key for key, _ in pairs)
+        repeated = [key for key in counts if counts[key] > 1]
+        notes.extend(
+            f"{key!r} stands there more than once: the last one counts" for key in repeated
+        )
+        return dict(pairs)
+
+    def constant(name: str) -> float:
+        notes.append(f"{name}: AirSim itself refuses that")
+        return float(name)
+
+    try:
+        try:
+            table = json.loads(strict, object_pairs_hook=collect, parse_constant=constant)
+        except json.JSONDecodeError as error:
+            notes.clear()
+            loose = json5.loads(strict, object_pairs_hook=collect)
+            table = json.loads(json.dumps(loose))  # which joins surrogate pairs
+            place = f"line {error.lineno}, column {error.colno}"
+            notes.append(f"{place}: AirSim itself refuses that: {error.msg}")
+            strict = json.dumps(table, ensure_ascii=False)
+        json.dumps(table, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"{where}: expected Unicode, found half a surrogate pair") from None
+    except RecursionError:
+        raise ConfigError(f"{where}: expected objects and lists less deep in one another") from None
+    except ValueError as error:
+        raise ConfigError(_printable(f"{where}: expected JSON, found: {error}")) from None
+    if not isinstance(table, dict):
+        raise ConfigError(f"{where}: expected an object {{…}}, found {strict.strip()!r:.80}")
+    return table, strict, notes
 
 
 class Keys:
     """One object; its keys are asked for by name.
 
     What is not given, null or NaN has its default, as in AirSim. What is of the wrong type is a
-    `ConfigError`.
-
-    Args:
-        table: As JSON has it.
-        path: Where it stands, for messages: ``settings.json: ``, and then the keys.
-        notes: Lines on what is not honoured.
+    `ConfigError`. `notes` get lines on what is not honoured, which begin with `path`: where the
+    object stands, as ``settings.json: `` and then the keys.
     """
 
     def __init__(self, table: Mapping[str, Any], path: str, notes: list[str]) -> None:
@@ -96,9 +147,7 @@ class Keys:
     def mount(self, position: Vector3 = ZERO, orientation: Vector3 = ZERO) -> dict[str, Any]:
         """Return `position` and `orientation` as our cameras and sensors have them, if given.
 
-        Args:
-            position: What is taken of X, Y, Z that are not given, if one is.
-            orientation: What is taken of Roll, Pitch, Yaw.
+        The arguments are what is taken of X, Y, Z, and of Roll, Pitch, Yaw, that are not given.
         """
         found: dict[str, Any] = {}
         places = (("position", "X Y Z", position), ("orientation", "Roll Pitch Yaw", orientation))

@@ -39,7 +39,7 @@ def test_what_import_prints_is_toml_that_says_where_it_is_from(tmp_path: Path) -
     settings_file(tmp_path, '{"ViewMode": "Fpv", // none\n "a\\nb = [": 1, "Wind": {"X": 1}}')
     done = runtime(tmp_path, "import", "settings.json", "--world", "yard")
     assert done.returncode == 0, done.stderr
-    assert "warning: settings.json: a comment in line 1: AirSim itself" in done.stderr
+    assert "warning: settings.json: line 1, column 21: AirSim itself refuses" in done.stderr
     assert "warning: settings.json: ViewMode: ignored: it changes only" in done.stderr
     assert done.stdout.startswith(
         "# Made from AirSim's settings.json by `python -m runtime import`"

@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 from runtime.logs import NodeLogger
 from sims.airsim import wire
-from sims.airsim.server.connection import LONGEST_QUEUE, OPEN_REQUESTS
-from sims.airsim.server.listener import Listener
+from sims.airsim.server.connections import LONGEST_QUEUE, OPEN_REQUESTS, Listener
 from sims.airsim.server.methods import RpcError, Table, rpc
 
 
@@ -30,11 +29,6 @@ class Methods:
         self.called: list[int] = []
         self.ended: list[str] = []
         self.vehicle: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
-
-    @rpc("ping")
-    def ping(self) -> bool:
-        """Answer."""
-        return True
 
     @rpc("note")
     def note(self, number: int) -> int:
@@ -157,8 +151,9 @@ def serve(scenario: Scenario) -> None:
 
     async def main() -> None:
         methods = Methods()
-        listener = Listener("127.0.0.1", 0, 64, NodeLogger("airsim"))
-        listener.serve(Table([methods]), "airsim")
+        log = NodeLogger("airsim")
+        listener = Listener("127.0.0.1", 0, 64, log)
+        listener.serve(Table([methods], log), "airsim")
         clients = Clients(listener.port)
         try:
             async with asyncio.timeout(20):
@@ -233,9 +228,7 @@ def test_a_client_that_does_not_read_is_not_served_until_it_does() -> None:
     serve(scenario)
 
 
-def test_replies_that_pile_up_unread_close_the_connection(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_replies_that_pile_up_unread_close_the_connection(caplog: pytest.LogCaptureFixture) -> None:
     async def scenario(methods: Methods, clients: Clients) -> None:
         client = await clients.connect()
         size = LONGEST_QUEUE // 3
@@ -302,7 +295,7 @@ def test_more_connections_than_allowed_are_closed_and_logged_once(
 def test_connections_that_never_speak_make_room_for_others(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("sims.airsim.server.connection.SILENT", 0.0)
+    monkeypatch.setattr("sims.airsim.server.connections.SILENT", 0.0)
 
     async def scenario(methods: Methods, clients: Clients) -> None:
         assert (await (await clients.connect()).call("ping")).result is True

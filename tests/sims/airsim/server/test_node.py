@@ -1,4 +1,4 @@
-"""Time that clients pause and step, and time that runs only while they wait."""
+"""Time that clients pause and step, and runs that are equal if their scripts are."""
 
 from __future__ import annotations
 
@@ -10,34 +10,35 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
 
+from runtime.channels.digest import Digest
 from runtime.node import Node
 from runtime.testing import run_nodes, spec
 from runtime.time.schedule import SECOND, Once
 from sims.airsim import wire
-from sims.airsim.client.rpc import RpcCallError, RpcClient
+from sims.airsim.client.connection import RpcCallError, RpcClient
 from sims.airsim.server import AirsimServer
 from sims.airsim.server.methods import Table, rpc
-from sims.airsim.server.node import PORTS
+from sims.airsim.server.node import PORTS, Time
 from tests.runtime.samples_runs import supervise
-from tests.sims.airsim.scripts import Caller, RefusedError, drone, with_script
+from tests.sims.airsim.scripts import Caller, drone, with_script
 
 
 class Tasks:
     """A vehicle's tasks, which end after so many simulated seconds, or are superseded."""
 
-    def __init__(self, server: AirsimServer) -> None:
-        self._server = server
+    def __init__(self, time: Time) -> None:
+        self._time, self._clock = time, time._clock
         self._tasks: dict[str, asyncio.Future[float]] = {}
 
     @rpc("task")
     def task(self, seconds: float, vehicle: str) -> Awaitable[float]:
         """Return the time at which it ended."""
-        clock, task = self._server.clock, asyncio.get_running_loop().create_future()
+        clock, task = self._clock, asyncio.get_running_loop().create_future()
         self._end(vehicle)
         self._tasks[vehicle] = task
 
@@ -46,12 +47,12 @@ class Tasks:
                 task.set_result(clock.now() / SECOND)
 
         clock.schedule.add(clock.now() + round(seconds * SECOND), Once(end))
-        return self._server.time.owed(task)
+        return self._time.owed(task)
 
     @rpc("now")
     def now(self) -> float:
         """Return the time."""
-        return self._server.clock.now() / SECOND
+        return self._clock.now() / SECOND
 
     def _end(self, vehicle: str) -> None:
         before = self._tasks.get(vehicle)
@@ -61,8 +62,9 @@ class Tasks:
 
 @pytest.fixture(autouse=True)
 def _with_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    def with_tasks(groups: Any) -> Table:
-        return Table([*groups, Tasks(groups[0]._server)])
+    def with_tasks(groups: Any, *more: Any) -> Table:
+        (time,) = (group for group in groups if isinstance(group, Time))
+        return Table([*groups, Tasks(time)], *more)
 
     monkeypatch.setattr("sims.airsim.server.node.Table", with_tasks)
 
@@ -120,12 +122,11 @@ def test_a_frame_is_an_image_of_the_fastest_camera(
     with_script(script, [drone(world=tiny_world, cameras=cameras)])
 
 
-@pytest.mark.parametrize("seconds", [math.nan, math.inf, -1.0, 1e300, "1", None])
-def test_steps_that_make_no_sense_are_refused(seconds: object, tiny_world: str) -> None:
+def test_steps_that_make_no_sense_are_refused(tiny_world: str) -> None:
     def script(airsim: Caller) -> None:
-        with pytest.raises(RefusedError, match="simContinueForTime"):
-            airsim("simContinueForTime", seconds)
-        assert airsim("now") == 0.0
+        for seconds in (math.nan, math.inf, -1.0, 1e300, "1", None):
+            airsim.refuses("simContinueForTime", "simContinueForTime", seconds)
+            assert airsim("now") == 0.0
 
     with_script(script, [drone(world=tiny_world)])
 
@@ -144,10 +145,7 @@ def test_running_time_is_paused_stepped_and_resumed(tiny_world: str) -> None:
 
 
 def test_a_run_in_real_time_has_no_time_that_stands(tiny_world: str) -> None:
-    nodes = [
-        drone(world=tiny_world),
-        spec(AirsimServer, "airsim", {"port": 0, "time": "paused"}),
-    ]
+    nodes = [drone(world=tiny_world), spec(AirsimServer, "airsim", {"port": 0, "time": "paused"})]
     error = supervise(nodes, clock="real").error
     assert 'time: expected "running", found "paused": the run is in real time' in str(error)
 
@@ -159,15 +157,15 @@ def test_a_client_cannot_pause_a_run_in_real_time(tiny_world: str) -> None:
         """Asks for a pause."""
 
         async def run(self) -> None:
-            client = await RpcClient.connect(
-                "127.0.0.1", self.share(PORTS, dict[str, int])["airsim"]
-            )
+            port = self.share(PORTS, dict[str, int])["airsim"]
+            loop = asyncio.get_running_loop()
+            _, client = await loop.create_connection(RpcClient, "127.0.0.1", port)
             for call in (("simPause", True), ("simContinueForTime", 1.0)):
                 with pytest.raises(RpcCallError) as error:
-                    await client.call(*call)
+                    await client.send(*call)
                 refused.append(str(error.value))
-            await client.call("simPause", False)
-            assert await client.call("simIsPaused") is False
+            await client.send("simPause", False)
+            assert await client.send("simIsPaused") is False
             client.close()
             self.stop("asked")
 
@@ -223,3 +221,67 @@ def test_a_run_that_a_client_left_standing_ends(caplog: pytest.LogCaptureFixture
         result = run_nodes([drone(), server, spec(Leaver, "client")], duration=3600.0)
     assert "no client is left to let it run" in caplog.text
     assert "no client came for 0.1 s while time stood" in result.reason
+
+
+YAW = {"is_rate": True, "yaw_or_rate": 0.0}
+
+
+def fly(airsim: Caller) -> list[Any]:
+    """Fly a little; the only waiting is for replies."""
+    airsim("enableApiControl", True, "")
+    airsim("armDisarm", True, "")
+    replies = [airsim("takeoff", 20.0, "")]
+    replies.append(airsim("moveToPosition", 1, 0, -2, 2, 3e38, 0, YAW, -1, 1, ""))
+    replies.append(airsim("getMultirotorState", ""))
+    replies.append(airsim("moveByVelocity", 0.0, 1.0, -0.5, 0.7, 0, YAW, ""))
+    airsim("simContinueForTime", 0.31)
+    replies.append(airsim("simGetVehiclePose", ""))
+    replies.append(airsim("land", 30.0, ""))
+    return [*replies, airsim("getMultirotorState", "")]
+
+
+def step(airsim: Caller) -> list[Any]:
+    """Fly a little, step by step; moves are not waited for."""
+    airsim("enableApiControl", True, "")
+    airsim("armDisarm", True, "")
+    airsim.send("takeoff", 20.0, "")
+    replies: list[Any] = []
+    for index in range(12):
+        airsim("simContinueForTime", 0.25)
+        if index == 6:
+            airsim.send("moveByVelocity", 1.0, 0.0, 0.0, 1.0, 0, YAW, "")
+        airsim("simContinueForFrames", 3)
+        replies.append(airsim("getMultirotorState", ""))
+    return replies
+
+
+@pytest.mark.parametrize(("flight", "setting"), [(fly, "awaited"), (step, "paused")])
+def test_equal_scripts_give_equal_runs_and_replies(
+    flight: Callable[[Caller], list[Any]],
+    setting: str,
+    tiny_world: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    send = Caller.send
+    lags = random.Random()  # real delays, which differ in each run
+
+    def slow(self: Caller, method: str, *arguments: Any) -> int:
+        time.sleep(lags.choice([0.0, 0.0, 0.001, 0.02]))  # a script that computes meanwhile
+        return send(self, method, *arguments)
+
+    monkeypatch.setattr(Caller, "send", slow)
+    seen = []
+    for _ in range(3):
+        replies: list[Any] = []
+        result = with_script(
+            lambda airsim, replies=replies: replies.extend(flight(airsim)),  # type: ignore[misc]
+            [drone(world=tiny_world)],
+            time=setting,
+        )
+        digest = Digest()
+        for event in result.sent:
+            digest(None, event)
+        seen.append((digest.hexdigest(), result.seconds, replies))
+    assert len(seen[0][2]) > 5
+    assert seen[0][2][-1]["timestamp"] > 3_000_000_000
+    assert seen[0] == seen[1] == seen[2]

@@ -1,4 +1,4 @@
-"""Whatever clients send, the server answers the next ping, and the run is what it would be."""
+"""The table of methods: as documented, and whatever clients send in its arguments."""
 
 from __future__ import annotations
 
@@ -17,13 +17,42 @@ from hypothesis import strategies as st
 from runtime.channels.digest import Digest
 from runtime.testing import NodeResult
 from sims.airsim import wire
-from sims.airsim.server.methods import Method, methods_of
-from tests.sims.airsim.methods_table import groups
+from sims.airsim.server import AirsimServer
+from sims.airsim.server.methods import reason_unsupported
+from tests.sims.airsim.methods_table import HEADING, PAGE, methods, rewritten, rows
 from tests.sims.airsim.scripts import Caller, drone, with_script
 
-METHODS: dict[str, Method] = {
-    name: method for group in groups() for name, method in methods_of(group).items()
-}
+
+def test_the_page_has_all_methods_as_they_are() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert page == rewritten(page), "run python -m tests.sims.airsim.methods_table"
+
+
+def test_the_table_has_what_a_run_serves(tiny_world: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    served: list[AirsimServer] = []
+    begin = AirsimServer.run
+
+    async def noted(self: AirsimServer) -> None:
+        served.append(self)
+        await begin(self)
+
+    monkeypatch.setattr(AirsimServer, "run", noted)
+
+    def script(airsim: Caller) -> None:
+        assert airsim("ping")
+
+    with_script(script, [drone(world=tiny_world)])
+    assert {row.name for row in rows()} == {*served[0].table.methods}
+    assert all(row.description.endswith(".") for row in rows())
+    assert not any(reason_unsupported(row.name) for row in rows())
+
+
+def test_a_page_without_the_heading_is_refused() -> None:
+    with pytest.raises(ValueError, match=HEADING.strip()):
+        rewritten("# Methods")
+
+
+METHODS = methods()
 OUT_OF_BOUNDS = {"simContinueForTime", "simContinueForFrames", "startRecording", "simPause"}
 """Methods that let time go on, which may take long, or write files."""
 

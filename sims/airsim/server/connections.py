@@ -1,46 +1,73 @@
-"""One client's connection: its requests in order, its replies as they come; bounded in all.
+"""Connections of clients: where they connect, their requests in order, and their replies.
 
-The socket is read directly, a little in each turn of the loop: a transport would read (and a
-client could have served) much at once, and would need telling when not to.
+All is bounded. A socket is read directly, a little in each turn of the loop: a transport would read
+(and a client could have served) much at once, and would need telling when not to.
 """
 
 from __future__ import annotations
 
 import asyncio
 import functools
+import re
 import socket
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from runtime.logs import NodeLogger
 from sims.airsim import wire
-from sims.airsim.server.incidents import Incidents
 from sims.airsim.server.methods import EXPECTED_ERRORS, Flavour, RpcError, Table, thrown
 
-OPEN_REQUESTS = 256
-"""Requests of one connection that may wait for their replies; one more is refused."""
-
-LONGEST_QUEUE = 64 << 20
-"""Bytes of replies that a client may leave unread; with more, its connection is closed."""
-
+OPEN_REQUESTS = 256  # requests of a connection that may wait for their replies; more are refused
+LONGEST_QUEUE = 64 << 20  # bytes of unread replies with more of which a connection is closed
+MOST_WARNINGS = 500  # different refusals that are logged as warnings; others are at debug level
+# Real seconds after which a connection that never spoke, or that did and waits for nothing, makes
+# room for another one, if there is none.
 SILENT, IDLE = 5.0, 300.0
-"""Real seconds after which a connection that never spoke, or that did and waits for nothing, makes
-room for another one, if there is none."""
-
+# Bytes that are read in one turn of the loop: some requests, or a part of a long one.
 SMALL, LARGE = 256, 2048
-"""Bytes that are read in one turn of the loop: some requests, or a part of a long one."""
+
+
+class Incidents:
+    """Counts and logs what happens on all connections."""
+
+    def __init__(self, log: NodeLogger) -> None:
+        self._log = log
+        self.counts: Counter[str] = Counter()
+        self._logged: set[tuple[str, str]] = set()
+
+    def refused(self, address: str, text: str) -> None:
+        """Log what a client was refused, once for each host and kind: texts equal but for numbers.
+
+        Scripts do not see the errors of calls that they do not join, so the log must tell them.
+        """
+        self.counts["refused"] += 1
+        key = address.rpartition(":")[0], re.sub(r"[\d.]+", "#", text)
+        is_new = key not in self._logged and len(self._logged) < MOST_WARNINGS
+        if is_new:
+            self._logged.add(key)
+        text = text if text.isprintable() else ascii(text)
+        (self._log.warning if is_new else self._log.debug)("%s: refused: %.400s", address, text)
+
+    def failed(self, method: str, error: BaseException) -> None:
+        """Log an error that is the server's own, once for each method."""
+        self.counts["failed"] += 1
+        if ("", method) not in self._logged:
+            self._logged.add(("", method))
+            self._log.error("%s failed, which is a bug of the server", method, exc_info=error)
+
+    def log_counts(self) -> None:
+        """Log how often each thing happened."""
+        if self.counts:
+            counts = (f"{count} {what}" for what, count in self.counts.items())
+            self._log.info("AirSim's clients: %s", ", ".join(counts))
 
 
 class Connection:
     """Serves one client.
 
     Args:
-        client: Its socket.
-        address: Its address, for messages.
-        table: The methods.
-        flavour: Whose structures the client is taken to expect.
-        incidents: Is told what happens.
         on_close: Called once the connection is closed.
     """
 
@@ -120,17 +147,17 @@ class Connection:
                 if isinstance(message, wire.Request):
                     self._serve(message)
                 else:
-                    self._incidents.count("replies, ignored")
+                    self._incidents.counts["replies, ignored"] += 1
         except wire.WireFormatError as error:
             self.close(str(error))
 
     def _serve(self, request: wire.Request) -> None:
         self._heard, self._spoke = time.monotonic(), True
-        self._incidents.count("requests" if request.id is not None else "notifications")
+        self._incidents.counts["requests" if request.id is not None else "notifications"] += 1
         try:
             if self._open >= OPEN_REQUESTS:
                 text = f"expected at most {OPEN_REQUESTS} open requests of one connection"
-                raise RpcError(thrown(request.method, len(request.arguments), text))
+                raise RpcError(_thrown(request, text))
             result = self._table.call(self, request.method, request.arguments)
         except RpcError as error:
             self._refuse(request, str(error))
@@ -159,13 +186,11 @@ class Connection:
     def _done(self, request: wire.Request, future: asyncio.Future[Any]) -> None:
         self._open -= 1
         if future.cancelled():
-            self._refuse(
-                request, thrown(request.method, len(request.arguments), "it was cancelled")
-            )
+            self._refuse(request, _thrown(request, "it was cancelled"))
         elif (error := future.exception()) is None:
             self._answer(request, None, future.result())
         elif isinstance(error, EXPECTED_ERRORS):
-            self._refuse(request, thrown(request.method, len(request.arguments), str(error)))
+            self._refuse(request, _thrown(request, str(error)))
         else:
             self._fail(request, error)
 
@@ -177,7 +202,7 @@ class Connection:
     def _fail(self, request: wire.Request, error: BaseException) -> None:
         self._incidents.failed(request.method, error)
         text = f"{type(error).__name__} in the server, whose log has more"
-        self._answer(request, thrown(request.method, len(request.arguments), text), None)
+        self._answer(request, _thrown(request, text), None)
 
     def _answer(self, request: wire.Request, error: str | None, result: Any) -> None:
         if request.id is None or self._is_closed:
@@ -220,3 +245,82 @@ class Connection:
             pass
         except OSError:
             self.close()
+
+
+def _thrown(request: wire.Request, text: str) -> str:
+    return thrown(request.method, len(request.arguments), text)
+
+
+class Listener:
+    """Lets clients in.
+
+    Clients may connect as soon as it is made; they are served from `serve` on.
+
+    Args:
+        port: Port to listen on; 0 for any that is free.
+        most: Connections that may be open at once.
+        on_change: Called whenever a client has come or left, with whether any is there.
+
+    Raises:
+        ValueError: The port is not free.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        most: int,
+        log: NodeLogger,
+        on_change: Callable[[bool], None] = lambda _: None,
+    ) -> None:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        try:
+            self._socket = socket.create_server((host, port), family=family)
+        except OSError as error:
+            raise ValueError(
+                f"port: expected one that is free on {host}, found {port}: {error}"
+            ) from None
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+        self._most = most
+        self._on_change = on_change
+        self._incidents = Incidents(log)
+        self._connections: set[Connection] = set()
+
+    def serve(self, table: Table, flavour: Flavour) -> None:
+        """Serve those who have connected, and those who will."""
+        self._table, self._flavour = table, flavour
+        asyncio.get_running_loop().add_reader(self._socket, self._accept)
+
+    def close(self) -> None:
+        """Close all connections, and log what was counted."""
+        self._on_change = lambda _: None
+        asyncio.get_running_loop().remove_reader(self._socket)
+        self._socket.close()
+        for connection in tuple(self._connections):
+            connection.close()
+        self._incidents.log_counts()
+
+    def _accept(self) -> None:
+        try:
+            client, (host, port, *_) = self._socket.accept()
+        except OSError:  # it is gone again
+            return
+        address = f"{host}:{port}"
+        if len(self._connections) >= self._most:
+            idlest = max(self._connections, key=Connection.spare_for)
+            if idlest.spare_for() < 0.0:
+                self._incidents.refused(address, f"expected at most {self._most} connections")
+                client.close()
+                return
+            idlest.close("it was idle, and another client came")
+        self._incidents.counts["connections"] += 1
+        connection = Connection(
+            client, address, self._table, self._flavour, self._incidents, self._left
+        )
+        self._connections.add(connection)
+        self._on_change(bool(self._connections))
+
+    def _left(self, connection: Connection) -> None:
+        self._connections.discard(connection)
+        self._on_change(bool(self._connections))

@@ -1,1 +1,0 @@
-"""Tests of reading AirSim's settings.json."""
