@@ -19,7 +19,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from events.base import Category, Event, Quaternion, Vector3, check, check_pose
 from events.frames import inverse as inverse_rotation
@@ -119,6 +118,8 @@ Pose = tuple[Vector3, Quaternion]
 
 def pose_matrix(position: Vector3, orientation: Quaternion) -> Floats:
     """Return a pose (metres; w, x, y, z) as the transform from child to parent, shape (4, 4)."""
+    from scipy.spatial.transform import Rotation  # a second, which not all who need events have
+
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat(orientation, scalar_first=True).as_matrix()
     matrix[:3, 3] = position
@@ -127,6 +128,8 @@ def pose_matrix(position: Vector3, orientation: Quaternion) -> Floats:
 
 def pose_tuples(matrix: npt.NDArray[Any]) -> Pose:
     """Return a transform, shape (4, 4), as position (metres) and orientation (w ≥ 0, x, y, z)."""
+    from scipy.spatial.transform import Rotation
+
     x, y, z = matrix[:3, 3].tolist()
     quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True, scalar_first=True)
     qw, qx, qy, qz = quaternion.tolist()
