@@ -22,6 +22,7 @@ from mkdocs.structure.files import File, Files
 from runtime.channels.links import LinkConfig
 from runtime.config.model import NetworkConfig, RunConfig
 from runtime.config.reading import find_nodes
+from runtime.figures import FIGURES
 from runtime.node import Node
 from runtime.tools.cli import app
 from runtime.tools.describe import SettingDescription, describe, describe_settings
@@ -39,6 +40,26 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     }.items():
         files.append(File.generated(config, path, content=content))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put the table of all figures where a page asks for it."""
+    return re.sub(r"<!-- all figures.*-->", lambda _: figures_section(), markdown)
+
+
+def figures_section() -> str:
+    """Return what a page has of all figures: their meanings, units and thresholds."""
+    rows = [
+        (
+            f"`{each.name}`",
+            each.meaning,
+            each.unit,
+            each.limit and f"at {each.limit}" + f" {each.default:g}" * (each.default is not None),
+        )
+        for each in FIGURES.values()
+    ]
+    head = ("figure", "what it is", "unit", "threshold, and its default")
+    return "\n".join(["## All figures", "", *_table(head, rows)])
 
 
 def _refuse(warning: str) -> None:

@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from nodes.judging.evaluation.coverage import Interval
 from nodes.judging.evaluation.judging import Errors
-from nodes.judging.evaluation.verdict import AT_LEAST, IF_ANY
 from nodes.judging.report.style import number
 from nodes.trajectory import Trajectory
 from runtime import summary
+from runtime.figures import FIGURES, figure
 from runtime.summary import (
     LinkSummary,
     OutsideSummary,
@@ -141,68 +141,6 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         return first if first > 1e15 else 0
 
 
-MAIN = {
-    "ate_rmse_m": ("absolute trajectory error (ATE), RMS", "m"),
-    "ate_percent": ("ATE in percent of the path", "%"),
-    "held_ate_percent": ("ATE over the whole flight, lost time as 100 % drift", "%"),
-    "final_ate_rmse_m": ("ATE after loop closures", "m"),
-    "final_ate_percent": ("the same in percent of the path", "%"),
-    "final_held_ate_percent": ("the same over the whole flight", "%"),
-    "coverage_percent": ("share of the flight with poses", "%"),
-    "ate_max_m": ("greatest position error", "m"),
-    "rot_rmse_deg": ("rotation error, RMS", "°"),
-    "rpe_trans_percent": ("relative pose error (RPE), position", "%"),
-    "rpe_rot_deg_per_m": ("relative pose error (RPE), rotation", "°/m"),
-    "rpe_mean_trans_percent": ("RPE, mean over 1 to 20 % of the path, position", "%"),
-    "rpe_mean_rot_deg_per_m": ("the same, rotation", "°/m"),
-    "drift_percent": ("drift at the end, in percent of the path", "%"),
-    "scale_error_percent": ("error of the scale", "%"),
-    "velocity_rmse_m_per_s": ("velocity error, RMS", "m/s"),
-    "heading_rmse_deg": ("heading error, RMS", "°"),
-    "nees_position": ("NEES of the position, 3 if consistent", ""),
-    "nees_pose": ("NEES of the pose, 6 if consistent", ""),
-    "within_3_sigma_percent": ("share of the positions within 3 sigma of their covariance", "%"),
-    "covariances_percent": ("share of the poses with a covariance", "%"),
-    "covariance_invalid": ("covariances that are none", ""),
-    "velocities_percent": ("share of the poses with a velocity", "%"),
-    "available_rmse_m": ("error of the newest pose at control ticks, RMS", "m"),
-    "available_rot_rmse_deg": ("rotation error of the same, RMS", "°"),
-    "plan_rmse_m": ("distance of the flight from its plan, RMS", "m"),
-    "plan_max_m": ("greatest distance of the flight from its plan", "m"),
-    "latency_p50_ms": ("latency, median", "ms"),
-    "latency_p99_ms": ("latency, 99th percentile", "ms"),
-    "frame_coverage_percent": ("share of the images with a pose", "%"),
-    "lost_seconds": ("time without a pose", "s"),
-    "lost_count": ("times lost", ""),
-    "initialization_seconds": ("time before the first pose", "s"),
-    "relocalization_max_seconds": ("longest time to have a pose again", "s"),
-    "restarts": ("times that it began anew, in a frame of its own or as a node", ""),
-    "repeated_stamps": ("poses whose stamp was not later than the one before", ""),
-    "future_stamps": ("poses and losses of a time that had not come", ""),
-    "not_causal": ("poses so late that later images may be in them", ""),
-    "other_bodies": ("poses of another body than the truth's", ""),
-    "early_end": ("time that the run ended before its plan", "s"),
-    "ended_by": ("who ended the run", ""),
-    "reads_truth": ("whether it reads the truth", ""),
-    "collisions": ("collisions of the vehicle", ""),
-    "rate_hz": ("estimates a second", "Hz"),
-}
-"""Figures that the top of the report shows: what they are, and their units."""
-
-_UNITS = {
-    "_percent": "%",
-    "_deg_per_m": "°/m",
-    "_m_per_s": "m/s",
-    "_deg": "°",
-    "_ms": "ms",
-    "_hz": "Hz",
-    "_m2": "m²",
-    "_m": "m",
-    "_s": "s",
-    "_seconds": "s",
-}
-"""Units of other figures, by the end of their names."""
-
 _NO_FIGURES = {"passed", "failed", "why"}
 
 
@@ -228,24 +166,24 @@ def figures(run: Run, *, main: bool) -> list[Row]:
     """Return the main figures, or all others, with the thresholds there are."""
     thresholds = run.verdict.thresholds if run.verdict is not None else {}
     asked = {name: limit for name, limit in thresholds.items() if limit is not None}
-    names = dict.fromkeys(MAIN) | dict.fromkeys(asked)
+    rows = [each for each in FIGURES.values() if each.report]
+    top = sorted(rows, key=lambda each: each.report != "head")
+    names = dict.fromkeys([*(each.name for each in top), *asked])
     if not main:
         others = dict.fromkeys(k for e in run.estimators for k in e.figures)
         names = {k: None for k in others if k not in names and k not in _NO_FIGURES}
-    rows = []
-    for name in names:
-        values = [e.figures.get(name) for e in run.estimators]
-        limit = asked.get(name)
-        if (limit is None or name in IF_ANY) and all(value is None for value in values):
-            continue
-        meaning, unit = MAIN.get(name) or (name.replace("_", " "), _unit(name))
+    found = []
+    for row in map(figure, names):
+        values = [e.figures.get(row.name) for e in run.estimators]
+        limit = asked.get(row.name)
         why = [e.figures.get("failed") or () for e in run.estimators]
-        missed = [any(str(reason).startswith(f"{name}: ") for reason in each) for each in why]
-        cells = list(zip(map(show, values), missed, strict=True))
-        rows.append(
-            Row(name, meaning, unit, "" if limit is None else f"{_side(name)} {limit:g}", cells)
-        )
-    return rows
+        missed = [any(str(each).startswith(f"{row.name}: ") for each in own) for own in why]
+        known = any(value is not None for value in values)
+        if known or any(missed) or (limit is not None and not row.optional):
+            cells = list(zip(map(show, values), missed, strict=True))
+            threshold = "" if limit is None else f"{row.side} {limit:g}"
+            found.append(Row(row.name, row.meaning, row.unit, threshold, cells))
+    return found
 
 
 def show(value: Any) -> str:
@@ -365,14 +303,6 @@ def outputs(run: Run) -> list[list[str]]:
     """Return what was sent."""
     seconds = max(run.facts.sim_seconds or 0.0, 1e-9)
     return [[k, str(n), f"{n / seconds:.1f}"] for k, n in sorted(run.facts.outputs.items())]
-
-
-def _unit(name: str) -> str:
-    return next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
-
-
-def _side(name: str) -> str:
-    return "≥" if name in AT_LEAST else "≤"
 
 
 def _counts(missed: dict[str, int]) -> str:

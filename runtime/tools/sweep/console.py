@@ -16,9 +16,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.table import Table
 from rich.text import Text
 
+from runtime.figures import IN_SWEEPS
 from runtime.tools.sweep.plan import Job, Plan
 from runtime.tools.sweep.process import Children, run_job
-from runtime.tools.sweep.tables import MAIN_FIGURES, Combination, Row, Rows, failed
+from runtime.tools.sweep.tables import Combination, Row, Rows, failed
 
 
 class Watch:
@@ -191,7 +192,7 @@ class _State(ProgressColumn):
 
 def summary_table(plan: Plan, combinations: Sequence[Combination]) -> Table:
     """Return the main figures that there are; `write_tables` has their quartiles, too."""
-    names = [n for n in MAIN_FIGURES if any(n in each.figures for each in combinations)]
+    names = [n for n in IN_SWEEPS if any(n in each.figures for each in combinations)]
     table = Table(title="median (least to most) of the runs", title_justify="left")
     for parameter in plan.parameters:
         table.add_column(parameter.path, overflow="fold")

@@ -14,16 +14,12 @@ import jinja2
 import msgspec
 import numpy as np
 
+from runtime.figures import FIGURES, IN_SWEEPS
 from runtime.run.results import write
 from runtime.tools.sweep.plan import Parameter, Plan, axis
-from runtime.tools.sweep.tables import MAIN_FIGURES, Row, Spread, in_order, numbers, summarise
+from runtime.tools.sweep.tables import Row, Spread, in_order, numbers, summarise
 
-PLOTTED = {
-    "ate_percent": "trajectory error (% of the path)",
-    "available_rmse_m": "error of the newest pose (m)",
-    "lost_seconds": "lost (s)",
-    "plan_rmse_m": "distance of the flight from its plan (m)",
-}
+PLOTTED = {each.name: each.plot for each in FIGURES.values() if each.plot}
 """Figure to what it is called on its axis."""
 
 _SHARES = "failures (% of the runs)"
@@ -175,7 +171,7 @@ def write_page(plan: Plan, rows: Sequence[Row]) -> Path:
         The page.
     """
     combinations = summarise(plan, rows)
-    figures = [n for n in MAIN_FIGURES if any(n in each.figures for each in combinations)]
+    figures = [n for n in IN_SWEEPS if any(n in each.figures for each in combinations)]
     summary = []
     for each in combinations:
         spreads = [each.figures.get(name) for name in figures]

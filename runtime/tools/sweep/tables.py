@@ -19,6 +19,7 @@ from typing import IO, Any, NotRequired, TypedDict
 import msgspec
 
 from runtime.errors import ConfigError
+from runtime.figures import IN_SWEEPS
 from runtime.tools.sweep.plan import Job, Plan
 
 
@@ -132,21 +133,6 @@ class Rows:
         return row
 
 
-MAIN_FIGURES = (
-    "ate_rmse_m",
-    "ate_percent",
-    "held_ate_percent",
-    "rpe_trans_percent",
-    "rpe_rot_deg_per_m",
-    "coverage_percent",
-    "lost_seconds",
-    "restarts",
-    "latency_p50_ms",
-    "available_rmse_m",
-)
-"""Figures of an estimator that ``summary.csv`` sums up, where a verdict has them."""
-
-
 class Spread(msgspec.Struct, frozen=True):
     """One figure over the runs that have it: median, first and third quartile, least and most."""
 
@@ -221,12 +207,12 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     costs_of_all = [[*h, name, *(costs.get(k) for k in keys)] for h, name, costs in workers]
     _write(plan.out / "costs.csv", header, costs_of_all)
     header = [*paths, "estimator", "runs", "failed", "missed", "passed", "repeatable"]
-    header += [f"{name}_{what}" for name in MAIN_FIGURES for what in SPREAD]
+    header += [f"{name}_{what}" for name in IN_SWEEPS for what in SPREAD]
     lines = []
     for each in summarise(plan, rows):
         line: list[Any] = [*each.settings, each.estimator, each.runs, each.failed, each.missed]
         line += [each.passed, each.repeatable]
-        for name in MAIN_FIGURES:
+        for name in IN_SWEEPS:
             line += [getattr(each.figures.get(name), field, None) for field in SPREAD.values()]
         lines.append(line)
     _write(plan.out / "summary.csv", header, lines)
@@ -261,7 +247,7 @@ def _combination(settings: tuple[str, ...], name: str, group: Sequence[Row]) -> 
     figures = [row["estimators"][name] for row in group if name in row["estimators"]]
     passed = [f["passed"] for f in figures if isinstance(f.get("passed"), bool)]
     spreads = {}
-    for main in MAIN_FIGURES:
+    for main in IN_SWEEPS:
         if found := numbers(f.get(main) for f in figures):
             spreads[main] = Spread.of(found)
     return Combination(
@@ -302,7 +288,7 @@ def _table(paths: list[str], rows: list[tuple[Job, Row]]) -> tuple[list[str], li
     """Return header and lines: one a run and estimator, or one for a run that has none."""
     header = ["run", *paths, *_seed(rows), "exit_code", "error", "passed", "sim_seconds", "digest"]
     found = {key for _, row in rows for f in row["estimators"].values() for key in f}
-    figures = [name for name in MAIN_FIGURES if name in found]
+    figures = [name for name in IN_SWEEPS if name in found]
     figures += sorted(found - {*figures})
     lines = []
     for job, row in rows:

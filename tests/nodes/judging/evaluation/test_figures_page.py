@@ -1,4 +1,4 @@
-"""The page of figures names every figure and every threshold there is."""
+"""The table of figures has every figure and every threshold there is, and the pages show it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from nodes.judging.evaluation.judging import judge
 from nodes.judging.evaluation.verdict import Thresholds
+from runtime.figures import FIGURES, IN_SWEEPS, figure
 from tests.nodes.judging.report.folders import recorded, walk
 
 PAGE = (Path(__file__).parents[4] / "docs" / "explanation" / "figures.md").read_text(
@@ -14,28 +15,29 @@ PAGE = (Path(__file__).parents[4] / "docs" / "explanation" / "figures.md").read_
 )
 
 
-def test_every_figure_and_threshold_is_explained() -> None:
+def test_every_figure_is_in_the_table_and_on_the_page() -> None:
     truth = walk(12)
     record = recorded(truth, silent=(5.0, 6.0), velocity=(1.0, 0.0, 0.0), covariance=(0.1,) * 36)
     record.final, record.final_frame_id = truth, "map"
     figures = {*judge(record, truth).figures} | {"plan_rmse_m", "plan_max_m", "collisions"}
     figures |= {"early_end", "ended_by", "reads_truth"}
     assert {"relocalization_p50_seconds", "nees_pose", "final_ate_percent"} <= figures
-    explained = set(re.findall(r"`(\w+)`", PAGE))
-    assert figures - {"method"} <= explained
-    assert {*Thresholds.__struct_fields__} <= explained
+    assert figures <= {*FIGURES}
+    assert "<!-- all figures" in PAGE  # `tools.docs_pages` puts the table there
 
 
-def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
+def test_thresholds_are_those_of_the_table_with_the_defaults_that_the_page_names() -> None:
+    asked = [each for each in FIGURES.values() if each.limit]
+    assert list(Thresholds.__struct_fields__) == [each.name for each in asked]
+    assert [getattr(Thresholds(), each.name) for each in asked] == [e.default for e in asked]
     assert "`coverage_percent` at least 90;" in PAGE
-    given = {name: getattr(Thresholds(), name) for name in Thresholds.__struct_fields__}
-    assert {k: v for k, v in given.items() if v is not None} == {
-        "coverage_percent": 90.0,
-        "covariance_invalid": 0,
-        "restarts": 0,
-        "repeated_stamps": 0,
-        "future_stamps": 0,
-        "other_bodies": 0,
-        "early_end": 0.0,
-        "collisions": 0,
-    }
+    counts = {each.name for each in asked if each.default == 0}
+    (sentence,) = re.findall(r"at least 90;(.*?)at most 0;", PAGE, re.DOTALL)
+    assert {*re.findall(r"`(\w+)`", sentence)} == counts
+    assert FIGURES["velocities_percent"].all_or_none == 95.0
+
+
+def test_units_are_the_ends_of_names_and_an_unknown_figure_has_words() -> None:
+    assert {each.name for each in FIGURES.values() if not each.unit} >= {"restarts", "nees_pose"}
+    assert (figure("late_p50_ms").unit, figure("late_p50_ms").meaning) == ("ms", "late p50 ms")
+    assert len(IN_SWEEPS) == len({*IN_SWEEPS}) == max(each.sweep for each in FIGURES.values())

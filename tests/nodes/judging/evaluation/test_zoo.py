@@ -190,6 +190,15 @@ def test_thresholds_that_nobody_is_there_to_meet_are_missed(
     assert ("expected an estimator" in str(found.get("failed"))) is not passed
 
 
+def test_nobody_invents_by_how_much_an_end_was_early() -> None:
+    animal = BAD["asks for it where no end is planned"]
+    found = conclude({"est": judged(animal)}, Thresholds(early_end=9.0), (), animal.end)
+    figures = found["estimators"]["est"]
+    assert figures["early_end"] is None
+    unknown = "early_end: ended early (by est: dark); the planned end is not known"
+    assert figures["failed"] == [unknown]
+
+
 def test_what_the_user_ended_is_not_judged() -> None:
     end = ended(by="user", reason="Ctrl-C", planned=False, stamp=3 * SECOND)
     for found in ({"est": judged(BAD["mute"])}, {}):

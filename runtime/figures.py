@@ -1,0 +1,209 @@
+"""The figures of a verdict, in one table: what each means, where it is shown, what it may be.
+
+Verdict, thresholds, report, sweep, the schema of the file and the documentation read this table. A
+figure that is not in it is shown all the same, by its name, among all others.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+
+class Figure(msgspec.Struct, frozen=True):
+    """One figure of an estimator.
+
+    Attributes:
+        name: In files; its end is the unit.
+        meaning: In words.
+        limit: Whether a threshold is the least that it may be, or the most; "" if there is none.
+        default: The threshold where the file gives none.
+        counts: Whether it is a whole number.
+        optional: Whether a threshold is not missed where there is no figure: not everybody sends
+            velocities, and nobody who never restarts counts how often.
+        all_or_none: Percent that are asked for as soon as there is any: of what comes with some of
+            the poses only, somebody may have chosen with which.
+        report: ``head`` and ``main`` stand at the top of a report, in this order.
+        sweep: Column among the main figures of a sweep; 0 if it is none of them.
+        plot: Title of its panel in the plots of a sweep; "" if there is none.
+    """
+
+    name: str
+    meaning: str
+    limit: Literal["", "least", "most"] = ""
+    default: float | None = None
+    counts: bool = False
+    optional: bool = False
+    all_or_none: float | None = None
+    report: Literal["head", "main", ""] = "main"
+    sweep: int = 0
+    plot: str = ""
+
+    @property
+    def unit(self) -> str:
+        """Of its values; "" if they have none."""
+        return next((unit for end, unit in _UNITS.items() if self.name.endswith(end)), "")
+
+    @property
+    def side(self) -> str:
+        """What stands before a threshold in a table."""
+        return "≥" if self.limit == "least" else "≤"
+
+    @property
+    def setting(self) -> str:
+        """What the threshold is, for the reference of settings."""
+        unit = f" ({self.unit})" if self.unit else ""
+        if self.all_or_none is not None:
+            unit += f"; if it is not given, {self.all_or_none:g} where there is any"
+        return f"{self.meaning[0].upper()}{self.meaning[1:]}{unit}, at {self.limit}."
+
+    def missed(self, limit: float | None, value: Any) -> str:
+        """Return a sentence if a value does not meet a threshold, or else nothing."""
+        if limit is None and value is not None:
+            limit = self.all_or_none
+        if limit is None or (value is None and self.optional):
+            return ""
+        found = "none" if value is None else f"{value:.4g}"
+        if value is not None and (value >= limit if self.limit == "least" else value <= limit):
+            return ""
+        return f"{self.name}: expected at {self.limit} {limit:g}, found {found}"
+
+
+_UNITS = {
+    "_percent": "%",
+    "_deg_per_m": "°/m",
+    "_m_per_s": "m/s",
+    "_deg": "°",
+    "_ms": "ms",
+    "_hz": "Hz",
+    "_m2": "m²",
+    "_m": "m",
+    "_s": "s",
+    "_seconds": "s",
+    "early_end": "s",
+}
+"""Units by the end of a figure's name."""
+
+
+def _error(name: str, meaning: str, **more: Any) -> Figure:
+    return Figure(name, meaning, "most", **more)
+
+
+def _share(name: str, meaning: str, **more: Any) -> Figure:
+    return Figure(name, meaning, "least", **more)
+
+
+def _count(name: str, meaning: str, default: int | None = 0, **more: Any) -> Figure:
+    return Figure(name, meaning, "most", default, True, True, **more)
+
+
+def _detail(name: str, meaning: str) -> Figure:
+    return Figure(name, meaning, report="")
+
+
+_LENGTHS = [f"{share} % of the path" for share in (1, 2, 5, 10, 20)]
+
+_TABLE = (
+    _detail("method", "what the estimator says that it is"),
+    _detail("vehicle", "vehicle by which it was judged"),
+    _detail("alignment", "how it was laid on the truth"),
+    _detail("scale", "true length of its unit in metres"),
+    _detail("estimates", "poses that count"),
+    _detail("compared", "poses within the truth's time"),
+    _detail("path_m", "length of the true path in the flight"),
+    _error("ate_rmse_m", "absolute trajectory error (ATE), RMS", report="head", sweep=1),
+    _error(
+        "ate_percent", "ATE in percent of the path", report="head", sweep=2,
+        plot="trajectory error (% of the path)",
+    ),
+    _detail("ate_mean_m", "ATE, mean"),
+    _detail("ate_median_m", "ATE, median"),
+    _detail("ate_std_m", "ATE, standard deviation"),
+    _detail("ate_north_rmse_m", "error along north, RMS"),
+    _detail("ate_east_rmse_m", "error along east, RMS"),
+    _detail("ate_down_rmse_m", "error along down, RMS"),
+    _detail("mse_m2", "mean square of the distances to the truth"),
+    _detail("held_ate_rmse_m", "ATE over the whole flight, lost time as 100 % drift, RMS"),
+    _error(
+        "held_ate_percent", "ATE over the whole flight, lost time as 100 % drift", report="head",
+        sweep=3,
+    ),
+    _detail("final_poses", "poses of the trajectory after loop closures"),
+    Figure("final_ate_rmse_m", "ATE after loop closures", report="head"),
+    _error(
+        "final_ate_percent", "ATE after loop closures, in percent of the path", report="head"
+    ),
+    _detail("final_rot_rmse_deg", "rotation error after loop closures, RMS"),
+    _detail("final_held_ate_rmse_m", "ATE after loop closures over the whole flight, RMS"),
+    Figure("final_held_ate_percent", "the same over the whole flight", report="head"),
+    _detail("why_not_final", "why the trajectory after loop closures was not judged"),
+    _error("ate_max_m", "greatest position error"),
+    _error("rot_rmse_deg", "rotation error, RMS"),
+    _error("rpe_trans_percent", "relative pose error (RPE), position", sweep=4),
+    _error("rpe_rot_deg_per_m", "relative pose error (RPE), rotation", sweep=5),
+    *(_detail(f"rpe_{length.split()[0]}_{end}", f"RPE over {length}, {what}") for length in _LENGTHS
+      for end, what in (("trans_percent", "position"), ("rot_deg_per_m", "rotation"))),
+    Figure("rpe_mean_trans_percent", "RPE, mean over 1 to 20 % of the path, position"),
+    Figure("rpe_mean_rot_deg_per_m", "the same, rotation"),
+    _error("drift_percent", "drift at the end, in percent of the path"),
+    _detail("drift_m_per_s", "drift at the end by time"),
+    Figure("scale_error_percent", "error of the scale"),
+    _error("lost_seconds", "time without a pose", sweep=7, plot="lost (s)"),
+    Figure("lost_count", "times lost"),
+    _error("initialization_seconds", "time before the first pose"),
+    _detail("relocalization_p50_seconds", "time to have a pose again, median"),
+    Figure("relocalization_max_seconds", "longest time to have a pose again"),
+    Figure("latency_p50_ms", "latency, median", sweep=9),
+    _error("latency_p99_ms", "latency, 99th percentile"),
+    _error(
+        "available_rmse_m", "error of the newest pose at control ticks, RMS", sweep=10,
+        plot="error of the newest pose (m)",
+    ),
+    Figure("available_rot_rmse_deg", "rotation error of the same, RMS"),
+    _error("available_age_ms", "age of the newest pose at control ticks, mean", report=""),
+    _error("velocity_rmse_m_per_s", "velocity error, RMS", optional=True),
+    Figure("heading_rmse_deg", "heading error, RMS"),
+    _error("nees_position", "NEES of the position, 3 if consistent", optional=True),
+    Figure("nees_pose", "NEES of the pose, 6 if consistent"),
+    _detail("nees_position_inside_percent", "share of the positions within 95 % bounds of NEES"),
+    _detail("nees_pose_inside_percent", "share of the poses within 95 % bounds of NEES"),
+    _share(
+        "within_3_sigma_percent", "share of the positions within 3 sigma of their covariance",
+        optional=True,
+    ),
+    _error(
+        "plan_rmse_m", "distance of the flight from its plan, RMS",
+        plot="distance of the flight from its plan (m)",
+    ),
+    Figure("plan_max_m", "greatest distance of the flight from its plan"),
+    _share(
+        "coverage_percent", "share of the flight with poses", default=90.0, report="head", sweep=6
+    ),
+    _share("frame_coverage_percent", "share of the images with a pose"),
+    _share("velocities_percent", "share of the poses with a velocity", all_or_none=95.0),
+    _share("covariances_percent", "share of the poses with a covariance", all_or_none=95.0),
+    _count("covariance_invalid", "covariances that are not symmetric and positive definite"),
+    _count("restarts", "times that it began anew, in a frame of its own or as a node", sweep=8),
+    _count("repeated_stamps", "poses whose stamp was not later than the one before"),
+    _count("future_stamps", "poses and losses of a time that had not come"),
+    _count("not_causal", "poses so late that later images may be in them", None),
+    _count("other_bodies", "poses of another body than the truth's"),
+    _error("early_end", "time that the run ended before its plan", default=0.0, optional=True),
+    Figure("ended_by", "who ended the run"),
+    Figure("reads_truth", "whether it reads the truth"),
+    _count("collisions", "collisions of the vehicle"),
+    Figure("rate_hz", "estimates a second"),
+    _detail("why", "why it, or a part of it, could not be judged"),
+)  # fmt: skip
+
+FIGURES = {figure.name: figure for figure in _TABLE}
+"""All figures by name; those with thresholds in the order of ``verdict.json``."""
+
+IN_SWEEPS = tuple(f.name for f in sorted(_TABLE, key=lambda f: f.sweep) if f.sweep)
+"""Figures of an estimator that ``summary.csv`` of a sweep sums up, where a verdict has them."""
+
+
+def figure(name: str) -> Figure:
+    """Return the row of a figure; of one that is not in the table, its name in words."""
+    return FIGURES.get(name) or Figure(name, name.replace("_", " "), report="")
