@@ -26,24 +26,11 @@ _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 )
 
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "<i2",
-    "int16": "<i2",
-    "ushort": "<u2",
-    "uint16": "<u2",
-    "int": "<i4",
-    "int32": "<i4",
-    "uint": "<u4",
-    "uint32": "<u4",
-    "float": "<f4",
-    "float32": "<f4",
-    "double": "<f8",
-    "float64": "<f8",
-}
+_NAMES = {
+    "i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16",
+    "i4": "int int32", "u4": "uint uint32", "f4": "float float32", "f8": "double float64",
+}  # fmt: skip
+_TYPES = {name: f"<{kind}" for kind, names in _NAMES.items() for name in names.split()}
 _LONGEST_HEADER = 1 << 16
 
 
@@ -89,17 +76,10 @@ def write_ply(
     rows["red"], rows["green"], rows["blue"] = colours.T
     named = frame_id.encode("unicode_escape").decode("ascii")  # in one line
     axes = ", x north, y east, z down" if frame_id == "map" else ""
-    names = {"float32": "float", "uint8": "uchar"}
-    properties = (f"property {names[_VERTEX[n].name]} {n}" for n in _VERTEX.names or ())
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            f"comment frame {named}: metres{axes}",
-            f"element vertex {len(rows)}",
-            *properties,
-            "end_header\n",
-        ]
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment frame {named}: metres{axes}\n"
+        f"element vertex {len(rows)}\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as new, new.open("wb") as file:

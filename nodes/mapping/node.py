@@ -18,12 +18,10 @@ from events import (
     Odometry,
     PointCloud,
     PoseStamped,
-    TransformStamped,
 )
 from events.geometry import pose_matrix
 from nodes.estimators import WORKER_ENVIRONMENT
 from nodes.mapping.cloud import Mapper
-from nodes.mapping.transforms import TransformError, TransformTree
 from nodes.trajectory.table import part_name
 from runtime import Bundle, Duration, Node, NodeConfig, Output, on
 from runtime.paths import OutputPath
@@ -74,7 +72,7 @@ class Mapping(Node[MappingConfig]):
 
     def __init__(self) -> None:
         self._camera: CameraAnnouncement | None = None
-        self._tree = TransformTree()
+        self._vehicle: Odometry | None = None  # the newest
         self._frame_id = "map"
         self._stamp = 0
         self._used = 0
@@ -111,17 +109,6 @@ class Mapping(Node[MappingConfig]):
             )
         self._camera = announcement
         self.narrow("frames", announcement.source)
-        self._tree.add(
-            TransformStamped(
-                stamp=announcement.stamp,
-                source=announcement.source,
-                frame_id=announcement.parent_frame_id,
-                child_frame_id=announcement.frame_id,
-                translation=announcement.position,
-                rotation=announcement.orientation,
-                static=True,
-            )
-        )
 
     def check(self) -> Iterable[str]:
         """Say if no camera gives what is needed."""
@@ -131,10 +118,13 @@ class Mapping(Node[MappingConfig]):
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
         """Note where the vehicle that carries the camera is."""
-        camera = self._camera
+        camera, before = self._camera, self._vehicle
         if camera is not None and camera.source.startswith(f"{event.source}/"):
             self._frame_id = event.frame_id
-            self._tree.add_odometry(event)
+            if event.child_frame_id == camera.parent_frame_id and (
+                before is None or event.stamp >= before.stamp
+            ):
+                self._vehicle = event
 
     async def run(self) -> None:
         """Add frames to the cloud."""
@@ -184,12 +174,10 @@ class Mapping(Node[MappingConfig]):
         if self.config.pose == "matched":
             self._frame_id = pose.frame_id
             return pose_matrix(pose.position, pose.orientation)
-        try:
-            known = self._tree.span(camera.parent_frame_id)
-            newest = 0 if known is None else known[1]
-            return self._tree.lookup(self._frame_id, camera.frame_id, newest)
-        except TransformError:  # the vehicle has not said where it is
+        if (vehicle := self._vehicle) is None:  # it has not said where it is
             return None
+        mounting = pose_matrix(camera.position, camera.orientation)
+        return pose_matrix(vehicle.position, vehicle.orientation) @ mounting
 
     async def _send(self) -> int:
         """Send the cloud, and return how many points it has."""

@@ -364,23 +364,15 @@ def _floats(name: str, array: Any, shape: tuple[int, int]) -> Floats:
 
 
 HISTORY = 10_000_000_000
-"""Nanoseconds for which poses are kept, if nothing else is asked for."""
+"""Nanoseconds for which recent poses are kept, back from the newest."""
 
 
 class RecentPoses:
-    """Poses of one frame in another, by time.
+    """Poses of one frame in another, by time."""
 
-    Args:
-        history: Nanoseconds for which poses are kept, back from the newest; `None` keeps all.
-    """
-
-    def __init__(self, history: int | None = HISTORY) -> None:
-        self._history = history
+    def __init__(self) -> None:
         self._stamps: list[int] = []
         self._poses: list[Pose] = []
-
-    def __len__(self) -> int:
-        return len(self._stamps)
 
     def add(self, stamp: int, position: Vector3, orientation: Quaternion) -> None:
         """Take in a pose (ns, metres, w x y z), in any order; one of the same stamp is replaced."""
@@ -391,13 +383,8 @@ class RecentPoses:
             return
         stamps.insert(place, stamp)
         poses.insert(place, (position, orientation))
-        if self._history is not None:
-            old = bisect_left(stamps, stamps[-1] - self._history)
-            del stamps[:old], poses[:old]
-
-    def span(self) -> tuple[int, int] | None:
-        """Return the first and the last stamp (ns) that are kept; `None` if there is none."""
-        return (self._stamps[0], self._stamps[-1]) if self._stamps else None
+        old = bisect_left(stamps, stamps[-1] - HISTORY)
+        del stamps[:old], poses[:old]
 
     def at(self, stamp: int) -> Pose | None:
         """Return the pose at a time (ns): positions linear, orientations by slerp.

@@ -285,8 +285,7 @@ def content_key(flight: Config) -> str:
         for path in sorted(Path("/").glob(pattern[1:])):
             found = path.stat()
             texts.append(f"{path} {found.st_size} {found.st_mtime_ns}")
-    here = (f"runtime.tools.flights.{name}" for name in ("layout", "recorder", "player"))
-    files = {*_sources([*(spec.node.__module__ for spec in flight.nodes), *here])}
+    files = {*_sources([*(spec.node.__module__ for spec in flight.nodes), __name__])}
     for path in _paths(to_builtins(flight)["nodes"]):
         files |= _read_by(path)
     texts += [f"{path} {_hashed([path.read_bytes()])}" for path in sorted(files)]

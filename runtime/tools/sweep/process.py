@@ -14,12 +14,12 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from runtime.channels.digest import combined
 from runtime.run.results import clear
+from runtime.summary import Verdict
 from runtime.tools.sweep.plan import Job
 from runtime.tools.sweep.tables import Row, failed
 
@@ -32,13 +32,6 @@ LIFELINE = "VISNAV_LIFELINE"
 """Environment variable of a run: number of a pipe at whose other end its sweep is."""
 
 
-class RunVerdict(msgspec.Struct, frozen=True):
-    """The part of a run's summary that says how well it went."""
-
-    passed: bool | None
-    estimators: dict[str, dict[str, Any]] = {}
-
-
 class Ended(msgspec.Struct, frozen=True):
     """What a sweep reads of a run's ``summary.json``."""
 
@@ -48,7 +41,7 @@ class Ended(msgspec.Struct, frozen=True):
     digest: str | None = None
     digests: dict[str, str] = {}
     not_deterministic: list[str] = []
-    verdict: RunVerdict | None = None
+    verdict: Verdict | None = None
     workers: dict[str, dict[str, float | None]] = {}
 
 
