@@ -1,21 +1,180 @@
-"""``SUITE.md``: one table of all, one for each scenario, and what they do not show."""
+"""``SUITE.md``: a table of all, one for each scenario, pictures, and what they do not show."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import cv2
 import jinja2
+import msgspec
+import numpy as np
 
-from bench.estimators.cells import COLUMNS, cells
-from bench.estimators.pictures import draw, pictures
-from bench.estimators.plan import Suite
+from bench.estimators.plan import Entrant, Suite
 from runtime.run.results import write
 from runtime.run.summarise import commit, environment
 from runtime.tools.sweep.plan import Plan
-from runtime.tools.sweep.tables import Row
+from runtime.tools.sweep.tables import Row, Spread, in_order, numbers, summarise
+
+COLUMNS = {
+    "held_ate_percent": "error, whole flight, %",
+    "ate_percent": "ATE as said, %",
+    "final_ate_percent": "ATE final, %",
+    "rpe_trans_percent": "RPE of 1 m, %",
+    "coverage_percent": "coverage, %",
+    "lost_seconds": "lost, s",
+    "initialization_seconds": "first pose, s",
+    "cpu_p50_ms": "CPU, ms a frame",
+    "peak_rss_mb": "memory, MB",
+}
+"""Figure to the head of its column."""
+
+RANKED = "held_ate_percent"
+"""The figure by which all are compared: a pose that is missing counts with the last one said."""
+
+
+class Cell(msgspec.Struct, frozen=True, kw_only=True):
+    """One estimator in one scenario, over all seeds and repeats.
+
+    Attributes:
+        entrant: The estimator.
+        runs: How many runs there are.
+        passed: How many of them met the thresholds.
+        reasons: Why runs failed, each once, with the figures of the first of them.
+        figures: Figure to its spread over the runs that have it.
+        repeatable: Whether all repeats of a seed gave the same, in words.
+    """
+
+    entrant: Entrant
+    runs: int
+    passed: int
+    reasons: tuple[str, ...]
+    figures: Mapping[str, Spread]
+    repeatable: str
+
+    @property
+    def verdict(self) -> str:
+        """In words: passed, failed, or how often of how many."""
+        if self.passed == self.runs:
+            return "passed"
+        return "**failed**" + f" {self.runs - self.passed} of {self.runs}" * bool(self.passed)
+
+    @property
+    def short(self) -> str:
+        """The cell of the table of all: the error, and whether it failed."""
+        error = self.figures.get(RANKED)
+        words = "" if error is None else f"{error.median:.3g}"
+        if error is not None and f"{error.least:.3g}" != f"{error.most:.3g}":
+            words += f" ({error.least:.3g} to {error.most:.3g})"
+        return words if self.passed == self.runs else f"{words} {self.verdict}".strip()
+
+
+def cells(suite: Suite, plan: Plan, rows: Sequence[Row]) -> dict[str, dict[str, Cell]]:
+    """Return what became of each estimator, by scenario and estimator."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for job, row in in_order(plan, rows):
+        groups.setdefault(tuple(text for _, text in job.settings), []).append(row)
+    repeatable = {each.settings: each.repeatable for each in summarise(plan, rows)}
+    found: dict[str, dict[str, Cell]] = {}
+    for scenario in suite.scenarios:
+        for entrant in suite.estimators:
+            key = (scenario.name, entrant.name)
+            if group := groups.get(key):
+                found.setdefault(scenario.name, {})[entrant.name] = Cell(
+                    entrant=entrant,
+                    runs=len(group),
+                    passed=sum(row["passed"] is True for row in group),
+                    reasons=_reasons(entrant.name, group),
+                    figures=_figures(entrant.name, group),
+                    repeatable=repeatable[key],
+                )
+    return found
+
+
+def _reasons(name: str, group: Sequence[Row]) -> tuple[str, ...]:
+    """Return why runs came to nothing or missed a threshold; each threshold once."""
+    found: dict[str, str] = {}
+    for row in group:
+        missed = row["estimators"].get(name, {}).get("failed") or []
+        for reason in [row["error"]] * bool(row["error"]) + missed:
+            found.setdefault(reason.partition(":")[0], reason)
+    return tuple(found.values())
+
+
+def _figures(name: str, group: Sequence[Row]) -> dict[str, Spread]:
+    figures = [row["estimators"].get(name, {}) | _costs(name, row) for row in group]
+    values = {figure: numbers(each.get(figure) for each in figures) for figure in COLUMNS}
+    return {figure: Spread.of(each) for figure, each in values.items() if each}
+
+
+def _costs(name: str, row: Row) -> dict[str, float | None]:
+    """Return what an estimator's process costs, by the names of `COLUMNS`."""
+    for worker, costs in row.get("workers", {}).items():
+        if worker.startswith(f"{name}."):
+            return {"cpu_p50_ms": costs.get("cpu_p50_ms"), "peak_rss_mb": costs.get("peak_rss_mb")}
+    return {}
+
+
+HEIGHT = 240
+"""Of the cameras' pictures, pixels."""
+
+
+def draw(suite: Suite, cells: Mapping[str, Mapping[str, Cell]], path: Path) -> None:
+    """Draw the error of each estimator in each scenario, with its range; crosses have failed."""
+    from matplotlib.figure import Figure
+
+    there = [e.name for e in suite.estimators if any(e.name in each for each in cells.values())]
+    figure = Figure(figsize=(2.1 * len(suite.scenarios) + 2.4, 4.6), layout="constrained")
+    axes: Any = figure.add_subplot()
+    for index, name in enumerate(there):
+        colour = f"C{index % 10}"
+        for place, scenario in enumerate(suite.scenarios):
+            cell = cells.get(scenario.name, {}).get(name)
+            spread = cell.figures.get(RANKED) if cell else None
+            if cell is None or spread is None:
+                continue
+            x = place + (index + 0.5) / len(there) * 0.8 - 0.4
+            axes.plot([x, x], [spread.least, spread.most], color=colour, lw=4, alpha=0.35)
+            mark = "o" if cell.passed == cell.runs else "x"
+            axes.plot(x, spread.median, mark, color=colour)
+        axes.plot([], [], "o", color=colour, label=name)
+    for place in range(1, len(suite.scenarios)):
+        axes.axvline(place - 0.5, color="0.85", lw=1)
+    axes.set_xticks(
+        range(len(suite.scenarios)), [f"{s.name}\n({s.level})" for s in suite.scenarios]
+    )
+    axes.set(yscale="log", ylabel="error over the whole flight, % of the path (cross: failed)")
+    axes.grid(axis="y", alpha=0.3)
+    figure.legend(loc="outside right upper", fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
+def pictures(plan: Plan, folder: Path) -> dict[str, str]:
+    """Put one row of images of each scenario's cameras into a folder.
+
+    Returns:
+        Scenario to the name of its file; without those of which no run has kept images.
+    """
+    found: dict[str, str] = {}
+    for job in plan.jobs:
+        name = dict(job.settings)["scenario"]
+        if name in found:
+            continue
+        frames = sorted((Path(job.out) / "frames").glob("*.jpg"))
+        newest = {frame.stem.rpartition("_")[0]: frame for frame in frames}
+        images = [cv2.imread(str(frame)) for frame in newest.values()]
+        small = [
+            cv2.resize(image, (round(image.shape[1] * HEIGHT / image.shape[0]), HEIGHT))
+            for image in images
+            if image is not None
+        ]
+        if small:
+            found[name] = f"{name}.jpg"
+            cv2.imwrite(str(folder / found[name]), np.hstack(small))
+    return found
 
 
 def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, command: str) -> None:

@@ -1,9 +1,4 @@
-"""From the estimates and the truth to figures.
-
-Pure functions; `nodes.judging.evaluation.node` collects, and `nodes.judging.evaluation.results`
-writes.
-
-Errors over a whole flight, in which time without a pose counts as the worst dead reckoning.
+"""From the estimates and the truth to figures: pure functions, and the flight of one vehicle.
 
 The errors of the poses there are (`nodes.judging.evaluation.metrics`) say nothing of those that are
 missing: an estimator that gives up when it gets difficult would look better than one that drifts.
@@ -11,8 +6,6 @@ Here every image of the flight has an error. Where the estimator is lost, its la
 what it cannot know is added: the length of the true path since then. So being lost costs as much as
 a drift of 100 %, wherever the vehicle flies meanwhile: a tour that ends where it began makes nobody
 look good who stayed there.
-
-What a run says of one vehicle: where it truly was, where it was meant to be, what it hit.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
-"""Errors of an estimated trajectory: absolute, relative, drift; and of one pose, on plain floats.
+"""Errors of an estimated trajectory: absolute, relative, drift; and its covariances against them.
 
 Definitions are those of J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems"
 (IROS 2012), as the tool evo computes them, so that its figures and ours agree. Both trajectories
 have the same stamps and are in one frame: see `nodes.judging.evaluation.alignment` for how they get
 there.
-
-Covariances that an estimator gives with its poses, held against its errors.
 """
 
 from __future__ import annotations

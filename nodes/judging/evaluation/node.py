@@ -1,7 +1,4 @@
-"""Holds estimates against the truth, live and at the end.
-
-Errors of an estimator while a run goes on.
-"""
+"""The node that holds estimates against the truth, live and at the end."""
 
 from __future__ import annotations
 

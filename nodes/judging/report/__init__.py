@@ -1,7 +1,7 @@
 """A run as one page to read, ``report.html``, and its figures.
 
-`node` writes it when a run ends; `page` is the page, `folder` reads what the run left, and the
-others draw one figure each.
+`page` is the page, and the node that writes it when a run ends; `folder` reads what the run left,
+`tables` is that data and its tables, and the others draw.
 """
 
 from nodes.judging.report.page import Report, ReportConfig

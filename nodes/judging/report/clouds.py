@@ -1,8 +1,7 @@
 """Clouds from one viewpoint on one scale, side by side: what is smeared shows beside what is not.
 
-The painting is done in `nodes.judging.report.clouds`; matplotlib only adds axes.
-
-Painting points straight into an array of pixels, the nearer over the farther.
+Points are painted straight into an array of pixels, the nearer over the farther; matplotlib only
+adds axes.
 """
 
 from __future__ import annotations

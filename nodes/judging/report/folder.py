@@ -1,9 +1,7 @@
-"""What a run left in its folder, read for the report.
+"""What a run left in its folder, read leniently for the report.
 
 Everything is optional, as a run may have been killed at any time: what is not there, or cannot be
 read, is named in `Run.missing`, and the rest of the report goes on without it.
-
-Trajectories as a report needs them: read leniently, with their gaps.
 """
 
 from __future__ import annotations

@@ -1,9 +1,4 @@
-"""The page itself: everything in one file, that needs no network and no script.
-
-The node that writes the report when a run is over.
-
-``report``: a run's folder as one page to read.
-"""
+"""The page itself, in one file that needs no network and no script; its node and its command."""
 
 from __future__ import annotations
 
@@ -203,7 +198,6 @@ class Report(Node[ReportConfig]):
             self.after_run(self._write)
 
     def _write(self, out: Path) -> None:
-
         write_report(out, self.config.figures)
 
 

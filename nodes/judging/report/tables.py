@@ -1,7 +1,4 @@
-"""The report's tables: figures beside their thresholds, facts of the run, punctuality.
-
-What there is to report of a run: plain data, read by `nodes.judging.report.folder`.
-"""
+"""What there is to report of a run, read by `nodes.judging.report.folder`, and its tables."""
 
 from __future__ import annotations
 

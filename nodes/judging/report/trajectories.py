@@ -1,7 +1,4 @@
-"""The trajectories, from above and from the side, on one scale; and the height over time.
-
-Sheets of the sample images in which an evaluation drew the features of an estimator.
-"""
+"""Trajectories from above, from the side and as height over time; sheets of sample images."""
 
 from __future__ import annotations
 

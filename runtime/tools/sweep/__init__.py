@@ -2,9 +2,9 @@
 
     config.toml, --vary, --seeds, --repeat → Plan of Jobs → Executor → Rows → tables and plots
 
-Read in this order: `values` (what ``--vary`` says), `plan` (which runs there are), `process` (one
-run), `rows` (what is remembered of it), `console` (all runs, and what a terminal shows meanwhile),
-`tables`, `plots` and `page` (the result). The command itself is `runtime.tools.cli.sweep`.
+Read in this order: `plan` (what ``--vary`` says, and which runs there are), `process` (one run),
+`tables` (what is remembered of it, and the result), `console` (all runs, and what a terminal shows
+meanwhile), `plots` (and the page). The command itself is `runtime.tools.cli.sweep`.
 
 The executor may be any of `concurrent.futures`, also one that spreads the runs over machines on
 which the project is installed. With Dask (``pip install distributed``)::

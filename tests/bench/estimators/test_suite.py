@@ -9,8 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from bench.estimators.cells import cells
-from bench.estimators.page import write_page
+from bench.estimators.page import cells, write_page
 from bench.estimators.plan import FOLDER, LEVELS, Suite, make_plan, read_suite
 from runtime.errors import CommandError, ConfigError
 from runtime.tools.sweep.tables import Row, failed

@@ -1,4 +1,4 @@
-"""The report of a run: what is on the page, and that it needs nothing beside it."""
+"""The page of a run: what is on it, and that it needs nothing beside it; and its command."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
+import runtime.tools.cli
 from nodes.judging.evaluation.verdict import Thresholds
 from nodes.judging.report.folder import read_run
-from nodes.judging.report.page import write_report
+from nodes.judging.report.page import report, write_report
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import write_tum
 from runtime.channels.answers import Answers
+from runtime.errors import ConfigError
 from runtime.summary import OutsideSummary
 from tests.nodes.judging.report.folders import evaluated, frame, ply, recorded, summary, walk
 
@@ -274,3 +278,33 @@ def test_a_system_that_lost_frames_is_told_at_the_top_and_in_a_table(tmp_path: P
     assert "slam 3 – 2 0 0 0 1 0 0 0 0 0 0 0 15 4" in page.text
     assert "no: frames were lost after 10 s of real time" in page.text
     assert f"digest of what slam was sent {answers.inputs()}" in page.text
+
+
+app = typer.Typer()
+app.command()(report)
+
+
+def test_it_prints_the_pages_path(tmp_path: Path) -> None:
+    summary(tmp_path)
+    done = CliRunner().invoke(app, [str(tmp_path)], catch_exceptions=False)
+    assert done.output.splitlines() == [str(tmp_path / "report.html")]
+
+
+def test_what_cannot_be_written_is_one_of_our_errors(tmp_path: Path) -> None:
+    summary(tmp_path)
+    (tmp_path / "plots").touch()
+    with pytest.raises(ConfigError, match=r"plots"):
+        CliRunner().invoke(app, [str(tmp_path)], catch_exceptions=False, standalone_mode=False)
+
+
+def test_a_folder_that_is_no_run_gives_one_line_and_exit_code_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["runtime", "report", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        runtime.tools.cli.main()
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith(f"error: {tmp_path}: expected the folder of a run")
+    assert said.err.count("\n") == 1
