@@ -138,7 +138,7 @@ class Evaluation(Node[EvaluationConfig]):
 
     def check(self) -> Iterable[str]:
         """Say if there is no such vehicle as the file names, or nobody to judge."""
-        asked = self.config.thresholds != Thresholds()
+        asked = self.config.thresholds.given
         if asked and not (self._records or self.senders_of(PoseEstimate, TrajectoryEstimate)):
             yield "thresholds: expected an estimator to judge, found none"
         if (name := self.config.vehicle) and name not in (names := self._vehicles.names):
