@@ -15,7 +15,7 @@ import numpy as np
 
 from events import Vector3
 from events.frames import flip_yz, flip_yz_rotation, from_yaw
-from sims.worlds.loading import WorldError
+from sims.worlds import WorldError
 
 TIMESTEP_NS = 1_000_000
 """Nanoseconds of one physics step."""

@@ -1,21 +1,98 @@
-"""Worlds to fly in: geometry, materials and lights, without vehicles and cameras.
+"""Worlds to fly in, found by name or path: geometry, materials, lights; no vehicles, no cameras.
 
 A built-in world costs physics little (primitives, all in the world body) and is made to be seen:
 textures are drawn from a seed, and nothing repeats for long.
 """
 
+from __future__ import annotations
+
+import difflib
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from runtime import VisnavError
 from sims.worlds.builder import CLEARANCE, TOURS
+from sims.worlds.corridor import corridor
 from sims.worlds.dynamics import Dynamics, Motion, Scene
-from sims.worlds.loading import WORLDS, WorldError, load_scene, load_world
+from sims.worlds.forest import forest
+from sims.worlds.hall import hall
+from sims.worlds.office import office
+from sims.worlds.yard import night, yard
 
 __all__ = [
-    "CLEARANCE",
-    "TOURS",
-    "WORLDS",
-    "Dynamics",
-    "Motion",
-    "Scene",
-    "WorldError",
-    "load_scene",
+    "CLEARANCE", "TOURS", "WORLDS", "Dynamics", "Motion", "Scene", "WorldError", "load_scene",
     "load_world",
-]
+]  # fmt: skip
+
+WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {
+    "hall": hall,
+    "yard": yard,
+    "corridor": corridor,
+    "office": office,
+    "night": night,
+    "forest": forest,
+}
+"""The worlds that are built in: name to the function that makes one from a seed, bare or not. One
+in which something moves by itself is a `Scene`."""
+
+
+class WorldError(VisnavError, ValueError):
+    """There is no such world, or the file is not one."""
+
+
+def load_world(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> mujoco.MjSpec:
+    """Return a world without what moves in it by itself; see `load_scene`."""
+    return load_scene(name_or_path, seed, bare=bare).spec
+
+
+def load_scene(name_or_path: str | Path, seed: int = 0, *, bare: bool = False) -> Scene:
+    """Return a world, ready for vehicles and cameras to be added.
+
+    What MuJoCo warns of from then on goes to the log.
+
+    Args:
+        name_or_path: A name in `WORLDS`, or the path of an MJCF file (what ends in ``.xml``,
+            contains a slash, or is a `Path`).
+        seed: Seed of a built-in world's textures; its geometry is the same for every seed, but for
+            what lies on shelves. A file has none.
+        bare: Leave out a built-in world's images, which nobody is to see.
+
+    Raises:
+        WorldError: No such name or file, or the file is no MJCF that compiles.
+    """
+    # Else they would go to a file of MuJoCo's in whatever folder the run was started.
+    mujoco.set_mju_user_warning(logging.getLogger("visnav.mujoco").warning)
+    text = str(name_or_path)
+    is_path = isinstance(name_or_path, Path) or "/" in text or text.lower().endswith(".xml")
+    if is_path:
+        return Scene(_from_file(Path(name_or_path)))
+    if text not in WORLDS:
+        known = ", ".join(sorted(WORLDS))
+        near = difflib.get_close_matches(text, WORLDS, n=2, cutoff=0.5)
+        hint = f"; did you mean {' or '.join(near)}?" if near else ""
+        raise WorldError(
+            f'world: expected one of {known}, or a path to an .xml file, found "{text}"{hint}'
+        )
+    built = WORLDS[text](seed, bare)
+    return built if isinstance(built, Scene) else Scene(built)
+
+
+def _from_file(path: Path) -> Any:
+    place = path.expanduser()
+    if not place.is_file():
+        what = "a directory" if place.is_dir() else "nothing"
+        raise WorldError(f"world: {place}: expected an MJCF file, found {what}")
+    try:
+        spec = mujoco.MjSpec.from_file(str(place))
+        # Compiled here once, so that a mistake is reported as the file's and not as a vehicle's.
+        spec.copy().compile()
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise WorldError(
+            f"world: {place}: expected an MJCF file that compiles, found: {reason}"
+        ) from error
+    return spec

@@ -51,8 +51,22 @@ class Material(NamedTuple):
     module: float = 0.0
 
 
-class Model:
-    """Collects a world.
+WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
+
+
+def sides(
+    half: tuple[float, float], middle: tuple[float, float] = (0.0, 0.0)
+) -> Iterator[tuple[str, tuple[float, float], float, float]]:
+    """Yield name, place of the foot, direction that it faces and width of a room's four walls."""
+    (x, y), (u, v) = half, middle
+    yield "wall_north", (u + x, v), 180.0, 2.0 * y
+    yield "wall_south", (u - x, v), 0.0, 2.0 * y
+    yield "wall_east", (u, v - y), 90.0, 2.0 * x
+    yield "wall_west", (u, v + y), -90.0, 2.0 * x
+
+
+class Builder:
+    """Collects a world: materials, surfaces, lights, and the solids that it is built of.
 
     Args:
         name: Name of the model, which its random numbers depend on.
@@ -236,24 +250,6 @@ class Model:
         )
         if cone:
             light.cutoff, light.exponent = cone, 1.5
-
-
-WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
-
-
-def sides(
-    half: tuple[float, float], middle: tuple[float, float] = (0.0, 0.0)
-) -> Iterator[tuple[str, tuple[float, float], float, float]]:
-    """Yield name, place of the foot, direction that it faces and width of a room's four walls."""
-    (x, y), (u, v) = half, middle
-    yield "wall_north", (u + x, v), 180.0, 2.0 * y
-    yield "wall_south", (u - x, v), 0.0, 2.0 * y
-    yield "wall_east", (u, v - y), 90.0, 2.0 * x
-    yield "wall_west", (u, v + y), -90.0, 2.0 * x
-
-
-class Builder(Model):
-    """A model, with methods for the solids that worlds are built of."""
 
     def box(
         self,

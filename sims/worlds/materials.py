@@ -397,7 +397,7 @@ SIZE = 384
 
 
 def sky(random: np.random.Generator, night: bool = False) -> Image:
-    """Return a sky for `Model.sky`: haze at the horizon, blue above, clouds that lie in one plane.
+    """Return a sky for `Builder.sky`: haze at the horizon, blue above, clouds in one plane.
 
     By night all of that is hardly seen, before a few stars.
     """

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sims.worlds import WORLDS, load_world, textures
-from sims.worlds.builder import Model
+from sims.worlds.builder import Builder
 from sims.worlds.materials import Image
 
 SAVED: dict[str, dict[str, str]] = json.loads(
@@ -67,7 +67,7 @@ class Drawings:
         return random.uniform(size=(5, 7, 3)).astype(np.float32)
 
     def world(self, seed: int = 0, name: str = "mine", bare: bool = False) -> bytes:
-        model = Model(name, seed, bare)
+        model = Builder(name, seed, bare)
         model.material("stone", self.draw, 1.0)
         return bytes(model.spec.texture("stone").data)
 
