@@ -295,15 +295,8 @@ class CameraRenderer:
                 alone = moment == 0.0
                 if not spec.readout and alone:
                     poses.append(stage.pose(number))
-                pieces.append(
-                    view.draw(
-                        stage,
-                        coloured,
-                        alone and "depth" in kinds,
-                        alone and "segmentation" in kinds,
-                        rows if len(bands) > 1 else None,
-                    )
-                )
+                wanted = (coloured, alone and "depth" in kinds, alone and "segmentation" in kinds)
+                pieces.append(view.draw(stage, *wanted, rows if len(bands) > 1 else None))
         whole = [stacked(pieces) for pieces in drawn]
         _, depth, numbers = whole[len(whole) // 2]
         return Captured(

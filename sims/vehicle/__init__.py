@@ -23,23 +23,7 @@ from sims.vehicle.position import Gains, Limits
 from sims.vehicle.simulation import PhysicsDivergedError, Simulation
 
 __all__ = [
-    "STANDING_HEIGHT",
-    "TIMESTEP_NS",
-    "Autopilot",
-    "Contact",
-    "Controller",
-    "Gains",
-    "Limits",
-    "Mixer",
-    "Motor",
-    "Motors",
-    "Phase",
-    "Physics",
-    "PhysicsDivergedError",
-    "Setpoint",
-    "Simulation",
-    "State",
-    "VehicleParameters",
-    "attach_vehicle",
-    "read_parameters",
-]
+    "STANDING_HEIGHT", "TIMESTEP_NS", "Autopilot", "Contact", "Controller", "Gains", "Limits",
+    "Mixer", "Motor", "Motors", "Phase", "Physics", "PhysicsDivergedError", "Setpoint",
+    "Simulation", "State", "VehicleParameters", "attach_vehicle", "read_parameters",
+]  # fmt: skip

@@ -337,6 +337,9 @@ DEPTH = 0.02
 FALL = 0.05
 """Metres above the ground at which a vehicle does not stand on it."""
 
+_SOLIDS = np.array([1, 0, 0, 0, 0, 0], np.uint8)
+"""Groups of geoms that rays hit: 0 alone."""
+
 
 class Clearance:
     """What a vehicle would meet at a place, or on a straight line."""
@@ -350,7 +353,7 @@ class Clearance:
         mujoco.mj_fwdPosition(model, self._data)
         self._movers = [mover_of(model, geom) for geom in range(model.ngeom)]
         solid = (model.geom_contype | model.geom_conaffinity) != 0
-        # Group 0: solids. Group 1: what a ray must not hit, which is only to be seen or moves.
+        # Group 1: what a ray must not hit, which is only to be seen or moves.
         self._no_hits = np.where(solid & (np.array(self._movers) == ""), 0, 1)
 
     def at(self, place: Vector3, *, now: bool = False) -> str:
@@ -391,20 +394,13 @@ class Clearance:
         if length < 1e-6:
             return None, None
         x, y, z = (component / length for component in way)
-        direction = np.array(flip_yz((x, y, z)))
+        origin, direction = np.array(flip_yz(start)), np.array(flip_yz((x, y, z)))
         hit = np.zeros(1, np.int32)
         groups = self._model.geom_group.copy()
         self._model.geom_group[:] = self._no_hits
         try:
             distance = mujoco.mj_ray(
-                self._model,
-                self._data,
-                np.array(flip_yz(start)),
-                direction,
-                np.array([1, 0, 0, 0, 0, 0], np.uint8),
-                1,
-                self._body,
-                hit,
+                self._model, self._data, origin, direction, _SOLIDS, 1, self._body, hit
             )
         finally:
             self._model.geom_group[:] = groups

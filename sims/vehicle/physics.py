@@ -188,11 +188,8 @@ class Physics:
 
     def put(self, state: State) -> None:
         """Have the vehicle be in a state at once, whatever is there; its rotors turn on."""
-        (x, y, z), (vx, vy, vz), (wx, wy, wz) = (
-            state.position,
-            state.velocity,
-            state.angular_velocity,
-        )
+        (x, y, z), (vx, vy, vz) = state.position, state.velocity
+        wx, wy, wz = state.angular_velocity
         qw, qx, qy, qz = normalize(state.orientation)
         self._pose[:] = (x, -y, -z, qw, qx, -qy, -qz)
         twist = np.array((vx, -vy, -vz, wx, -wy, -wz))

@@ -129,12 +129,8 @@ class Builder:
         top = self.random.uniform(0.0, material.height - height)
         if material.module > 0.0:
             top = math.floor(top / material.module) * material.module
-        return (
-            left / material.width,
-            top / material.height,
-            (left + width) / material.width,
-            (top + height) / material.height,
-        )
+        across, down = material.width, material.height
+        return left / across, top / down, (left + width) / across, (top + height) / down
 
     def look(
         self,
@@ -342,11 +338,8 @@ class Builder:
         middle = (place[0], place[1], place[2] + height / 2.0)
         self.panel(f"{name}.look", material, window, size, middle, facing)
         angle = math.radians(facing)
-        behind = (
-            place[0] - math.cos(angle) * thick / 2.0,
-            place[1] - math.sin(angle) * thick / 2.0,
-            middle[2],
-        )
+        x, y = math.cos(angle) * thick / 2.0, math.sin(angle) * thick / 2.0
+        behind = (place[0] - x, place[1] - y, middle[2])
         half = [thick / 2.0, width / 2.0, height / 2.0]
         self.solid(name, mujoco.mjtGeom.mjGEOM_BOX, half, behind, facing)
 

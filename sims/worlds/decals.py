@@ -172,13 +172,8 @@ def paste(image: Image, piece: Image, left: int, top: int, border: int = 0) -> N
     """Put a piece into an image, with a shadow line around it."""
     height, width = piece.shape[:2]
     if border:
-        cv2.rectangle(
-            image,
-            (left - border, top - border),
-            (left + width + border - 1, top + height + border - 1),
-            (0.30, 0.28, 0.26),
-            -1,
-        )
+        end = (left + width + border - 1, top + height + border - 1)
+        cv2.rectangle(image, (left - border, top - border), end, (0.30, 0.28, 0.26), -1)
     image[top : top + height, left : left + width] = piece
 
 
@@ -204,12 +199,8 @@ def tile(number: int, columns: int, rows: int) -> tuple[float, float, float, flo
     """Return the window of one image of `sheets`, by its number, a hair inside its edges."""
     row, column = divmod(number % (columns * rows), columns)
     hair = 0.002
-    return (
-        column / columns + hair,
-        row / rows + hair,
-        (column + 1) / columns - hair,
-        (row + 1) / rows - hair,
-    )
+    left, top = column / columns + hair, row / rows + hair
+    return left, top, (column + 1) / columns - hair, (row + 1) / rows - hair
 
 
 STOREY = 3.1

@@ -222,14 +222,9 @@ def _things(b: Builder, crates: Material, steel: Material) -> None:
         b.crate(f"crate_{number}", crates, edge, (x, y, base), turn)
     for number, (x, y, colour) in enumerate(BARRELS):
         row = 0 if colour == "blue" else 1
+        side = (0.0, row * 0.4, 1.0, row * 0.4 + 0.4)
         b.cylinder(
-            f"barrel_{number}",
-            steel,
-            0.29,
-            0.88,
-            (x, y, 0.0),
-            side=(0.0, row * 0.4, 1.0, row * 0.4 + 0.4),
-            top=(0.02, 0.82, 0.3, 0.98),
+            f"barrel_{number}", steel, 0.29, 0.88, (x, y, 0.0), (0.02, 0.82, 0.3, 0.98), side
         )
 
 
@@ -283,14 +278,9 @@ def _shell(b: Builder, posters: Material) -> None:
         for offset in np.arange(-width / 2 + 1.7, width / 2 - 1.0, 2.9):
             at = np.array(place) + inward * 0.02 + along * (offset + b.random.uniform(-0.3, 0.3))
             height = float(b.random.uniform(0.95, 1.25))
-            b.panel(
-                f"{name}_poster_{count}",
-                posters,
-                decals.tile(count % 12, 4, 3),
-                (0.75 * height, height),
-                (float(at[0]), float(at[1]), float(b.random.uniform(1.5, 2.0))),
-                facing,
-            )
+            where = (float(at[0]), float(at[1]), float(b.random.uniform(1.5, 2.0)))
+            b.panel(f"{name}_poster_{count}", posters, decals.tile(count % 12, 4, 3),
+                    (0.75 * height, height), where, facing)  # fmt: skip
             count += 1
         brick = b.material(name, functools.partial(_wall, width=width), DENSITY)
         b.wall(name, brick, (width, HEIGHT), (*place, 0.0), facing)
@@ -305,14 +295,9 @@ def _roof(b: Builder, wood: Material, steel: Material) -> None:
     for number, y in enumerate((-3.0, 3.0)):
         for piece, x in enumerate((-6.0, -2.0, 2.0, 6.0)):
             bare = (0.0, 0.82, 1.0, 0.99)  # the steel's lowest band has no paint
-            b.box(
-                f"duct_{number}_{piece}",
-                steel,
-                (4.0, 0.4, 0.34),
-                (x, y, HEIGHT - 0.85),
-                windows=dict.fromkeys(("left", "right", "top", "bottom"), bare),
-                hidden=("front", "back"),
-            )
+            b.box(f"duct_{number}_{piece}", steel, (4.0, 0.4, 0.34), (x, y, HEIGHT - 0.85),
+                  windows=dict.fromkeys(("left", "right", "top", "bottom"), bare),
+                  hidden=("front", "back"))  # fmt: skip
     ceiling = b.material("ceiling", _ceiling, CEILING_DENSITY)
     b.ceiling("ceiling", ceiling, (NORTH, WEST), HEIGHT)
 

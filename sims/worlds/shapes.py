@@ -109,17 +109,11 @@ def face_size(name: str, size: tuple[float, float, float]) -> tuple[float, float
 def box(size: tuple[float, float, float], windows: dict[str, Window]) -> Surface:
     """Return those faces of a box about the origin that `windows` names."""
     extent = np.asarray(size)
-    return join(
-        [
-            quad(
-                np.array(FACES[name][0]) * extent / 2.0,
-                np.array(FACES[name][1]) * extent,
-                np.array(FACES[name][2]) * extent,
-                window,
-            )
-            for name, window in windows.items()
-        ]
-    )
+    surfaces = []
+    for name, window in windows.items():
+        corner, right, down = (np.array(sign) * extent for sign in FACES[name])
+        surfaces.append(quad(corner / 2.0, right, down, window))
+    return join(surfaces)
 
 
 def cylinder(
