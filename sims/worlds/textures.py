@@ -110,7 +110,7 @@ def _read(path: Path) -> npt.NDArray[np.uint8]:
 def _write(path: Path, image: npt.NDArray[np.uint8]) -> None:
     """Write a texture as a whole, whoever else does so at the same time."""
     if not path.parent.is_dir():
-        path.parent.mkdir(parents=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         _tidy(path.parent)
     content = len(image).to_bytes(_SIZE) + image.tobytes()
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as unfinished:
