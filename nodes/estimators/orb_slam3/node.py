@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from events import DepthImage, Image, Imu
@@ -19,7 +18,7 @@ from nodes.estimators import (
     sample_rows,
 )
 from nodes.estimators.orb_slam3.process import INSTALL, OrbSlam3Process
-from nodes.estimators.orb_slam3.settings import LENSES, Mode, OrbSettings, Settings, make_settings
+from nodes.estimators.orb_slam3.settings import LENSES, Mode, OrbSettings, make_settings
 from nodes.estimators.orb_slam3.vocabulary import find_vocabulary
 from runtime import Bundle, Duration
 from runtime.paths import InputPath
@@ -90,22 +89,19 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         yield from missing
         if missing:
             return
+        config = self.config
         try:
-            self._settings()
-            find_vocabulary(self.config.vocabulary)
+            self._settings = make_settings(
+                config.mode, self.cameras, self.imu_announcement, config.orb
+            )
+            self._vocabulary = find_vocabulary(config.vocabulary)
         except ValueError as error:
             yield str(error)
 
     async def on_ready(self) -> None:
         """Start ORB-SLAM3, in a process of its own."""
-        self.the_camera()
-        self._slam = await self.worker(
-            OrbSlam3Process,
-            self._settings(),
-            self._vocabulary(),
-            float(self.config.mapping_timeout),
-            latency=self.config.latency,
-        )
+        told = self._settings, self._vocabulary, float(self.config.mapping_timeout)
+        self._slam = await self.worker(OrbSlam3Process, *told, latency=self.config.latency)
 
     async def run(self) -> None:
         """Track each image; those that arrive meanwhile are skipped."""
@@ -129,23 +125,3 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
     async def on_end(self) -> None:
         """Send the trajectory after loop closures and other corrections."""
         self.publish_trajectory(*await self._slam.call_for(0.0, OrbSlam3Process.trajectory))
-
-    def _settings(self) -> Settings:
-        """Return ORB-SLAM3's settings for the sensors.
-
-        Raises:
-            ValueError: It cannot compute with them.
-        """
-        config = self.config
-        return make_settings(config.mode, self.cameras, self.imu_announcement, config.orb)
-
-    def _vocabulary(self) -> Path:
-        """Return the vocabulary's file.
-
-        Raises:
-            FatalError: There is none, or it is in another format.
-        """
-        try:
-            return find_vocabulary(self.config.vocabulary)
-        except ValueError as error:
-            self.log.fatal("%s", error)

@@ -1,12 +1,10 @@
-"""Training of the bag of visual words by which ORB-SLAM3 recognizes places.
+"""The bag of visual words by which ORB-SLAM3 recognizes places: its training, and its file.
 
 A tree of binary descriptors, made by k-majority (Grana et al., *A fast approach for integrating
 ORB descriptors in the bag of words model*, 2013): k-means with Hamming distance, where a centre's
 bit is what most of its members have. The file is DBoW2's text format, as in ORB-SLAM3's own
 ``ORBvoc.txt``: a line ``k L scoring weighting``, then one line a node after its parent's line,
 ``parent leaf d0 … d31 weight``, the root not being written.
-
-Vocabularies as files: DBoW2's text format, checks, and the folder of our own ones.
 """
 
 from __future__ import annotations
@@ -20,17 +18,23 @@ from typing import Annotated
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from runtime.run.results import replacing
 
 Bytes = npt.NDArray[np.uint8]
-Words = npt.NDArray[np.uint64]
-Floats = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int64]
 
 _BYTES = 32
 """Bytes of one ORB descriptor."""
+
+_ITERATIONS = 10
+"""Of moving the centres, at most; later ones change next to nothing."""
+
+_SCORING, _WEIGHTING = 0, 0
+"""L1 norm and tf-idf, which ORB-SLAM3 expects (DBoW2's ScoringType and WeightingType)."""
+
+_FIELDS = 2 + _BYTES + 1
+"""Numbers on a node's line: parent, leaf or not, descriptor, weight."""
 
 
 class TreeShape(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,26 +81,6 @@ class Vocabulary(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     descriptors: Bytes
     weights: npt.NDArray[np.float64]
 
-    def words(self, descriptors: Bytes) -> Integers:
-        """Return the word of each descriptor: int64 (m,), indices of leaves.
-
-        From the root down, to the nearest child each time, as DBoW2 does.
-        """
-        queries, nodes = _pack(descriptors), _pack(self.descriptors)
-        children: list[list[int]] = [[] for _ in self.parents]
-        for child, parent in enumerate(self.parents[1:].tolist(), 1):
-            children[parent].append(child)
-        found = np.zeros(len(queries), np.int64)
-        waiting = np.arange(len(queries))
-        while len(waiting):
-            for node in np.unique(found[waiting]):
-                here = waiting[found[waiting] == node]
-                below = np.array(children[node])
-                nearest = _distances(queries[here, None], nodes[below]).argmin(1)
-                found[here] = below[nearest]
-            waiting = waiting[~self.leaves[found[waiting]]]
-        return found
-
 
 def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary:
     """Make a vocabulary from the descriptors of images.
@@ -123,7 +107,7 @@ def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary
         )
     descriptors = np.concatenate(images)
     image_of = np.repeat(np.arange(len(images)), [len(found) for found in images])
-    parents, centres, node_of = _grow(_pack(descriptors), shape)
+    parents, centres, node_of = _grow(descriptors, shape)
     leaves = np.ones(len(parents), bool)
     leaves[parents[1:]] = False
     # One more than there are images: a word that all of them show keeps a weight above 0, below
@@ -136,112 +120,69 @@ def train(images: Sequence[Bytes], shape: TreeShape | None = None) -> Vocabulary
         depth=shape.header_depth(),
         parents=parents,
         leaves=leaves,
-        descriptors=centres.view(np.uint8),
+        descriptors=centres,
         weights=weights,
     )
 
 
-def _grow(descriptors: Words, shape: TreeShape) -> tuple[Integers, Words, Integers]:
+def _grow(descriptors: Bytes, shape: TreeShape) -> tuple[Integers, Bytes, Integers]:
     """Split all descriptors again and again, one level of the tree at a time.
 
     Returns:
-        Parents (n,), centres (n, 4), and each descriptor's leaf.
+        Parents (n,), centres (n, 32), and each descriptor's leaf.
     """
     rng = np.random.default_rng(shape.seed)
-    bits = np.unpackbits(descriptors.view(np.uint8), axis=1).astype(np.float32)
+    parents, centres = [-1], [np.zeros(_BYTES, np.uint8)]
     leaf_of = np.zeros(len(descriptors), np.int64)
-    parents = [np.array([-1])]
-    centres = [np.zeros((1, descriptors.shape[1]), np.uint64)]
-    count = 1
-    members = np.arange(len(descriptors))
+    level = [np.arange(len(descriptors))]
     for _ in range(shape.depth):
-        nodes, group = np.unique(leaf_of[members], return_inverse=True)
-        cluster, found = _split(descriptors[members], bits[members], group, shape.branching, rng)
-        used, child = np.unique(cluster, return_inverse=True)
-        parents.append(nodes[used // shape.branching])
-        centres.append(found[used])
-        leaf_of[members] = count + child
-        count += len(used)
-        # One descriptor, or many alike, cannot be split any further.
-        alike = (descriptors[members] == found[cluster]).all(1)
-        mixed = np.bincount(child, ~alike) > 0
-        members = members[mixed[child]]
-        members = members[np.argsort(leaf_of[members], kind="stable")]
-        if not len(members):
-            break
-    return np.concatenate(parents), np.concatenate(centres), leaf_of
+        above, level = level, []
+        for members in above:
+            node = int(leaf_of[members[0]])
+            found, cluster = _split(descriptors[members], shape.branching, rng)
+            for number, centre in enumerate(found):
+                below = members[cluster == number]
+                leaf_of[below] = len(parents)
+                parents.append(node)
+                centres.append(centre)
+                # One descriptor, or many alike, cannot be split any further.
+                if (descriptors[below] != centre).any():
+                    level.append(below)
+    return np.array(parents), np.array(centres), leaf_of
 
 
-def _split(
-    descriptors: Words, bits: Floats, group: Integers, k: int, rng: np.random.Generator
-) -> tuple[Integers, Words]:
-    """Split each group into at most k clusters.
-
-    Args:
-        descriptors: uint64 (n, 4).
-        bits: The same, a number each, float32 (n, 256).
-        group: int64 (n,), ascending from 0 without gaps.
+def _split(descriptors: Bytes, k: int, rng: np.random.Generator) -> tuple[Bytes, Integers]:
+    """Split descriptors into at most k clusters.
 
     Returns:
-        The cluster of each descriptor, ``group * k + j``; centres, uint64 (groups * k, 4).
+        Centres (n, 32), and the cluster of each descriptor.
     """
-    starts = np.flatnonzero(np.diff(group, prepend=-1))
-    centres = np.zeros((len(starts), k, descriptors.shape[1]), np.uint64)
-    distances = np.full((len(group), k), _NONE, np.int64)
-    # k-means++ (Arthur & Vassilvitskii 2007) in all groups at once. The least of exponential
-    # variates divided by weights picks an item with a probability proportional to its weight.
-    weight = np.ones(len(group))
-    for j in range(k):
-        with np.errstate(divide="ignore"):
-            draw = rng.exponential(size=len(group)) / weight
-        least = np.minimum.reduceat(draw, starts)
-        picked = np.flatnonzero((draw == least[group]) & np.isfinite(draw))
-        centres[group[picked], j] = descriptors[picked]
-        open_ = np.isfinite(least)[group]
-        distances[open_, j] = _distances(descriptors[open_], centres[group[open_], j])
-        weight = distances.min(1).astype(np.float64) ** 2
-    used = distances[starts] != _NONE
-    cluster = group * k + distances.argmin(1)
+    # k-means++ (Arthur & Vassilvitskii 2007).
+    centres = descriptors[rng.integers(len(descriptors), size=1)]
+    nearest = _distances(descriptors, centres)[:, 0]
+    while len(centres) < k and nearest.any():
+        share = np.cumsum(nearest**2)
+        picked = np.searchsorted(share, rng.integers(share[-1]), "right")
+        centres = np.vstack([centres, descriptors[picked]])
+        nearest = np.minimum(nearest, _distances(descriptors, centres[-1:])[:, 0])
+    bits = np.unpackbits(descriptors, axis=1)
+    cluster = _distances(descriptors, centres).argmin(1)
     for _ in range(_ITERATIONS):
-        sizes = np.bincount(cluster, minlength=len(starts) * k)
-        member = sparse.csr_array(
-            (np.ones(len(cluster), np.float32), (cluster, np.arange(len(cluster)))),
-            shape=(len(sizes), len(cluster)),
-        )
-        majority = np.packbits(2 * (member @ bits) >= sizes[:, None], axis=1)
-        centres[sizes.reshape(-1, k) > 0] = _pack(majority)[sizes > 0]
-        for j in range(k):
-            distances[:, j] = _distances(descriptors, centres[group, j])
-        distances[~used[group]] = _NONE
-        before, cluster = cluster, group * k + distances.argmin(1)
+        used, cluster = np.unique(cluster, return_inverse=True)
+        share = np.array([bits[cluster == number].mean(0) for number in range(len(used))])
+        centres = np.packbits(share >= 0.5, axis=1)
+        before, cluster = cluster, _distances(descriptors, centres).argmin(1)
         if np.array_equal(before, cluster):
             break
-    return cluster, centres.reshape(len(starts) * k, -1)
+    used, cluster = np.unique(cluster, return_inverse=True)
+    return centres[used], cluster
 
 
-def _pack(descriptors: Bytes) -> Words:
-    """Return descriptors as uint64 (n, 4), for quick counting of bits."""
-    return np.ascontiguousarray(descriptors).view(np.uint64)
-
-
-def _distances(a: Words, b: Words) -> Integers:
-    """Return the Hamming distances along the last axis of two arrays that broadcast."""
-    distances: Integers = np.bitwise_count(a ^ b).sum(-1, dtype=np.int64)
+def _distances(descriptors: Bytes, centres: Bytes) -> Integers:
+    """Return the Hamming distances of descriptors from centres, shape (n, k)."""
+    a, b = (np.ascontiguousarray(each).view(np.uint64) for each in (descriptors, centres))
+    distances: Integers = np.bitwise_count(a[:, None] ^ b).sum(-1, dtype=np.int64)
     return distances
-
-
-_NONE = 999
-"""Distance from a centre that is not there; more than any two descriptors have."""
-
-_ITERATIONS = 10
-"""Of moving the centres, at most; later ones change next to nothing."""
-
-
-_SCORING, _WEIGHTING = 0, 0
-"""L1 norm and tf-idf, which ORB-SLAM3 expects (DBoW2's ScoringType and WeightingType)."""
-
-_FIELDS = 2 + 32 + 1
-"""Numbers on a node's line: parent, leaf or not, descriptor, weight."""
 
 
 def cached_vocabulary(shape: TreeShape, cache_dir: Path | None = None) -> Path:

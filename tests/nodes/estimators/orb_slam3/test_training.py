@@ -11,8 +11,8 @@ from events import Event, Image
 from nodes.estimators.orb_slam3.training import VocabularyTrainer, describe, vocabulary
 from runtime.errors import ConfigError, NodeError
 from runtime.testing import run_node
-from tests.nodes.estimators.orb_slam3.reading import read_vocabulary
 from tests.nodes.estimators.orb_slam3.scene import views
+from tests.nodes.estimators.orb_slam3.test_vocabulary import read_vocabulary
 
 SHAPE = {"branching": 5, "depth": 2, "index_level": 0}
 CONFIG = """
@@ -77,13 +77,18 @@ def test_no_images_make_an_error_and_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_leaves_orb_slam3_out_and_puts_the_file_where_it_looks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    config = tmp_path / "config.toml"
-    config.write_text(CONFIG, encoding="utf-8")
+    path = tmp_path / "config.toml"
+    path.write_text(CONFIG, encoding="utf-8")
+    return path
+
+
+def test_the_command_leaves_orb_slam3_out_and_puts_the_file_where_it_looks(
+    tmp_path: Path, config: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit, match=r"^0$"):
         vocabulary(config, quiet=True)
     [path] = (tmp_path / "cache" / "visnav-runtime").iterdir()
@@ -93,19 +98,16 @@ def test_the_command_leaves_orb_slam3_out_and_puts_the_file_where_it_looks(
 
 
 def test_the_command_writes_where_it_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, config: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    config = tmp_path / "config.toml"
-    config.write_text(CONFIG, encoding="utf-8")
     with pytest.raises(SystemExit, match=r"^0$"):
         vocabulary(config, out=Path("own.txt"), quiet=True)
     assert read_vocabulary(tmp_path / "own.txt").leaves.any()
     assert f'vocabulary = "{tmp_path / "own.txt"}"' in capsys.readouterr().out
 
 
-def test_the_command_refuses_a_name_that_orb_slam3_would_read_as_binary(tmp_path: Path) -> None:
-    config = tmp_path / "config.toml"
-    config.write_text(CONFIG, encoding="utf-8")
+def test_the_command_refuses_a_name_that_orb_slam3_would_read_as_binary(
+    tmp_path: Path, config: Path
+) -> None:
     with pytest.raises(ConfigError, match=r"--out: expected a name that ends with \.txt"):
         vocabulary(config, out=tmp_path / "own.voc", quiet=True)
