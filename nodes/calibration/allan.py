@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from events import ImuAnnouncement
-from nodes.calibration.proofs import Figure
+from nodes.calibration.proofs import Figure, judged
 
 Floats = npt.NDArray[np.float64]
 
@@ -101,13 +101,11 @@ def noise(imu: ImuAnnouncement, samples: dict[str, Floats]) -> Iterator[tuple[Cu
         fitted = densities(seconds, found, white, walk)
         tried = trials(white, walk, step, imu.rate, len(rows))
         model = np.sqrt(white**2 / seconds + walk**2 * seconds / 3.0)
-        figures = []
-        for kind, announced, value, expected in zip(
-            ("noise_density", "random_walk"), (white, walk), fitted, tried.T, strict=True
-        ):
-            figures.append(
-                _figure(imu, f"{name}_{kind}", announced, value, expected, len(rows) / imu.rate)
-            )
+        names = f"{name}_noise_density", f"{name}_random_walk"
+        figures = [
+            _figure(imu, *each, len(rows) / imu.rate)
+            for each in zip(names, (white, walk), fitted, tried.T, strict=True)
+        ]
         yield Curve(name, seconds, np.sqrt(found), model), figures
 
 
@@ -128,8 +126,8 @@ def _figure(
 ) -> Figure:
     if announced == 0.0:
         limit = 1.5 * float(expected.max()) + 1e-9
-        remark = f"{imu.source}: {name} is {value:.3g}, announced as 0" * (value > limit)
-        return Figure(imu.source, f"{name} where 0 is announced", value, limit, "", remark)
+        wrong = f"{imu.source}: {name} is {value:.3g}, announced as 0"
+        return judged(imu.source, f"{name} where 0 is announced", value, limit, "", wrong)
     middle, spread = float(np.median(expected)), float(expected.std()) / announced
     off = abs(value / middle - 1.0) if middle else float("inf")
     limit, remark = ALLOWED, ""

@@ -1,7 +1,4 @@
-"""``selftest`` and ``lint``: whether a rig is what it says, and whether it says what is meant.
-
-The self-test as a page: figures, curves and where each point fell, in one file.
-"""
+"""``selftest`` and ``lint``: whether a rig is what it says, and whether it says what is meant."""
 
 from __future__ import annotations
 
@@ -9,13 +6,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-import jinja2
 import numpy as np
 import typer
 
 from nodes.calibration.selftest import TITLES, Result
 from nodes.judging.report import style
-from nodes.judging.report.page import embedded
+from nodes.judging.report.page import embedded, page_of
 from runtime.paths import source_file
 from runtime.tools.cli.commands import ConfigFile, Overrides
 
@@ -39,8 +35,7 @@ def selftest(
     the stamps of image, depth, pose and IMU agree. Writes selftest.html, with all figures.
     Ends with 0 if all is proven, and 1 if something is not as announced.
     """
-    from nodes.calibration.selftest import TITLES, prove, subjects
-    from nodes.judging.report.style import number
+    from nodes.calibration.selftest import prove, subjects
     from runtime.config.reading import load_configuration
     from runtime.errors import ConfigError
     from runtime.run.results import claim
@@ -64,8 +59,8 @@ def selftest(
                 f"{spec.name}: {proof}. {TITLES[proof]}: {state if figures else 'not applicable'}"
             )
             for figure in figures:
-                limit = "" if figure.limit is None else f" (at most {number(figure.limit)})"
-                value = f"{number(figure.value)}{limit} {figure.unit}"
+                limit = "" if figure.limit is None else f" (at most {style.number(figure.limit)})"
+                value = f"{style.number(figure.value)}{limit} {figure.unit}"
                 print(f"    {figure.subject}: {figure.name}: {value}")
                 if figure.remark:
                     print(f"        {figure.remark}")
@@ -95,13 +90,12 @@ def lint(
 
     from runtime.config.reading import load_configuration
     from runtime.tools import preflight
-    from runtime.tools import preflight as rules
     from runtime.tools.cli.run import leave_behind
 
     settings = load_configuration(config, overrides or [])
     brought_up = preflight.of_nodes(settings)
     errors = brought_up.errors
-    found = [] if errors else rules.lint(settings, brought_up.announcements, ignore or [])
+    found = [] if errors else preflight.lint(settings, brought_up.announcements, ignore or [])
     for finding in found:
         print(finding)
     for error in errors:
@@ -117,23 +111,9 @@ def write_page(path: Path, name: str, results: Sequence[Result]) -> None:
     Raises:
         OSError: A file cannot be written.
     """
-    here = Path(__file__).parent
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader([here, here.parent / "report"]),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
     with style.drawing():
-        plots = {
-            result.vehicle: [
-                embedded(plot.write(path.parent, ()), plot.title, plot.caption, plot.photo)
-                for plot in _plots(result)
-            ]
-            for result in results
-        }
-    page = environment.get_template("selftest.html.jinja").render(
+        plots = {r.vehicle: [embedded(plot, path.parent) for plot in _plots(r)] for r in results}
+    page = page_of(Path(__file__).with_name("selftest.html.jinja")).render(
         name=name, results=results, titles=TITLES, plots=plots, text=style.number
     )
     path.write_text(page, encoding="utf-8", newline="\n")

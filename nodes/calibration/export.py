@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -76,12 +77,14 @@ def export_calibration(
         for kind in ("rgb", "depth"):
             shutil.rmtree(folder / f"{kind}_{number}", ignore_errors=True)
     reader, sequence = Recorded(recording), VslamLab(folder, rig, DEPTH_FACTOR, zero)
-    wanted = (Image, DepthImage, Imu, Odometry)
-    take: dict[type[Any], Any] = {Imu: sequence.imu, Odometry: sequence.odometry}
-    for _, event in reader.events(0, None, lambda kind, _: issubclass(kind, wanted)):
-        if type(event) in take:
-            take[type(event)](event)
-        elif isinstance(event, Image | DepthImage) and (file := sequence.note(event)) is not None:
+    take: dict[type[Any], Callable[[Any], ImageFile | None]] = {
+        Image: sequence.image,
+        DepthImage: sequence.depth,
+        Imu: sequence.imu,
+        Odometry: sequence.odometry,
+    }
+    for _, event in reader.events(0, None, lambda kind, _: kind in take):
+        if (file := take[type(event)](event)) is not None:
             file()
     reader.close()
     sequence.close()
@@ -137,16 +140,8 @@ class VslamLab(Recording):
         header = "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n"
         self._truth = self.rows("groundtruth.csv", header)
 
-    def image(self, event: Image) -> ImageFile | None:
-        """Note an image of one of the cameras."""
-        return self.note(event)
-
-    def depth(self, event: DepthImage) -> ImageFile | None:
-        """Note a depth image of one of the cameras."""
-        return self.note(event)
-
-    def note(self, event: Image | DepthImage) -> ImageFile | None:
-        """Note an image of either kind, and return what is left to write."""
+    def image(self, event: Image | DepthImage) -> ImageFile | None:
+        """Note an image of one of the cameras, and return what is left to write."""
         kind = "rgb" if isinstance(event, Image) else "depth"
         name = f"{kind}_{self._names.get(event.source, -1)}"
         if name not in self._stamps:
@@ -155,6 +150,8 @@ class VslamLab(Recording):
         convert = functools.partial(depth_in_steps, per_metre=self.depth_factor)
         path = self.folder / name / f"{self.epoch + event.stamp}.png"
         return ImageFile(path, event.data, in_colour if kind == "rgb" else convert)
+
+    depth = image
 
     def odometry(self, event: Odometry) -> None:
         """Note where the body is."""

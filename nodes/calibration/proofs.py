@@ -61,6 +61,11 @@ class Figure(msgspec.Struct, frozen=True):
         return self.limit is None or self.value <= self.limit
 
 
+def judged(subject: str, name: str, value: float, limit: float, unit: str, wrong: str) -> Figure:
+    """Return a figure that says what is wrong if it is not within its limit."""
+    return Figure(subject, name, value, limit, unit, "" if value <= limit else wrong)
+
+
 class Points(msgspec.Struct, frozen=True, eq=False):
     """Discs of a camera's images: where they are, where they should be, and how they move.
 
@@ -109,11 +114,11 @@ def integration(imu: ImuAnnouncement, samples: Sequence[Imu], motion: Motion, be
         turn = after
     off = float(np.linalg.norm(place - places[-1]))
     length = seconds[-1]
-    remark = "" if off <= _POSITION else (
+    wrong = (
         f"the ideal IMU, integrated over {length:.2f} s, ends {off:.3f} m from the truth: its "
         "samples, their stamps or its mounting are not what is announced"
-    )  # fmt: skip
-    return Figure(imu.source, f"position after {length:.2f} s", off, _POSITION, "m", remark)
+    )
+    return judged(imu.source, f"position after {length:.2f} s", off, _POSITION, "m", wrong)
 
 
 def discs(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Points:
@@ -179,17 +184,14 @@ def projection(camera: CameraAnnouncement, points: Points) -> Figure:
     worst = float(np.quantile(distance, _MOST)) if len(distance) else float("nan")
     wild = float(np.nanmax(distance, initial=0.0))
     worst = wild if wild > 3.0 * limit else worst
-    remark = ""
-    if not len(distance):
-        remark = f"{camera.source}: no sphere of the room was seen whole, so nothing is proven"
-    elif not worst <= limit:
-        gone = int(np.isnan(distance).sum())
-        remark = (
-            f"{camera.source}: points fall up to {wild:.2f} px beside their "
-            f"pixels{f', and {gone} are missing' if gone else ''}{_likely(camera, points)}"
-        )
+    gone = int(np.isnan(distance).sum())
+    wrong = "no sphere of the room was seen whole, so nothing is proven"
+    if len(distance):
+        missing = f", and {gone} are missing" if gone else ""
+        wrong = f"points fall up to {wild:.2f} px beside their pixels{missing}"
+        wrong += _likely(camera, points)
     name = f"{_MOST:.0%} of {len(distance)} points beside their pixels"
-    return Figure(camera.source, name, worst, limit, "px", remark)
+    return judged(camera.source, name, worst, limit, "px", f"{camera.source}: {wrong}")
 
 
 def depth(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: float) -> Figure:
@@ -219,17 +221,15 @@ def depth(camera: CameraAnnouncement, kept: _Collector, motion: Motion, angle: f
         off.append(wrong[clear])
         ratio.append(samples[clear, 2] / met[0][0][clear])
     errors = np.abs(np.concatenate(off)) if off else np.zeros(0)
-    worst = float(np.quantile(errors, _MOST)) if len(errors) else float("nan")
-    remark = ""
-    if not len(errors):
-        remark = f"{camera.source}: no depth came, so nothing is proven"
-    elif worst > _DEPTH:
-        remark = (
-            f"{camera.source}: depth is up to {1e3 * worst:.1f} mm beside the true surfaces: its "
-            f"median is {float(np.median(np.concatenate(ratio))):.4f} times the truth"
+    worst, says = float("nan"), "no depth came, so nothing is proven"
+    if len(errors):
+        worst = float(np.quantile(errors, _MOST))
+        says = (
+            f"depth is up to {1e3 * worst:.1f} mm beside the true surfaces: its median is "
+            f"{float(np.median(np.concatenate(ratio))):.4f} times the truth"
         )
     name = f"{_MOST:.0%} of {len(errors)} depths beside the surfaces"
-    return Figure(camera.source, name, worst, _DEPTH, "m", remark)
+    return judged(camera.source, name, worst, _DEPTH, "m", f"{camera.source}: {says}")
 
 
 def exported(rig: Rig, folder: Path) -> Iterator[Figure]:
@@ -263,10 +263,8 @@ def read_back(rig: Rig, name: str, folder: Path, generator: np.random.Generator)
         pixels = found.project(rays @ pose[:3, :3].T + pose[:3, 3])
         off = float(np.abs(pixels - camera.info.project(rays)).max(initial=0.0))
         worst = max(worst, off if np.isfinite(off) else float("inf"))
-    remark = "" if worst <= _EXPORT else (
-        f"the files for {name} project up to {worst:.3g} px beside what is announced"
-    )  # fmt: skip
-    return Figure(rig.body, name, worst, _EXPORT, "px", remark)
+    wrong = f"the files for {name} project up to {worst:.3g} px beside what is announced"
+    return judged(rig.body, name, worst, _EXPORT, "px", wrong)
 
 
 def stamps(
@@ -278,14 +276,14 @@ def stamps(
     for name, have in (("images", kept.images), ("depth images", kept.depths)):
         if have[source]:
             lonely = len(shot - set(have[source]))
-            remark = f"{source}: {lonely} exposures have no {name[:-1]} of their stamp"
-            yield Figure(source, f"exposures without {name}", lonely, 0, "", remark * (lonely > 0))
+            wrong = f"{source}: {lonely} exposures have no {name[:-1]} of their stamp"
+            yield judged(source, f"exposures without {name}", lonely, 0, "", wrong)
     half = round(camera.readout * 5e8)
     wanted = {s + d for s in shot for d in ({0, half, -half} if half else {0})}
     poses = kept.poses[source]
     missing = sum(not any(s + d in poses for d in (0, 1, -1)) for s in wanted)
-    remark = f"{source}: {missing} poses of rows are missing, or bear other stamps"
-    yield Figure(source, "poses of rows missing", missing, 0, "", remark * (missing > 0))
+    wrong = f"{source}: {missing} poses of rows are missing, or bear other stamps"
+    yield judged(source, "poses of rows missing", missing, 0, "", wrong)
     times = np.array(sorted(s for s in poses if s >= kept.taken_off), np.int64)
     true = times - round(camera.time_offset * 1e9)
     times, true = times[true <= motion.stamps[-1]], true[true <= motion.stamps[-1]]
@@ -299,8 +297,8 @@ def stamps(
             ("camera poses turned against them", angle, _TURN, "rad"),
         ):
             worst = float(value.max())
-            remark = f"{source}: {name} by {worst:.2g} {unit}: stamps or mounting are not true"
-            yield Figure(source, name, worst, limit, unit, remark * (worst > limit))
+            wrong = f"{source}: {name} by {worst:.2g} {unit}: stamps or mounting are not true"
+            yield judged(source, name, worst, limit, unit, wrong)
     if points is not None and len(points.off):
         yield _late(f"{source}", "images", points.flow, points.off)
 
@@ -322,12 +320,11 @@ def _late(source: str, what: str, flow: Floats, off: Floats) -> Figure:
     fine = np.isfinite(off).all(axis=1)
     moved = float((flow[fine] ** 2).sum())
     late = -float((off[fine] * flow[fine]).sum()) / moved if moved else 0.0
-    remark = (
+    wrong = (
         f"{source}: {what} show what was {abs(1e3 * late):.2f} ms "
         f"{'before' if late > 0 else 'after'} the time that their stamps say"
     )
-    value = abs(late)
-    return Figure(source, f"{what} off their stamps", value, _LATE, "s", remark * (value > _LATE))
+    return judged(source, f"{what} off their stamps", abs(late), _LATE, "s", wrong)
 
 
 def _boxes(

@@ -30,6 +30,7 @@ from events import (
     Announcement,
     CameraAnnouncement,
     DepthImage,
+    Event,
     Image,
     Imu,
     ImuAnnouncement,
@@ -38,7 +39,6 @@ from events import (
     Quaternion,
     TakenOff,
     Vector3,
-    VehicleEvent,
 )
 from events.geometry import inverse
 from runtime import Node, on
@@ -325,26 +325,17 @@ class _Collector(Node):
         elif isinstance(announcement, ImuAnnouncement):
             self.imu_announced = announcement
 
-    @on(Odometry)
-    def note_odometry(self, event: Odometry) -> None:
-        """Keep where the vehicle is."""
-        self.odometry.append(event)
-
-    @on(Imu)
-    def note_imu(self, event: Imu) -> None:
-        """Keep a measurement."""
-        self.imu.append(event)
-
-    @on(VehicleEvent)
-    def note_vehicle(self, event: VehicleEvent) -> None:
-        """Note when the vehicle flies."""
-        if isinstance(event, TakenOff):
+    @on(Odometry, Imu, TakenOff, PoseStamped)
+    def note(self, event: Event) -> None:
+        """Keep where vehicle and cameras are, what the IMU measures, and when the vehicle flies."""
+        if isinstance(event, Odometry):
+            self.odometry.append(event)
+        elif isinstance(event, Imu):
+            self.imu.append(event)
+        elif isinstance(event, PoseStamped):
+            self.poses[event.source][event.stamp] = event
+        else:
             self.taken_off = event.stamp
-
-    @on(PoseStamped)
-    def note_pose(self, event: PoseStamped) -> None:
-        """Keep where a camera was."""
-        self.poses[event.source][event.stamp] = event
 
     @on(Image)
     def note_image(self, event: Image) -> None:
@@ -358,9 +349,8 @@ class _Collector(Node):
         depth = event.data
         pixels = np.random.default_rng(0).integers(0, depth.size, _SAMPLES)
         rows, columns = np.divmod(pixels, depth.shape[1])
-        self.depths[event.source][event.stamp] = np.column_stack(
-            [columns, rows, depth[rows, columns]]
-        ).astype(np.float64)
+        kept = np.column_stack([columns, rows, depth[rows, columns]])
+        self.depths[event.source][event.stamp] = kept.astype(np.float64)
         self.own[event.source][event.stamp] = depth < NEAREST
 
 

@@ -26,21 +26,16 @@ Announced = Sequence[Announcement]
 
 def baseline(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
     """Of a stereo pair too close together nothing has depth; too far apart, nothing is in both."""
-    for right in cameras(announced):
-        for left in cameras(announced):
-            if right.stereo != left.source:
-                continue
-            apart = math.dist(left.position, right.position)
-            if not 0.02 <= apart <= 1.0:
-                yield Finding(
-                    right.source, f"its baseline is {apart:.3g} m", "0.05 to 0.5 m is usual"
-                )
-            elif abs(apart - right.baseline) > 1e-3:
-                yield Finding(
-                    right.source,
-                    f"it is {apart:.3f} m from {left.source}, and announces {right.baseline:.3f} m",
-                    "announce the distance between both positions",
-                )
+    for left, right in stereo_pairs(announced):
+        apart = math.dist(left.position, right.position)
+        if not 0.02 <= apart <= 1.0:
+            yield Finding(right.source, f"its baseline is {apart:.3g} m", "0.05 to 0.5 m is usual")
+        elif abs(apart - right.baseline) > 1e-3:
+            yield Finding(
+                right.source,
+                f"it is {apart:.3f} m from {left.source}, and announces {right.baseline:.3f} m",
+                "announce the distance between both positions",
+            )
 
 
 def square_pixels(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
@@ -152,18 +147,15 @@ def zero_noise(config: Config, announced: Announced) -> Iterator[Finding]:
 
 def stamps(config: Config, announced: Announced) -> Iterator[Finding]:  # noqa: ARG001
     """Both eyes of a stereo pair are matched by their stamps."""
-    for right in cameras(announced):
-        for left in cameras(announced):
-            if right.stereo != left.source:
-                continue
-            for name in ("rate", "time_offset"):
-                one, other = getattr(left, name), getattr(right, name)
-                if one != other:
-                    found = f"its {name} is {other:g}, that of {left.source} {one:g}"
-                    yield Finding(right.source, found, "take the same, or stamps cannot match")
-            if left.time_jitter or right.time_jitter:
-                found = f"its stamps and those of {left.source} have a jitter"
-                yield Finding(right.source, found, "take it out, or match them by nearest stamps")
+    for left, right in stereo_pairs(announced):
+        for name in ("rate", "time_offset"):
+            one, other = getattr(left, name), getattr(right, name)
+            if one != other:
+                found = f"its {name} is {other:g}, that of {left.source} {one:g}"
+                yield Finding(right.source, found, "take the same, or stamps cannot match")
+        if left.time_jitter or right.time_jitter:
+            found = f"its stamps and those of {left.source} have a jitter"
+            yield Finding(right.source, found, "take it out, or match them by nearest stamps")
 
 
 def needs(config: Config, announced: Announced) -> Iterator[Finding]:
@@ -204,6 +196,14 @@ RULES = [
 def cameras(announced: Announced) -> list[CameraAnnouncement]:
     """Return the cameras."""
     return [each for each in announced if isinstance(each, CameraAnnouncement)]
+
+
+def stereo_pairs(
+    announced: Announced,
+) -> Iterator[tuple[CameraAnnouncement, CameraAnnouncement]]:
+    """Yield the left and the right camera of each stereo rig."""
+    for right in cameras(announced):
+        yield from ((left, right) for left in cameras(announced) if right.stereo == left.source)
 
 
 def estimators(config: Config, announced: Announced) -> list[NodeSpec]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,8 @@ default, which is off."""
 
 _SECONDS, _RATE = 9.0, 5.0
 """Length of the flight; images a second, about."""
+
+_COLLECTOR = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
 
 
 class Result(msgspec.Struct, eq=False):
@@ -111,11 +113,17 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
     """
     folder.mkdir(parents=True, exist_ok=True)
     table = _alone(config, spec)
-    announced = _announced(table, config, folder, 0.05)
+    world = folder / "room.xml"
+    table["world"] = str(world.resolve())
+    world.write_text(mjcf(0.05), encoding="utf-8")
+    brought_up = preflight.of_nodes(_config([table], config, 1.0))
+    if brought_up.errors:
+        raise ConfigError("; ".join(brought_up.errors))
+    announced = brought_up.announcements
     cameras = [each for each in announced if isinstance(each, CameraAnnouncement)]
     focal = min((each.info.fx for each in cameras), default=256.0)
     angle = float(np.clip(13.0 / focal, 0.035, 0.08))
-    (folder / "room.xml").write_text(mjcf(angle), encoding="utf-8")
+    world.write_text(mjcf(angle), encoding="utf-8")
     notes = [
         f"Each camera takes about {_RATE:g} images a second, without noise, blur and what else is "
         "not geometry or time; the error of its depth is switched off, too."
@@ -131,7 +139,7 @@ def prove(config: Config, spec: NodeSpec, folder: Path, standing: float) -> Resu
         begin = max(kept.imu[0].stamp, kept.taken_off) + 50_000_000  # in mid-flight
         figures[1].append(proofs.integration(kept.imu_announced, kept.imu, motion, begin))
         seconds = needed(imu, standing)
-        still = _run(_standing(table, seconds), config)
+        still = _run([table | {"cameras": [], "control_rate": 20}, _COLLECTOR], config, seconds)
         samples = {
             "gyroscope": np.array([sample.angular_velocity for sample in still.imu]),
             "accelerometer": np.array([sample.linear_acceleration for sample in still.imu]),
@@ -174,41 +182,23 @@ def _alone(config: Config, spec: NodeSpec) -> dict[str, Any]:
     return table  # type: ignore[no-any-return]
 
 
-def _announced(table: dict[str, Any], config: Config, folder: Path, angle: float) -> Sequence[Any]:
-    (folder / "room.xml").write_text(mjcf(angle), encoding="utf-8")
-    table["world"] = str(folder.resolve() / "room.xml")
-    found = preflight.of_nodes(_config([table], config, 1.0))
-    if found.errors:
-        raise ConfigError("; ".join(found.errors))
-    return found.announcements
-
-
 def _flight(table: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     """Return the nodes of the flight: still, then up, then moving about all axes."""
-    excitation = {"duration": "6s", "amplitude": 0.3, "frequency": 0.4, "yaw": 45.0}
-    collector = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
     if "trajectory" in table:
         path = folder.resolve() / "path.tum"
         path.write_text("".join(_path()), encoding="utf-8")
-        return [table | {"trajectory": str(path)}, collector]
+        return [table | {"trajectory": str(path)}, _COLLECTOR]
     pilot = {
         "name": "selftest_pilot",
         "type": "WaypointFollower",
         "start_delay": "0.1s",
         "waypoints": [[0.0, 0.0, float(CENTRE[2])], [0.4, 0.0, float(CENTRE[2])]],
         "heading": "fixed",
-        "excitation": excitation,
+        "excitation": {"duration": "6s", "amplitude": 0.3, "frequency": 0.4, "yaw": 45.0},
     }
     if "imu" in table:
         table = table | {"imu": table["imu"] | {"ideal": True}}
-    return [table, pilot, collector]
-
-
-def _standing(table: dict[str, Any], seconds: float) -> list[dict[str, Any]]:
-    """Return the nodes of a vehicle that stands, with nothing but its IMU."""
-    still = table | {"cameras": [], "control_rate": 20}
-    collector = {"name": "collector", "type": f"{_Collector.__module__}:_Collector"}
-    return [still | {"_seconds": seconds}, collector]
+    return [table, pilot, _COLLECTOR]
 
 
 def _path() -> Iterator[str]:
@@ -226,9 +216,8 @@ def _config(nodes: list[dict[str, Any]], config: Config, seconds: float) -> Conf
     return parse({"run": run, "nodes": nodes}, "selftest")
 
 
-def _run(nodes: list[dict[str, Any]], config: Config) -> _Collector:
+def _run(nodes: list[dict[str, Any]], config: Config, seconds: float = _SECONDS) -> _Collector:
     """Run nodes, and return the last of them."""
-    seconds = nodes[0].pop("_seconds", _SECONDS)
     kept: list[Supervisor] = []
 
     @contextlib.contextmanager

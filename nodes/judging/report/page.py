@@ -89,7 +89,7 @@ def write_report(out: Path, formats: Sequence[str] = ("png", "svg")) -> Path:
                 ((draw(run) for draw in curves), draw_clouds(run), draw_frames(run)),
                 strict=True,
             ):
-                place += [_written(each, plots, formats) for each in found if each is not None]
+                place += [embedded(each, plots, formats) for each in found if each is not None]
     page = out / PAGE
     page.write_text(render(run, *shown), encoding="utf-8", newline="\n")
     return page
@@ -102,14 +102,7 @@ def render(
     frames: list[dict[str, str]],
 ) -> str:
     """Return the page."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    return environment.get_template("page.html.jinja").render(
+    return page_of(Path(__file__).parent / "page.html.jinja").render(
         run=run,
         main=tables.figures(run, main=True),
         others=tables.figures(run, main=False),
@@ -128,20 +121,28 @@ def render(
     )
 
 
-def _written(plot: Plot, folder: Path, formats: Sequence[str]) -> dict[str, str]:
-    return embedded(plot.write(folder, formats), plot.title, plot.caption, plot.photo)
+def page_of(template: Path) -> jinja2.Template:
+    """Return the template of a page, which may include the report's ``style.css.jinja``."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader([template.parent, Path(__file__).parent]),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return environment.get_template(template.name)
 
 
-def embedded(path: Path, title: str, caption: str, photo: bool) -> dict[str, str]:
-    """Return a figure for a page that holds it whole: its title, caption and source."""
-    data, kind = path.read_bytes(), "png"
-    if photo:
+def embedded(plot: Plot, folder: Path, formats: Sequence[str] = ()) -> dict[str, str]:
+    """Write a figure; return it for a page that holds it whole: its title, caption and source."""
+    data, kind = plot.write(folder, formats).read_bytes(), "png"
+    if plot.photo:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if image is not None:
             data, kind = cv2.imencode(".jpg", image, _QUALITY)[1].tobytes(), "jpeg"
     return {
-        "title": title,
-        "caption": caption,
+        "title": plot.title,
+        "caption": plot.caption,
         "source": f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}",
     }
 

@@ -46,7 +46,7 @@ def flown(*cameras: CameraAnnouncement, length: float = 6.0, images: int = 4) ->
             "angular_velocity": vector(rates[k]),
         }
         w, x, y, z = turns[k].as_quat(scalar_first=True).tolist()
-        kept.note_odometry(
+        kept.note(
             Odometry(
                 source="drone",
                 position=vector(places[k]),
@@ -55,7 +55,7 @@ def flown(*cameras: CameraAnnouncement, length: float = 6.0, images: int = 4) ->
                 **common,
             )
         )
-        kept.note_imu(Imu(source="drone/imu", linear_acceleration=vector(forces[k]), **common))
+        kept.note(Imu(source="drone/imu", linear_acceleration=vector(forces[k]), **common))
     kept.imu_announced = IMU
     motion = Motion(kept.odometry)
     for camera in cameras:
@@ -85,7 +85,7 @@ def expose(kept: _Collector, camera: CameraAnnouncement, motion: Motion, stamp: 
             at = np.array([stamp + shift - round(camera.time_offset * 1e9)])
             place, turn = motion.mounted(at, camera.position, camera.orientation)
             w, x, y, z = turn[0].as_quat(scalar_first=True).tolist()
-            kept.note_pose(
+            kept.note(
                 PoseStamped(
                     stamp=stamp + shift,
                     source=camera.source,

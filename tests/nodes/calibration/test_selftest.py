@@ -8,9 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from events import Announcement, CameraAnnouncement, ImuAnnouncement
+from nodes.calibration.allan import Curve
+from nodes.calibration.command import write_page
+from nodes.calibration.proofs import Figure, Points
 from nodes.calibration.selftest import Result, prove, subjects
 from runtime.config.reading import load, parse
 from runtime.errors import ConfigError
@@ -114,6 +118,19 @@ def test_the_command_passes_on_the_standard_tour(tmp_path: Path) -> None:
     assert "drone: 3. Known points fall on their pixels: passed" in done.stdout
     page = (tmp_path / "selftest.html").read_text(encoding="utf-8")
     assert page.count("<img") == 2
+
+
+def test_the_page_needs_nothing_beside_it(tmp_path: Path) -> None:
+    bad = Figure("drone/camera", "points beside their pixels", 2.0, 0.1, "px", "points fall beside")
+    seconds = np.array([0.1, 1.0, 10.0])
+    curve = Curve("gyroscope", seconds, seconds**-0.5, seconds**-0.5)
+    points = Points(np.ones((3, 2)), np.full((3, 2), 0.1), np.zeros((3, 2)))
+    result = Result("drone", {1: [], 3: [bad]}, ["a note"], [curve], {"drone/camera": points})
+    write_page(tmp_path / "selftest.html", "tour", [result])
+    page = (tmp_path / "selftest.html").read_text(encoding="utf-8")
+    for text in ("Self-test of tour", "points fall beside", "nothing to prove", "a note", "--bad"):
+        assert text in page
+    assert page.count('<img src="data:image/png;base64,') == 2
 
 
 def test_a_file_without_a_simulator_is_refused(tmp_path: Path) -> None:
