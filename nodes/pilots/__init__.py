@@ -4,9 +4,8 @@
 an estimator gives, and `Teleop` by the keys of a keyboard.
 """
 
-from nodes.pilots.pilot import Pilot, PilotConfig, WaypointFollower
+from nodes.pilots.pilot import Pilot, PilotConfig, VisualPilot, VisualPilotConfig, WaypointFollower
 from nodes.pilots.teleop import Keys, Teleop, TeleopConfig
-from nodes.pilots.visual_pilot import VisualPilot, VisualPilotConfig
 from nodes.pilots.waypoint_path import Excitation, FigureEight
 
 __all__ = [

@@ -1,7 +1,7 @@
-"""What all scripted flights have in common: take off, follow a path, land, end the run.
+"""Scripted flights: take off, follow a path, land, end the run.
 
 By which pose the path is followed is up to the subclass: `WaypointFollower` takes the vehicle's
-true one, `nodes.pilots.visual_pilot` an estimator's.
+true one, `VisualPilot` an estimator's: visual navigation in closed loop.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import asyncio
 import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any
 
 import msgspec
@@ -26,6 +26,7 @@ from events import (
     Odometry,
     PathAnnouncement,
     PilotAnnouncement,
+    PlannedPose,
     PoseEstimate,
     PositionSetpoint,
     Shutdown,
@@ -34,6 +35,7 @@ from events import (
     Vector3,
     VehicleAnnouncement,
     VehicleEvent,
+    VelocitySetpoint,
 )
 from events.frames import yaw_of
 from nodes.pilots.waypoint_path import (
@@ -47,6 +49,7 @@ from nodes.pilots.waypoint_path import (
     plan,
 )
 from runtime import Duration, Node, NodeConfig, Output, on
+from runtime.config.parameters import Changeable
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -101,6 +104,7 @@ class PilotConfig(NodeConfig):
 
 
 C = TypeVar("C", bound=PilotConfig, default=PilotConfig)
+E = TypeVar("E")
 
 
 class Pilot(Node[C], ABC):
@@ -201,10 +205,12 @@ class Pilot(Node[C], ABC):
 
     def send_command(self, command: type[Command], **fields: Any) -> None:
         """Send a command to the vehicle that is flown."""
+        self.commands.send(self.made(command, **fields))
+
+    def made(self, event: Callable[..., E], **fields: Any) -> E:
+        """Return an event of now about the vehicle that is flown."""
         vehicle = self.config.vehicle
-        self.commands.send(
-            command(stamp=self.clock.now(), source=self.name, vehicle=vehicle, **fields)
-        )
+        return event(stamp=self.clock.now(), source=self.name, vehicle=vehicle, **fields)
 
     def _plan(self, start: Odometry | PoseEstimate) -> WaypointPath | None:
         """Return the path from here; `None` if it has no length and no excitation."""
@@ -247,25 +253,121 @@ class WaypointFollower(Pilot[PilotConfig]):
     async def follow(self, path: WaypointPath) -> None:
         """Send a position set-point for every step of the path."""
         start = self.clock.now()
-        rows = zip(
-            path.position.tolist(),
-            path.velocity.tolist(),
-            path.acceleration.tolist(),
-            path.yaw.tolist(),
-            path.yaw_rate.tolist(),
-            strict=True,
-        )
-        for index, (position, velocity, acceleration, yaw, yaw_rate) in enumerate(rows):
+        for index in range(len(path.position)):
             await self.clock.sleep_until(start + round(index * path.step * 1e9))
+            self.setpoints.send(self.made(PositionSetpoint, **path.row(index)))
+
+
+class VisualPilotConfig(PilotConfig):
+    """Settings of a visual pilot, besides those of every scripted flight.
+
+    Attributes:
+        gain: Correction for the distance from the path, (m/s)/m.
+        yaw_gain: Correction for the error of the heading, (rad/s)/rad.
+        max_correction: Highest speed of the correction, metres per second.
+        estimate_timeout: Age of the newest estimate beyond which the vehicle stops and waits for
+            the next one.
+        landing_timeout: Time for which it waits; then it lands where it is, and the run ends.
+    """
+
+    gain: Changeable[Positive] = 1.0
+    yaw_gain: Changeable[Positive] = 1.0
+    max_correction: Changeable[Positive] = 0.5
+    estimate_timeout: Changeable[Duration] = Duration(0.5)  # immutable
+    landing_timeout: Changeable[Duration] = Duration(10.0)
+
+
+class VisualPilot(Pilot[VisualPilotConfig]):
+    """Flies a vehicle along waypoints by the poses that an estimator gives.
+
+    It knows no other pose, and sends velocities in the frame of the vehicle's own heading, so every
+    error of the estimate, that of the heading included, shows in the flight. (The vehicle itself
+    holds its attitude and velocity, by its true state.)
+
+    Waypoints are in the frame of the first estimate. Estimates in any other frame are ignored:
+    those of a restarted estimator, for example, are in ``odom_1``, whose origin is where the
+    vehicle was then. Without estimates the vehicle hovers; it goes on when estimates in the first
+    frame come again, and lands when they do not.
+    """
+
+    setpoints = Output(VelocitySetpoint)
+    plans = Output(PlannedPose)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._frame = ""
+        self._refused = ""
+
+    @on(PoseEstimate)
+    def estimates(self, event: PoseEstimate) -> None:
+        """Note the estimated pose, if it is in the frame of the flight."""
+        frame = self._frame = self._frame or event.frame_id
+        if event.frame_id != frame:
+            if event.frame_id != self._refused:
+                self._refused = event.frame_id
+                said = "%s: expected estimates in %s, found %s: not followed"
+                self.log.warning(said, event.source, frame, event.frame_id)
+            return
+        self.update_pose(event)
+
+    async def follow(self, path: WaypointPath) -> None:
+        """Send the path's velocity, corrected for the distance of the estimate from the path."""
+        clock = self.clock
+        step, last = round(path.step * 1e9), len(path.position) - 1
+        start = clock.now()
+        for index in range(last + 1):
+            await clock.sleep_until(start + index * step)
+            waited = await self._wait_for_estimate()
+            if waited is None:
+                return
+            start += waited
+            x, y, z = path.position[index].tolist()
+            yaw = float(path.yaw[index])
+            self.plans.send(self.made(PlannedPose, position=(x, y, z), yaw=yaw))
+            assert self.pose is not None
+            # Compared with the path at the stamp of the image, so that its age does not matter.
+            then = min(max(round((self.pose.stamp - start) / step), 0), last)
+            config = self.config  # which may change during the flight
+            correction = config.gain * (path.position[then] - self.pose.position)
+            size = math.sqrt(float(correction @ correction))
+            if size > config.max_correction:
+                correction *= config.max_correction / size
+            north, east, down = (path.velocity[index] + correction).tolist()
+            heading = float(path.yaw[then]) - yaw_of(self.pose.orientation)
+            yaw_error = math.remainder(heading, math.tau)
+            # The estimated heading now: the path's, less the error.
+            velocity = _turned((north, east, down), yaw_error - yaw)
+            turn = float(path.yaw_rate[index]) + config.yaw_gain * yaw_error
             self.setpoints.send(
-                PositionSetpoint(
-                    stamp=self.clock.now(),
-                    source=self.name,
-                    vehicle=self.config.vehicle,
-                    position=tuple(position),
-                    velocity=tuple(velocity),
-                    acceleration=tuple(acceleration),
-                    yaw=yaw,
-                    yaw_rate=yaw_rate,
-                )
+                self.made(VelocitySetpoint, frame_id="heading", velocity=velocity, yaw_rate=turn)
             )
+
+    async def _wait_for_estimate(self) -> int | None:
+        """Stop while the newest estimate is too old.
+
+        Returns:
+            Time that this took (ns); `None` if it took so long that the flight is over.
+        """
+        start = self.clock.now()
+        assert self.pose is not None
+        if start - self.pose.stamp <= self.config.estimate_timeout * 1e9:
+            return 0
+        self.log.warning(
+            "no estimate in %s for %g s: waiting for one", self._frame, self.config.estimate_timeout
+        )
+        self.send_command(Hover)
+        while (now := self.clock.now()) - self.pose.stamp > self.config.estimate_timeout * 1e9:
+            if now - start > self.config.landing_timeout * 1e9:
+                missed = f"no estimate in {self._frame} for {self.config.landing_timeout:g} s"
+                self.log.error("%s: landing", missed)
+                self.outcome = f"{missed}: landed"
+                return None
+            await self.clock.sleep(1 / self.config.rate)
+        return self.clock.now() - start
+
+
+def _turned(vector: Vector3, angle: float) -> Vector3:
+    """Return a vector turned about the vertical by an angle, clockwise seen from above."""
+    x, y, z = vector
+    c, s = math.cos(angle), math.sin(angle)
+    return (c * x - s * y, s * x + c * y, z)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 
@@ -45,7 +45,9 @@ _MOTIONS: dict[str, tuple[int, int, int, int]] = {
 }
 """Signs of x, y, z and yaw rate in the ``heading`` frame: x ahead, y to the right, z down."""
 
-_COMMANDS: dict[str, type[Command]] = {"land": Land, "hover": Hover, "arm": Arm, "disarm": Disarm}
+_COMMANDS: dict[str, type[Command]] = {
+    "takeoff": Takeoff, "land": Land, "hover": Hover, "arm": Arm, "disarm": Disarm
+}  # fmt: skip
 
 _STILL: Vector3 = (0.0, 0.0, 0.0)
 
@@ -217,10 +219,9 @@ class Teleop(Node[TeleopConfig]):
         if action == "quit":
             self.shutdowns.send(Shutdown(stamp=stamp, source=source, reason="quit by key"))
             return
-        command = Takeoff if action == "takeoff" else _COMMANDS[action]
-        fields = {"altitude": self.config.altitude} if action == "takeoff" else {}
-        vehicle = self.config.vehicle
-        self.commands.send(command(stamp=stamp, source=source, vehicle=vehicle, **fields))
+        fields: dict[str, Any] = {"vehicle": self.config.vehicle}
+        fields |= {"altitude": self.config.altitude} if action == "takeoff" else {}
+        self.commands.send(_COMMANDS[action](stamp=stamp, source=source, **fields))
 
 
 def approach(now: Vector3, goal: Vector3, step: float) -> Vector3:

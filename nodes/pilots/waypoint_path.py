@@ -1,15 +1,12 @@
 """Timed paths through waypoints: rounded corners, limited speed and acceleration, smooth heading.
 
-Pure numpy; the nodes that fly them are in `nodes.pilots.pilot` and its subclasses.
-
-Manoeuvres that a scripted flight can be given: excitation, a figure eight, a sweeping heading.
-
-Pure numpy; `nodes.pilots.pilot` puts them together with the path through the waypoints.
+And what a scripted flight can be given besides: excitation, a figure eight, a sweeping heading.
+Pure numpy; `nodes.pilots.pilot` puts them together.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -26,6 +23,10 @@ _SPACING = 0.02
 _REST = 1.0
 """Seconds at rest at both ends, so that smoothing neither cuts the path short nor starts it with
 a jerk."""
+
+
+_COLUMNS = ("position", "velocity", "acceleration", "yaw", "yaw_rate")
+"""What a `WaypointPath` has for each moment."""
 
 
 class WaypointPath(msgspec.Struct, frozen=True, eq=False):
@@ -46,6 +47,11 @@ class WaypointPath(msgspec.Struct, frozen=True, eq=False):
     acceleration: Floats
     yaw: Floats
     yaw_rate: Floats
+
+    def row(self, index: int) -> dict[str, Any]:
+        """Return position, velocity, … of one moment: tuples and numbers, by name."""
+        values = {name: getattr(self, name)[index].tolist() for name in _COLUMNS}
+        return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
 
     @property
     def seconds(self) -> float:
@@ -125,13 +131,10 @@ def _round_corners(points: Floats, radius: float) -> Floats:
     return np.concatenate(rounded)
 
 
-def _arc_length(points: Floats) -> Floats:
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-
-
 def _resample(points: Floats, spacing: float) -> tuple[Floats, Floats]:
     """Return points at equal distances along the path, and those distances."""
-    along = _arc_length(points)
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
     keep = np.concatenate([[True], np.diff(along) > 0])
     at = np.linspace(0.0, along[-1], max(int(along[-1] / spacing), 2))
     return np.stack([np.interp(at, along[keep], axis) for axis in points[keep].T], axis=1), at
@@ -279,6 +282,6 @@ def headed(path: WaypointPath, heading: Heading, yaw: float) -> WaypointPath:
 
 def joined(first: WaypointPath, second: WaypointPath) -> WaypointPath:
     """Return two paths of one step, the second of which begins where the first one ends."""
-    fields = ("position", "velocity", "acceleration", "yaw", "yaw_rate")
-    parts = {name: np.concatenate([getattr(p, name) for p in (first, second)]) for name in fields}
+    both = first, second
+    parts = {name: np.concatenate([getattr(path, name) for path in both]) for name in _COLUMNS}
     return WaypointPath(step=first.step, **parts)
