@@ -28,7 +28,7 @@ from events import (
     Odometry,
     PoseStamped,
 )
-from nodes.vehicles import Vehicles
+from events.announcements import Vehicles
 
 WORLD_AXES = "world: x north, y west, z up; origin on the ground"
 """The world of a data set, for the heads of its files: z up, as their readers expect it.

@@ -27,6 +27,7 @@ from events import (
     TrackingEvent,
     TrajectoryEstimate,
 )
+from events.announcements import Vehicles
 from events.frames import angle_between
 from events.geometry import Pose, pose_matrix, pose_tuples
 from nodes.judging.evaluation.judging import Flight, Judgement, collision_rows, judge
@@ -36,7 +37,6 @@ from nodes.judging.evaluation.verdict import Thresholds, conclude, planned_end
 from nodes.trajectory import Trajectory
 from nodes.trajectory.formats import tum_row
 from nodes.trajectory.table import GrowingFile
-from nodes.vehicles import Vehicles
 from runtime import Duration, Node, NodeConfig, Output, on
 from runtime.errors import suggest
 from runtime.paths import source_file

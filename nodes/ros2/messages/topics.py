@@ -14,8 +14,8 @@ from typing import Annotated, Literal
 import msgspec
 
 from events import CameraAnnouncement
+from events.announcements import Vehicles
 from events.frames import Axes, axes_of
-from nodes.vehicles import Vehicles
 from runtime import NodeConfig
 
 NO_HASH = "TypeHashNotSupported"

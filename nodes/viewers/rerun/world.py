@@ -26,9 +26,9 @@ from events import (
     Vector3,
     Wind,
 )
+from events.announcements import Vehicles
 from nodes.ros2.messages.images import depth_in_steps, encode_depth, encode_image
 from nodes.trajectory import RecentPoses
-from nodes.vehicles import Vehicles
 from nodes.viewers.common import (
     INLIER,
     OUTLIER,
